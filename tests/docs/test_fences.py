@@ -34,7 +34,7 @@ KINDS = {
     *(("sh", mark) for mark in ("", "slow", "fragment", "wrong")),
     ("json", ""),
     ("yaml", ""),
-    *(("diff", mark) for mark in ("", "slow")),
+    ("diff", ""),
     ("text", ""),
 }
 RUN = ("", "slow", "wrong")

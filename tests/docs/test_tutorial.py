@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import linecache
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
+import gymnasium
 import pytest
+from mani_skill.utils.registration import REGISTERED_ENVS
 
 import workbench
-from tests.docs.pages import Fence
-from tests.docs.test_fences import commands, opens
-from tests.docs.walk import FILE, STEPS, Step, after, mistake, write
-from workbench.checks.rules import RULES
+from tests.docs.pages import Fence, fences
+from tests.docs.test_fences import OPENS_A_PAGE, commands, opens
+from tests.docs.walk import FILE, PAGE, STEPS, Step, after, mistake, write
 from workbench.cli.main import main
 
+ENV_ID = "PushIt-v1"
 UNTIL_LATER = {"3. The scene": {"kinematic-never-moved"}, "4. Where an episode begins": {"success-at-reset"}}
 """What the page says that a step leaves to the next one."""
 QUICK = {"record": ["--no-pictures"], "check": ["--workers", "1"]}
@@ -31,79 +34,84 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.title)
 def test_a_step_does_what_the_page_says(
-    step: Step, folder: Path, child_process: None, capfd: pytest.CaptureFixture[str]
+    step: Step, folder: Path, renderer: None, child_process: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    walk(step, folder, capfd, ("", "fragment"))
+    after(STEPS.index(step), folder)
+    for fence, below in pairs(step):
+        if fence.language == "python":
+            write(fence, folder)
+        elif fence.language == "diff":
+            goes_wrong(fence, below, folder / FILE, capfd)
+        elif fence.language == "sh":
+            for words in commands(fence):
+                if not is_long(words):
+                    expect(type_in(words[1:], capfd), below)
     # As the reader leaves it: what the mistakes broke is kept, and any envs can be reset and stepped.
-    named = {rule for fence in step.fences if fence.language == "text" for rule in _RULE.findall(fence.text)}
-    said = type_in(["check", FILE, "--select", ",".join(sorted({"runs", *named}))], capfd)
+    quoted = {rule for fence in step.fences if fence.language == "text" for rule in _RULE.findall(fence.text)}
+    rules = ",".join(sorted({"runs", *quoted}))
+    said = type_in(["check", FILE, "--seeds", "8", "--select", rules], capfd)
     assert " 0 broken" in said, said
+    if step is STEPS[-1]:
+        (recorded,) = (folder / "recordings").glob("*.json")
+        success = workbench.read_episode(recorded).evaluate["success"]
+        assert success[-1].all() and not success[:-1].any() and len(success) > 10
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.title)
-def test_a_step_with_pictures_and_pages_does_what_the_page_says(
+def test_a_step_keeps_all_rules_and_opens(
     step: Step, folder: Path, renderer: None, child_process: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    walk(step, folder, capfd, ("", "fragment", "slow"))
+    """But for those that the page names as left to the next step."""
+    after(STEPS.index(step) + 1, folder)
     said = type_in(["check", FILE], capfd)
     assert set(_RULE.findall(said)) == UNTIL_LATER.get(step.title, set()), said
+    for fence, below in pairs(step):
+        for words in commands(fence) if fence.language == "sh" else ():
+            if words[1] == "check":
+                expect(said, below)
+            elif words[1] in OPENS_A_PAGE:
+                opens(words, folder)
+            elif words[1] == "record":
+                type_in(words[1:], capfd)
 
 
-def test_the_last_step_leaves_an_episode_with_success(
-    folder: Path, child_process: None, capfd: pytest.CaptureFixture[str]
-) -> None:
-    walk(STEPS[-1], folder, capfd, ("", "fragment"))
-    (description,) = (folder / "recordings").glob("*.json")
-    episode = workbench.read_episode(description)
-    assert episode.success and 10 < len(episode.action) < 50
-
-
-def test_what_is_quoted_is_of_all_steps_and_the_whole_page() -> None:
+def test_all_of_the_page_is_walked() -> None:
     """A heading or a fence that the walk overlooks would be checked by nobody."""
     assert [step.title.split(".")[0] for step in STEPS] == [str(number) for number in range(1, 11)]
-    quoted = [fence for step in STEPS for fence in step.fences if fence.language == "diff"]
+    assert sum(len(step.fences) for step in STEPS) == len(fences(PAGE))
+    assert all(fence.mark in ("", "fragment") for fence in fences(PAGE))
+    quoted = [fence for fence in fences(PAGE) if fence.language == "diff"]
     assert len(quoted) >= 14
-    assert {rule for step in STEPS for fence in step.fences for rule in _RULE.findall(fence.text)} <= set(
-        RULES
-    )
 
 
-def walk(step: Step, folder: Path, capfd: pytest.CaptureFixture[str], marks: tuple[str, ...]) -> None:
-    """Do a step, in a folder where those before it are done."""
-    after(STEPS.index(step), folder)
-    file = folder / FILE
-    for fence, below in zip(step.fences, (*step.fences[1:], None)):
-        if fence.mark not in marks:
-            continue
-        if fence.language == "python":
-            write(fence, folder)
-        elif fence.language == "sh":
-            for words in commands(fence):
-                expect(type_there(words[1:], folder, "slow" in marks, capfd), below)
-        elif fence.language == "diff":
-            right = file.read_text()
-            file.write_text(mistake(fence, right))
-            assert below is not None and below.language == "text", f"{fence.place}: its message is missing"
-            rules = _RULE.findall(below.text)
-            assert rules, f"{below.place} names no rule"
-            expect(type_in(["check", FILE, "--select", ",".join(rules)], capfd), below)
-            file.write_text(right)
+def pairs(step: Step) -> Iterator[tuple[Fence, Fence | None]]:
+    """Each fence of a step with the one below it."""
+    return zip(step.fences, (*step.fences[1:], None))
 
 
-def type_there(words: list[str], folder: Path, slow: bool, capfd: pytest.CaptureFixture[str]) -> str:
-    """What a command prints; empty for one that is for `make test-all` alone."""
-    whole = words[0] in ("open", "review") or (words[0] == "check" and "--select" not in words)
-    if not whole:
-        return type_in(words, capfd)
-    if slow and words[0] != "check":
-        opens(["workbench", *words], folder)
-    return type_in(words, capfd) if slow and words[0] == "check" else ""
+def is_long(words: list[str]) -> bool:
+    """Whether `make test-all` alone types it: it opens a page, or checks every rule."""
+    return words[1] in (*OPENS_A_PAGE, "check")
+
+
+def goes_wrong(fence: Fence, below: Fence | None, file: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Make a mistake, check the rules that the fence below it quotes, and undo it."""
+    assert below is not None and below.language == "text", f"{fence.place}: its message is missing below it"
+    rules = _RULE.findall(below.text)
+    assert rules, f"{below.place} names no rule"
+    right = file.read_text()
+    file.write_text(mistake(fence, right))
+    expect(type_in(["check", FILE, "--select", ",".join(rules)], capfd), below)
+    file.write_text(right)
 
 
 def type_in(words: list[str], capfd: pytest.CaptureFixture[str]) -> str:
     """What a command prints in this process."""
     linecache.checkcache()
+    for known in (REGISTERED_ENVS, gymnasium.registry):
+        # As in a process of its own: a recording leaves the task registered, by another test's file.
+        known.pop(ENV_ID, None)
     capfd.readouterr()
     with pytest.raises(SystemExit):
         main([*words, *QUICK.get(words[0], [])])
@@ -113,7 +121,7 @@ def type_in(words: list[str], capfd: pytest.CaptureFixture[str]) -> str:
 
 def expect(said: str, below: Fence | None) -> None:
     """That each paragraph of the fence was said; ``...`` stands for anything."""
-    if below is None or below.language != "text" or not said:
+    if below is None or below.language != "text":
         return
     flat = " ".join(said.split())
     for paragraph in below.text.strip().split("\n\n"):

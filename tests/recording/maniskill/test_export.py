@@ -51,7 +51,9 @@ def test_maniskills_dataset_class_loads_what_was_recorded(recordings: list[Path]
     assert len(data) == sum(one.length for one in ours)
     np.testing.assert_array_equal(np.concatenate([one.action for one in ours]), data.actions)
     np.testing.assert_array_equal(np.concatenate([one.reward for one in ours]), data.rewards)
-    stock: Any = gym.make("PushCube-v1", obs_mode="state", render_backend="none", control_mode="pd_ee_delta_pos")
+    stock: Any = gym.make(
+        "PushCube-v1", obs_mode="state", render_backend="none", control_mode="pd_ee_delta_pos"
+    )
     obs, _ = stock.reset(seed=ours[0].info.seed)
     np.testing.assert_allclose(data.obs[0], obs[0].numpy(), atol=1e-5)
     stock.close()

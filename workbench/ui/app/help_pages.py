@@ -171,7 +171,9 @@ def _coloured(code: str, language: str, attributes: str) -> str:
         return ""
     kinds = {"-": "gone", "+": "come"}
     return "".join(
-        f'<span class="{kinds[line[0]]}">{html.escape(line)}</span>' if line[0] in kinds else html.escape(line)
+        f'<span class="{kinds[line[0]]}">{html.escape(line)}</span>'
+        if line[0] in kinds
+        else html.escape(line)
         for line in code.splitlines(keepends=True)
     )
 
