@@ -129,10 +129,9 @@ def main(options: Options) -> None:
         lines.append(line)
     if options.write:
         cores = len(os.sched_getaffinity(0))
-        text = (
-            f"{HEAD}\n\nOn {cores} cores, without a GPU; both sides in one run: take the ratios.\n\n"
-            + "\n".join(lines)
-        )
+        clock = "the processor's time of all threads" if options.processor else "wall time"
+        text = f"{HEAD}\n\nOn {cores} cores, without a GPU, {clock}; all sides in one run: take the ratios.\n\n"
+        text += "\n".join(lines)
         page = PAGE.read_text()
         there = re.search(rf"^{re.escape(HEAD)}$.*?(?=^## |\Z)", page, re.M | re.S)
         page = page.replace(there[0], f"{text}\n\n") if there else f"{page.rstrip()}\n\n{text}\n"

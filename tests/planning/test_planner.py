@@ -41,7 +41,7 @@ class PlannedEnv(PushCubeEnv):
     def compute_dense_reward(self, obs, action, info):
         height = info["height"]
         if self.trouble == "nan":
-            return torch.where(height > 0.2, torch.nan, height)
+            return torch.where(height > 0.2, torch.nan, 1 - height)
         if self.trouble == "noise":
             return height + torch.rand_like(height)
         info["reward_terms"] = {"height": height, "still": torch.zeros_like(height)}
