@@ -46,18 +46,18 @@ class ReachBallEnv(BaseEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         with torch.device(self.device):
-            self.agent.reset(self.agent.keyframes["rest"].qpos)
+            self.agent.reset(torch.tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32))
             lowest, highest = torch.tensor([-0.1, -0.2, 0.05]), torch.tensor([0.1, 0.2, 0.35])
             p = lowest + torch.rand((len(env_idx), 3)) * (highest - lowest)
             self.ball.set_pose(Pose.create_from_pq(p=p))
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        offset = self.agent.tcp.pose.p - self.ball.pose.p
+        offset = self.agent.tcp_pose.p - self.ball.pose.p
         distance = torch.linalg.norm(offset, dim=1)
         return {"success": distance < NEAR, "offset": offset, "distance": distance}
 
     def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        return {"tcp_pose": self.agent.tcp.pose.raw_pose, "ball": self.ball.pose.p}
+        return {"tcp_pose": self.agent.tcp_pose.raw_pose, "ball": self.ball.pose.p}
 
     def compute_dense_reward(self, obs: Any, action: Any, info: dict[str, Any]) -> torch.Tensor:
         return 1 - torch.tanh(5 * torch.linalg.norm(info["offset"][:, :2], dim=1))

@@ -130,7 +130,9 @@ def main(options: Options) -> None:
     if options.write:
         cores = len(os.sched_getaffinity(0))
         clock = "the processor's time of all threads" if options.processor else "wall time"
-        text = f"{HEAD}\n\nOn {cores} cores, without a GPU, {clock}; all sides in one run: take the ratios.\n\n"
+        text = (
+            f"{HEAD}\n\nOn {cores} cores, without a GPU, {clock}; all sides in one run: take the ratios.\n\n"
+        )
         text += "\n".join(lines)
         page = PAGE.read_text()
         there = re.search(rf"^{re.escape(HEAD)}$.*?(?=^## |\Z)", page, re.M | re.S)
