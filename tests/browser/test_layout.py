@@ -166,6 +166,17 @@ def test_all_tabs_are_in_one_row_and_inputs_are_written_as_their_labels(desk: De
     assert len(fonts) > 8 and len(set(fonts)) == 1, set(fonts)
 
 
+def test_what_a_control_says_of_itself_stands_beside_its_panel(desk: Desk) -> None:
+    desk.tab("Run")
+    desk.page.locator("//label[text()='Seed']/ancestor::*[.//input][1]//input").first.hover()
+    tooltip = desk.page.get_by_role("tooltip")
+    expect(tooltip).to_have_text("A new seed resets every env.")
+    inside, panel = tooltip.bounding_box(), desk.page.locator("[data-dock-region=right]").bounding_box()
+    assert inside is not None and panel is not None and inside["x"] + inside["width"] < panel["x"]
+    desk.page.mouse.move(400, 300)
+    expect(tooltip).to_have_count(0)
+
+
 def test_nothing_lies_over_what_is_looked_at_through_a_camera(desk: Desk) -> None:
     choose_camera(desk)
     timeline = desk.page.locator("[data-floating-window]")
