@@ -2,7 +2,7 @@
 
     python -m tests.sweeps.solve_tasks                         all tasks that are not in solve_tasks.json yet
     python -m tests.sweeps.solve_tasks PickCube-v1 --seeds 4   some tasks, again
-    python -m tests.sweeps.solve_tasks --write                 also into web_assets/docs/reference/solved_tasks.md
+    python -m tests.sweeps.solve_tasks --write                 what is there into web_assets/docs/reference/solved_tasks.md
 
 A task is added to solve_tasks.json as soon as it is done, so a sweep that was stopped goes on. Tasks that need a download
 or have no dense reward are left out. Control tasks have no success: what planned episodes of `CONTROL_STEPS` steps earn
@@ -38,7 +38,7 @@ class Options:
     seeds: int = 16
     workers: int = len(os.sched_getaffinity(0))
     write: bool = False
-    """Put the table into the docs page too."""
+    """Put what is in the file into the docs page, and run nothing."""
 
 
 @dataclass
@@ -152,6 +152,8 @@ def write(rows: list[Row]) -> None:
 
 def main(options: Options) -> None:
     known: dict[str, Any] = json.loads(FILE.read_text()) if FILE.exists() else {}
+    if options.write:
+        return write([Row(**known[task]) for task in tasks() if task in known])
     for task in options.tasks or [task for task in tasks() if task not in known]:
         try:
             row = solved(task, options)
@@ -160,9 +162,6 @@ def main(options: Options) -> None:
         known[task] = asdict(row)
         FILE.write_text(json.dumps(known, indent=1))
         print(*table([row]), sep="\n", flush=True)
-    if options.write:
-        order = [task for task in tasks() if task in known]
-        write([Row(**known[task]) for task in order])
 
 
 if __name__ == "__main__":

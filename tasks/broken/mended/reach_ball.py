@@ -68,3 +68,7 @@ class ReachBallEnv(BaseEnv):
 
     def compute_normalized_dense_reward(self, obs: Any, action: Any, info: dict[str, Any]) -> torch.Tensor:
         return self.compute_dense_reward(obs, action, info)
+
+
+# ManiSkill takes lists and sapien.Pose where its annotations do not say so.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
