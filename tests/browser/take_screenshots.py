@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -27,6 +26,7 @@ from playwright.sync_api import Browser, Page, expect
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.browser.film import take_film
 from tests.browser.tutorial_pictures import take_steps, text_after
+from tests.docs.commands import commands
 from tests.docs.walk import FILE, STEPS, after
 from tests.drive.page import browser_at, close_notice, new_page, open_workbench
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
@@ -364,8 +364,8 @@ def shoot_tutorial(browser: Browser) -> None:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         after(len(STEPS), folder)
-        (typed, *_) = (fence for fence in STEPS[-1].fences if fence.text.startswith("workbench record"))
-        words = shlex.split(typed.text.replace("\\\n", ""))
+        typed = next(fence for fence in STEPS[-1].fences if fence.language == "sh")
+        (words,) = commands(typed)
         subprocess.run([sys.executable, "-m", "workbench.cli.main", *words[1:]], check=True, cwd=folder)
         with open_workbench("recordings", cwd=folder, what="review") as opened:
             page, _ = new_page(browser)

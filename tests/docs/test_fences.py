@@ -13,11 +13,8 @@ import shutil
 import subprocess
 import sys
 import textwrap
-import urllib.request
 import warnings
-from collections.abc import Iterator
 from contextlib import redirect_stdout
-from http.cookiejar import CookieJar
 from pathlib import Path
 
 import pytest
@@ -25,8 +22,8 @@ import torch
 import tyro
 import yaml
 
+from tests.docs.commands import OPENS_A_PAGE, commands, opens
 from tests.docs.pages import PAGES, ROOT, Fence, fences, without_fences
-from tests.drive.page import open_workbench
 from workbench.cli import main
 
 KINDS = {
@@ -38,7 +35,6 @@ KINDS = {
     ("text", ""),
 }
 RUN = ("", "slow", "wrong")
-OPENS_A_PAGE = ("open", "review")
 COMMANDS = {"open": main.open_page} | {
     name: getattr(main, name)
     for name in ("new", "record", "check", "solve", "review", "rescore", "share", "export", "view", "doctor")
@@ -85,14 +81,6 @@ def test_a_fragment_is_well_formed(page: Path) -> None:
         elif fence.language == "sh":
             for words in commands(fence):
                 well_formed(words, fence)
-
-
-def commands(fence: Fence) -> Iterator[list[str]]:
-    """The commands of a fence, as words; what follows a # or redirects is not among them."""
-    for line in re.sub(r"\\\n", "", fence.text).splitlines():
-        words = shlex.split(line, comments=True)
-        if words:
-            yield words
 
 
 def well_formed(words: list[str], fence: Fence) -> None:
@@ -204,13 +192,3 @@ def run_command(words: list[str], fence: Fence, desk: Path, wanted: str | None) 
     said = " ".join((ended.stdout + ended.stderr).split())
     assert (ended.returncode == 0) == (wanted is None), f"{fence.place}: {shlex.join(words)} says {said}"
     assert wanted is None or wanted in said, f"{fence.place}: {shlex.join(words)} says {said}"
-
-
-def opens(words: list[str], desk: Path) -> None:
-    """It prints an address, the page answers there, and Ctrl-C ends it."""
-    with open_workbench(*words[2:], cwd=desk, what=words[1]) as opened:
-        browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
-        with browser.open(opened.url, timeout=60) as answer:
-            assert answer.status == 200 and b"workbench/" in answer.read()
-        if words[1] == "open":
-            opened.wait_for_line("^loaded ", 120)

@@ -126,6 +126,13 @@ def test_what_looks_like_html_in_the_text_of_a_page_is_shown() -> None:
     assert "<script>" not in made and "&lt;script&gt;" in made and "<code>&lt;b&gt;</code>" in made
 
 
+def test_lines_of_a_diff_are_told_apart_and_shown_as_text() -> None:
+    text = "# x\n\n```diff\n a = <b>\n-c = <d>\n+e = <f>\n```\n\n```text\n-not <g>\n```\n"
+    made = html_of(Topic("x", "x", "Use it", "web_assets/docs/x.md", text))
+    assert '\n<span class="gone">-c = &lt;d&gt;\n</span><span class="come">+e = &lt;f&gt;\n</span>' in made
+    assert " a = &lt;b&gt;\n" in made and "-not &lt;g&gt;\n" in made and made.count("<span") == 2
+
+
 def test_no_page_has_a_script_or_a_handler() -> None:
     for topic in topics():
         body = reply(topic.name)[2].decode()
