@@ -286,6 +286,18 @@ def shoot_rescored(browser: Browser) -> None:
         desk.shoot("rescored")
 
 
+def shoot_checks(browser: Browser) -> None:
+    """A goal that is reached at the reset: the finding, why it matters, and how to mend it."""
+    text, good = TASK.read_text(), "(distance < GOAL_RADIUS)"
+    assert good in text
+    text = text.replace(good, "(distance < 3 * GOAL_RADIUS)")
+    with live_page(browser, "--num-envs", "16", *CONTROL, task=text, checks=True) as desk:
+        desk.tab("Checks")
+        expect(desk.page.get_by_text(re.compile(r"^\d+ rules checked in "))).to_be_visible(timeout=240_000)
+        desk.page.locator("[data-rule=success-at-reset]").get_by_text("Why, mend").click()
+        desk.shoot("checks")
+
+
 def shoot_busy(browser: Browser) -> None:
     """A loop that does not end, in the reward of a new version."""
     lines = TASK.read_text().splitlines()
@@ -389,6 +401,7 @@ SHOTS: dict[str, Callable[[Browser], None]] = {
     "branch": shoot_branch,
     "rescored": shoot_rescored,
     "busy": shoot_busy,
+    "checks": shoot_checks,
     "review": shoot_review,
     "tutorial": shoot_tutorial,
 }
