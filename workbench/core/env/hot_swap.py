@@ -94,10 +94,15 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
 def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
     """Call `do`, and undo what it did to the env; returns and raises as `rehearse_hooks`."""
     every = list(range(env.num_envs))
-    kept = take_snapshot(env)
+    kept, had = take_snapshot(env), set(vars(env))
     try:
         with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
             do()
+    except BaseException:
+        # Else a buffer with a row for the one env of the rehearsal is what the mended hook finds.
+        for name in set(vars(env)) - had:
+            delattr(env, name)
+        raise
     finally:
         maniskill_private.set_reset_mask(env, every)
         own = isinstance(env, BatchedCpuMixin)

@@ -166,7 +166,13 @@ def write_task_state(
             carried[leaf.path] = None
             continue
         if not kept.per_env:
-            if all_envs:
+            if (
+                isinstance(value, (torch.Tensor, np.ndarray))
+                and is_per_env(value, env.num_envs)
+                and np.ndim(kept.values)
+            ):
+                missed[leaf.path] = "it had no row for each env, and has one now"
+            elif all_envs:
                 leaf.put(_whole_value(kept, env))
                 carried[leaf.path] = None
             elif not _equal(kept.values, value):
