@@ -185,9 +185,9 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
     assert [o.id for o in view.opened] == ["a"]
     said = " ".join(view.problems)
     assert (
-        "file b: it is a picture of a cat" in said
+        "file b was not opened. it is a picture of a cat" in said
         and "ZeroDivisionError: oh" in said
-        and "file d: gone" in said
+        and "file d was not opened. gone" in said
     )
     assert "no longer in the folder" in said
     review.open(["b"])

@@ -316,7 +316,7 @@ def test_many_recordings_stand_side_by_side(shown: Shown, folder: Path) -> None:
     assert not shown.panels.shows("Layout")
     (cubes,) = shown.panels.bodies("cube")
     assert len(cubes.batched_positions) == 6
-    assert sorted(shown.panels.labels()) == ["5", "6", "A, seed 20", "B", "C", "D"]
+    assert sorted(shown.panels.labels()) == ["A, seed 20", "B", "C", "D", "E", "F"]
 
 
 def test_of_too_many_recordings_only_the_selected_one_is_named(shown: Shown, folder: Path) -> None:
