@@ -1,6 +1,6 @@
 """What playing loses while the Checks tab checks: python tests/benchmarks/play_beside_checks.py [--num-envs 16]
 
-A session with a worker on the example task plays at unlimited speed, without a page. Windows without checks and windows in
+A session with a worker on the example task plays, without a page, at unlimited speed or (--speed 1) in real time. Windows without checks and windows in
 which the background process checks all rules come in turns, in one run. Prints the control steps a second of both (median
 of the windows), their ratio, how long a whole check took beside the play, and how long alone.
 """
@@ -30,6 +30,8 @@ class Options:
     """Of one window."""
     windows: int = 5
     """Of each kind."""
+    speed: float = math.inf
+    """Times real time."""
     task: str = str(TASKS / "push_cube.py")
 
 
@@ -61,7 +63,7 @@ def main(options: Options) -> None:
         live_session(options.task, Path(folder), options.num_envs, draw=True) as session,
     ):
         session.checks.check_after_each_save(False)
-        session.change(speed=math.inf)
+        session.change(speed=options.speed)
         whole_check(session)  # shaders are compiled
         alone = whole_check(session)
         session.play()
@@ -75,7 +77,7 @@ def main(options: Options) -> None:
         rules = len(session.checks.view.results)
     one, other = statistics.median(without), statistics.median(beside)
     print(
-        f"{Path(options.task).name}, {options.num_envs} envs, unlimited speed, {options.windows} windows of each kind"
+        f"{Path(options.task).name}, {options.num_envs} envs, speed {options.speed:g}, {options.windows} windows of each kind"
     )
     print(
         f"control steps a second: {one:.1f} without checks, {other:.1f} beside them: {other / one:.2f} of it"
