@@ -133,7 +133,8 @@ def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of
     expect(page.get_by_text(f"{ENVS} envs now")).to_be_visible()
     row = page.locator(".wb-seen-table tbody tr").filter(has_text="cube")
     expect(row.locator("td").nth(1)).to_have_text("100 %")
-    assert float(row.locator("td").nth(2).inner_text().split(" px")[0]) > 10
+    pixels, of_picture = row.locator("td").nth(2).inner_text().split("\n")
+    assert float(pixels.removesuffix(" px")) > 10 and of_picture.endswith(" %")
     expect(page.get_by_text("measure again")).to_have_count(0)
     press(page, "Keep this placement as A")
     page.locator(".wb-planes [data-press]").last.click()

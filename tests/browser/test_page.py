@@ -256,10 +256,6 @@ def test_record_keeps_an_episode(calm: Desk) -> None:
     expect(calm.page.get_by_text(written.name).first).to_be_visible()
 
 
-def test_nothing_went_wrong_in_the_console(desk: Desk) -> None:
-    assert desk.errors == []
-
-
 def test_what_is_typed_right_after_the_keys_that_open_a_window_goes_into_it(calm: Desk) -> None:
     page = calm.page
     dark = page.locator("html[data-mantine-color-scheme=dark]")
@@ -285,3 +281,7 @@ def test_what_is_typed_right_after_the_keys_that_open_a_window_goes_into_it(calm
     page.keyboard.press("Escape")
     expect(page.get_by_role("dialog")).to_have_count(0)
     expect(dark).to_have_count(1)
+
+
+def test_nothing_went_wrong_in_the_console(desk: Desk) -> None:
+    assert desk.errors == []
