@@ -39,8 +39,10 @@ def address(folder: Path) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def desk(address: str, browser: Browser) -> Iterator[tuple[Page, list[str]]]:
     with page_at(browser, address) as (page, errors):
-        # The newest, and the library beside it.
+        # The newest, and the library beside it: one that folds itself when the newest is open takes a click with it.
+        expect(page.locator(".wb-status")).to_contain_text("paused")
         expect(page.locator(".wb-status")).to_contain_text("seed0002")
+        says(page, "step 0 / 12")
         expect(page.locator(".wb-library")).to_be_visible()
         yield page, errors
 

@@ -75,6 +75,8 @@ class ReviewPage:
         self._pictures: dict[CameraKey, Picture] = {}
         self._pictures_serial = 0
         self._had_opened = tuple(one.id for one in review.view().opened)
+        self._awaited: tuple[str, ...] = ()
+        """The newest recording, until it is open."""
         self._fold_other: Callable[[bool], None] = lambda folded: None
         """Folds and unfolds rerun's panel."""
         self._other_folded = False
@@ -234,12 +236,16 @@ class ReviewPage:
         whole = [row for row in listed.rows if row.problem is None]
         if whole and not view.opened:
             newest = max(whole, key=lambda row: row.written or 0.0)
-            self._had_opened = (newest.id,)
-            self._review.open((newest.id,))
+            self._had_opened = self._awaited = (newest.id,)
+            self._review.open(self._awaited)
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
         """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""
         ids = tuple(one.id for one in view.opened)
+        if self._awaited and not ids:
+            # Still being read: "nothing is open" is not news, and what opens then is not another one.
+            return
+        self._awaited = ()
         if ids != self._had_opened:
             self._had_opened = ids
             if not ids or self._smallest_view() < NARROW:
