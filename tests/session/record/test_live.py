@@ -77,7 +77,7 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
     live = written(session, 2)
     session.save_past()
     wait_until(session, lambda view: bool(view.recording.saving.message), "the keeping")
-    said = f"kept 2 episodes, {2 * STEPS} steps; none of them had ended"
+    said = f"saved 2 episodes, {2 * STEPS} steps; none of them had ended"
     assert session.view().recording.saving.message == said
     every = written(session, 4)
     kept = {episode.info.env_index: episode for episode in every[2:]}
@@ -181,6 +181,32 @@ def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(ses
         assert_same(kept(), episode)
         assert session.view().studio.progress is not None, "the keep came last"
         assert came() == of
+
+
+@pytest.mark.slow
+def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it(session: Session) -> None:
+    count = session.view().recording.episodes_written
+    session.reset()
+    wait_until(session, lambda view: elapsed(view) == 0, "a reset")
+    step(session, 2)
+    played = session.view()
+    assert played.task is not None and played.task.file is not None and played.step is not None
+    file = Path(played.task.file)
+    text = file.read_text()
+    file.write_text(text.replace("= 3\n", "= 4\n"))
+    wait_until(
+        session, lambda view: view.task is not None and view.task.source_hash != played.task.source_hash, "it"
+    )
+    session.save_past((0,))
+    kept = written(session, count + 1)[-1]
+    assert kept.info.source_hash == played.task.source_hash
+    assert list(kept.info.source.values()) == list(played.task.source.values())
+    np.testing.assert_array_equal(kept.reward[-1], played.step.reward[0])
+    assert "an earlier version" in session.view().recording.saving.message
+    file.write_text(text)
+    wait_until(
+        session, lambda view: view.task is not None and view.task.source_hash == played.task.source_hash, "it"
+    )
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,8 @@ class LiveState:
     tried_options: TaskOptions | None = None
     """Options that a person applied and that no load has taken or refused yet."""
     wants_play: bool = False
+    versions: list[tuple[int, TaskDescription]] = field(default_factory=list)
+    """The versions that made the moments of `timeline`, oldest first, each with the serial of its first one."""
 
     def __post_init__(self) -> None:
         self.set(seed=self.options.seed, options=self.options)
@@ -126,6 +128,7 @@ class LiveState:
             self.set(step=self.timeline.history.replace_last(event.first))
             if before is None or before.source_hash != task.source_hash:
                 self.timeline.history.begin_version(task.outlier_rules)
+                self.versions.append((self.timeline.history.last + 1, task))
         if report is None or report.level not in ("same", "patched"):
             self.set(cameras_serial=self.now.cameras_serial + 1)
             self.new_pictures(**{} if kept else {"pictures": {}})
@@ -154,6 +157,7 @@ class LiveState:
             last = -1 if self.timeline is None else self.timeline.history.last
             table = EnvTable(task.geometry, first, task.control_dt, task.reward_mode, task.outlier_rules)
             self.timeline = Timeline(table, self.history_bytes, last + 1, task.joints)
+            self.versions = [(last + 1, task)]
 
     def stepped(self, event: Stepped) -> None:
         if self.timeline is None:
@@ -415,11 +419,19 @@ class LiveState:
         envs = range(self.now.task.num_envs) if env_idx is None else env_idx
         serial = None if shown is None else shown.serial
         found = {env: find_episode(history, env, serial, before) for env in envs}
-        episodes = tuple(episode for episode in found.values() if isinstance(episode, PastEpisode))
+        episodes = tuple(
+            replace(episode, played_by=self._version_of(episode.moments[-1][0].serial))
+            for episode in found.values()
+            if isinstance(episode, PastEpisode)
+        )
         if not episodes:
             env, why = next(iter(found.items()))
             return f"nothing was kept of env {env}: {why}"
         return SaveRequest(self.now.task, load, placed, episodes)
+
+    def _version_of(self, serial: int) -> TaskDescription | None:
+        """The version that made this moment."""
+        return next((task for first, task in reversed(self.versions) if first <= serial), None)
 
     def view(self, **known: Any) -> SessionView:
         """The view of the shown moment.

@@ -44,6 +44,8 @@ class PastEpisode:
     moments: tuple[EnvMoment, ...]
     seed: int
     """Negative if unknown."""
+    played_by: TaskDescription | None = None
+    """The version that made its last moment; None for the running one."""
 
     @property
     def steps(self) -> int:
@@ -130,7 +132,8 @@ class PastSaver:
 
     The history has poses, actions, rewards and results of ``evaluate`` as they were, and a snapshot of each moment. The
     rest (env states, observations, pictures of all cameras) is read from envs that are put back to the snapshots. So the
-    file equals that of a live recording; but after an edit of the task's file that rest is what the new code gives.
+    file equals that of a live recording; but after an edit of the task's file that rest is what the new code gives. The
+    recorded source is that of the version that played.
     """
 
     def __init__(
@@ -187,8 +190,8 @@ class PastSaver:
                         if (writer := writers.get(episode.env)) is not None:
                             writer.set_source(moment.acted_by)
                         else:
-                            seed = seeds[episode.env]
-                            writer = GatheredEpisode.of(self._folder, what.task, episode.env, seed)
+                            seed, task = seeds[episode.env], _as_played(what.task, episode)
+                            writer = GatheredEpisode.of(self._folder, task, episode.env, seed)
                             writers[episode.env] = writer
                         writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
 
@@ -209,7 +212,15 @@ class PastSaver:
         unfinished = sum(not episode.ended for episode in what.episodes)
         lost = sum(seeds[episode.env] != episode.seed for episode in what.episodes)
         kept = f"saved {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
-        self._report(kept + _unfinished_text(unfinished, len(made)) + _lost_seed_text(lost, len(made)))
+        earlier = sum(
+            _as_played(what.task, episode).source_hash != what.task.source_hash for episode in what.episodes
+        )
+        self._report(
+            kept
+            + _unfinished_text(unfinished, len(made))
+            + _lost_seed_text(lost, len(made))
+            + _earlier_text(earlier, len(made))
+        )
 
     def _verified_seed(self, job: Job, episode: PastEpisode) -> int:
         """Its seed, if a reset of its env alone with it gives the first state; else -1.
@@ -236,6 +247,14 @@ class PastSaver:
         self._on_change()
 
 
+def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:
+    """The running version with the source that made the episode's rewards: its scene and cameras are in the pictures."""
+    played = episode.played_by
+    if played is None:
+        return task
+    return replace(task, file=played.file, source_hash=played.source_hash, source=played.source)
+
+
 def _unfinished_text(count: int, kept: int) -> str:
     if not count:
         return ""
@@ -249,3 +268,13 @@ def _lost_seed_text(count: int, kept: int) -> str:
         return ""
     what = "its start was" if kept == 1 else "their starts were" if count == kept else f"{count} starts were"
     return f"; {what} drawn for several envs at once, so their first state is recorded and no seed"
+
+
+def _earlier_text(count: int, kept: int) -> str:
+    if not count:
+        return ""
+    what = "it was" if kept == 1 else "they were" if count == kept else f"{count} were"
+    return (
+        f"; {what} played by an earlier version of the file: that source and its rewards are recorded, observations and "
+        "pictures are the present version's"
+    )

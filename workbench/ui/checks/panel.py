@@ -136,7 +136,8 @@ def mark_html(found: list[Card], press_id: str) -> str:
     if newest and len(rows) > 1:
         newest += f" and {len(rows) - 1} more"
     stops = any(finding.degree == "stop" for finding in rows)
-    return render("checks_mark", press_id=press_id, count=len(rows), newest=newest, stops=stops)
+    old = all(card.old for card in found)
+    return render("checks_mark", press_id=press_id, count=len(rows), newest=newest, stops=stops, old=old)
 
 
 def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) -> str:
