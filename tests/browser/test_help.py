@@ -26,7 +26,8 @@ def served(child_process: None) -> Iterator[GatedServer]:
     gated_server.close()
 
 
-@pytest.mark.parametrize("theme", ["dark", pytest.param("light", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("theme", ["dark", "light"])
 def test_every_page_of_the_documents_opens_with_its_pictures(
     served: GatedServer, browser: Browser, theme: str
 ) -> None:

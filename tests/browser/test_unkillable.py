@@ -25,6 +25,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator
         yield Desk(page, errors, file, opened)
 
 
+@pytest.mark.slow
 def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> None:
     desk.tab("Run")
     provoke(desk.file, "evaluate", "loop")
@@ -46,6 +47,7 @@ def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> No
     expect(desk.page.get_by_text(re.compile("was interrupted in evaluate"))).to_have_count(0)
 
 
+@pytest.mark.slow
 def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
     desk.tab("Run")
     provoke(desk.file, "evaluate", "native")

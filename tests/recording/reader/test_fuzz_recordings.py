@@ -207,7 +207,7 @@ def fuzz(original: Original, folder: Path, count: int, seed: int) -> int:
     return told
 
 
-@pytest.mark.parametrize("kind", ["ours", "alone", "theirs", "dataset"])
+@pytest.mark.parametrize("kind", ["ours", "alone", pytest.param("theirs", marks=pytest.mark.slow), "dataset"])
 def test_damaged_recordings_are_rows_and_sentences(
     kind: str, originals: dict[str, Original], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -257,6 +257,7 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     session.change(cameras=())
 
 
+@pytest.mark.slow
 def test_recording_writes_an_episode_that_rerun_verifies(session: Session) -> None:
     settle(session)
     session.start_recording((1,))

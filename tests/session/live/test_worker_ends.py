@@ -52,7 +52,7 @@ DEATHS = [
     ("thread", "ended with exit code 1"),
     ("detach", "was killed by SIGKILL"),
 ]
-QUICK = ("garbage", "headless")
+QUICK = ("garbage",)
 """Each costs a new process; the first has detached a child too."""
 
 
@@ -181,6 +181,7 @@ def test_a_task_file_that_is_no_file_any_more_is_told_and_the_mended_one_loaded(
     wait_until(session, lambda v: v.problem is None, "the mended file")
 
 
+@pytest.mark.slow
 def test_a_task_that_goes_to_another_folder_is_reloaded_and_recorded_as_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -259,6 +259,7 @@ def test_what_was_begun_last_is_left_alone_by_what_waits_behind_it(
     assert done == ["first", "behind"]
 
 
+@pytest.mark.slow
 def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes_on_with_another(
     background: Background, tmp_path: Path
 ) -> None:

@@ -189,7 +189,7 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
     session.reset()
     wait_until(session, lambda view: elapsed(view) == 0, "a reset")
     step(session, 2)
-    played = session.view()
+    played = wait_until(session, lambda view: elapsed(view) == 2, "the steps")
     assert played.task is not None and played.task.file is not None and played.step is not None
     file = Path(played.task.file)
     text = file.read_text()
