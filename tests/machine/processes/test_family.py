@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
 import sys
+import termios
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -40,6 +42,12 @@ def detach():
 
 
 def main(how, *_):
+    if how == "terminal":
+        print("ready", flush=True)
+        try:
+            os.read(os.open("/dev/tty", os.O_RDWR), 1)
+        except OSError:
+            os._exit(7)
     if how in ("hold", "share"):
         held = mmap.mmap(-1, 64 * 2**20, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         held.write(b"x" * len(held))
@@ -91,6 +99,28 @@ def begin(child_process: None, tmp_path: Path) -> Iterator[Callable[..., subproc
     yield begin
     for process in begun:
         end_family(process)
+
+
+def test_code_that_asks_the_terminal_is_refused_and_not_stopped(child_process: None, tmp_path: Path) -> None:
+    (tmp_path / "family_member.py").write_text(_MEMBER)
+    ours, theirs = os.openpty()
+    process = subprocess.Popen(
+        python_command(
+            "-m", "workbench.machine.processes.family", str(os.getpid()), "family_member", "terminal"
+        ),
+        env=child_environment(PYTHONPATH=str(tmp_path)),
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(theirs, termios.TIOCSCTTY, 0),
+    )
+    try:
+        assert process.wait(timeout=30) == 7
+    finally:
+        end_family(process)
+        os.close(ours)
+        os.close(theirs)
 
 
 def members(keeper: int) -> list[psutil.Process]:

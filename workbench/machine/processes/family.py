@@ -149,8 +149,12 @@ def begin_family(server: int) -> None:
     worker = os.fork()
     if worker != 0:
         _keep(worker)
-    # A group of its own: signals of the author's code to its group must not reach the keeper.
-    os.setsid()
+    # A group of its own: signals of the author's code to its group must not reach the keeper. No session of its own: Linux
+    # shares the cores among sessions first (autogroups), and work that should leave them to another worker could not.
+    os.setpgid(0, 0)
+    for number in (signal.SIGTTIN, signal.SIGTTOU):
+        # Else code that asks the terminal, which belongs to the server's group, is stopped for ever.
+        signal.signal(number, signal.SIG_IGN)
     end_with_parent(keeper)
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
 

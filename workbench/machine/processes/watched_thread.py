@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
-import resource
 import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +75,8 @@ def stop_listening(listener: Callable[[str], None]) -> None:
 def on_free_cores(wanted: Callable[[], bool]) -> Iterator[None]:
     """Within this, the threads of this process, and those that they start, run only on cores that nobody else wants.
 
-    A nice value is not enough: on two busy cores, play at unlimited speed was slower beside a process at nice 10.
+    A nice value is not enough: on two busy cores, play at unlimited speed was slower beside a process at nice 10. Those
+    that want the cores must be in the same session (see `begin_family`).
 
     Args:
         wanted: asked often; after True they run as before, since somebody waits for this process.
@@ -88,28 +87,16 @@ def on_free_cores(wanted: Callable[[], bool]) -> Iterator[None]:
     def watch() -> None:
         while not done.wait(_LOOK) and not wanted():
             pass
-        _share_of_session(0)
         _schedule(os.SCHED_OTHER, {int(thread) for thread in os.listdir("/proc/self/task")})
 
     watching = threading.Thread(target=watch, name="on-free-cores", daemon=True)
     watching.start()
     _schedule(os.SCHED_IDLE, low)
-    _share_of_session(19)
     try:
         yield
     finally:
         done.set()
         watching.join()
-
-
-def _share_of_session(nice: int) -> None:
-    """Of Linux's autogroups: a process that leads a session of its own, as ours do, shares the cores as one with those of
-    other sessions, whatever its threads ask for. Left alone where it could not be put back."""
-    if os.geteuid() != 0 and resource.getrlimit(resource.RLIMIT_NICE)[0] < 20:
-        return
-    # A kernel without them has no such file.
-    with suppress(OSError):
-        Path("/proc/self/autogroup").write_text(str(nice))
 
 
 def _schedule(policy: int, threads: set[int]) -> None:

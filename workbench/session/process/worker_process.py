@@ -91,7 +91,7 @@ class WorkerProcess:
                 stderr=subprocess.PIPE,
                 bufsize=0,
                 pass_fds=fds,
-                start_new_session=True,
+                process_group=0,
                 env=child_environment(PYTHONUNBUFFERED="1"),
             )
             self._heartbeat = HeartbeatReader(heartbeat)
