@@ -279,7 +279,8 @@ def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
                 if node.func.attr == "as_quat" and not any(word in text for word in _REORDERED):
                     yield Found(
-                        "as_quat() gives x, y, z, w. Write as_quat(scalar_first=True), or np.roll(q, 1, axis=-1).",
+                        "as_quat() gives x, y, z, w. Write np.roll(q, 1, axis=-1) after it, or, from SciPy 1.14 on, "
+                        "as_quat(scalar_first=True).",
                         module.place(node),
                     )
 
