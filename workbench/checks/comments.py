@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from workbench.checks.results import RuleResult, State
 from workbench.checks.rules import RULES, did_you_mean
 from workbench.core.rules import Silence, silences
+from workbench.machine.parse_python import parse_python
 
 _DECIDED: tuple[State, ...] = ("kept", "broken", "silenced")
 
@@ -94,7 +95,7 @@ def _lines_of_other_tasks(
 
 def _classes(text: str) -> list[ast.ClassDef]:
     try:
-        return [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.ClassDef)]
+        return [node for node in ast.walk(parse_python(text)) if isinstance(node, ast.ClassDef)]
     except (SyntaxError, ValueError, RecursionError):
         return []  # the page has it from a file that is being edited
 

@@ -21,6 +21,7 @@ import mani_skill
 from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.core.rules import Degree, Finding, Silence, silence_of
+from workbench.machine.parse_python import parse_python
 
 MOST_ROWS = 64
 """Places that are kept; breaches at further places are only counted."""
@@ -347,7 +348,7 @@ def _methods(task: type) -> Iterator[tuple[str, Any]]:
 def _lines_that_assign(function: Any, wanted: str) -> Iterator[int]:
     try:
         lines, first = inspect.getsourcelines(function)
-        tree = ast.parse(textwrap.dedent("".join(lines)))
+        tree = parse_python(textwrap.dedent("".join(lines)))
     except (OSError, SyntaxError):  # made without a text, or a lambda in the middle of a line
         return
     for node in ast.walk(tree):

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal, get_args
 
+from workbench.machine.parse_python import parse_python
+
 Degree = Literal["stop", "warn", "off"]
 """*stop* raises at the line that broke the rule; *warn* reports the line, and the operation continues as without rules, to the
 last bit. By default a rule stops where the state of other envs is overwritten, since every number after that is wrong."""
@@ -221,7 +223,7 @@ def _read(text: str) -> tuple[tuple[Silence, ...], tuple[tuple[int, int, int], .
         return (), ()
     try:
         found = tuple(_comments(text))
-        scopes = tuple(_scopes(ast.parse(text)))
+        scopes = tuple(_scopes(parse_python(text)))
     except (SyntaxError, tokenize.TokenError, ValueError, RecursionError):
         return (), ()
     return found, scopes

@@ -21,6 +21,7 @@ from workbench.authoring.loading.task_content import CannotRead, read_text, sour
 from workbench.authoring.reload.call_graph import TwoVersions
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN, RecordedRun
 from workbench.jobs.task import TaskDescription, TaskOptions
+from workbench.machine.parse_python import parse_python
 from workbench.recording.episode.episode import Episode, EpisodeInfo
 from workbench.recording.episode.side_files import folder_of, side_file_path
 
@@ -274,7 +275,7 @@ def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
 def _class_of(text: str, env_id: str) -> str | None:
     """The class that is registered under this id, or has it as its name; None if there is none."""
     try:
-        tree = ast.parse(text)
+        tree = parse_python(text)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         return None
     for cls, _, id_node in registrations_in(tree):

@@ -23,6 +23,7 @@ from workbench.authoring.loading.library_names import (
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem, definition_line, problem_from_exception
 from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file
+from workbench.machine.parse_python import parse_python
 
 Policy = Callable[[Any], Any]
 """Gets the task's observation (batched, as its ``obs_mode`` gives it); returns an array or tensor (N, A), one action (A,)
@@ -201,7 +202,7 @@ def _python_files(folder: Path) -> list[Path]:
 def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
     """Names of public functions of one required parameter, and whether it is called as an observation."""
     try:
-        tree = ast.parse(read_regular_file(file, _MOST_BYTES))
+        tree = parse_python(read_regular_file(file, _MOST_BYTES))
     except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
         return []  # a file that cannot be read has no policy to list; choosing it by name says why
     found = []

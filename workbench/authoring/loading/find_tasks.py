@@ -12,6 +12,7 @@ from pathlib import Path
 
 from workbench.authoring.loading.library_names import LIBRARY_FOLDERS
 from workbench.machine.files import read_regular_file
+from workbench.machine.parse_python import parse_python
 
 DEEPEST = 6
 """Folders below the first that are searched."""
@@ -92,7 +93,7 @@ def read_task_file(path: Path) -> TaskFile | None:
         with warnings.catch_warnings():
             # A text with "\d" would warn in the terminal.
             warnings.simplefilter("ignore")
-            tree = ast.parse(raw)
+            tree = parse_python(raw)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         # A broken file that names BaseEnv most likely is a task that somebody is writing.
         return TaskFile(path, (), ()) if b"(BaseEnv)" in raw else None

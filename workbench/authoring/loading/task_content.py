@@ -14,6 +14,7 @@ from workbench.authoring.loading.library_names import is_library, is_own_file
 from workbench.authoring.loading.modules import module_name, read_exactly
 from workbench.authoring.loading.reference import find_in
 from workbench.authoring.source.text import plain_line_ends
+from workbench.machine.parse_python import parse_python
 
 MOST_MODULES = 300
 _DYNAMIC = frozenset(
@@ -95,7 +96,7 @@ class _ContentReader:
         while self._waiting:
             path = self._waiting.pop()
             try:
-                tree = ast.parse(self._texts[str(path)])
+                tree = parse_python(self._texts[str(path)])
             except (SyntaxError, ValueError, RecursionError, MemoryError):
                 self._unseen[f"{self._short(path)} is no Python that can be read."] = None
                 continue

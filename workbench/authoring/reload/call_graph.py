@@ -9,6 +9,8 @@ from functools import cached_property
 from pathlib import PurePath
 from typing import Literal
 
+from workbench.machine.parse_python import parse_python
+
 Kind = Literal["function", "value", "import", "class", "statements"]
 Key = tuple[str, str]
 """File and name within it: ``("/x/push.py", "PushEnv.evaluate")``."""
@@ -84,7 +86,7 @@ class Symbol:
 
 def read_symbols(path: str, text: str, keep_docstrings: bool = False) -> dict[Key, Symbol]:
     """The symbols of one file, in order. Raises SyntaxError, as ``compile``."""
-    tree = ast.parse(text, path)
+    tree = parse_python(text, path)
     if not keep_docstrings:
         _remove_docstrings(tree)
     return {symbol.key: symbol for symbol in _scope(path, tree.body, None)}
@@ -381,7 +383,7 @@ def line_in(old: str, new: str, line: int) -> int | None:
     content of the texts raises.
     """
     try:
-        before, after = ast.parse(old), ast.parse(new)
+        before, after = parse_python(old), parse_python(new)
     except (SyntaxError, ValueError, RecursionError):  # ValueError: a null byte
         return None
     found = _block_at(before, line)

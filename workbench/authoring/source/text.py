@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
+from workbench.machine.parse_python import parse_python
+
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 Scope = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 Span = tuple[int, int]
@@ -54,7 +56,7 @@ class SourceFile:
         self.path = path
         self.text = text
         try:
-            self.module = ast.parse(text)
+            self.module = parse_python(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as exc:
             reason = f"line {exc.lineno}: {exc.msg}" if isinstance(exc, SyntaxError) else str(exc)
             raise RefusedEdit(f"{self.name} is not valid Python now: {reason}") from exc

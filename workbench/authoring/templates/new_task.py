@@ -18,6 +18,7 @@ from workbench.authoring.loading.library_names import is_library
 from workbench.authoring.loading.modules import read_exactly
 from workbench.machine.files import create_file, read_regular_file, replace_file
 from workbench.machine.folders import example_tasks
+from workbench.machine.parse_python import parse_python
 
 LONGEST_NAME = 60
 _MOST_BLANK = 64 * 1024
@@ -183,7 +184,7 @@ def _new_text(file: Path, bare: str, origin: str) -> tuple[str, str, NewTask]:
         raise CannotBegin(f"{source} cannot be read: {error}.") from error
     known = [
         (cls.name, uid.value)
-        for cls, _, uid in registrations_in(ast.parse(text))
+        for cls, _, uid in registrations_in(parse_python(text))
         if isinstance(uid, ast.Constant) and isinstance(uid.value, str)
     ]
     ids = {uid: f"{bare}{uid}" for _, uid in known}

@@ -14,6 +14,7 @@ from workbench.checks.rules import RULES, degree_of_each
 from workbench.core.broken_rule import Place
 from workbench.core.capture.outliers import OUTLIER_RULES
 from workbench.core.rules import Degree, Finding, silence_of
+from workbench.machine.parse_python import parse_python
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class Places:
     def modules(self) -> tuple[Module, ...]:
         """The task's file first. Files that are no Python are left out: they were executed, so there are none."""
         texts = {str(file): self._text(str(file)) for file in self._loaded.source_files}
-        return tuple(Module(file, ast.parse(text)) for file, text in texts.items())
+        return tuple(Module(file, parse_python(text)) for file, text in texts.items())
 
     def _text(self, file: str) -> str:
         return self._loaded.source.get(file) or "".join(linecache.getlines(file))

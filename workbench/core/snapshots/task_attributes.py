@@ -20,6 +20,7 @@ from mani_skill.utils.structs.pose import Pose
 
 from workbench.core.maniskill_private import task_class
 from workbench.core.simulation.strict_system import TENSORS
+from workbench.machine.parse_python import parse_python
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 """Immutable values, which need no copy."""
@@ -176,7 +177,7 @@ def base_env_members() -> frozenset[str]:
     Options, spaces, sensors, last observation and generators: no state, or restored by name (elapsed steps, generators).
     ``agent`` is entered.
     """
-    tree = ast.parse(textwrap.dedent(inspect.getsource(BaseEnv)))
+    tree = parse_python(textwrap.dedent(inspect.getsource(BaseEnv)))
     targets = (node for node in ast.walk(tree) if isinstance(node, ast.Attribute))
     names = {
         node.attr

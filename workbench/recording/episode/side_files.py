@@ -11,6 +11,7 @@ from io import BufferedReader
 from pathlib import Path, PurePosixPath
 
 from workbench.machine.files import NotARegularFile, open_regular_file, read_regular_file
+from workbench.machine.parse_python import parse_python
 
 MOST_FILES = 200
 MOST_LISTED_FILES = 5000
@@ -131,7 +132,7 @@ def _strings(texts: Iterable[str]) -> set[str]:
     found: set[str] = set()
     for text in texts:
         try:
-            nodes = list(ast.walk(ast.parse(text)))
+            nodes = list(ast.walk(parse_python(text)))
         except (SyntaxError, ValueError, RecursionError):
             continue
         alone = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}

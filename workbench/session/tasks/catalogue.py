@@ -14,6 +14,7 @@ from pathlib import Path
 from workbench.authoring.loading.find_tasks import FoundTasks, TaskFile, find_task_files
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import example_tasks
+from workbench.machine.parse_python import parse_python
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.text import short_line
 from workbench.session.tasks.recents import MOST_ENVS, RecentTask, RecentTasks
@@ -249,6 +250,6 @@ def _shown(text: str) -> str:
 def _first_line(file: Path) -> str:
     """The first line of the docstring of an example."""
     try:
-        return (ast.get_docstring(ast.parse(file.read_bytes())) or "").partition("\n")[0].replace("`", "")
+        return (ast.get_docstring(parse_python(file.read_bytes())) or "").partition("\n")[0].replace("`", "")
     except (OSError, SyntaxError, ValueError):
         return ""
