@@ -20,7 +20,8 @@ from workbench.core.rules import Degree, Finding
 from workbench.core.scene.shapes import SceneGeometry
 
 Backend = Literal["auto", "cpu", "gpu"]
-ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
+ActionSource = Literal["hold", "zero", "random", "sliders", "policy", "solve"]
+"""``solve``: planned by rollouts of the task; elsewhere than an `ActionChooser`."""
 
 
 @dataclass(frozen=True)

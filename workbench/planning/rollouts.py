@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from workbench.core.env import actions
 from workbench.core.env.task_env import EnvOptions, build_env
 from workbench.core.maniskill_private import task_class
-from workbench.core.scene.scene_index import once_a_scene, scene_index
+from workbench.core.scene.scene_index import once_a_scene, read_poses, scene_index
 from workbench.core.snapshots.rng import read_shared_rng, write_shared_rng
 from workbench.core.snapshots.snapshot import Snapshot, restore_snapshot
 from workbench.planning.options import PlanOptions
@@ -46,6 +46,8 @@ class Plan:
     success_at: NDArray[np.int32]
     """(K,) the step at which each rollout succeeded, from 1 on; 0 if it did not."""
     seconds: float
+    paths: NDArray[np.float32] | None = None
+    """(K, H + 1, 3) where the body that was asked for went in each rollout, metres in the env's frame."""
 
     @property
     def returns(self) -> NDArray[np.float32]:
@@ -180,10 +182,13 @@ class RolloutPlanner:
             )
         known.add(env)
 
-    def plan(self, snapshot: Snapshot, env: int) -> Plan:
+    def plan(self, snapshot: Snapshot, env: int, traced: int | None = None) -> Plan:
         """Plan from the state that this env has in the snapshot, going on from its last plan.
 
         The process's random generators are left as they were.
+
+        Args:
+            traced: the body, by its place in `core.scene.scene_index.SceneIndex.names`, that `Plan.paths` follows.
 
         Raises:
             KeyError: the env's episode was not begun.
@@ -200,7 +205,9 @@ class RolloutPlanner:
                 # What a task draws in a step would else depend on all that was drawn in this process.
                 _seed_shared_rng(sampler.draw_seed())
                 knots = sampler.candidates(self._hold())
-                rewards, terms, succeeded = self._roll_out(self._from_unit(sampler.sequences(knots)))
+                paths: list[NDArray[np.float32]] = []
+                sequences = self._from_unit(sampler.sequences(knots))
+                rewards, terms, succeeded = self._roll_out(sequences, traced, paths)
                 sampler.improve(knots, rewards.sum(1))
         finally:
             write_shared_rng(shared, device)
@@ -212,6 +219,7 @@ class RolloutPlanner:
             {name: term.numpy() for name, term in terms.items()},
             succeeded.numpy(),
             time.perf_counter() - began,
+            np.stack(paths, 1) if paths else None,
         )
 
     def close(self) -> None:
@@ -226,9 +234,13 @@ class RolloutPlanner:
         return torch.minimum(torch.maximum(sized, self._low), self._high)
 
     def _roll_out(
-        self, sequences: torch.Tensor
+        self, sequences: torch.Tensor, traced: int | None, paths: list[NDArray[np.float32]]
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]:
-        """Rewards (K, H), sums of the terms (K,), and the steps of success (K,), of actions (K, H, A) from the present state."""
+        """Rewards (K, H), sums of the terms (K,), and the steps of success (K,), of actions (K, H, A) from the present state.
+
+        Args:
+            traced: the body whose places (K, 3), now and after each step, are put into `paths`; None for none.
+        """
         count, horizon, _ = sequences.shape
         env, device = self.env, self.env.device
         sequences = sequences.to(device)
@@ -237,6 +249,8 @@ class RolloutPlanner:
         succeeded = torch.zeros(count, dtype=torch.int32, device=device)
         terms: dict[str, torch.Tensor] = {}
         for h in range(horizon):
+            if traced is not None:
+                paths.append(read_poses(env)[:, traced, :3])
             _, reward, _, _, info = env.step(actions.by_robot(self._parts, sequences[:, h]))
             rewards[:, h] = torch.where(alive, _row(reward, rewards), 0.0)
             given: Any = info.get("reward_terms")
@@ -248,6 +262,8 @@ class RolloutPlanner:
                 succeeded[now] = h + 1
             if "fail" in info:
                 alive &= ~_row(info["fail"], alive)
+        if traced is not None:
+            paths.append(read_poses(env)[:, traced, :3])
         return rewards.cpu(), {name: term.cpu() for name, term in terms.items()}, succeeded.cpu()
 
 

@@ -22,6 +22,7 @@ from workbench.session.checks.checks import Checks
 from workbench.session.checks.profile import StepProfiler
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.live_state import LiveState, SharedState, scene_kept
+from workbench.session.live.solver import Solver
 from workbench.session.live.timeline import TimeTravel
 from workbench.session.live.versions import Versions
 from workbench.session.live.view import SessionView
@@ -37,6 +38,7 @@ from workbench.session.protocol.messages import (
     Loaded,
     LoadFailed,
     Placed,
+    PlanWanted,
     Play,
     Progress,
     Request,
@@ -143,6 +145,8 @@ class Session:
         """The rules of the running version."""
         self.profiler = StepProfiler(self._notify, self._background)
         """Where a step of the running version goes."""
+        self.solver = Solver(self._notify, self._send, lambda: self._set_playing(False))
+        """Plans the actions of the source *solve*."""
         self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
         """The timeline."""
@@ -181,7 +185,8 @@ class Session:
         }
         with self._lock:
             view = self._state.view(**known)
-        return replace(view, studio=self.studio.view(view.step, view.settings.selected_env))
+        env = view.settings.selected_env
+        return replace(view, studio=self.studio.view(view.step, env), solve=self.solver.view(env))
 
     def env_rows(self) -> EnvRows | None:
         """The table of envs; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
@@ -225,6 +230,7 @@ class Session:
         self._set_playing(True)
 
     def pause(self) -> None:
+        self.solver.stop()
         self._set_playing(False)
 
     def step(self) -> None:
@@ -256,6 +262,9 @@ class Session:
             if not self._state.change(**settings):
                 return
             policy, folder = self._state.policy, self._state.folder
+            source = self._state.now.settings.action_source
+        if source != "solve":
+            self.solver.stop()
         self._send_settings()
         self._policy_file.follow(policy, folder)
         self._notify()
@@ -379,6 +388,7 @@ class Session:
         self.rescorer.rescoring.close()
         self.checks.close()
         self.profiler.close()
+        self.solver.close()
         self.studio.close()
         self.past_saver.close()
         self._background.end()
@@ -410,6 +420,8 @@ class Session:
             self._on_stepped(event)
         elif isinstance(event, Answer | Progress):
             self._asker.take(event)
+        elif isinstance(event, PlanWanted):
+            self._on_plan_wanted(event)
         else:
             with self._lock:
                 self._state.take(event)
@@ -472,9 +484,19 @@ class Session:
     def _on_stepped(self, event: Stepped) -> None:
         with self._lock:
             self._state.stepped(event)
+            planned = self._state.now.settings.action_source == "solve"
+        self.solver.stepped(event, planned)
         self._recorder.take(event)
 
+    def _on_plan_wanted(self, event: PlanWanted) -> None:
+        load = self.versions.running_load()
+        with self._lock:
+            settings = self._state.now.settings
+        if load is not None:
+            self.solver.plan(event, load, settings)
+
     def _on_save(self) -> None:
+        self.solver.stop()
         self.rescorer.stop(StoppedBy.SAVE)
         self.checks.stop(StoppedBy.SAVE)
         self.studio.interrupted()

@@ -15,6 +15,7 @@ from workbench.session.cameras.view import StudioView
 from workbench.session.checks.checks import ChecksView
 from workbench.session.checks.profile import ProfileView
 from workbench.session.history.curves import Curves
+from workbench.session.live.solver import SolveView
 from workbench.session.live.timeline import TimelineView
 from workbench.session.process.captured_output import NOTHING_PRINTED, Printed
 from workbench.session.process.heartbeat import Busy
@@ -132,6 +133,8 @@ class SessionView:
     """Where a control step goes."""
     studio: StudioView = StudioView()
     """The camera studio."""
+    solve: SolveView = SolveView()
+    """The plans of the selected env."""
 
     @property
     def shown_cameras(self) -> ShownCameras | None:

@@ -18,6 +18,7 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
 from workbench.jobs.task import ActionSource, Stepped, TaskDescription, TaskOptions
 from workbench.machine.processes.wire import Call, Question
+from workbench.planning.options import PlanOptions
 
 LoadLevel = Literal["auto", "patched", "cameras", "rebuilt"]
 """How to load a new version; ``auto`` takes the least that is safe. See `workbench.authoring.reload.level`."""
@@ -96,6 +97,12 @@ class Settings:
     """Searched for the policy's file after the current folder."""
     sliders: tuple[float, ...] = ()
     """(A,) the action of every env while `action_source` is ``sliders``."""
+    plan: PlanOptions = PlanOptions()
+    """How actions are planned while `action_source` is ``solve``."""
+    solve_all: bool = False
+    """Plan for every env in turn; else for the selected one, and the others hold still."""
+    traced: str = ""
+    """The body whose way in the rollouts is shown; empty for the robot's tool."""
     selected_env: int = 0
     cameras: tuple[CameraRequest, ...] = ()
     """Cameras to draw in the selected env; none while no page is open."""
@@ -107,6 +114,17 @@ class ReadPolicyAgain:
 
     play: bool
     """Start playing if the import succeeds."""
+
+
+@dataclass(frozen=True)
+class FollowPlan:
+    """The answer to a `PlanWanted`: actions to take from that moment on. Dropped if anything else moved the envs since."""
+
+    number: int
+    """Of the `PlanWanted`."""
+    env_idx: tuple[int, ...]
+    actions: NDArray[np.float32]
+    """(S, n, A) for S control steps and these envs; the others hold still."""
 
 
 @dataclass(frozen=True)
@@ -231,6 +249,7 @@ Request = (
     | Reset
     | Settings
     | ReadPolicyAgain
+    | FollowPlan
     | PlaceCamera
     | SetCapture
     | Restore
@@ -302,6 +321,20 @@ class LoadFailed:
     """The tasks of the file, the one that was tried first; empty where the file has only one or none was tried."""
     options: TaskOptions | None = None
     """Those of the `Load` that failed; None if the problem came later."""
+
+
+@dataclass(frozen=True)
+class PlanWanted:
+    """The worker waits for actions to take; followed by a `FollowPlan`, or by nothing where there is no plan."""
+
+    number: int
+    """`Stepped.number` of the moment to plan from."""
+    env_idx: tuple[int, ...]
+    """The envs to plan for."""
+    snapshot: bytes = b""
+    """A pickled `core.snapshots.snapshot.Snapshot` of these envs at that moment."""
+    why_not: str = ""
+    """Why there is no snapshot; empty if there is one."""
 
 
 @dataclass(frozen=True)
@@ -394,6 +427,7 @@ Event = (
     | Loaded
     | LoadFailed
     | Stepped
+    | PlanWanted
     | Pictures
     | Placed
     | PastPictures

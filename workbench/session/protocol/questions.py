@@ -20,6 +20,7 @@ from workbench.core.rules import Degree
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.jobs.rescore.verdict import Rescore
 from workbench.machine.processes.wire import Question
+from workbench.planning.options import PlanArguments
 from workbench.session.protocol.messages import Load, PlaceCamera, Reset, WarmUp
 
 # --- cameras ---------------------------------------------------------------------------------------
@@ -110,6 +111,54 @@ class CheckGroup(Question[CheckedGroup]):
 @dataclass(frozen=True)
 class ProfileStep(Question[StepProfile]):
     """Time the hooks and lines of a control step on envs of its own. Any request behind it ends it."""
+
+
+# --- plans -------------------------------------------------------------------------------------------
+# Only for a worker that does not play: its envs are the rollouts.
+
+
+@dataclass(frozen=True)
+class PlannedEnv:
+    """What was found for one env, and what the last round of its K rollouts earned."""
+
+    env: int
+    actions: NDArray[np.float32]
+    """(S, A) for the control steps before the next plan."""
+    horizon: int
+    """H, control steps of a rollout."""
+    returns: NDArray[np.float32]
+    """(K,) best first, NaN last; what each rollout earned."""
+    plan: int
+    """Which of them was the plan itself as it was before."""
+    hold: int
+    """Which of them held still."""
+    success_at: NDArray[np.int32]
+    """(K,) the step of the horizon at which each succeeded, from 1 on; 0 if it did not."""
+    paths: NDArray[np.float32]
+    """(P, H + 1, 3) the way of the traced body in some of them, best first; metres in the env's frame."""
+    drawn: tuple[int, ...]
+    """(P,) which of the rollouts `paths` are."""
+    traced: str
+    """The body; empty if the task has none to trace."""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Plans for the envs that were asked for, in their order."""
+
+    envs: tuple[PlannedEnv, ...]
+
+
+@dataclass(frozen=True)
+class PlanActions(Question[Planned]):
+    """Plan the next actions of some envs, going on from their last plans. Any request behind it ends it."""
+
+    snapshot: bytes
+    """A pickled `core.snapshots.snapshot.Snapshot` of these envs."""
+    options: PlanArguments
+    traced: str = ""
+    """As `Settings.traced`."""
 
 
 # --- moments of the past -----------------------------------------------------------------------------
@@ -225,7 +274,7 @@ class DrawTask(Question[TaskPicture]):
 
 
 QUESTIONS = (
-    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), CheckGroup, ProfileStep, RescoreMoments, CaptureMoment,
+    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), CheckGroup, ProfileStep, PlanActions, RescoreMoments, CaptureMoment,
     Rescore, MakeScene, ListTasks, DrawTask,
 )  # fmt: skip
 """All types that a `Call` may hold."""

@@ -40,6 +40,7 @@ from workbench.session.protocol.messages import (
     CannotAnswer,
     DrawPast,
     EnterRecording,
+    FollowPlan,
     Inspect,
     ListenForDebugger,
     Load,
@@ -68,6 +69,7 @@ from workbench.session.protocol.questions import (
     DrawTask,
     ListTasks,
     MakeScene,
+    PlanActions,
     ProfileStep,
     RescoreMoments,
     RunCameras,
@@ -84,6 +86,7 @@ from workbench.session.worker.go_back import (
 from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
 from workbench.session.worker.make_scene import SceneEnv, draw_task, registered_ids
 from workbench.session.worker.pacing import Pacer, Rate, throttled
+from workbench.session.worker.plans import FollowedPlan, WorkerPlans, envs_to_plan, succeeded
 from workbench.session.worker.reload import Running, load_version
 from workbench.session.worker.step_events import StepEvents
 
@@ -109,6 +112,9 @@ class Worker:
         self._task = GuardedTask(self._line, self._interrupts, heartbeat, self._steps, self._pause)
         self._cameras = WorkerCameras(self._task, self._on_first_picture)
         self._checks = WorkerChecks(self._line.waits)
+        self._plans = WorkerPlans(self._line.waits)
+        self._followed = FollowedPlan(self._line.send)
+        self._one_planned_step = False
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
         self._playing = False
@@ -130,6 +136,7 @@ class Worker:
             Reset: self._reset,
             Settings: self._apply_settings,
             ReadPolicyAgain: self._read_policy_again,
+            FollowPlan: self._follow_plan,
             PlaceCamera: self._cameras.place,
             SetCapture: lambda request: self._steps.capture(request.env_idx, request.from_reset),
             Restore: lambda request: self._task.guarded(partial(self._go, request)),
@@ -153,8 +160,7 @@ class Worker:
                     continue
                 work = partial(self._handlers[type(request)], request)
                 self._task.run(_DOING.get(type(request)), work)
-            now = time.monotonic()
-            if self._playing and self._pacer.due(now):
+            if self._playing and self._step_due(time.monotonic()):
                 self._pacer.spend()
                 self._task.run("stepping", partial(self._task.guarded, self._step_once))
             if self._cameras.placing_due:
@@ -217,6 +223,9 @@ class Worker:
         if isinstance(question, CheckGroup | ProfileStep):
             options = TaskOptions() if self._loaded_by is None else self._loaded_by.options
             return self._checks.answer(opened, options, question, report)
+        if isinstance(question, PlanActions):
+            env_kwargs = {} if self._loaded_by is None else self._loaded_by.options.env_kwargs
+            return self._plans.answer(opened, env_kwargs, question, report)
         assert isinstance(question, Rescore)
         # Imported late: rerun and the readers take a third of a second.
         from workbench.jobs.rescore import run as rescore_run
@@ -227,7 +236,7 @@ class Worker:
 
     def _sleep(self) -> float:
         waits = [_IDLE]
-        if self._playing:
+        if self._playing and not self._followed.awaited:
             waits.append(self._pacer.wait())
         picture = self._cameras.wait(time.monotonic())
         if picture is not None:
@@ -273,6 +282,8 @@ class Worker:
         self, opened: OpenedTask, report: ReloadReport | None, request: Load, send: Callable[[Loaded], None]
     ) -> None:
         self._checks.close()
+        self._plans.loaded(opened, None if report is None else report.level)
+        self._followed.forget()
         before, self._task.opened = self._task.opened, opened
         self._loaded_by, self._last = request, opened.first
         if report is None or report.level not in ("same", "patched"):
@@ -315,6 +326,8 @@ class Worker:
 
     def _play(self, request: Play) -> None:
         self._playing = request.playing and self._task.opened is not None
+        self._one_planned_step = False
+        self._followed.forget()
         self._pacer.start(time.monotonic())
         self._rate.clear()
         self._send_status(None)
@@ -338,6 +351,12 @@ class Worker:
             self._pacer.start(time.monotonic())
         self._chooser.sliders = new.sliders
         self._cameras.watch(new.selected_env, new.cameras)
+        if (new.action_source, new.solve_all, new.selected_env) != (
+            old.action_source,
+            old.solve_all,
+            old.selected_env,
+        ):
+            self._followed.forget()
         if (new.action_source, new.policy, new.policy_folder) != (
             old.action_source,
             old.policy,
@@ -376,23 +395,63 @@ class Worker:
     def _single_step(self, request: SingleStep) -> None:
         if self._playing:
             self._pause()
-        self._task.guarded(self._step_once)
+        self._one_planned_step = self._is_planned and not self._plan_ready()
+        if not self._one_planned_step:
+            self._task.guarded(self._step_once)
+
+    def _follow_plan(self, request: FollowPlan) -> None:
+        self._followed.take(request)
+        if self._one_planned_step and self._plan_ready():
+            self._one_planned_step = False
+            self._task.guarded(self._step_once)
+
+    @property
+    def _is_planned(self) -> bool:
+        return self._settings.action_source == "solve" and self._task.opened is not None
+
+    def _plan_ready(self) -> bool:
+        """Whether there is an action to take now; it is asked for if there is none."""
+        opened, last = self._task.opened, self._last
+        if opened is None or last is None:
+            return False
+        envs = envs_to_plan(self._settings, opened.env, last)
+        return self._followed.ready(opened, self._steps.number, envs)
+
+    def _step_due(self, now: float) -> bool:
+        # The plan first: the next one is made while the pace of the last is kept.
+        ready = not self._is_planned or self._plan_ready()
+        return self._pacer.due(now) and ready
 
     def _step_once(self, opened: OpenedTask) -> None:
         if opened.env.observes_pictures:
             self._cameras.settle()  # the observation is about to draw the same scene
-        action = self._chooser.next_action(opened.env)
+        if self._is_planned:
+            action = self._followed.next_action(opened.env, self._steps.number)
+        else:
+            action = self._chooser.next_action(opened.env)
+        before = self._last
         with blamed("step", opened.loaded, opened.env):
             step = opened.env.step(action)
         self._rate.tick(time.monotonic())
         self._send_step(step, np.zeros(opened.env.num_envs, bool))
         ended = np.flatnonzero(step.terminated | step.truncated)
+        if self._is_planned:
+            done = succeeded(step)
+            # What is solved stays, to be looked at and kept.
+            ended = ended[~done[ended]]
+            if before is not None and self._all_solved(done, succeeded(before)):
+                self._pause()
         if len(ended) == 0:
             return
         if self._settings.episode_end == "reset":
             self._reset_envs(opened, tuple(int(i) for i in ended), self._chooser.fresh_seeds(len(ended)))
         elif self._settings.episode_end == "pause":
             self._pause()
+
+    def _all_solved(self, done: np.ndarray, before: np.ndarray) -> bool:
+        """Whether the last of the envs that are planned for has succeeded in this step."""
+        planned = slice(None) if self._settings.solve_all else self._settings.selected_env
+        return bool(done[planned].all() and not before[planned].all())
 
     def _reset_envs(
         self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
@@ -469,6 +528,7 @@ class Worker:
 
     def _pause(self) -> None:
         self._playing = False
+        self._followed.forget()
         self._send_status(None)
 
     def _on_first_picture(self, there: bool) -> None:

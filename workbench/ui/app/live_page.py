@@ -26,6 +26,7 @@ from workbench.ui.live.log_panel import LogPanel
 from workbench.ui.live.rescored import PastRescorePanel, RescoredAbove
 from workbench.ui.live.reward import CurvesPanel, NumbersPanel
 from workbench.ui.live.run_panel import NEXT, PREVIOUS, RESET_ALL, RESET_THIS, STEP, RunPanel
+from workbench.ui.live.solve_panel import SolvePanel
 from workbench.ui.live.status_line import StatusLine
 from workbench.ui.live.timeline import GO_ON, LIVE, UNDO, TimelinePanel
 from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
@@ -133,6 +134,7 @@ class Page:
         with run_tab:
             add_hints(server)
             self._run = RunPanel(server, session)
+            self._solve = SolvePanel(server, session, self._link)
             self._view_panel = ViewPanel(server, dark)
             version = VersionPanel(server, session, self._link)
             options = EnvOptionsPanel(server, session)
@@ -163,7 +165,16 @@ class Page:
             profile = StepProfilePanel(server, session, self._link)
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             log = LogPanel(server, session.clear_printed)
-        parts = [self._run, self._view_panel, version, options, self._studio, *reward, self._rescored]
+        parts = [
+            self._run,
+            self._solve,
+            self._view_panel,
+            version,
+            options,
+            self._studio,
+            *reward,
+            self._rescored,
+        ]
         return run_tab, [*parts, self._inspect, self._record, checks, profile, log]
 
     def _add_table_of_envs(self) -> None:
@@ -252,6 +263,7 @@ class Page:
         self._timeline.fold(self._studio.looks_through)
         self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE, placed)
         self._forces.draw(self._inspect.forces(view), offset)
+        self._solve.draw_in_view(view, offset)
         # A scene of another size is framed again; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
         if self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size)):

@@ -112,7 +112,9 @@ SOURCES: dict[str, ActionSource] = {
     "random": "random",
     "sliders": "sliders",
     "policy": "policy",
+    "solve": "solve",
 }
+SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
 STEP, RESET_ALL, RESET_THIS = "Step", "Reset all", "Reset this env"
 PREVIOUS, NEXT = "‹ previous", "next ›"
 CHOOSE = "choose one"
@@ -212,7 +214,7 @@ class RunPanel(PagePart[SessionView]):
 
         with gui.add_folder("Actions"):
             self._source = Control(
-                gui.add_dropdown("Source", tuple(SOURCES), initial_value="hold still"),
+                gui.add_dropdown("Source", tuple(SOURCES), initial_value="hold still", hint=SOURCE_HINT),
                 read=lambda value: SOURCES[value],
                 send=self._choose_source,
                 shown=lambda source: _name_of(SOURCES, source),

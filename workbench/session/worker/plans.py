@@ -1,0 +1,245 @@
+"""Plans in the worker: asks for them where it plays, and makes them in the background process."""
+
+from __future__ import annotations
+
+import pickle
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
+
+from workbench.authoring.loading.blamed import blamed
+from workbench.core.env import actions
+from workbench.core.env.hot_swap import put_class
+from workbench.core.env.keywords import constructor_arguments
+from workbench.core.env.step_result import StepResult
+from workbench.core.env.task_env import TaskEnv
+from workbench.core.maniskill_private import objects_of
+from workbench.core.scene.scene_index import scene_index
+from workbench.core.snapshots.snapshot import Snapshot
+from workbench.jobs.open_task import OpenedTask
+from workbench.planning.options import PlanOptions
+from workbench.planning.rollouts import NotAlike, Plan, RolloutPlanner, make_rollout_env
+from workbench.session.protocol.messages import (
+    SCENE_KEPT,
+    CannotAnswer,
+    FollowPlan,
+    PlanWanted,
+    ReloadLevel,
+    Settings,
+)
+from workbench.session.protocol.questions import PlanActions, Planned, PlannedEnv
+
+MOST_PATHS = 24
+"""Rollouts of which a page gets the way."""
+
+
+class FollowedPlan:
+    """The actions of the worker that plays while they are planned. The worker goes on with its loop until a plan comes."""
+
+    def __init__(self, send: Callable[[PlanWanted], None]) -> None:
+        """
+        Args:
+            send: sends to the server.
+        """
+        self._send = send
+        self._asked: int | None = None
+        self._at = -1
+        """The moment that the next of `_actions` is for."""
+        self._actions: deque[NDArray[np.float32]] = deque()
+        self._env_idx: tuple[int, ...] = ()
+
+    @property
+    def awaited(self) -> bool:
+        """Whether a plan was asked for and has not come."""
+        return self._asked is not None and not self._actions
+
+    def ready(self, opened: OpenedTask, moment: int, envs: Sequence[int]) -> bool:
+        """Whether there is an action for this moment; if there is none, it is asked for, once.
+
+        Args:
+            moment: `Stepped.number`.
+            envs: to plan for.
+        """
+        if self._actions and self._at == moment:
+            return True
+        self._actions.clear()
+        if self._asked != moment:
+            self._asked = moment
+            self._send(_wanted(opened, moment, tuple(envs)))
+        return False
+
+    def take(self, plan: FollowPlan) -> None:
+        """A plan came."""
+        if plan.number == self._asked:
+            self._at, self._env_idx, self._actions = plan.number, plan.env_idx, deque(plan.actions)
+
+    def next_action(self, task: TaskEnv, moment: int) -> NDArray[np.float32]:
+        """(N, A) for this moment, which is `ready`."""
+        action = actions.hold_action(task.parts, task.num_envs)
+        planned = self._actions.popleft()
+        self._at, self._asked = moment + 1, None
+        # Between two versions a plan of the old one may come for a robot with other joints.
+        if planned.shape[1] == action.shape[1] and max(self._env_idx, default=-1) < len(action):
+            action[list(self._env_idx)] = planned
+        return action
+
+    def forget(self) -> None:
+        """What moves the envs has changed: a plan that is under way is not followed."""
+        self._asked = None
+        self._actions.clear()
+
+
+def envs_to_plan(settings: Settings, task: TaskEnv, last: StepResult) -> list[int]:
+    """The envs that are planned for: those that have not succeeded, or all where every one has."""
+    if not settings.solve_all:
+        return [min(settings.selected_env, task.num_envs - 1)]
+    done = succeeded(last)
+    unsolved = [env for env in range(task.num_envs) if not done[env]]
+    return unsolved or list(range(task.num_envs))
+
+
+def succeeded(step: StepResult) -> NDArray[np.bool_]:
+    """(N,) False throughout for a task without success."""
+    success = step.evaluate.get("success", np.zeros(len(step.reward)))
+    return np.array([bool(np.all(one)) for one in success])
+
+
+def _wanted(opened: OpenedTask, moment: int, envs: tuple[int, ...]) -> PlanWanted:
+    try:
+        return PlanWanted(moment, envs, pickle.dumps(opened.env.snapshot(list(envs))))
+    except Exception as error:
+        # A task may keep anything on itself: as for the history (`step_events`), that must not end it.
+        return PlanWanted(
+            moment, envs, why_not=f"its state cannot be copied: {type(error).__name__}: {error}"
+        )
+
+
+class WorkerPlans:
+    """Makes plans with envs of its own, which are the rollouts; they are made when they are first wanted.
+
+    An env's plan goes on from its last one as long as its episode does: a snapshot that does not follow from the last
+    plan begins anew.
+    """
+
+    def __init__(self, waits: Callable[[], bool]) -> None:
+        """
+        Args:
+            waits: whether a request waits, which ends the planning.
+        """
+        self._waits = waits
+        self._env: BaseEnv | None = None
+        self._planner: RolloutPlanner | None = None
+        self._options = PlanOptions()
+        self._next: dict[int, tuple[int, int]] = {}
+        """The episode's seed, and its control steps at the next plan, of each env that has a plan."""
+
+    def answer(
+        self,
+        opened: OpenedTask,
+        env_kwargs: dict[str, object],
+        question: PlanActions,
+        report: Callable[..., None],
+    ) -> Planned:
+        """
+        Args:
+            env_kwargs: with which the task was opened.
+            report: called with how many envs are done, and their total.
+
+        Raises:
+            CannotAnswer: a request came, or the task cannot be planned for.
+            TaskError: it raised in a rollout, or while the envs were built.
+        """
+        planner = self._made(opened, env_kwargs, PlanOptions(**vars(question.options)))
+        try:
+            planner.require_alike(opened.env.env, 0)
+        except NotAlike as error:
+            raise CannotAnswer(str(error)) from None
+        snapshot: Snapshot = pickle.loads(question.snapshot)
+        traced = _body_to_trace(planner.env, question.traced)
+        planned: list[PlannedEnv] = []
+        for place, env in enumerate(snapshot.env_idx):
+            if self._waits():
+                raise CannotAnswer("another request came")
+            report(place, len(snapshot.env_idx))
+            memory = snapshot.memory
+            seed, elapsed = int(memory.episode_seeds[place]), int(memory.elapsed_steps[place])
+            if self._next.get(env) != (seed, elapsed):
+                planner.begin(env, max(seed, 0))
+            with blamed("step", opened.loaded, TaskEnv(planner.env)):
+                plan = planner.plan(snapshot, env, traced)
+            self._next[env] = seed, elapsed + question.options.every
+            name = "" if traced is None else scene_index(planner.env).names[traced]
+            planned.append(_for_page(env, plan, question.options.every, name))
+        return Planned(tuple(planned))
+
+    def loaded(self, opened: OpenedTask, level: ReloadLevel | None) -> None:
+        """Another version of the task runs in this process."""
+        if self._env is not None and level in SCENE_KEPT:
+            put_class(self._env, opened.loaded.cls)
+        else:
+            self.close()
+
+    def close(self) -> None:
+        """Close the rollouts' envs."""
+        if self._env is not None:
+            self._env.close()
+        self._env = self._planner = None
+        self._next = {}
+
+    def _made(
+        self, opened: OpenedTask, env_kwargs: dict[str, object], options: PlanOptions
+    ) -> RolloutPlanner:
+        if self._env is not None and self._env.num_envs != options.rollouts:
+            self.close()
+        if self._env is None:
+            kwargs = constructor_arguments(opened.loaded.cls, env_kwargs, BaseEnv)
+            with blamed("build", opened.loaded):
+                self._env = make_rollout_env(
+                    opened.env.env, {**opened.loaded.default_kwargs, **kwargs}, options.rollouts
+                )
+        if self._planner is None or self._options != options:
+            self._next = {}
+            try:
+                # Quickly restored: a person who waits sees no difference in the last bit of a contact.
+                self._planner, self._options = RolloutPlanner(self._env, options, exact=False), options
+            except ValueError as error:
+                raise CannotAnswer(str(error)) from None
+        return self._planner
+
+
+def _for_page(env: int, plan: Plan, steps: int, traced: str) -> PlannedEnv:
+    returns = plan.returns
+    order = np.argsort(np.where(np.isfinite(returns), -returns, np.inf), kind="stable")
+    # Evenly from the best to the worst, or the page would show only what is much like the best.
+    drawn = np.unique(np.linspace(0, len(order) - 1, MOST_PATHS).astype(int))
+    paths = np.zeros((0, 0, 3), np.float32) if plan.paths is None else plan.paths[order[drawn]]
+    return PlannedEnv(
+        env,
+        plan.actions[:steps],
+        plan.rewards.shape[1],
+        returns[order],
+        int(np.flatnonzero(order == 0)[0]),
+        int(np.flatnonzero(order == 1)[0]),
+        plan.success_at[order],
+        paths,
+        tuple(map(int, drawn)),
+        traced,
+        plan.seconds,
+    )
+
+
+def _body_to_trace(env: BaseEnv, name: str) -> int | None:
+    """The place of this body, or of the robot's tool if it has one, else of its last link; None if there is neither."""
+    names = scene_index(env).names
+    if name in names:
+        return names.index(name)
+    tool = getattr(env.agent, "tcp", None)
+    if tool is not None:
+        found = scene_index(env).name_of(objects_of(tool)[0])
+        if found is not None:
+            return names.index(found)
+    links = [place for place, kind in enumerate(scene_index(env).kinds) if kind == "link"]
+    return links[-1] if links else None
