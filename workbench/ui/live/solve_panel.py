@@ -15,6 +15,7 @@ from workbench.session.live.session import Session
 from workbench.session.live.solver import SolveView
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.questions import PlannedEnv
+from workbench.session.record.save_past import SaveStatus
 from workbench.ui.scene.rollout_traces import RolloutTraces
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.inputs import Control, tell_all
@@ -36,6 +37,7 @@ MOST_ROLLOUTS, LONGEST_HORIZON = 256, 3.0
 MOST_TOLD = 4
 """Solved envs that are named."""
 CHART_HEIGHT = 150
+NOT_SAVED = SaveStatus()
 PREDICTED, ACHIEVED = "#228be6", "#f08c00"
 SETTLE = 0.5
 """Seconds: other rollouts are other envs, which are not built for each place of a slider that is passed."""
@@ -167,8 +169,10 @@ class SolvePanel(PagePart[SessionView]):
             self._told = solve.solved
             return
         plan = view.settings.plan
-        self._status.content = solve_html(solve, task.num_envs, self._link)
+        saving = view.recording.saving
+        self._status.content = solve_html(solve, task.num_envs, saving, self._link)
         self._save.visible = bool(solve.solved) and not view.playing
+        self._save.disabled = saving.progress is not None
         self._mode.visible = offers_better_mode(view)
         self._envs.handle.visible = task.num_envs > 1
         self._envs.show(view.settings.solve_all)
@@ -270,7 +274,9 @@ def is_flat(plan: PlannedEnv) -> bool:
     return bool(np.ptp(plan.returns) == 0 and not plan.success_at.any())
 
 
-def solve_html(solve: SolveView, num_envs: int, link: LinkTo = no_links) -> str:
+def solve_html(
+    solve: SolveView, num_envs: int, saving: SaveStatus = NOT_SAVED, link: LinkTo = no_links
+) -> str:
     """What the plan came to, or what to do for one."""
     plan = solve.plan
     returns: list[tuple[str, float]] = []
@@ -284,6 +290,8 @@ def solve_html(solve: SolveView, num_envs: int, link: LinkTo = no_links) -> str:
     return render(
         "solve",
         solve=solve,
+        saving=saving.message if saving.progress is None and solve.solved else "",
+        failed=saving.failed,
         solved=solve.solved[:MOST_TOLD],
         more=max(0, len(solve.solved) - MOST_TOLD),
         several=num_envs > 1,

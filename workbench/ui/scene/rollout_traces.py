@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from workbench.ui.scene.env_grid import InView
 
-BEST, CHOSEN = (255, 146, 43), (240, 62, 150)
-GOOD, BAD = (66, 153, 225), (120, 130, 145)
+BEST, CHOSEN = (10, 255, 25), (255, 0, 110)
+"""Linear, not sRGB: viser's page draws the colours of single lines much lighter than other colours."""
+GOOD, BAD = (10, 60, 200), (70, 75, 85)
 """Of the others, from the second best to the worst."""
 STEPS = 12
 """Most segments of a way: half a second of a hand's way is smooth."""

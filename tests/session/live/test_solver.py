@@ -1,0 +1,108 @@
+"""The source of actions *solve* in a real session: plans of a process beside are followed until the task is solved."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.session import TASKS, live_session, start_over, step, wait_until
+from workbench.planning.options import PlanOptions
+from workbench.session.live.session import Session
+
+FEW = PlanOptions(rollouts=16, horizon=0.3, noise=0.8)
+"""Enough for a cube that is pushed."""
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("author") / "push_cube.py"
+    file.write_text((TASKS / "push_cube.py").read_text())
+    return file
+
+
+@pytest.fixture(scope="module")
+def session(child_process: None, file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    recordings = tmp_path_factory.mktemp("recordings")
+    with live_session(file, recordings, num_envs=2, control_mode="pd_ee_delta_pose") as session:
+        session.change(action_source="solve", plan=FEW, speed=float("inf"))
+        yield session
+
+
+def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(session: Session) -> None:
+    start_over(session, 3)
+    before = session.view().step
+    session.play()
+    view = wait_until(session, lambda view: bool(view.solve.solved_at) and not view.playing, "a success")
+    step = view.step
+    assert step is not None and before is not None
+    assert view.solve.solved == ((0, view.solve.solved_at),)
+    assert step.evaluate["success"].tolist() == [True, False]
+    assert step.elapsed_steps[0] == view.solve.solved_at == len(view.solve.achieved)
+    # The cube of the other env lies where it lay.
+    assert view.task is not None
+    cube = view.task.geometry.body_names.index("cube")
+    assert np.abs(step.poses[1, cube] - before.poses[1, cube]).max() < 1e-3
+    plan = view.solve.plan
+    assert plan is not None and plan.horizon == 6 and plan.actions.shape == (1, 7)
+    assert len(plan.returns) == 16 and (np.diff(plan.returns) <= 0).all()
+    assert plan.paths.shape == (16, 7, 3) and plan.traced == "panda/panda_hand_tcp"
+    # What is predicted and what comes is of one size: the best of the last plan is a success.
+    assert np.isfinite(view.solve.predicted).all() and view.solve.predicted[-1] == pytest.approx(1, abs=0.6)
+
+
+def test_the_solved_episode_is_saved_like_any_other(session: Session) -> None:
+    session.save_past((0,))
+    view = wait_until(session, lambda view: bool(view.recording.saving.message), "the recording")
+    assert view.recording.saving.message.startswith("saved 1 episode") and not view.recording.saving.failed
+
+
+def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(session: Session) -> None:
+    start_over(session, 4)
+    view = step(session)
+    assert view.step is not None and view.step.elapsed_steps.tolist() == [1, 1] and not view.playing
+    session.play()
+    wait_until(session, lambda view: view.step is not None and view.step.elapsed_steps[0] >= 2, "two steps")
+    session.pause()
+    view = wait_until(session, lambda view: not view.playing, "the pause")
+    time.sleep(0.5)
+    assert session.view().step_serial - view.step_serial <= 1
+    assert session.view().solve.state == "none"
+
+
+def test_another_body_is_traced_and_all_envs_are_planned_for_in_turn(session: Session) -> None:
+    start_over(session, 5)
+    session.change(solve_all=True, traced="cube", plan=replace(FEW, every=2))
+    session.play()
+    session.change(selected_env=1)
+    view = wait_until(session, lambda view: view.solve.plan is not None, "a plan of the other env")
+    plan = view.solve.plan
+    assert plan is not None and plan.env == 1 and plan.traced == "cube" and plan.actions.shape == (2, 7)
+    session.pause()
+    session.change(solve_all=False, traced="", plan=FEW, selected_env=0)
+
+
+def test_a_save_is_planned_with_and_one_that_fails_in_a_rollout_says_where(
+    session: Session, file: Path
+) -> None:
+    text = file.read_text()
+    start_over(session, 6)
+    # It fails later than a load tries it.
+    broken = "        if (self.elapsed_steps > 4).any():\n            raise ValueError('too far')\n        return reward\n"
+    assert text.count("        return reward\n") == 1
+    serial = session.view().task_serial
+    file.write_text(text.replace("        return reward\n", broken))
+    wait_until(session, lambda view: view.task_serial > serial, "the version")
+    session.play()
+    view = wait_until(session, lambda view: view.solve.state == "failed", "the failure")
+    wait_until(session, lambda view: not view.playing, "the pause")
+    assert view.solve.problem is not None and view.solve.problem.message == "ValueError: too far"
+    assert view.solve.problem.file == str(file)
+    file.write_text(text)
+    wait_until(session, lambda view: view.task_serial > serial + 1, "the mended version")
+    step(session)
+    assert session.view().solve.state == "planning"
