@@ -148,6 +148,24 @@ def test_a_dataset_goes_into_the_recordings_folder(
     assert (wanted.export.instruction, wanted.export.only_successes) == ("push it", True)
 
 
+def test_demonstrations_go_there_too_and_are_not_offered_to_be_saved_without_their_json(
+    panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
+) -> None:
+    panels.set("Make", "ManiSkill demonstrations (h5)")
+    panel.draw(Chosen((RECORDING,)))
+    assert panels.shows("Only successes") and not panels.shows("Task") and not panels.shows("Camera")
+    panels.press("Make")
+    (wanted,) = making.wanted
+    assert wanted.what == "maniskill" and wanted.export.only_successes
+    assert wanted.folder.parent == tmp_path / "datasets" and wanted.folder.suffix == ".h5"
+    wanted.folder.parent.mkdir()
+    wanted.folder.write_bytes(b"h5")
+    making.shown = MakingView(made=(Made((wanted.folder,), "1 episode, 8 steps."),))
+    panel.draw(Chosen((RECORDING,)))
+    assert "1 episode, 8 steps." in panels.html() and str(wanted.folder) in panels.html()
+    assert "download" not in panels.html()
+
+
 def test_only_successes_cannot_be_ticked_where_none_reaches_success(
     panel: SharePanel, panels: Panels, making: Noted
 ) -> None:

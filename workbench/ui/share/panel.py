@@ -32,7 +32,11 @@ WHAT: dict[str, What] = {
     "Animated 3D page (html)": "page",
     "Sheet of pictures (png)": "sheet",
     "LeRobot dataset": "lerobot",
+    "ManiSkill demonstrations (h5)": "maniskill",
 }
+WHEN = "\u2039date and time\u203a"
+DATASETS: tuple[What, ...] = ("lerobot", "maniskill")
+"""One of all recordings, kept in the folder of recordings."""
 ALL_CAMERAS = "every camera"
 SELECTED, OPENED = "the selected recordings", "the open recordings"
 MOST_SHOWN = 6
@@ -122,10 +126,10 @@ class SharePanel:
         if self._camera.options != options:
             self._camera.options = options
         self._camera.visible = what == "film" and len(options) > 2
-        self._successes.visible = what == "lerobot"
+        self._successes.visible = what in DATASETS
         self._successes.disabled = chosen.successes == 0
         self._successes.value = self._wants_successes and chosen.successes != 0
-        self._fitting.visible = what == "lerobot" and len(names) > 1
+        self._fitting.visible = what in DATASETS and len(names) > 1
         self._task.visible = what == "lerobot"
         self._make.visible = not view.running
         self._stop.visible = view.running
@@ -142,7 +146,7 @@ class SharePanel:
         if not chosen.sources:
             return
         wanted = MakeRequest(what, chosen.sources, Path(), eye=_eye_of(client) if chosen.in_view else None)
-        if what == "lerobot":
+        if what in DATASETS:
             now = datetime.datetime.now()
             words = self._task.value.strip()[:400]
             export = ExportOptions(
@@ -150,7 +154,7 @@ class SharePanel:
                 only_fitting=self._fitting.value,
                 instruction=words or None,
             )
-            folder = self._folder / "datasets" / f"lerobot_{now:%Y-%m-%dT%H-%M-%S}"
+            folder = self._folder / "datasets" / dataset_name(what, f"{now:%Y-%m-%dT%H-%M-%S}")
             self._making.start(replace(wanted, folder=folder, export=export))
             return
         camera = self._camera.value if self._camera.value in chosen.cameras else EVERY_CAMERA
@@ -164,7 +168,9 @@ class SharePanel:
 
     def _links(self, made: Made) -> list[tuple[str, Path, str]]:
         """Address, path and short name of each file."""
-        files = [path for path in made.paths if path.is_file()]
+        # A dataset stays where it is: the .h5 of demonstrations belongs to the .json beside it.
+        kept = self._folder / "datasets"
+        files = [path for path in made.paths if path.is_file() and not path.is_relative_to(kept)]
         short = short_names([path.name for path in files])
         return [(self._offers.address(path, download=True), path, name) for path, name in zip(files, short)]
 
@@ -176,8 +182,8 @@ def will_make(
     their short names, the folder ``where`` they go (empty for downloads), and a sentence of what to know before."""
     names = [source.stem for source in chosen.sources]
     of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
-    if what == "lerobot":
-        where = f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a"
+    if what in DATASETS:
+        where = f"{folder / 'datasets'}/{dataset_name(what, WHEN)}"
         known, note = chosen.successes, ""
         if known == 0:
             note = (
@@ -187,7 +193,8 @@ def will_make(
             )
         elif only_successes and known is not None and known < len(names):
             of = f"of the {known} of these {len(names)} recordings that reach success"
-        return {"what": f"one dataset {of}", "files": (), "where": where, "note": note}
+        one = "one dataset" if what == "lerobot" else "one file of demonstrations, and its .json,"
+        return {"what": f"{one} {of}", "files": (), "where": where, "note": note}
     if what != "film":
         files = [file_name(what, name) for name in names]
     elif camera in chosen.cameras:
@@ -199,6 +206,11 @@ def will_make(
         return {"what": f"one video for each camera{known} {of}", "files": (), "where": "", "note": ""}
     named = list(zip(files, short_names(files)))
     return {"what": counted(len(files), "file"), "files": named, "where": "", "note": ""}
+
+
+def dataset_name(what: What, when: str) -> str:
+    """Of the folder or file below ``datasets``."""
+    return f"lerobot_{when}" if what == "lerobot" else f"demonstrations_{when}.h5"
 
 
 _TIME = re.compile(r"_\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d")

@@ -1,0 +1,64 @@
+"""A task is solved on the page, its episode is saved, and becomes a file of demonstrations for ManiSkill's baselines."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.drive.desk import Desk
+from tests.drive.page import TASK, page_on
+from tests.drive.waiting import until
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Desk]:
+    file = Path(shutil.copy(TASK, tmp_path_factory.mktemp("author")))
+    arguments = ("--num-envs", "1", "--env", "render_backend=none", "--env", "control_mode=pd_ee_delta_pose")
+    with page_on(file, *arguments, browser=browser) as (page, errors, opened):
+        yield Desk(page, errors, file, opened)
+
+
+def choose(desk: Desk, label: str, option: str) -> None:
+    desk.page.get_by_label(label, exact=True).locator("visible=true").first.click()
+    desk.page.get_by_role("option", name=option, exact=True).click()
+
+
+@pytest.mark.slow
+def test_a_task_is_solved_saved_and_exported_with_the_mouse_alone(desk: Desk) -> None:
+    page = desk.page
+    desk.tab("Run")
+    choose(desk, "Source", "solve")
+    expect(page.get_by_text(re.compile("actions are planned by rollouts"))).to_be_visible()
+    desk.button("Play").click()
+    save = desk.button("Save the solved episode")
+    expect(save).to_be_visible(timeout=120_000)
+    expect(page.get_by_text(re.compile(r"^Solved at step \d+$"))).to_be_visible()
+    expect(page.get_by_text("paused", exact=True)).to_be_visible()
+    expect(page.get_by_text(re.compile("The best rollout: return"))).to_be_visible()
+    save.click()
+    expect(page.get_by_text(re.compile("^saved 1 episode"))).to_be_visible()
+    desk.tab("Episodes")
+    desk.button("Review recordings").click()
+    expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
+    desk.tab("Share")
+    page.locator('input[value="Video of a camera (mp4)"]:not([type="hidden"])').click()
+    page.get_by_role("option", name="ManiSkill demonstrations (h5)").click()
+    desk.button("Make").click()
+    datasets = desk.file.parent / "recordings" / "datasets"
+    (file,) = until(lambda: list(datasets.glob("demonstrations_*.h5")), "the demonstrations")
+    told = json.loads(file.with_suffix(".json").read_text())
+    assert [episode["success"] for episode in told["episodes"]] == [True]
+    with h5py.File(file) as demonstrations:
+        steps = len(demonstrations["traj_0/actions"])
+    assert steps == told["episodes"][0]["elapsed_steps"] > 0
+    expect(page.get_by_text(re.compile(f"^1 episode, {steps} steps"))).to_be_visible()
+    assert desk.errors == []
