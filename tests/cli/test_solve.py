@@ -14,7 +14,8 @@ import pytest
 
 from workbench.cli.main import main
 from workbench.jobs.record import RecordProgress
-from workbench.jobs.solve import SolveOptions, SolveReport, solve
+from workbench.jobs.solve import SolveOptions, solve
+from workbench.jobs.solve_report import SolveReport
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.recording.reader.read_episode import read_episode

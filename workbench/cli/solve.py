@@ -32,7 +32,8 @@ from workbench.cli.terminal import (
 )
 from workbench.jobs.pool import PoolError
 from workbench.jobs.record import with_given_actions
-from workbench.jobs.solve import SolvedSeed, SolveOptions, SolveReport, solve
+from workbench.jobs.solve import SolveOptions, solve
+from workbench.jobs.solve_report import SolvedSeed, SolveReport
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text
@@ -112,15 +113,9 @@ def print_report(report: SolveReport) -> None:
         out.print(table)
     for verdict in report.verdicts:
         _print_verdict(verdict)
-    print_text(summary(report))
+    print_text(report.summary)
     if report.seeds:
         print_text(f"Look at them with: workbench review {shlex.quote(str(report.seeds[0].path.parent))}")
-
-
-def summary(report: SolveReport) -> str:
-    """``Solved 14 of 16 seeds, in 9 control steps (median). 61 s.``"""
-    steps = "" if report.median_steps is None else f", in {report.median_steps:g} control steps (median)"
-    return f"Solved {len(report.solved)} of {len(report.seeds)} seeds{steps}. {report.seconds:.0f} s."
 
 
 def _cells(one: SolvedSeed) -> Iterator[str]:

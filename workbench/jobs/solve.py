@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
 
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.actions import SOLVE
 from workbench.jobs.pool import Executor
-from workbench.jobs.record import RecordOptions, RecordProgress, record
+from workbench.jobs.record import RecordOptions, RecordProgress, Written, record
+from workbench.jobs.solve_report import SolvedSeed, SolveReport
 from workbench.jobs.task import TaskOptions
 from workbench.planning.episodes import PlannedEpisode
 from workbench.planning.options import PlanOptions
-from workbench.planning.verdicts import Verdict, in_the_way, of_episodes
+from workbench.planning.verdicts import in_the_way, of_episodes
 
 _AFTER_SUCCESS = 5
 """Control steps that an episode goes on after its success: does it stay solved?"""
@@ -56,50 +56,6 @@ class SolveOptions:
         )
 
 
-@dataclass(frozen=True)
-class SolvedSeed:
-    """What came of one seed."""
-
-    seed: int
-    solved_at: int
-    """The control step of its success, from 1 on; 0 without one."""
-    steps: int
-    total_reward: float
-    """Over all steps, those after its success too."""
-    seconds: float
-    """Wall time of its plans."""
-    in_the_way: str
-    """Why it was not solved; empty if it was."""
-    path: Path
-    """Its recording."""
-
-
-@dataclass(frozen=True)
-class SolveReport:
-    """What came of all seeds that were tried to the end."""
-
-    seeds: tuple[SolvedSeed, ...]
-    verdicts: tuple[Verdict, ...]
-    seconds: float
-    """Wall time, opening the task included."""
-    stopped: bool
-    """It was stopped before all seeds were tried."""
-
-    @property
-    def solved(self) -> tuple[SolvedSeed, ...]:
-        return tuple(one for one in self.seeds if one.solved_at)
-
-    @property
-    def median_steps(self) -> float | None:
-        """Of the solved seeds, to their success; None without one."""
-        return median(one.solved_at for one in self.solved) if self.solved else None
-
-    @property
-    def fails(self) -> bool:
-        """Whether the reward breaks a rule, or no seed was solved."""
-        return bool(self.verdicts) or not self.solved
-
-
 def solve(
     what: SolveOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
@@ -107,12 +63,32 @@ def solve(
     stop: Callable[[], bool] = lambda: False,
     on_finding: Callable[[Finding], None] = warn_of,
     executor: Executor | None = None,
+    on_report: Callable[[SolveReport], None] = lambda report: None,
 ) -> SolveReport:
-    """Solve, recording every episode; arguments and errors as of `record`."""
+    """Solve, recording every episode.
+
+    Other arguments and errors as of `record`.
+
+    Args:
+        on_report: called after each seed, with what is known so far.
+    """
     began = time.monotonic()
-    recorded = record(what.recording(), on_activity, on_progress, stop, on_finding, executor)
+    done: dict[int, Written] = {}
+
+    def noted(progress: RecordProgress) -> None:
+        on_progress(progress)
+        if progress.over is not None and progress.over[1] is not None:
+            done[progress.over[0]] = progress.over[1]
+            so_far = [done[number] for number in sorted(done)]
+            on_report(_report(so_far, time.monotonic() - began, stopped=False))
+
+    recorded = record(what.recording(), on_activity, noted, stop, on_finding, executor)
+    return _report(recorded.written, time.monotonic() - began, recorded.stopped)
+
+
+def _report(recorded: Sequence[Written], seconds: float, stopped: bool) -> SolveReport:
     planned: list[PlannedEpisode] = []
-    for written in recorded.written:
+    for written in recorded:
         assert written.planned is not None
         planned.append(written.planned)
     rows = [
@@ -125,6 +101,6 @@ def solve(
             in_the_way(episode, planned),
             written.path,
         )
-        for written, episode in zip(recorded.written, planned, strict=True)
+        for written, episode in zip(recorded, planned, strict=True)
     ]
-    return SolveReport(tuple(rows), tuple(of_episodes(planned)), time.monotonic() - began, recorded.stopped)
+    return SolveReport(tuple(rows), tuple(of_episodes(planned)), seconds, stopped)

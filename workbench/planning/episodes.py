@@ -1,16 +1,20 @@
-"""What is known of an episode whose actions were planned: what it earned, and what its rollouts earned at each step."""
+"""What is known of an episode whose actions were planned: what it earned, and what its rollouts earned at each step.
+
+Imports no torch."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.env.step_result import StepResult
-from workbench.planning.rollouts import Plan
+
+if TYPE_CHECKING:
+    from workbench.planning.rollouts import Plan
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from workbench.session.cameras.selection import KeptPlacements
 from workbench.session.cameras.studio import CameraStudio
 from workbench.session.checks.checks import Checks
 from workbench.session.checks.profile import StepProfiler
+from workbench.session.checks.solve_seeds import SeedsSolver
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.live_state import LiveState, SharedState, scene_kept
 from workbench.session.live.solver import Solver
@@ -147,6 +148,8 @@ class Session:
         """Where a step of the running version goes."""
         self.solver = Solver(self._notify, self._send, lambda: self._set_playing(False))
         """Plans the actions of the source *solve*."""
+        self.seeds_solver = SeedsSolver(self._notify, recordings)
+        """Solves the task from many seeds."""
         self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
         """The timeline."""
@@ -182,6 +185,7 @@ class Session:
             "rescored": self.rescorer.rescoring.view,
             "checks": self.checks.view,
             "profile": self.profiler.view,
+            "seeds": self.seeds_solver.view,
         }
         with self._lock:
             view = self._state.view(**known)
@@ -373,6 +377,13 @@ class Session:
         if (load := self.versions.running_load()) is not None:
             self.profiler.profile(load)
 
+    def solve_seeds(self, seeds: int) -> None:
+        """Solve the file as it is saved from seeds 0 to `seeds` - 1."""
+        with self._lock:
+            plan = self._state.now.settings.plan
+        if (load := self.versions.running_load()) is not None:
+            self.seeds_solver.solve(load, seeds, plan)
+
     def show(self, env: int, serial: int) -> None:
         """Select an env and show a moment of the history."""
         self.change(selected_env=env)
@@ -389,6 +400,7 @@ class Session:
         self.checks.close()
         self.profiler.close()
         self.solver.close()
+        self.seeds_solver.close()
         self.studio.close()
         self.past_saver.close()
         self._background.end()
@@ -460,6 +472,7 @@ class Session:
         # After the rescoring was begun: of two jobs for which nobody waits, the later comes first.
         self.checks.loaded(load, before is not None and before.env_id == event.task.env_id)
         self.profiler.loaded()
+        self.seeds_solver.loaded()
         self.versions.follow(event.task, stale)
         self._send_settings()
         self.studio.send_placements(placed)

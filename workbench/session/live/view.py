@@ -14,6 +14,7 @@ from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.session.cameras.view import StudioView
 from workbench.session.checks.checks import ChecksView
 from workbench.session.checks.profile import ProfileView
+from workbench.session.checks.solve_seeds import SeedsView
 from workbench.session.history.curves import Curves
 from workbench.session.live.solver import SolveView
 from workbench.session.live.timeline import TimelineView
@@ -131,6 +132,8 @@ class SessionView:
     """The rules of the running version, checked in the background."""
     profile: ProfileView = ProfileView()
     """Where a control step goes."""
+    seeds: SeedsView = SeedsView()
+    """The task solved from many seeds."""
     studio: StudioView = StudioView()
     """The camera studio."""
     solve: SolveView = SolveView()

@@ -6,6 +6,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import viser
@@ -17,6 +18,7 @@ from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.cameras.studio import StudioPanel
 from workbench.ui.checks.panel import TAB as CHECKS
 from workbench.ui.checks.panel import ChecksMark, ChecksPanel
+from workbench.ui.checks.solve_seeds import SolveSeedsPanel
 from workbench.ui.checks.step_profile import StepProfilePanel
 from workbench.ui.live.banners import INTERRUPT, NEW_WORKER, RELOAD, RESTART, Banner, BusyBanner
 from workbench.ui.live.env_panel import EnvPanel
@@ -58,6 +60,7 @@ class Page:
         session: The session.
         dark: The first theme.
         on_review: Called when a person wants to see the recordings.
+        on_look: Called with the recording that a person wants to look at.
         stage: The 3-D view; None makes one.
         commands: Further ones for the palette.
         clock: Of all parts of the page.
@@ -71,6 +74,7 @@ class Page:
         session: Session,
         dark: bool = True,
         on_review: Callable[[], None] = lambda: None,
+        on_look: Callable[[Path], None] = lambda path: None,
         stage: Stage | None = None,
         commands: tuple[Command, ...] = (),
         clock: Clock = time.monotonic,
@@ -81,7 +85,7 @@ class Page:
         self._session = session
         self._clock = clock
         self._link = partial(editor_link, editor, known=session.versions.knows_file)
-        self._on_review = on_review
+        self._on_review, self._on_look = on_review, on_look
         self._loop = RedrawLoop(server, "page", session.wait, lambda: self._count_clients() > 0, self.redraw)
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
@@ -162,6 +166,7 @@ class Page:
             review.on_click(lambda _: on_review())
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, session, checks_tab, self._link)
+            seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
             profile = StepProfilePanel(server, session, self._link)
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             log = LogPanel(server, session.clear_printed)
@@ -175,7 +180,7 @@ class Page:
             *reward,
             self._rescored,
         ]
-        return run_tab, [*parts, self._inspect, self._record, checks, profile, log]
+        return run_tab, [*parts, self._inspect, self._record, checks, seeds, profile, log]
 
     def _add_table_of_envs(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)

@@ -227,9 +227,17 @@ class ReviewPage:
         self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures)
 
     def _open_the_newest(self, view: ReviewView) -> None:
-        """Begin with a recording, once; the library stays as it is, also on a small screen."""
+        """Begin with a recording, once, or with the one that was wanted; the library stays as it is, also on a small screen."""
         place = self._place
         listed = place.shelf.library.view()
+        if place.wanted is not None:
+            named = {path.name: row for row in listed.rows if row.problem is None for path in row.paths}
+            if (row := named.get(place.wanted.name)) is None:
+                return  # it was written a moment ago, and is listed in another
+            place.wanted, place.newest_opened = None, True
+            self._had_opened = self._awaited = (row.id,)
+            self._review.open(self._awaited)
+            return
         if place.newest_opened or (not view.opened and (listed.reading is not None or not listed.rows)):
             return
         place.newest_opened = True

@@ -101,6 +101,8 @@ class Workplace:
         another task is continued."""
         self.newest_opened = False
         """The review has begun with the newest recording; it does so once."""
+        self.wanted: Path | None = None
+        """A file of the recording that a person wants to look at, until the review has opened it."""
         self.dialog = TrustDialog(self.server)
         clearances = Clearances(self.task_files, self.dialog.ask, all_trusted=trust)
         self.go_live = GoLive(self, make_session, clearances, base)
@@ -178,6 +180,10 @@ class Workplace:
         if self.home is not None:
             self.home.close()
 
+    def _look_at(self, recording: Path) -> None:
+        self.wanted = recording
+        self.pages.show("review")
+
     def _page(self, which: Which, dark: bool) -> Page | ReviewPage | StartPage:
         if which == "start":
             return StartPage(self, dark)
@@ -193,6 +199,7 @@ class Workplace:
             self.session,
             dark,
             lambda: self.pages.show("review"),
+            self._look_at,
             self.stage,
             self.commands,
             editor=self._editor,

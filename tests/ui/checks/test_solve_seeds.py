@@ -1,0 +1,107 @@
+"""The folder *Solve many seeds*: what it says, and what it asks the session for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import viser
+
+from tests.drive.panels import Panels
+from tests.ui.scenes import problem, running
+from workbench.jobs.solve_report import SolvedSeed, SolveReport
+from workbench.planning.verdicts import Verdict
+from workbench.session.checks.solve_seeds import SeedsView
+from workbench.ui.checks.solve_seeds import SOLVE, STOP_SOLVING, SolveSeedsPanel, seeds_html, verdict_cards
+
+REPORT = SolveReport(
+    (
+        SolvedSeed(0, 8, 13, 9.25, 3.2, "", Path("/r/seed0.rrd")),
+        SolvedSeed(1, 0, 50, 21.5, 12.5, "earned <0.9> a step without success", Path("/r/seed1.rrd")),
+    ),
+    (Verdict("reward-exploited", "1 of 2 episodes earned more", (1,)),),
+    20.0,
+    False,
+)
+DONE = SeedsView("done", 4, REPORT, total=2)
+
+
+@dataclass
+class RecordedSession:
+    """Stands where the session stands for the panel, and notes what it was asked."""
+
+    view: SeedsView = DONE
+    asked: list[object] = field(default_factory=list)
+
+    @property
+    def seeds_solver(self) -> RecordedSession:
+        return self
+
+    def solve_seeds(self, seeds: int) -> None:
+        self.asked.append(seeds)
+
+    def stop(self) -> None:
+        self.asked.append("stop")
+
+
+@dataclass
+class Shown:
+    panel: SolveSeedsPanel
+    session: RecordedSession
+    panels: Panels
+    looked_at: list[Path]
+
+    def draw(self, seeds: SeedsView) -> None:
+        self.panel.draw(running(1, seeds=seeds))
+
+
+@pytest.fixture
+def shown(server: viser.ViserServer) -> Iterator[Shown]:
+    session, looked_at = RecordedSession(), list[Path]()
+    panel = SolveSeedsPanel(server, session, looked_at.append)  # type: ignore[arg-type]
+    yield Shown(panel, session, Panels(server), looked_at)
+
+
+def test_so_many_seeds_as_are_typed_are_solved_and_it_can_be_stopped(shown: Shown) -> None:
+    shown.draw(SeedsView())
+    assert "Every episode is recorded" in shown.panels.html() and not shown.panels.shows(STOP_SOLVING)
+    shown.panels.set("Seeds", 12)
+    shown.panels.press(SOLVE)
+    shown.draw(SeedsView("starting", 1, total=12, activity="importing push_cube.py"))
+    assert "0 of 12 seeds" in shown.panels.html() and "importing push_cube.py" in shown.panels.html()
+    assert not shown.panels.shows(SOLVE, "button")
+    shown.panels.press(STOP_SOLVING)
+    assert shown.session.asked == [12, "stop"]
+
+
+def test_each_seed_has_a_row_that_opens_its_recording(shown: Shown) -> None:
+    shown.draw(DONE)
+    said = shown.panels.html()
+    assert "Solved 1 of 2 seeds, in 8 control steps (median). 20 s." in said
+    assert "earned &lt;0.9&gt; a step without success" in said and "21.5" in said
+    shown.panels.press("look 1")
+    assert shown.looked_at == [Path("/r/seed1.rrd")]
+
+
+def test_a_verdict_is_a_card_as_of_the_checks_with_its_seeds(shown: Shown) -> None:
+    shown.draw(DONE)
+    assert 'data-rule="reward-exploited"' in shown.panels.html()
+    assert "1 of 2 episodes earned more (seeds 1)" in shown.panels.html()
+    assert "<b>Mend</b>" not in shown.panels.html()
+    shown.panels.press("fold reward-exploited")
+    shown.draw(DONE)
+    assert "<b>Mend</b>" in shown.panels.html()
+    (card,) = verdict_cards(REPORT, old=True)
+    assert card.old
+
+
+def test_it_says_why_it_failed_where_it_was_stopped_and_of_which_version_it_is() -> None:
+    def html(seeds: SeedsView) -> str:
+        return seeds_html(seeds, lambda seed: str(seed))
+
+    failed = html(SeedsView("failed", why="the task failed", problem=problem()))
+    assert "the task failed: KeyError" in failed and "push.py:88" in failed
+    stopped = html(SeedsView("stopped", report=REPORT, total=9, stale=True))
+    assert "stopped by hand after 2 seeds" in stopped and "of the version before" in stopped

@@ -1,0 +1,181 @@
+"""Solves the open task from many seeds in processes beside, as ``workbench solve`` does, and keeps every episode."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from workbench.authoring.problem import Problem, TaskError
+from workbench.jobs.pool import Deal, ItemQueue, PoolError, Processes, Work
+from workbench.jobs.solve_report import SolveReport
+from workbench.jobs.task import TaskOptions
+from workbench.planning.options import PlanOptions
+from workbench.session.process.job_lane import Job, JobFailed, JobLane
+from workbench.session.protocol.messages import Load
+
+_NICENESS = 10
+"""The worker that plays comes first."""
+SeedsState = Literal["none", "starting", "solving", "done", "stopped", "failed"]
+RUNNING: tuple[SeedsState, ...] = ("starting", "solving")
+
+
+@dataclass(frozen=True)
+class SeedsView:
+    """What came of the seeds so far."""
+
+    state: SeedsState = "none"
+    serial: int = 0
+    """Grows with every change."""
+    report: SolveReport | None = None
+    """Of the seeds that are done; of an earlier version if `stale`."""
+    total: int = 0
+    """Seeds that were asked for."""
+    activity: str = ""
+    """What is done before the first seed."""
+    stale: bool = False
+    """Another version runs since."""
+    why: str = ""
+    """Why it failed, as text."""
+    problem: Problem | None = None
+    """What the author's code raised."""
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """What to solve, as fields of `jobs.solve.SolveOptions`, whose module the server cannot import."""
+
+    task: str
+    out: Path
+    seeds: int
+    workers: int
+    plan: PlanOptions
+    options: TaskOptions
+
+
+class SeedsSolver:
+    """Solves seeds 0 to N - 1 of the task's file as it is saved. All methods but `close` return at once."""
+
+    def __init__(self, on_change: Callable[[], None], recordings: Path) -> None:
+        """
+        Args:
+            on_change: called when `view` has changed.
+            recordings: the folder for the episodes.
+        """
+        self._on_change, self._recordings = on_change, recordings.absolute()
+        self._lock = threading.Lock()
+        self._view = SeedsView()
+        self._lane = JobLane("solve-seeds", on_change, self._failed)
+
+    @property
+    def view(self) -> SeedsView:
+        return self._view
+
+    def solve(self, load: Load, seeds: int, plan: PlanOptions) -> None:
+        """Solve so many seeds; a running job ends, and keeps what is done.
+
+        Args:
+            load: loads the running version.
+        """
+        if not isinstance(load.task, str):
+            # Only the texts of a recording's task were cleared, not the file that bears its name.
+            self._change(state="failed", why="this task comes from a recording: open its file to solve it")
+            return
+        workers = max(1, min(seeds, len(os.sched_getaffinity(0)) // 2))
+        setup = _Setup(load.task, self._recordings, seeds, workers, plan, replace(load.options, seed=0))
+        with self._lock:
+            self._lane.start("solving seeds", lambda job: self._solve(job, setup))
+            self._set(
+                state="starting", report=None, total=seeds, activity="", stale=False, why="", problem=None
+            )
+        self._on_change()
+
+    def loaded(self) -> None:
+        """Another version runs: what is known is of an earlier one."""
+        with self._lock:
+            if self._view.report is not None:
+                self._set(stale=True)
+        self._on_change()
+
+    def stop(self) -> None:
+        """End it; seeds that are done stay, with their recordings."""
+        with self._lock:
+            self._lane.stop()
+            if self._view.state not in RUNNING:
+                return
+            self._set(state="stopped", activity="")
+        self._on_change()
+
+    def close(self) -> None:
+        """Stop; returns when the processes have ended."""
+        self.stop()
+        self._lane.close()
+
+    # --- on the lane ---------------------------------------------------------------------------------
+
+    def _solve(self, job: Job, setup: _Setup) -> None:
+        work = Work(_run, (setup,), SolveReport, SolveReport | str, "that solves")
+        deal: Deal[SolveReport, SolveReport | str] = Deal(
+            range(1),
+            lambda number, report: self._take(job, report),
+            lambda news: self._take(job, news),
+            lambda: job.stopped,
+        )
+        try:
+            Processes().run(work, deal)
+        except TaskError as error:
+            raise JobFailed("the task failed", error.problem) from error
+        except OSError as error:
+            raise JobFailed(f"no process could be started: {error}") from error
+        except PoolError as error:
+            raise JobFailed(str(error)) from error
+        self._update(job, state="done")
+
+    def _take(self, job: Job, news: SolveReport | str) -> None:
+        if isinstance(news, str):
+            self._update(job, activity=news)
+        else:
+            self._update(job, state="solving", report=news, activity="")
+
+    def _failed(self, job: Job, failure: JobFailed) -> None:
+        self._update(job, state="failed", why=str(failure), problem=failure.problem, activity="")
+
+    # --- the view ------------------------------------------------------------------------------------
+
+    def _update(self, job: Job, **values: Any) -> None:
+        with self._lock:
+            if job.stopped:
+                return
+            self._set(**values)
+        self._on_change()
+
+    def _change(self, **values: Any) -> None:
+        with self._lock:
+            self._set(**values)
+        self._on_change()
+
+    def _set(self, **values: Any) -> None:
+        self._view = replace(self._view, serial=self._view.serial + 1, **values)
+
+
+def _run(setup: _Setup, queue: ItemQueue) -> None:
+    """Runs in the other process, which starts the workers."""
+    from workbench.jobs.solve import SolveOptions, solve
+
+    if queue.next() is None:
+        return
+    os.nice(_NICENESS)
+    what = SolveOptions(
+        setup.task, setup.out, setup.seeds, setup.workers, plan=setup.plan, options=setup.options
+    )
+    report = solve(
+        what,
+        on_activity=queue.send_update,
+        stop=lambda: queue.limit() == 0,
+        on_finding=lambda finding: None,
+        on_report=queue.send_update,
+    )
+    queue.send_result(0, report)
