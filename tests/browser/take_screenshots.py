@@ -298,6 +298,19 @@ def shoot_checks(browser: Browser) -> None:
         desk.shoot("checks")
 
 
+def shoot_solve(browser: Browser) -> None:
+    """Some steps of a plan, paused: the rollouts, and what they earned."""
+    with live_page(browser, "--num-envs", "1", "--env", "control_mode=pd_ee_delta_pose") as desk:
+        desk.choose("Source", "solve")
+        for step in range(1, 4):
+            desk.button("Step")
+            expect(desk.page.locator(".wb-timeline").get_by_text(f"step {step} /")).to_be_visible(
+                timeout=60_000
+            )
+        desk.page.locator(".wb-solve").evaluate("e => e.scrollIntoView({block: 'start'})")
+        desk.shoot("solve")
+
+
 def shoot_busy(browser: Browser) -> None:
     """A loop that does not end, in the reward of a new version."""
     lines = TASK.read_text().splitlines()
@@ -402,6 +415,7 @@ SHOTS: dict[str, Callable[[Browser], None]] = {
     "rescored": shoot_rescored,
     "busy": shoot_busy,
     "checks": shoot_checks,
+    "solve": shoot_solve,
     "review": shoot_review,
     "tutorial": shoot_tutorial,
 }

@@ -1,0 +1,125 @@
+"""Plans in the worker: asked for once a moment, followed while nothing else moves the envs, and made by rollouts."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.session import TASKS
+from workbench.authoring.loading.load import load_task
+from workbench.jobs.open_task import OpenedTask, Opening, build_task
+from workbench.jobs.task import TaskOptions
+from workbench.planning.options import PlanOptions
+from workbench.session.protocol.messages import CannotAnswer, FollowPlan, PlanWanted, Settings
+from workbench.session.protocol.questions import PlanActions, PlannedEnv
+from workbench.session.worker.plans import MOST_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
+
+MADE = {"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
+SMALL = PlanOptions(rollouts=6, horizon=0.2)
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+
+@pytest.fixture(scope="module")
+def push() -> Iterator[OpenedTask]:
+    opened = opened_with(TASKS / "push_cube.py", 2, **MADE)
+    yield opened
+    opened.env.close()
+
+
+def opened_with(file: Path, num_envs: int, **env_kwargs: object) -> OpenedTask:
+    options = TaskOptions(num_envs, "cpu", 0, env_kwargs)
+    return build_task(load_task(str(file)), options, Opening(on_finding=lambda finding: None))
+
+
+@pytest.fixture
+def plan(push: OpenedTask) -> Iterator[Callable[..., tuple[PlannedEnv, ...]]]:
+    plans = WorkerPlans(lambda: False)
+
+    def ask(envs: list[int], options: PlanOptions = SMALL, traced: str = "") -> tuple[PlannedEnv, ...]:
+        question = PlanActions(pickle.dumps(push.env.snapshot(envs)), options, traced)
+        return plans.answer(push, MADE, question, lambda done, total: None).envs
+
+    yield ask
+    plans.close()
+
+
+def test_each_env_gets_a_plan_of_its_own_and_what_its_rollouts_earned(
+    push: OpenedTask, plan: Callable[..., tuple[PlannedEnv, ...]]
+) -> None:
+    poses = push.env.reset(3).poses
+    one, other = plan([0, 1])
+    assert (one.env, other.env) == (0, 1) and one.horizon == 4
+    assert one.actions.shape == (1, 7) and not np.array_equal(one.returns, other.returns)
+    assert (np.diff(one.returns) <= 0).all() and {one.plan, one.hold} <= set(range(6))
+    assert one.paths.shape == (6, 5, 3) and one.drawn == tuple(range(6)) and len(one.drawn) <= MOST_PATHS
+    # They begin where the hand is.
+    hand = push.description.geometry.body_names.index("panda/panda_hand_tcp")
+    assert np.abs(one.paths[:, 0] - poses[0, hand, :3]).max() < 1e-5
+
+
+def test_a_plan_goes_on_while_its_episode_does_and_begins_anew_with_another(
+    push: OpenedTask, plan: Callable[..., tuple[PlannedEnv, ...]]
+) -> None:
+    push.env.reset(3)
+    (first,) = plan([0])
+    (again,) = plan([0])  # from the same moment: nothing was followed
+    assert np.allclose(first.actions, again.actions, atol=1e-4)
+    push.env.step(np.stack([again.actions[0], np.zeros(7, np.float32)]))
+    (further,) = plan([0])
+    # The plan itself is among the candidates: it is not holding still any more.
+    assert further.returns[further.plan] != further.returns[further.hold]
+
+
+def test_another_number_of_rollouts_and_another_body_count_from_the_next_plan_on(
+    push: OpenedTask, plan: Callable[..., tuple[PlannedEnv, ...]]
+) -> None:
+    push.env.reset(3)
+    (one,) = plan([1], PlanOptions(rollouts=8, horizon=0.2, every=3), "cube")
+    assert len(one.returns) == 8 and one.actions.shape == (3, 7) and one.traced == "cube"
+
+
+def test_a_task_with_other_bodies_in_each_env_has_no_plan_and_says_what_to_do() -> None:
+    opened = opened_with(TASKS / "different_objects.py", 2, render_backend="none")
+    plans = WorkerPlans(lambda: False)
+    question = PlanActions(pickle.dumps(opened.env.snapshot([0])), SMALL)
+    with pytest.raises(CannotAnswer, match="build the same bodies in each env"):
+        plans.answer(opened, {"render_backend": "none"}, question, lambda done, total: None)
+    plans.close()
+    opened.env.close()
+
+
+def test_a_plan_is_asked_for_once_and_dropped_if_anything_else_moved_the_envs(push: OpenedTask) -> None:
+    asked: list[PlanWanted] = []
+    followed = FollowedPlan(asked.append)
+    assert not followed.ready(push, 5, [1]) and not followed.ready(push, 5, [1])
+    assert [(one.number, one.env_idx) for one in asked] == [(5, (1,))] and followed.awaited
+    assert pickle.loads(asked[0].snapshot).env_idx == (1,)
+    actions = np.full((2, 1, 7), 0.25, np.float32)
+    followed.take(FollowPlan(4, (1,), actions))
+    assert followed.awaited, "a plan of another moment"
+    followed.take(FollowPlan(5, (1,), actions))
+    assert followed.ready(push, 5, [1]) and not followed.awaited
+    action = followed.next_action(push.env, 5)
+    assert (action[1] == 0.25).all() and not (action[0] == 0.25).any()
+    assert followed.ready(push, 6, [1]) and len(asked) == 1
+    # A reset came between.
+    assert not followed.ready(push, 7, [1]) and len(asked) == 2
+    followed.forget()
+    followed.take(FollowPlan(7, (1,), actions))
+    assert not followed.ready(push, 7, [1])
+
+
+def test_what_is_solved_is_not_planned_for_until_all_is(push: OpenedTask) -> None:
+    last = push.env.reset(3)
+    assert envs_to_plan(Settings(selected_env=1), push.env, last) == [1]
+    every = Settings(solve_all=True)
+    assert envs_to_plan(every, push.env, last) == [0, 1]
+    last.evaluate["success"] = np.array([True, False])
+    assert envs_to_plan(every, push.env, last) == [1]
+    last.evaluate["success"] = np.array([True, True])
+    assert envs_to_plan(every, push.env, last) == [0, 1]
