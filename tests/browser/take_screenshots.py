@@ -307,7 +307,10 @@ def shoot_solve(browser: Browser) -> None:
             expect(desk.page.locator(".wb-timeline").get_by_text(f"step {step} /")).to_be_visible(
                 timeout=60_000
             )
-        desk.page.locator(".wb-solve").evaluate("e => e.scrollIntoView({block: 'start'})")
+        title = desk.page.get_by_role("button", name="Solve", exact=True).or_(
+            desk.page.get_by_text("Solve", exact=True)
+        )
+        title.first.evaluate("e => e.scrollIntoView({block: 'start'})")
         desk.shoot("solve")
 
 
