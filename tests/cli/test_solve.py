@@ -15,9 +15,9 @@ import pytest
 from workbench.cli.main import main
 from workbench.jobs.record import RecordProgress
 from workbench.jobs.solve import SolveOptions, solve
-from workbench.jobs.solve_report import SolveReport
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
+from workbench.planning.verdicts import SolveReport
 from workbench.recording.reader.read_episode import read_episode
 
 pytestmark = pytest.mark.usefixtures("child_process")

@@ -33,11 +33,10 @@ from workbench.cli.terminal import (
 from workbench.jobs.pool import PoolError
 from workbench.jobs.record import with_given_actions
 from workbench.jobs.solve import SolveOptions, solve
-from workbench.jobs.solve_report import SolvedSeed, SolveReport
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text
-from workbench.planning.verdicts import Verdict
+from workbench.planning.verdicts import SolvedSeed, SolveReport, Verdict
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
 

@@ -12,11 +12,10 @@ from workbench.core.rules import Finding
 from workbench.jobs.actions import SOLVE
 from workbench.jobs.pool import Executor
 from workbench.jobs.record import RecordOptions, RecordProgress, Written, record
-from workbench.jobs.solve_report import SolvedSeed, SolveReport
 from workbench.jobs.task import TaskOptions
 from workbench.planning.episodes import PlannedEpisode
 from workbench.planning.options import PlanOptions
-from workbench.planning.verdicts import in_the_way, of_episodes
+from workbench.planning.verdicts import SolvedSeed, SolveReport, in_the_way, of_episodes
 
 _AFTER_SUCCESS = 5
 """Control steps that an episode goes on after its success: does it stay solved?"""

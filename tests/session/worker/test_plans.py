@@ -18,7 +18,7 @@ from workbench.session.protocol.messages import CannotAnswer, FollowPlan, PlanWa
 from workbench.session.protocol.questions import PlanActions, PlannedEnv
 from workbench.session.worker.plans import MOST_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
 
-MADE = {"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
+MADE: dict[str, object] = {"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
 SMALL = PlanOptions(rollouts=6, horizon=0.2)
 
 pytestmark = pytest.mark.usefixtures("child_process")

@@ -11,8 +11,7 @@ import viser
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import problem, running
-from workbench.jobs.solve_report import SolvedSeed, SolveReport
-from workbench.planning.verdicts import Verdict
+from workbench.planning.verdicts import SolvedSeed, SolveReport, Verdict
 from workbench.session.checks.solve_seeds import SeedsView
 from workbench.ui.checks.solve_seeds import SOLVE, STOP_SOLVING, SolveSeedsPanel, seeds_html, verdict_cards
 

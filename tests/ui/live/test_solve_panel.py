@@ -30,7 +30,7 @@ from workbench.ui.live.solve_panel import (
     solve_html,
 )
 
-PATHS = np.zeros((3, 5, 3), np.float32) + np.arange(5, dtype=np.float32)[:, None] / 10
+PATHS = np.broadcast_to(np.arange(5, dtype=np.float32)[:, None] / 10, (3, 5, 3)).astype(np.float32)
 PLAN = PlannedEnv(
     env=0,
     actions=np.zeros((1, 2), np.float32),

@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 from workbench.authoring.problem import Problem, TaskError
 from workbench.jobs.pool import Deal, ItemQueue, PoolError, Processes, Work
-from workbench.jobs.solve_report import SolveReport
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
+from workbench.planning.verdicts import SolveReport
 from workbench.session.process.job_lane import Job, JobFailed, JobLane
 from workbench.session.protocol.messages import Load
 

@@ -9,7 +9,7 @@ import viser
 
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
-from workbench.jobs.solve_report import SolveReport
+from workbench.planning.verdicts import SolveReport
 from workbench.session.checks.checks import ChecksView
 from workbench.session.checks.solve_seeds import RUNNING, SeedsView
 from workbench.session.live.session import Session
