@@ -122,3 +122,19 @@ def test_what_is_open_in_the_review_is_open_when_one_comes_back(place: Workplace
     place.pages.show("review")
     assert place.pages.wait_for("review", timeout=60)
     assert place.shelf.review is review
+
+
+def test_a_recording_that_is_wanted_is_opened_also_if_it_is_not_the_newest(
+    place: Workplace, gated_server: GatedServer, tmp_path: Path
+) -> None:
+    (older,) = tmp_path.glob("*.rrd")
+    write(tmp_path, made(4, seed=9))
+    place.pages.start("live")
+    place.look_at(older)
+    assert place.pages.wait_for("review", timeout=60)
+    review = place.shelf.review
+    with tabs_of(gated_server.url) as tabs:
+        tabs.open()
+        opened = until(lambda: review.view().opened, "an open recording", seen=lambda: review.view().problems)
+    assert [one.episode.info.seed for one in opened] == [3]
+    assert place.wanted is None

@@ -180,7 +180,8 @@ class Workplace:
         if self.home is not None:
             self.home.close()
 
-    def _look_at(self, recording: Path) -> None:
+    def look_at(self, recording: Path) -> None:
+        """Open the recording with this file in the review."""
         self.wanted = recording
         self.pages.show("review")
 
@@ -199,7 +200,7 @@ class Workplace:
             self.session,
             dark,
             lambda: self.pages.show("review"),
-            self._look_at,
+            self.look_at,
             self.stage,
             self.commands,
             editor=self._editor,
