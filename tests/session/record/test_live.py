@@ -190,22 +190,23 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
     wait_until(session, lambda view: elapsed(view) == 0, "a reset")
     step(session, 2)
     played = wait_until(session, lambda view: elapsed(view) == 2, "the steps")
-    assert played.task is not None and played.task.file is not None and played.step is not None
-    file = Path(played.task.file)
+    version = played.task
+    assert version is not None and version.file is not None and played.step is not None
+    file = Path(version.file)
     text = file.read_text()
     file.write_text(text.replace("= 3\n", "= 4\n"))
     wait_until(
-        session, lambda view: view.task is not None and view.task.source_hash != played.task.source_hash, "it"
+        session, lambda view: view.task is not None and view.task.source_hash != version.source_hash, "it"
     )
     session.save_past((0,))
     kept = written(session, count + 1)[-1]
-    assert kept.info.source_hash == played.task.source_hash
-    assert list(kept.info.source.values()) == list(played.task.source.values())
+    assert kept.info.source_hash == version.source_hash
+    assert list(kept.info.source.values()) == list(version.source.values())
     np.testing.assert_array_equal(kept.reward[-1], played.step.reward[0])
     assert "an earlier version" in session.view().recording.saving.message
     file.write_text(text)
     wait_until(
-        session, lambda view: view.task is not None and view.task.source_hash == played.task.source_hash, "it"
+        session, lambda view: view.task is not None and view.task.source_hash == version.source_hash, "it"
     )
 
 
