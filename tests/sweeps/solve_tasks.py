@@ -6,7 +6,8 @@
 
 A task is added to solve_tasks.json as soon as it is done, so a sweep that was stopped goes on. Tasks that need a download
 or have no dense reward are left out. Control tasks have no success: what planned episodes of `CONTROL_STEPS` steps earn
-stands beside what random and zero actions earn.
+stands beside what random and zero actions earn. Seconds are the processor's, of all threads and processes: the
+wall's would say how busy the machine was.
 """
 
 from __future__ import annotations
@@ -14,20 +15,30 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from datetime import date
+from importlib.metadata import version
 from pathlib import Path
 from statistics import mean, median
 from typing import Annotated, Any
 
 import tyro
 
+from workbench.machine.files import replace_file
+
 FILE = Path("solve_tasks.json")
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "web_assets" / "docs" / "reference" / "solved_tasks.md"
 MARKS = "<!-- solved -->\n", "<!-- /solved -->"
 CONTROL_STEPS = 100
+CARTPOLE_STEPS = 300
+SEEDS = 16
+FEWER = {"PushT-v1": 4, "TwoRobotPickCube-v1": 4, "TwoRobotStackCube-v1": 4, "PullCubeTool-v1": 4}
+"""Seeds of tasks whose episodes are long and whose steps are slow."""
+CONTROL_SEEDS = 4
 PLAIN = {"render_backend": "none"}
 
 
@@ -35,7 +46,8 @@ PLAIN = {"render_backend": "none"}
 class Options:
     tasks: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Ids, or files of `tasks/`; all if none are named."""
-    seeds: int = 16
+    seeds: int | None = None
+    """16 if it is not given, and fewer for the slow ones."""
     workers: int = len(os.sched_getaffinity(0))
     write: bool = False
     """Put what is in the file into the docs page, and run nothing."""
@@ -53,16 +65,19 @@ class Row:
     """None for a control task."""
     median_steps: float | None = None
     seconds: float = 0.0
-    """Wall time, opening the task included, a seed."""
+    """The processor's, opening the task included, a seed."""
     why: tuple[str, ...] = ()
-    """What stood in the way of the seeds that were not solved, and the verdicts."""
+    """The verdicts, and what stood in the way of the seeds that none of them has."""
     returns: dict[str, float] | None = None
     """Of a control task, the mean reward a step, by who acts."""
+    day: str = ""
+    """On which it ran."""
 
 
 def tasks() -> list[str]:
     """Ids and files with a dense reward that need no download, control tasks last."""
     import mani_skill.envs  # noqa: F401  registers the ids
+    from mani_skill.envs.sapien_env import BaseEnv
     from mani_skill.utils.registration import REGISTERED_ENVS
 
     from workbench.core.env.task_env import default_reward_mode
@@ -70,7 +85,9 @@ def tasks() -> list[str]:
     found: dict[str, list[str]] = {"tabletop": [], "control": []}
     for env_id, spec in REGISTERED_ENVS.items():
         kind = spec.cls.__module__.split(".")[-2]
-        dense = default_reward_mode(spec.cls) in ("dense", "normalized_dense")
+        # ManiSkill's humanoids declare a dense reward and have none.
+        has_one = spec.cls.compute_dense_reward is not BaseEnv.compute_dense_reward
+        dense = has_one and default_reward_mode(spec.cls) in ("dense", "normalized_dense")
         if kind in found and dense and not spec.asset_download_ids:
             found[kind].append(env_id)
     files = [
@@ -82,72 +99,108 @@ def tasks() -> list[str]:
 
 
 def solved(task: str, options: Options) -> Row:
-    from workbench.jobs.record import RecordOptions, record
+    began = _processor_seconds()
+    control = task.startswith("MS-")
+    seeds = options.seeds or (CONTROL_SEEDS if control else FEWER.get(task, SEEDS))
+    with tempfile.TemporaryDirectory() as folder:
+        row = (_earned if control else _solved)(task, seeds, options.workers, Path(folder))
+    row.seconds = round((_processor_seconds() - began) / seeds, 1)
+    return row
+
+
+def _processor_seconds() -> float:
+    return sum(
+        used.ru_utime + used.ru_stime
+        for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
+
+
+def _solved(task: str, seeds: int, workers: int, folder: Path) -> Row:
     from workbench.jobs.solve import SolveOptions, solve
     from workbench.jobs.task import TaskOptions
     from workbench.recording.reader.read_episode import read_episode
 
-    with tempfile.TemporaryDirectory() as folder:
-        what = SolveOptions(
-            task, Path(folder), options.seeds, options.workers, options=TaskOptions(env_kwargs=PLAIN)
+    report = solve(SolveOptions(task, folder, seeds, workers, options=TaskOptions(env_kwargs=PLAIN)))
+    why = [
+        f"[{one.rule}](../rules/{one.rule}.md), {_seeds(one.seeds)}: {one.message}" for one in report.verdicts
+    ]
+    told = {seed for one in report.verdicts for seed in one.seeds}
+    others: dict[str, list[int]] = {}
+    for one in report.seeds:
+        if one.in_the_way and one.seed not in told:
+            others.setdefault(one.in_the_way, []).append(one.seed)
+    why += [f"{_seeds(found)}: {text}" for text, found in others.items()]
+    mode = read_episode(report.seeds[0].path).info.control_mode or ""
+    return Row(task, mode, seeds, len(report.solved), report.median_steps, why=tuple(why))
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
+
+
+def _earned(task: str, seeds: int, workers: int, folder: Path) -> Row:
+    from workbench.jobs.record import RecordOptions, record
+    from workbench.jobs.task import TaskOptions
+    from workbench.recording.reader.read_episode import read_episode
+
+    row, returns = Row(task, "", seeds), dict[str, float]()
+    steps = CARTPOLE_STEPS if "Cartpole" in task else CONTROL_STEPS
+    for actions in ("solve", "random", "zero"):
+        envs = TaskOptions(num_envs=workers, env_kwargs=PLAIN)
+        what = RecordOptions(
+            task,
+            folder / actions,
+            seeds,
+            actions=actions,
+            pictures=False,
+            max_steps=steps,
+            workers=workers,
+            options=envs,
         )
-        if not task.startswith("MS-"):
-            report = solve(what)
-            mode = read_episode(report.seeds[0].path).info.control_mode or ""
-            reasons = [f"seed {one.seed} {one.in_the_way}" for one in report.seeds if one.in_the_way]
-            verdicts = [f"{one.rule}: {one.message}" for one in report.verdicts]
-            row = Row(
-                task, mode, options.seeds, len(report.solved), report.median_steps, why=(*verdicts, *reasons)
-            )
-            row.seconds = round(report.seconds / options.seeds, 1)
-            return row
-        row = Row(task, "", options.seeds, returns={})
-        for actions in ("solve", "random", "zero"):
-            envs = TaskOptions(num_envs=options.workers, env_kwargs=PLAIN)
-            done = record(
-                RecordOptions(
-                    task,
-                    Path(folder, actions),
-                    options.seeds,
-                    actions=actions,
-                    pictures=False,
-                    max_steps=CONTROL_STEPS,
-                    workers=options.workers,
-                    options=envs,
-                )
-            )
-            assert row.returns is not None
-            row.returns[actions] = round(mean(one.total_reward / one.steps for one in done.written), 4)
-            if actions == "solve":
-                row.mode = read_episode(done.written[0].path).info.control_mode or ""
-                row.median_steps = median(one.steps for one in done.written)
-        return row
+        done = record(what)
+        returns[actions] = round(mean(one.total_reward / one.steps for one in done.written), 4)
+        if actions == "solve":
+            row.mode = read_episode(done.written[0].path).info.control_mode or ""
+            row.median_steps = median(one.steps for one in done.written)
+            ended = [one.seed for one in done.written if one.steps < steps]
+            row.why = (f"{_seeds(ended)} ended before step {steps}",) if ended else ()
+    row.returns = returns
+    return row
 
 
 def table(rows: list[Row]) -> Iterator[str]:
-    yield "| task | control mode | solved | control steps (median) | seconds a seed | why not |"
+    yield "| task | control mode | solved | control steps (median) | processor seconds a seed | what the rollouts told |"
     yield "| --- | --- | ---: | ---: | ---: | --- |"
     for row in rows:
-        if row.solved is not None:
+        if row.returns is None:
             steps = "" if row.median_steps is None else f"{row.median_steps:g}"
-            why = "; ".join(row.why).replace("|", "/")
-            yield f"| {row.task} | {row.mode} | {row.solved} of {row.seeds} | {steps} | {row.seconds:.0f} | {why} |"
-    control = [row for row in rows if row.returns]
-    if control:
-        yield ""
-        yield "| control task | control mode | steps (median) | planned, reward a step | random | zero |"
-        yield "| --- | --- | ---: | ---: | ---: | ---: |"
+            count = "" if row.solved is None else f"{row.solved} of {row.seeds}"
+            yield f"| {row.task} | {row.mode} | {count} | {steps} | {row.seconds:.0f} | {_told(row)} |"
+    control = [row for row in rows if row.returns is not None]
+    if not control:
+        return
+    yield ""
+    yield "| control task | control mode | seeds | steps (median) | reward a step, planned | random | zero | what was seen |"
+    yield "| --- | --- | ---: | ---: | ---: | ---: | ---: | --- |"
     for row in control:
         earned = row.returns or {}
-        told = " | ".join(f"{earned.get(name, float('nan')):.3f}" for name in ("solve", "random", "zero"))
-        yield f"| {row.task} | {row.mode} | {row.median_steps:g} | {told} |"
+        told = " | ".join(f"{earned[name]:.3f}" for name in ("solve", "random", "zero"))
+        yield f"| {row.task} | {row.mode} | {row.seeds} | {row.median_steps:g} | {told} | {_told(row)} |"
+
+
+def _told(row: Row) -> str:
+    return "; ".join(row.why).replace("|", "/").replace("\n", " ")
 
 
 def write(rows: list[Row]) -> None:
-    page = PAGE.read_text()
+    days = sorted({row.day for row in rows})
+    run = f"Run {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "Not run yet"
+    versions = ", ".join(f"{name} {version(name)}" for name in ("mani_skill", "sapien", "torch"))
+    text = "\n".join([f"{run}, with {versions}.", "", *table(rows), ""])
     pattern = f"{re.escape(MARKS[0])}.*?{re.escape(MARKS[1])}"
-    text = "\n".join([*table(rows), ""])
-    PAGE.write_text(re.sub(pattern, lambda _: f"{MARKS[0]}{text}{MARKS[1]}", page, flags=re.DOTALL))
+    page = PAGE.read_text()
+    page = re.sub(pattern, lambda _: f"{MARKS[0]}{text}{MARKS[1]}", page, flags=re.DOTALL)
+    replace_file(PAGE, page.encode())
 
 
 def main(options: Options) -> None:
@@ -158,9 +211,10 @@ def main(options: Options) -> None:
         try:
             row = solved(task, options)
         except Exception as error:
-            row = Row(task, "", options.seeds, 0, why=(f"{type(error).__name__}: {error}",))
+            row = Row(task, "", 0, why=(f"{type(error).__name__}: {error}",))
+        row.day = date.today().isoformat()
         known[task] = asdict(row)
-        FILE.write_text(json.dumps(known, indent=1))
+        replace_file(FILE, json.dumps(known, indent=1).encode())
         print(*table([row]), sep="\n", flush=True)
 
 
