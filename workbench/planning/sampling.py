@@ -6,12 +6,16 @@ import torch
 
 from workbench.planning.options import PlanOptions
 
-_SMALL = 0.3
-"""Of the noise, for a third of the candidates: what is nearly right is not improved by chance alone."""
+_SMALL = 0.05, 0.5
+"""Least and most of the noise, for a third of the candidates: what is nearly right is not improved by large steps."""
 _MOVED = 0.5
 """Of the dimensions, for a third of the candidates, those that differ from the plan."""
 _FLIPS = 0.3
-"""Of the knots of a dimension that switches, those that are drawn anew."""
+"""Of the knots of a dimension that switches, those that are drawn anew, in half of the candidates: what carries
+something away is not found by candidates that let it fall."""
+_TOP = 0.25
+"""Of the candidates, the best ones, whose spread is the measure of MPPI's temperature: where many drop what they hold, the
+spread of all is so wide that the good ones count the same."""
 _KEPT = 2
 """Best candidates of a round that are tried again in the next."""
 _LEAST_SPREAD = 0.2
@@ -55,7 +59,8 @@ class Sampler:
         return int(torch.randint(2**31, (1,), generator=self._generator))
 
     def candidates(self, hold: torch.Tensor) -> torch.Tensor:
-        """(K, P, A) knots within -1 to 1: the plan itself, holding still, the best of the last round, and others around the plan.
+        """(K, P, A) knots within -1 to 1: the plan itself, holding still, the best of the last round, others around the plan,
+        and a sixth around holding still, since a plan that leads nowhere is not left by small steps.
 
         Args:
             hold: (A,) the action that changes nothing; the plan that an episode begins with.
@@ -65,14 +70,19 @@ class Sampler:
         shape = (self._options.rollouts, *self._mean.shape)
         drawn = torch.randn(shape, generator=self._generator)
         flips = torch.rand(shape, generator=self._generator) < _FLIPS
+        flips &= torch.rand((shape[0], 1, 1), generator=self._generator) < 0.5
         some = torch.rand((shape[0], 1, shape[2]), generator=self._generator) < _MOVED
         # What only a long motion shows is found by a third of one action throughout, in some of the dimensions.
         drawn[0::3], flips[0::3] = drawn[0::3, :1].clone(), flips[0::3, :1].clone()
         side = torch.sign(drawn)
         drawn[0::3] *= some[0::3]
-        drawn[2::3] *= _SMALL
+        least, most = _SMALL
+        power = torch.rand((len(drawn[2::3]), 1, 1), generator=self._generator)
+        drawn[2::3] *= least * (most / least) ** power
+        around = self._mean.repeat(shape[0], 1, 1)
+        around[0::6] = hold
         switched = torch.where(flips, side, self._mean)
-        knots = torch.where(self._switches, switched, self._mean + drawn * self._spread)
+        knots = torch.where(self._switches, switched, around + drawn * self._spread)
         knots[0], knots[1] = self._mean, hold
         if self._kept is not None:
             knots[2 : 2 + len(self._kept)] = self._kept
@@ -99,9 +109,12 @@ class Sampler:
             least = _LEAST_SPREAD * self._noise
             self._spread = 0.5 * self._spread + 0.5 * torch.maximum(elites.std(0, correction=0), least)
         else:
-            width = self._options.temperature * returns[finite].std(correction=0)
+            top = returns[best[: min(max(2, round(_TOP * len(knots))), int(finite.sum()))]]
+            width = self._options.temperature * top.std(correction=0)
             weights = torch.softmax((returns - returns[best[0]]) / (width + 1e-12), 0)
-            self._mean = (weights[:, None, None] * knots).sum(0)
+            mean = (weights[:, None, None] * knots).sum(0)
+            # The mean of open and closed would be neither.
+            self._mean = torch.where(self._switches, knots[best[0]], mean)
         self._kept = knots[best[:_KEPT]].clone()
 
     def shift(self, steps: int) -> None:
