@@ -18,6 +18,9 @@ _TOP = 0.25
 spread of all is so wide that the good ones count the same."""
 _KEPT = 2
 """Best candidates of a round that are tried again in the next."""
+_QUIET = 1.0
+"""Of MPPI, in spreads of the best candidates: what moving in every dimension as much as may be must earn more than holding
+still. Turns that earn nothing would else add up, and a hand that came aslant grasps badly."""
 _LEAST_SPREAD = 0.2
 """Of CEM, of the noise: a spread that has vanished never finds anything again."""
 
@@ -45,6 +48,9 @@ class Sampler:
         self._spread = self._noise
         self._mean: torch.Tensor | None = None
         self._kept: torch.Tensor | None = None
+        self._hold = torch.zeros(len(switches))
+        self._taken: torch.Tensor | None = None
+        """(A,) the action that was taken last; None before the first."""
         self._times = torch.linspace(0, steps - 1, options.knots)
         self._weights = _weights(torch.arange(steps, dtype=torch.float32), self._times)
 
@@ -63,8 +69,12 @@ class Sampler:
         and a sixth around holding still, since a plan that leads nowhere is not left by small steps.
 
         Args:
-            hold: (A,) the action that changes nothing; the plan that an episode begins with.
+            hold: (A,) the action that changes nothing; the plan that an episode begins with. What switches stays as it was
+                last: a gripper that is told to stay at the width of what it holds lets it fall.
         """
+        if self._taken is not None:
+            hold = torch.where(self._switches, self._taken, hold)
+        self._hold = hold
         if self._mean is None:
             self._mean = hold.expand(self._options.knots, -1).clone()
         shape = (self._options.rollouts, *self._mean.shape)
@@ -110,7 +120,11 @@ class Sampler:
             self._spread = 0.5 * self._spread + 0.5 * torch.maximum(elites.std(0, correction=0), least)
         else:
             top = returns[best[: min(max(2, round(_TOP * len(knots))), int(finite.sum()))]]
-            width = self._options.temperature * top.std(correction=0)
+            spread = top.std(correction=0)
+            moved = torch.where(self._switches, 0.0, (knots - self._hold).square()).mean((1, 2))
+            returns = returns - _QUIET * spread * moved
+            best = returns.argsort(descending=True, stable=True)
+            width = self._options.temperature * spread
             weights = torch.softmax((returns - returns[best[0]]) / (width + 1e-12), 0)
             mean = (weights[:, None, None] * knots).sum(0)
             # The mean of open and closed would be neither.
@@ -119,6 +133,8 @@ class Sampler:
 
     def shift(self, steps: int) -> None:
         """Move the plan on by control steps that were taken: what was planned for then is at its beginning now."""
+        if self._mean is not None:
+            self._taken = self.sequences(self._mean[None])[0, min(steps, self._steps) - 1]
         weights = _weights((self._times + steps).clamp(max=self._steps - 1), self._times)
         if self._mean is not None:
             self._mean = self._between(self._mean, weights)
