@@ -5,6 +5,11 @@ of an episode, with each of the two ways to restore; *bare*, the same actions fr
 `workbench.make` gives them, which are restored before the clock starts. Printed are the medians and their ratios.
 
     python tests/benchmarks/solve.py --write    # also into web_assets/docs/reference/benchmarks.md
+    python tests/benchmarks/solve.py --demonstrations 20
+
+With ``--demonstrations``, in place of that: successes an hour of ``workbench record --actions solve --successes`` and of
+ManiSkill's motion-planning scripts (`mani_skill.examples.motionplanning.panda.run`, which need mplib), each one run with as
+many processes as cores, start included.
 """
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
@@ -12,10 +17,14 @@ of an episode, with each of the two ways to restore; *bare*, the same actions fr
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import resource
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -32,7 +41,8 @@ from workbench.core.maniskill_private import open_env
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import RolloutPlanner, make_rollout_env
 
-PAGE = Path(__file__).resolve().parents[2] / "web_assets" / "docs" / "reference" / "benchmarks.md"
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "web_assets" / "docs" / "reference" / "benchmarks.md"
 HEAD = "## Planning (`tests/benchmarks/solve.py`)"
 
 
@@ -46,8 +56,10 @@ class Options:
     plan: PlanOptions = field(default_factory=PlanOptions)
     processor: bool = False
     """Take the processor's time of all threads in place of the wall's: on a machine that others use, only that says something."""
+    demonstrations: int = 0
+    """Successes of each side, in place of the table of plans."""
     write: bool = False
-    """Put the table into the docs page too."""
+    """Put the table of plans into the docs page too."""
 
 
 def seconds(action: Callable[[], Any], clock: Callable[[], float]) -> float:
@@ -121,8 +133,53 @@ def table(options: Options) -> Iterator[str]:
         )
 
 
+# --- a factory of demonstrations -------------------------------------------------------------------------
+
+
+def factories(env_id: str, count: int, folder: Path) -> dict[str, list[str]]:
+    """The command of each side."""
+    cores = str(len(os.sched_getaffinity(0)))
+    ours = ["workbench.cli.main", "record", env_id, "--actions", "solve", "--successes", str(count)]
+    ours += ["--no-pictures", "--num-envs", cores, "--workers", cores]
+    ours += ["--env", "render_backend=none", "--out", str(folder / "ours")]
+    theirs = ["mani_skill.examples.motionplanning.panda.run", "--env-id", env_id, "--num-traj", str(count)]
+    theirs += ["--only-count-success", "--num-procs", cores, "--sim-backend", "cpu"]
+    theirs += ["--record-dir", str(folder / "theirs")]
+    return {"solve": ours, "motion planning": theirs}
+
+
+def factory_table(options: Options) -> Iterator[str]:
+    yield "| task | side | successes | wall, s | successes an hour | processor's seconds a success |"
+    yield "|---|---|---|---|---|---|"
+    for env_id in options.env_ids:
+        with tempfile.TemporaryDirectory() as folder:
+            for side, command in factories(env_id, options.demonstrations, Path(folder)).items():
+                used, began = _children_seconds(), time.perf_counter()
+                subprocess.run(
+                    [sys.executable, "-m", *command], check=True, cwd=ROOT, stdout=subprocess.DEVNULL
+                )
+                wall, processor = time.perf_counter() - began, _children_seconds() - used
+                count = sum(map(_successes, Path(folder).rglob("*.json")))
+                for file in Path(folder).rglob("*.json"):
+                    file.unlink()
+                yield f"| {env_id} | {side} | {count} | {wall:.0f} | {3600 * count / wall:.0f} | {processor / count:.1f} |"
+
+
+def _successes(file: Path) -> int:
+    return sum(bool(episode.get("success")) for episode in json.loads(file.read_text())["episodes"])
+
+
+def _children_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def main(options: Options) -> None:
     torch.set_num_threads(1)
+    if options.demonstrations:
+        for line in factory_table(options):
+            print(line, flush=True)
+        return
     lines = []
     for line in table(options):
         print(line, flush=True)

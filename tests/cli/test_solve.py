@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import json
+import os
+import pty
+import subprocess
+import sys
+import termios
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +18,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from tests.drive.waiting import until
 from workbench.cli.main import main
 from workbench.jobs.record import RecordProgress
 from workbench.jobs.solve import SolveOptions, solve
@@ -108,6 +115,54 @@ def test_what_is_done_is_kept_and_reported_where_it_is_stopped(lift: Path) -> No
 
     report = solve(options_of(lift), on_progress=on_progress, stop=done.is_set)
     assert report.stopped and len(report.seeds) == 1 and report.seeds[0].path.is_file()
+
+
+@pytest.mark.slow
+def test_a_real_ctrl_c_in_a_terminal_keeps_and_reports_what_is_done(lift: Path) -> None:
+    ours, theirs = pty.openpty()
+    kept, folder = lift.parent / "out", lift.parent
+    given = ["--seeds", "500", "--workers", "2", "--rollouts", "16", "--horizon", "0.2"]
+    given += ["--env", "render_backend=none", "--out", str(kept), "--json-file", str(folder / "solved.json")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "workbench.cli.main", "solve", str(lift), *given],
+        env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "200"},
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+        # Only a process whose terminal this is gets the signal of its keys, and so do those that it started.
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    )
+    os.close(theirs)
+    said: list[bytes] = []
+
+    def read() -> None:
+        try:
+            while piece := os.read(ours, 65536):
+                said.append(piece)
+        except OSError:  # nobody has the other end any more
+            return
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+
+    def printed() -> str:
+        return b"".join(said).decode(errors="replace")
+
+    try:
+        until(lambda: len(list(kept.glob("*.json"))) >= 2, "two episodes", seen=printed)
+        os.write(ours, b"\x03")
+        assert process.wait(timeout=60) == 2
+    finally:
+        process.kill()
+        process.wait()
+        reader.join(timeout=10)
+        os.close(ours)
+    told = json.loads((folder / "solved.json").read_text())
+    count = len(list(kept.glob("*.json")))
+    assert told["stopped"] and 2 <= told["tried"] == count < 500
+    assert f"Solved {told['solved']} of {count} seeds" in printed()
+    assert "interrupted; finished episodes were kept" in printed() and "Traceback" not in printed()
 
 
 def test_the_command_prints_and_writes_reports(lift: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -109,6 +109,19 @@ def test_a_task_that_raises_breaks_one_rule_and_leaves_the_others_undecided(tmp_
     )
 
 
+def test_a_reward_with_rows_of_rows_breaks_one_rule_at_its_line(tmp_path: Path) -> None:
+    square = "reward = reach + push\n", "reward = (reach + push)[:, None] + reach\n"
+    task = task_of(tmp_path, square)
+    report = check(options(task, "runs", "reward-rows", "reward-finite", "reward-ratio"))
+    assert states(report) == {
+        "runs": "failed", "reward-rows": "broken", "reward-finite": "failed", "reward-ratio": "failed"
+    }  # fmt: skip
+    (finding,) = report.findings
+    assert finding.line is not None and "shape (4, 4)" in finding.message
+    (finding,) = check(options(task, "runs")).findings
+    assert finding.rule == "runs" and finding.line is not None and "shape (4, 4)" in finding.message
+
+
 def test_a_rule_that_is_not_decided_is_no_success(tmp_path: Path) -> None:
     """Where `runs` is not asked for, nothing else would tell a job in CI."""
     report = check(options(task_of(tmp_path, RAISES), "reward-finite"))

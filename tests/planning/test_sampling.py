@@ -123,6 +123,38 @@ def test_the_plan_and_holding_still_are_always_among_the_candidates() -> None:
     assert torch.equal(knots[1], hold.expand(4, 3))
 
 
+def test_holding_still_holds_what_the_gripper_has() -> None:
+    sampler = sampler_of()
+    improved(sampler, 20, torch.tensor([0.3, -0.8, -1.0]))
+    assert sampler.plan[0, 2] == -1
+    sampler.shift(1)
+    # An env says where its gripper is: at the width of what it holds, which no force holds then.
+    assert sampler.candidates(torch.tensor([0.0, 0.0, 0.2]))[1].tolist() == [[0.0, 0.0, -1.0]] * 4
+
+
+def test_what_earns_nothing_is_hardly_moved() -> None:
+    plans = []
+    for seed in range(8):
+        sampler = sampler_of(seed=seed)
+        for _ in range(20):
+            knots = sampler.candidates(torch.zeros(3))
+            sampler.improve(knots, -(sampler.sequences(knots)[..., 0] - 0.6).square().sum(1))
+        plans.append(sampler.plan)
+    needed, idle = torch.stack(plans).unbind(2)[:2]
+    assert (needed - 0.6).abs().mean() < 0.2
+    assert idle.abs().mean() < 0.12
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_gripper_of_the_plan_is_open_or_closed(method: Method) -> None:
+    sampler = sampler_of(PlanOptions(method, rollouts=32))
+    for _ in range(5):
+        knots = sampler.candidates(torch.tensor([0.0, 0.0, 1.0]))
+        sampler.improve(knots, torch.randn(32, generator=torch.Generator().manual_seed(3)))
+        if method != "cem":
+            assert set(sampler.plan[:, 2].tolist()) <= {-1.0, 1.0}
+
+
 def test_the_seed_alone_decides_what_is_drawn() -> None:
     one, same, other = sampler_of(seed=3), sampler_of(seed=3), sampler_of(seed=4)
     torch.manual_seed(0)

@@ -1,12 +1,14 @@
 """`workbench solve` over ManiSkill's tabletop and control tasks and the examples, as a table.
 
-    python -m tests.sweeps.solve_tasks                         all tasks that are not in solve_tasks.json yet
-    python -m tests.sweeps.solve_tasks PickCube-v1 --seeds 4   some tasks, again
+    python -m tests.sweeps.solve_tasks                         all tasks, as far as they are not in solve_tasks.json yet
+    python -m tests.sweeps.solve_tasks PickCube-v1 --seeds 4   some tasks
+    python -m tests.sweeps.solve_tasks PickCube-v1 --again     what is there of it is forgotten first
     python -m tests.sweeps.solve_tasks --write                 what is there into web_assets/docs/reference/solved_tasks.md
 
-A task is added to solve_tasks.json as soon as it is done, so a sweep that was stopped goes on. Tasks that need a download
-or have no dense reward are left out. Control tasks have no success: what planned episodes of `CONTROL_STEPS` steps earn
-stands beside what random and zero actions earn.
+Each episode is added to solve_tasks.json as soon as it is over, so a sweep that was stopped goes on. The table and its
+verdicts are made of that file. Tasks that need a download or have no dense reward are left out. Control tasks have no
+success: what planned episodes of `CONTROL_STEPS` steps earn stands beside what random and zero actions earn. Seconds are the
+processor's, of all threads and processes: the wall's would say how busy the machine was.
 """
 
 from __future__ import annotations
@@ -14,20 +16,33 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import tempfile
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import date
+from importlib.metadata import version
 from pathlib import Path
 from statistics import mean, median
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
+
+from workbench.machine.files import replace_file
+from workbench.planning.episodes import PlannedEpisode
+from workbench.planning.verdicts import in_the_way, of_episodes
 
 FILE = Path("solve_tasks.json")
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "web_assets" / "docs" / "reference" / "solved_tasks.md"
 MARKS = "<!-- solved -->\n", "<!-- /solved -->"
+SEEDS = 16
+FEWER = {"PushT-v1": 4, "TwoRobotPickCube-v1": 4, "TwoRobotStackCube-v1": 4, "PullCubeTool-v1": 4}
+"""Seeds of tasks whose episodes are long and whose steps are slow."""
+CONTROL_SEEDS = 4
 CONTROL_STEPS = 100
+CARTPOLE_STEPS = 300
 PLAIN = {"render_backend": "none"}
 
 
@@ -35,8 +50,11 @@ PLAIN = {"render_backend": "none"}
 class Options:
     tasks: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Ids, or files of `tasks/`; all if none are named."""
-    seeds: int = 16
+    seeds: int | None = None
+    """16 if it is not given, and fewer for the slow ones."""
     workers: int = len(os.sched_getaffinity(0))
+    again: bool = False
+    """Forget what is in the file of these tasks."""
     write: bool = False
     """Put what is in the file into the docs page, and run nothing."""
 
@@ -46,23 +64,24 @@ class Row:
     """What came of one task."""
 
     task: str
-    mode: str
+    mode: str = ""
     """Control mode."""
-    seeds: int
-    solved: int | None = None
-    """None for a control task."""
-    median_steps: float | None = None
+    episodes: list[dict[str, Any]] = field(default_factory=list)
+    """Planned ones, in the order of their seeds from 0 on: the fields of `PlannedEpisode`."""
     seconds: float = 0.0
-    """Wall time, opening the task included, a seed."""
-    why: tuple[str, ...] = ()
-    """What stood in the way of the seeds that were not solved, and the verdicts."""
-    returns: dict[str, float] | None = None
-    """Of a control task, the mean reward a step, by who acts."""
+    """The processor's for all of them, each opening of the task included."""
+    returns: dict[str, float] = field(default_factory=dict)
+    """Of a control task, the mean reward a step of random and of zero actions."""
+    error: str = ""
+    """Why it cannot be planned."""
+    day: str = ""
+    """On which the last episode ran."""
 
 
 def tasks() -> list[str]:
     """Ids and files with a dense reward that need no download, control tasks last."""
     import mani_skill.envs  # noqa: F401  registers the ids
+    from mani_skill.envs.sapien_env import BaseEnv
     from mani_skill.utils.registration import REGISTERED_ENVS
 
     from workbench.core.env.task_env import default_reward_mode
@@ -70,7 +89,9 @@ def tasks() -> list[str]:
     found: dict[str, list[str]] = {"tabletop": [], "control": []}
     for env_id, spec in REGISTERED_ENVS.items():
         kind = spec.cls.__module__.split(".")[-2]
-        dense = default_reward_mode(spec.cls) in ("dense", "normalized_dense")
+        # ManiSkill's humanoids declare a dense reward and have none.
+        has_one = spec.cls.compute_dense_reward is not BaseEnv.compute_dense_reward
+        dense = has_one and default_reward_mode(spec.cls) in ("dense", "normalized_dense")
         if kind in found and dense and not spec.asset_download_ids:
             found[kind].append(env_id)
     files = [
@@ -81,86 +102,185 @@ def tasks() -> list[str]:
     return [*found["tabletop"], *(str(file.relative_to(ROOT)) for file in files), *found["control"]]
 
 
-def solved(task: str, options: Options) -> Row:
-    from workbench.jobs.record import RecordOptions, record
-    from workbench.jobs.solve import SolveOptions, solve
+def is_control(task: str) -> bool:
+    return task.startswith("MS-")
+
+
+# --- running ---------------------------------------------------------------------------------------------
+
+
+class Known:
+    """The rows so far, in their file."""
+
+    def __init__(self) -> None:
+        told: dict[str, Any] = json.loads(FILE.read_text()) if FILE.exists() else {}
+        self.rows = {task: Row(**row) for task, row in told.items()}
+
+    def of(self, task: str, again: bool) -> Row:
+        if again:
+            self.rows.pop(task, None)
+        return self.rows.setdefault(task, Row(task))
+
+    def save(self) -> None:
+        replace_file(FILE, json.dumps({task: asdict(row) for task, row in self.rows.items()}).encode())
+
+
+def run(row: Row, options: Options, known: Known) -> None:
+    """The episodes that a row lacks; each is saved as soon as those before it are there."""
+    from workbench.jobs.record import RecordOptions, RecordProgress, record
+    from workbench.jobs.solve import SolveOptions
     from workbench.jobs.task import TaskOptions
     from workbench.recording.reader.read_episode import read_episode
 
+    control, task = is_control(row.task), row.task
+    steps = (CARTPOLE_STEPS if "Cartpole" in task else CONTROL_STEPS) if control else None
+    most = options.seeds or (CONTROL_SEEDS if control else FEWER.get(task, SEEDS))
+    first, before, began = len(row.episodes), row.seconds, _processor_seconds()
+    ended: dict[int, dict[str, Any]] = {}
+
+    def on_progress(progress: RecordProgress) -> None:
+        if progress.over is None or (written := progress.over[1]) is None:
+            return
+        assert written.planned is not None
+        ended[written.seed] = as_json(written.planned)
+        row.mode = row.mode or read_episode(written.path).info.control_mode or ""
+        while len(row.episodes) in ended:
+            row.episodes.append(ended.pop(len(row.episodes)))
+        row.seconds = before + _processor_seconds() - began
+        row.day = date.today().isoformat()
+        known.save()
+        print(f"{task} seed {written.seed}: {_said(written.planned)}", flush=True)
+
     with tempfile.TemporaryDirectory() as folder:
-        what = SolveOptions(
-            task, Path(folder), options.seeds, options.workers, options=TaskOptions(env_kwargs=PLAIN)
-        )
-        if not task.startswith("MS-"):
-            report = solve(what)
-            mode = read_episode(report.seeds[0].path).info.control_mode or ""
-            reasons = [f"seed {one.seed} {one.in_the_way}" for one in report.seeds if one.in_the_way]
-            verdicts = [f"{one.rule}: {one.message}" for one in report.verdicts]
-            row = Row(
-                task, mode, options.seeds, len(report.solved), report.median_steps, why=(*verdicts, *reasons)
+        if first < most:
+            plain = TaskOptions(seed=first, env_kwargs=PLAIN)
+            what = SolveOptions(
+                task, Path(folder), most - first, options.workers, False, steps, options=plain
             )
-            row.seconds = round(report.seconds / options.seeds, 1)
-            return row
-        row = Row(task, "", options.seeds, returns={})
-        for actions in ("solve", "random", "zero"):
-            envs = TaskOptions(num_envs=options.workers, env_kwargs=PLAIN)
-            done = record(
-                RecordOptions(
-                    task,
-                    Path(folder, actions),
-                    options.seeds,
-                    actions=actions,
-                    pictures=False,
-                    max_steps=CONTROL_STEPS,
-                    workers=options.workers,
-                    options=envs,
-                )
+            record(what.recording(), on_progress=on_progress)
+        for actions in ("random", "zero") if control and not row.returns else ():
+            envs = TaskOptions(num_envs=most, env_kwargs=PLAIN)
+            out = Path(folder, actions)
+            plain_run = RecordOptions(
+                task, out, most, actions=actions, pictures=False, max_steps=steps, options=envs
             )
-            assert row.returns is not None
-            row.returns[actions] = round(mean(one.total_reward / one.steps for one in done.written), 4)
-            if actions == "solve":
-                row.mode = read_episode(done.written[0].path).info.control_mode or ""
-                row.median_steps = median(one.steps for one in done.written)
-        return row
+            done = record(plain_run)
+            row.returns[actions] = mean(one.total_reward / one.steps for one in done.written)
+    known.save()
 
 
-def table(rows: list[Row]) -> Iterator[str]:
-    yield "| task | control mode | solved | control steps (median) | seconds a seed | why not |"
+def _processor_seconds() -> float:
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(each.ru_utime + each.ru_stime for each in used)
+
+
+def _said(episode: PlannedEpisode) -> str:
+    if episode.solved_at:
+        return f"solved at step {episode.solved_at}"
+    return f"{episode.steps} steps, {episode.reward.mean():.3f} a step, {episode.reward[-1]:.3f} at its end"
+
+
+def as_json(episode: PlannedEpisode) -> dict[str, Any]:
+    told = {
+        name: getattr(value, "tolist", lambda value=value: value)() for name, value in vars(episode).items()
+    }
+    return {**told, "terms": {name: term.tolist() for name, term in episode.terms.items()}}
+
+
+def from_json(told: dict[str, Any]) -> PlannedEpisode:
+    kinds = {"success": np.bool_, "fail": np.bool_}
+    rows = {
+        name: np.array(value, kinds.get(name, np.float32))
+        for name, value in told.items()
+        if isinstance(value, list)
+    }
+    terms = {name: np.array(term, np.float32) for name, term in told["terms"].items()}
+    return PlannedEpisode(**{**told, **rows, "terms": terms})
+
+
+# --- the table -------------------------------------------------------------------------------------------
+
+
+def table(rows: Sequence[Row]) -> Iterator[str]:
+    yield "| task | control mode | solved | control steps (median) | processor seconds a seed | what the rollouts told |"
     yield "| --- | --- | ---: | ---: | ---: | --- |"
     for row in rows:
-        if row.solved is not None:
-            steps = "" if row.median_steps is None else f"{row.median_steps:g}"
-            why = "; ".join(row.why).replace("|", "/")
-            yield f"| {row.task} | {row.mode} | {row.solved} of {row.seeds} | {steps} | {row.seconds:.0f} | {why} |"
-    control = [row for row in rows if row.returns]
-    if control:
-        yield ""
-        yield "| control task | control mode | steps (median) | planned, reward a step | random | zero |"
-        yield "| --- | --- | ---: | ---: | ---: | ---: |"
+        if is_control(row.task):
+            continue
+        episodes = [from_json(told) for told in row.episodes]
+        solved = [one.solved_at for one in episodes if one.solved_at]
+        count = f"{len(solved)} of {len(episodes)}" if episodes else ""
+        steps = f"{median(solved):g}" if solved else ""
+        yield f"| {row.task} | {row.mode} | {count} | {steps} | {_seconds(row)} | {_cell(_why(row, episodes))} |"
+    control = [row for row in rows if is_control(row.task)]
+    if not control:
+        return
+    yield ""
+    yield "| control task | control mode | seeds | steps (median) | reward a step, planned | random | zero | processor seconds a seed |"
+    yield "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"
     for row in control:
-        earned = row.returns or {}
-        told = " | ".join(f"{earned.get(name, float('nan')):.3f}" for name in ("solve", "random", "zero"))
-        yield f"| {row.task} | {row.mode} | {row.median_steps:g} | {told} |"
+        episodes = [from_json(told) for told in row.episodes]
+        planned = f"{mean(one.reward.mean() for one in episodes):.3f}" if episodes else row.error
+        others = " | ".join(f"{row.returns[name]:.3f}" if row.returns else "" for name in ("random", "zero"))
+        steps = f"{median(one.steps for one in episodes):g}" if episodes else ""
+        yield (
+            f"| {row.task} | {row.mode} | {len(episodes)} | {steps} | {_cell([planned])} | {others} | {_seconds(row)} |"
+        )
 
 
-def write(rows: list[Row]) -> None:
-    page = PAGE.read_text()
+def _seconds(row: Row) -> str:
+    return f"{row.seconds / len(row.episodes):.0f}" if row.episodes else ""
+
+
+def _why(row: Row, episodes: Sequence[PlannedEpisode]) -> Iterator[str]:
+    """The verdicts, and what stood in the way of the seeds that none of them has."""
+    if row.error:
+        yield row.error
+    verdicts = of_episodes(episodes)
+    for one in verdicts:
+        yield f"[{one.rule}](../rules/{one.rule}.md), {_seeds(one.seeds)}: {one.message}"
+    told = {seed for one in verdicts for seed in one.seeds}
+    others: dict[str, list[int]] = {}
+    for one in episodes:
+        if not one.solved_at and one.seed not in told:
+            others.setdefault(in_the_way(one, episodes), []).append(one.seed)
+    for text, found in others.items():
+        yield f"{_seeds(found)}: {text}"
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
+
+
+def _cell(texts: Iterator[str] | Sequence[str]) -> str:
+    return "; ".join(texts).replace("|", "/").replace("\n", " ")
+
+
+def write(rows: Sequence[Row]) -> None:
+    days = sorted({row.day for row in rows if row.day})
+    ran = f"Run {' to '.join(dict.fromkeys((days[0], days[-1])))}" if days else "Not run yet"
+    versions = ", ".join(f"{name} {version(name)}" for name in ("mani_skill", "sapien", "torch"))
+    text = "\n".join([f"{ran}, with {versions}.", "", *table(rows), ""])
     pattern = f"{re.escape(MARKS[0])}.*?{re.escape(MARKS[1])}"
-    text = "\n".join([*table(rows), ""])
-    PAGE.write_text(re.sub(pattern, lambda _: f"{MARKS[0]}{text}{MARKS[1]}", page, flags=re.DOTALL))
+    page = PAGE.read_text()
+    page = re.sub(pattern, lambda _: f"{MARKS[0]}{text}{MARKS[1]}", page, flags=re.DOTALL)
+    replace_file(PAGE, page.encode())
 
 
 def main(options: Options) -> None:
-    known: dict[str, Any] = json.loads(FILE.read_text()) if FILE.exists() else {}
+    known = Known()
     if options.write:
-        return write([Row(**known[task]) for task in tasks() if task in known])
-    for task in options.tasks or [task for task in tasks() if task not in known]:
+        return write([known.rows[task] for task in tasks() if task in known.rows])
+    for task in options.tasks or tasks():
+        row = known.of(task, options.again)
+        if row.error and not options.tasks:
+            continue
+        row.error = ""
         try:
-            row = solved(task, options)
+            run(row, options, known)
         except Exception as error:
-            row = Row(task, "", options.seeds, 0, why=(f"{type(error).__name__}: {error}",))
-        known[task] = asdict(row)
-        FILE.write_text(json.dumps(known, indent=1))
+            row.error, row.day = f"{type(error).__name__}: {error}", date.today().isoformat()
+            known.save()
         print(*table([row]), sep="\n", flush=True)
 
 

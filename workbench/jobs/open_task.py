@@ -9,7 +9,7 @@ from typing import Any
 
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.blamed import blamed, returns_check
 from workbench.authoring.loading.load import (
     LoadedTask,
     import_modules,
@@ -22,7 +22,6 @@ from workbench.authoring.problem import (
     MESSAGE_LIMIT,
     Interrupted,
     TaskError,
-    check_step_returns,
     shorten,
 )
 from workbench.checks.evidence.places import rules_of_outliers
@@ -300,17 +299,6 @@ def _rerun_notice() -> str:
     except ImportError as error:
         text = f"Recordings are not possible: {error}."
     return f"{text} {untested_text()}" if text else ""
-
-
-def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
-    """The check that `TaskEnv` calls with the returns of ``evaluate`` and the reward; raises TaskError for wrong shapes."""
-
-    def check(evaluate: Mapping[str, Any], reward: Any) -> None:
-        problem = check_step_returns(loaded.cls, num_envs, evaluate, reward, loaded.source_files)
-        if problem is not None:
-            raise TaskError(problem)
-
-    return check
 
 
 def _rules(loaded: LoadedTask, options: TaskOptions) -> Degree | None:

@@ -25,7 +25,8 @@ class PlanArguments:
         horizon: seconds that a plan looks ahead; 0 for half a second, but from 8 to 20 control steps.
         knots: actions that a candidate is made of, in equal distances; between them it is interpolated.
         noise: standard deviation of a candidate's knots around the plan, of half the range of each action dimension.
-        temperature: of mppi, in standard deviations of what the candidates earned; the lower, the more the best ones count.
+        temperature: of mppi, in standard deviations of what the best quarter of the candidates earned; the lower, the more
+            the best ones count.
         elites: of cem, the part of the candidates that make the next plan.
         rounds: times that candidates are drawn and rolled out for one plan.
         every: control steps that are taken before the next plan.
@@ -36,7 +37,7 @@ class PlanArguments:
     horizon: float = 0.0
     knots: int = 4
     noise: float = 0.5
-    temperature: float = 0.1
+    temperature: float = 0.2
     elites: float = 0.1
     rounds: int = 1
     every: int = 1

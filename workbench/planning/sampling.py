@@ -6,14 +6,21 @@ import torch
 
 from workbench.planning.options import PlanOptions
 
-_SMALL = 0.3
-"""Of the noise, for a third of the candidates: what is nearly right is not improved by chance alone."""
+_SMALL = 0.05, 0.5
+"""Least and most of the noise, for a third of the candidates: what is nearly right is not improved by large steps."""
 _MOVED = 0.5
 """Of the dimensions, for a third of the candidates, those that differ from the plan."""
 _FLIPS = 0.3
-"""Of the knots of a dimension that switches, those that are drawn anew."""
+"""Of the knots of a dimension that switches, those that are drawn anew, in half of the candidates: what carries
+something away is not found by candidates that let it fall."""
+_TOP = 0.25
+"""Of the candidates, the best ones, whose spread is the measure of MPPI's temperature: where many drop what they hold, the
+spread of all is so wide that the good ones count the same."""
 _KEPT = 2
 """Best candidates of a round that are tried again in the next."""
+_QUIET = 1.0
+"""Of MPPI, in spreads of the best candidates: what moving in every dimension as much as may be must earn more than holding
+still. Turns that earn nothing would else add up, and a hand that came aslant grasps badly."""
 _LEAST_SPREAD = 0.2
 """Of CEM, of the noise: a spread that has vanished never finds anything again."""
 
@@ -41,6 +48,9 @@ class Sampler:
         self._spread = self._noise
         self._mean: torch.Tensor | None = None
         self._kept: torch.Tensor | None = None
+        self._hold = torch.zeros(len(switches))
+        self._taken: torch.Tensor | None = None
+        """(A,) the action that was taken last; None before the first."""
         self._times = torch.linspace(0, steps - 1, options.knots)
         self._weights = _weights(torch.arange(steps, dtype=torch.float32), self._times)
 
@@ -55,24 +65,34 @@ class Sampler:
         return int(torch.randint(2**31, (1,), generator=self._generator))
 
     def candidates(self, hold: torch.Tensor) -> torch.Tensor:
-        """(K, P, A) knots within -1 to 1: the plan itself, holding still, the best of the last round, and others around the plan.
+        """(K, P, A) knots within -1 to 1: the plan itself, holding still, the best of the last round, others around the plan,
+        and a sixth around holding still, since a plan that leads nowhere is not left by small steps.
 
         Args:
-            hold: (A,) the action that changes nothing; the plan that an episode begins with.
+            hold: (A,) the action that changes nothing; the plan that an episode begins with. What switches stays as it was
+                last: a gripper that is told to stay at the width of what it holds lets it fall.
         """
+        if self._taken is not None:
+            hold = torch.where(self._switches, self._taken, hold)
+        self._hold = hold
         if self._mean is None:
             self._mean = hold.expand(self._options.knots, -1).clone()
         shape = (self._options.rollouts, *self._mean.shape)
         drawn = torch.randn(shape, generator=self._generator)
         flips = torch.rand(shape, generator=self._generator) < _FLIPS
+        flips &= torch.rand((shape[0], 1, 1), generator=self._generator) < 0.5
         some = torch.rand((shape[0], 1, shape[2]), generator=self._generator) < _MOVED
         # What only a long motion shows is found by a third of one action throughout, in some of the dimensions.
         drawn[0::3], flips[0::3] = drawn[0::3, :1].clone(), flips[0::3, :1].clone()
         side = torch.sign(drawn)
         drawn[0::3] *= some[0::3]
-        drawn[2::3] *= _SMALL
+        least, most = _SMALL
+        power = torch.rand((len(drawn[2::3]), 1, 1), generator=self._generator)
+        drawn[2::3] *= least * (most / least) ** power
+        around = self._mean.repeat(shape[0], 1, 1)
+        around[0::6] = hold
         switched = torch.where(flips, side, self._mean)
-        knots = torch.where(self._switches, switched, self._mean + drawn * self._spread)
+        knots = torch.where(self._switches, switched, around + drawn * self._spread)
         knots[0], knots[1] = self._mean, hold
         if self._kept is not None:
             knots[2 : 2 + len(self._kept)] = self._kept
@@ -99,13 +119,22 @@ class Sampler:
             least = _LEAST_SPREAD * self._noise
             self._spread = 0.5 * self._spread + 0.5 * torch.maximum(elites.std(0, correction=0), least)
         else:
-            width = self._options.temperature * returns[finite].std(correction=0)
+            top = returns[best[: min(max(2, round(_TOP * len(knots))), int(finite.sum()))]]
+            spread = top.std(correction=0)
+            moved = torch.where(self._switches, 0.0, (knots - self._hold).square()).mean((1, 2))
+            returns = returns - _QUIET * spread * moved
+            best = returns.argsort(descending=True, stable=True)
+            width = self._options.temperature * spread
             weights = torch.softmax((returns - returns[best[0]]) / (width + 1e-12), 0)
-            self._mean = (weights[:, None, None] * knots).sum(0)
+            mean = (weights[:, None, None] * knots).sum(0)
+            # The mean of open and closed would be neither.
+            self._mean = torch.where(self._switches, knots[best[0]], mean)
         self._kept = knots[best[:_KEPT]].clone()
 
     def shift(self, steps: int) -> None:
         """Move the plan on by control steps that were taken: what was planned for then is at its beginning now."""
+        if self._mean is not None:
+            self._taken = self.sequences(self._mean[None])[0, min(steps, self._steps) - 1]
         weights = _weights((self._times + steps).clamp(max=self._steps - 1), self._times)
         if self._mean is not None:
             self._mean = self._between(self._mean, weights)

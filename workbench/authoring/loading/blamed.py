@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import linecache
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,17 @@ class blamed:
             if blamed is not None:
                 return blamed
         return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
+
+
+def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
+    """The check that `TaskEnv` calls with the returns of ``evaluate`` and the reward; raises TaskError for wrong shapes."""
+
+    def check(evaluate: Mapping[str, Any], reward: Any) -> None:
+        problem = check_step_returns(loaded.cls, num_envs, evaluate, reward, loaded.source_files)
+        if problem is not None:
+            raise TaskError(problem)
+
+    return check
 
 
 def _problem_at_its_place(error: BrokenRule | ForgottenInit, stage: str, loaded: LoadedTask) -> Problem:

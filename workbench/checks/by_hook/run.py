@@ -52,6 +52,7 @@ GROUPS: tuple[Group, ...] = (
 )
 """In the order in which they run: what people meet most first."""
 CORE_GROUP = "GPU simulation"
+_OF_RETURNS = ("evaluate-rows", "reward-rows")
 CORE_RESETS = 6
 """Resets of random envs, with steps between them."""
 
@@ -72,17 +73,27 @@ def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> 
             continue
         except TaskError as error:
             seconds = time.perf_counter() - began
+            known = _is_known(error, checkup, degrees)
+            if rule == "runs" and not known:
+                yield replace(result_of(rule, degrees[rule], [*seen, raised(error)]), seconds=seconds)
+                continue
             # What it had found before that is true all the same.
             yield replace(
                 result_of(rule, degrees[rule], seen), state="failed", why=str(error), seconds=seconds
             )
             # What a policy raised is no fault of the task.
-            of_task = error.problem.stage != "policy" and rule != "runs"
+            of_task = error.problem.stage != "policy" and not known
             if of_task and degrees["runs"] != "off" and (cause := raised(error)) not in told:
                 told.add(cause)
                 yield result_of("runs", degrees["runs"], [cause])
             continue
         yield replace(result_of(rule, degrees[rule], seen), seconds=time.perf_counter() - began)
+
+
+def _is_known(error: TaskError, checkup: Checkup, degrees: Mapping[str, Degree]) -> bool:
+    """Whether a rule tells it, with its line: the type or shape of what a hook returned."""
+    returned = (each.rule for each in checkup.findings if each.rule in _OF_RETURNS)
+    return error.problem.stage == "returns" and any(degrees[rule] != "off" for rule in returned)
 
 
 def run_core(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
@@ -100,7 +111,7 @@ def run_core(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> I
     except TaskError as error:
         for rule in _core_rules(degrees):
             yield RuleResult(rule, "failed", why=str(error))
-        if degrees["runs"] != "off":
+        if degrees["runs"] != "off" and not _is_known(error, checkup, degrees):
             yield result_of("runs", degrees["runs"], [raised(error)])
 
 

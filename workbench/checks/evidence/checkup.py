@@ -15,7 +15,7 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.blamed import blamed, returns_check
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import TaskError
 from workbench.checks.evidence.builds import Built, Merged, Placed, noting_builds, noting_poses, shapes_of_env
@@ -283,7 +283,7 @@ class Checkup:
                 asset_ids=self.loaded.asset_ids,
                 default_kwargs=self.loaded.default_kwargs,
             )
-            return TaskEnv(env, self.loaded.max_episode_steps)
+            return TaskEnv(env, self.loaded.max_episode_steps, check=returns_check(self.loaded, num_envs))
 
     def reset(
         self, task: TaskEnv, seed: int | list[int] | None, env_idx: list[int] | None = None

@@ -12,7 +12,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import common
 from numpy.typing import NDArray
 
-from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.blamed import blamed, returns_check
 from workbench.checks.evidence.checkup import Checkup, leaf_rows
 from workbench.core import maniskill_private
 from workbench.core.capture.recorded_state import read_states, write_states
@@ -93,6 +93,7 @@ def _ask(checkup: Checkup, task: TaskEnv, action: NDArray[np.float32], seen: Odd
                 seen.obs.append(leaf_rows(obs, task.num_envs))
             hook = getattr(task.env, DENSE_HOOKS[mode]) if mode in DENSE_HOOKS else task.env.get_reward
             reward = hook(obs=obs, action=given, info=info)
+        returns_check(checkup.loaded, task.num_envs)(info, reward)
         rows = torch.as_tensor(reward).double().numpy(force=True)
         seen.reward.setdefault(mode, []).append(np.broadcast_to(rows, (task.num_envs,)).copy())
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.blamed import blamed, returns_check
 from workbench.authoring.loading.load import LoadedTask, RefusedClass, load_task, undo_load, with_late_imports
 from workbench.authoring.loading.modules import read_source
 from workbench.authoring.loading.reference import reference_to_class
@@ -37,7 +37,6 @@ from workbench.jobs.open_task import (
     build_task,
     import_task,
     notices_of,
-    returns_check,
     with_advice,
 )
 from workbench.jobs.task import changed_options
