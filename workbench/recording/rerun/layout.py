@@ -219,7 +219,7 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
         "metallic": pa.array([material.metallic], pa.float64()),
         "roughness": pa.array([material.roughness], pa.float64()),
     }
-    if material.texture is not None and _is_large(material.texture):
+    if material.texture is not None and visual.mesh.uvs is not None and _is_large(material.texture):
         # Rerun's own texture is uncompressed: that of ManiSkill's table would be three quarters of most recordings.
         pixels = np.ascontiguousarray(material.texture[..., :3])
         extras["texture"] = pa.array(np.frombuffer(encode("rgb", pixels), np.uint8))

@@ -75,6 +75,8 @@ from workbench.session.worker.pacing import throttled
 _PERIOD = 1 / 15
 _PAUSE_SHARE = 0.3
 """Of the time a round took."""
+SIMPLIFYING = "simplified meshes"
+"""Name of the thread that makes them."""
 _STILL = 0.3
 """Seconds after the last fast picture until an exact one is drawn, if nothing moves."""
 
@@ -320,7 +322,9 @@ class WorkerCameras:
             )
             if self._may_be_fast:
                 meshes = unknown_meshes(scene.sub_scenes)
-            self._simplifying = threading.Thread(target=_simplify, args=(meshes,), daemon=True)
+            self._simplifying = threading.Thread(
+                target=_simplify, args=(meshes,), name=SIMPLIFYING, daemon=True
+            )
             self._simplifying.start()
         return self._may_be_fast and not self._simplifying.is_alive()
 
