@@ -23,7 +23,7 @@ _CLUSTER_CELLS = 64
 _COARSEST_CELLS = 16
 _WELD_CELLS = 1_000_000
 _MOST_PIECES = 200
-_LEAST_FACES = 48
+_LEAST_FACES = 24
 _GENTLE, _USUAL = 3, 7
 """How fast the threshold of a collapse grows (the method's ``agg``): the slower, the more cheap edges go before dear ones."""
 
@@ -55,8 +55,8 @@ def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
         return mesh
     reduced = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
     if mesh.normals is None or len(mesh.faces) > _DENSE:
-        return _shared_vertices(reduced)
-    return _shared_vertices(replace(reduced, normals=_normals_of_source(reduced, mesh)))
+        return share_vertices(reduced)
+    return share_vertices(replace(reduced, normals=_normals_of_source(reduced, mesh)))
 
 
 def coarsen_mesh(mesh: Mesh, max_faces: int, source: Mesh, by_pieces: bool = False) -> Mesh:
@@ -76,11 +76,12 @@ def coarsen_mesh(mesh: Mesh, max_faces: int, source: Mesh, by_pieces: bool = Fal
     coarse = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
     if source.normals is not None:
         coarse = replace(coarse, normals=_normals_of_source(coarse, source))
-    return _shared_vertices(coarse)
+    return share_vertices(coarse)
 
 
-def _shared_vertices(mesh: Mesh) -> Mesh:
-    """`mesh` with equal vertices only once."""
+def share_vertices(mesh: Mesh) -> Mesh:
+    """`mesh` with equal vertices only once: exporters give every triangle its own three. Normals that differ by half a
+    degree count as equal."""
     rows = [np.ascontiguousarray(mesh.vertices)]
     if mesh.normals is not None:
         rows.append(np.round(mesh.normals, 2).astype(np.float32) + np.float32(0))

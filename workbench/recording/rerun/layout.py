@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import threading
 import weakref
@@ -20,7 +21,7 @@ from transforms3d.quaternions import qconjugate, qmult
 
 from workbench.core.camera_data import CameraInfo
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
-from workbench.recording.episode.encoded_pictures import MILLIMETRES_PER_METRE, Modality, decode, encode
+from workbench.recording.episode.encoded_pictures import MILLIMETRES_PER_METRE, Modality, decode
 from workbench.recording.episode.episode import CameraTrack, Episode, camera_names
 from workbench.recording.rerun.chunks import TimedChunks, series_chunk, static_chunk, static_pose
 
@@ -179,7 +180,8 @@ def _world() -> Chunk:
     return static_chunk(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
 
-VIEWER_TEXELS = 256
+_TEXTURE_QUALITY = 75
+VIEWER_TEXELS = 128
 """On the longest side of a texture as rerun shows it; the workbench reads the full one, beside it as a JPEG."""
 _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 """Results of `_mesh_chunk` by the visual's id, while the visual lives: the next episode of the scene reuses them, since
@@ -221,13 +223,19 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
     }
     if material.texture is not None and visual.mesh.uvs is not None and _is_large(material.texture):
         # Rerun's own texture is uncompressed: that of ManiSkill's table would be three quarters of most recordings.
-        pixels = np.ascontiguousarray(material.texture[..., :3])
-        extras["texture"] = pa.array(np.frombuffer(encode("rgb", pixels), np.uint8))
+        extras["texture"] = pa.array(np.frombuffer(_jpeg(material.texture), np.uint8))
     return static_chunk(entity, mesh, rr.AnyValues(**extras))
 
 
 def _is_large(texture: NDArray[np.uint8]) -> bool:
     return max(texture.shape[:2]) > VIEWER_TEXELS
+
+
+def _jpeg(texture: NDArray[np.uint8]) -> bytes:
+    encoded = io.BytesIO()
+    image = Image.fromarray(np.ascontiguousarray(texture[..., :3]))
+    image.save(encoded, "JPEG", quality=_TEXTURE_QUALITY, optimize=True)
+    return encoded.getvalue()
 
 
 def _small(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
