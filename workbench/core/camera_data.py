@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 CameraKind = Literal["sensor", "human"]
 PictureDegree = Literal["exact", "fast"]
-"""``exact``: SAPIEN's own, to the bit. ``fast``: heavy meshes are simplified, see `core.cameras.fast_shapes`."""
+"""``exact``: SAPIEN's own, to the bit. ``fast``: heavy meshes are simplified, see `core.scene.fast_shapes`."""
 CameraKey = tuple[CameraKind, str]
 """Kind and name: a sensor and a camera for people may have the same name."""
 

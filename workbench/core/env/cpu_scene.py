@@ -30,7 +30,6 @@ from workbench.core.broken_rule import (
     warn_of,
 )
 from workbench.core.camera_data import CameraKey, CameraKind, PictureDegree
-from workbench.core.cameras.fast_shapes import Bodies, FastShapes, shown
 from workbench.core.env.partial_reset import (
     KeptControllers,
     explain_reset_errors,
@@ -47,6 +46,7 @@ from workbench.core.maniskill_private import (
     substeps_are_unwatched,
 )
 from workbench.core.rules import Degree, Finding, degrees_of
+from workbench.core.scene.fast_shapes import Bodies, FastShapes, shown
 from workbench.core.simulation.accessors import install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system

@@ -24,7 +24,6 @@ from workbench.authoring.source.read_values import module_of
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core import maniskill_private
 from workbench.core.camera_data import CameraKey, Picture, PictureDegree
-from workbench.core.cameras.fast_shapes import unknown_meshes
 from workbench.core.cameras.place import PlacedCameras
 from workbench.core.cameras.render import (
     KINDS,
@@ -48,6 +47,7 @@ from workbench.core.capture.state_columns import read_state_columns
 from workbench.core.env.cpu_scene import BatchedCpuScene
 from workbench.core.env.hot_swap import keep_observation_space, put_class, undone
 from workbench.core.env.task_env import TaskEnv
+from workbench.core.scene.fast_shapes import unknown_meshes
 from workbench.core.scene.mesh_levels import levels_of
 from workbench.core.scene.shapes import Mesh
 from workbench.jobs.open_task import OpenedTask
