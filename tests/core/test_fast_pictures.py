@@ -17,6 +17,7 @@ from tests.core.drawn_envs import batched
 from workbench.core.cameras.render import take_pictures
 from workbench.core.env.hot_swap import exchange_cameras
 from workbench.core.env.task_env import BackendUnavailable, EnvOptions
+from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
 
 pytestmark = pytest.mark.usefixtures("renderer")
 
@@ -74,6 +75,7 @@ def test_a_colour_that_is_changed_later_shows_in_both(env: Any) -> None:
             material.base_color = [0.0, 1.0, 0.0, 1.0]
         for degree in ("exact", "fast"):
             (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ALL)], degree=degree)
+            assert picture.rgb is not None
             hand = picture.rgb[picture.segmentation == link._objs[0].entity.per_scene_id].astype(int)
             assert len(hand) > 50
             assert (hand[:, 1] > hand[:, 0] + 20).mean() > 0.8
@@ -133,3 +135,15 @@ def test_other_degrees_and_gpu_simulation_are_refused() -> None:
         EnvOptions(1, pictures="quick")  # type: ignore[arg-type]
     with pytest.raises(BackendUnavailable), pytest.warns(UserWarning, match="other"):
         workbench.make("PickCube-v1", 1, backend="gpu", pictures="fast")
+
+
+def test_after_a_restored_snapshot_both_are_what_they_were(env: Any) -> None:
+    def taken(degree: Any) -> Any:
+        return take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree=degree)[0].rgb
+
+    exact, fast = taken("exact"), taken("fast")
+    snapshot = take_snapshot(env)
+    env.step(torch.from_numpy(env.action_space.sample()))
+    restore_snapshot(env, snapshot)
+    np.testing.assert_array_equal(taken("exact"), exact)
+    np.testing.assert_array_equal(taken("fast"), fast)

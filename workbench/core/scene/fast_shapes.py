@@ -19,8 +19,9 @@ from workbench.core.scene.simplify import drop_uvs
 HEAVY = 500
 """Bodies with more triangles are simplified; the others stay exact."""
 TOLERANCE = 0.6
-"""Pixels that a surface may be off."""
-_NEAREST = 0.05
+"""Pixels that a surface may be off in a picture of `_SMALL` pixels; in larger ones more, since fewer of all pixels are edges."""
+_SMALL = 128
+_NEAREST = 0.02
 """Metres. Nothing is looked at from nearer for long, and a camera within its own mount would forbid any simplification."""
 _FINEST = 1e-4
 """Metres. Tolerances are this times a power of two, so that poses that differ a little give the same meshes."""
@@ -91,11 +92,12 @@ class FastShapes:
         """In metres, by the name of the body: the same in all envs, where equal states are to look alike."""
         finest: dict[str, float] = {}
         for env, (component, of_env) in enumerate(zip(camera, self._heavy, strict=True)):
-            position, pixel = component.get_global_pose().p, _pixel(component)
+            pixels_off = TOLERANCE * max(1.0, component.height / _SMALL) ** 0.5
+            position, pixel = np.asarray(component.get_global_pose().p, np.float32), _pixel(component)
             for entity, body in of_env:
                 name = _shared_name(entity, env)
                 distance = _distance(position, np.asarray(body.get_global_aabb_fast()))
-                off = TOLERANCE * pixel * max(distance, _NEAREST)
+                off = pixels_off * pixel * max(distance, _NEAREST)
                 finest[name] = min(finest.get(name, np.inf), off)
         return {name: _rounded(off) for name, off in finest.items()}
 
@@ -113,7 +115,7 @@ class FastShapes:
 def heavy_bodies(sub_scene: sapien.Scene) -> Iterator[sapien.render.RenderBodyComponent]:
     """The bodies with so many triangles that they are simplified; not those with normal maps."""
     for entity in sub_scene.entities:
-        body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        body: Any = entity.find_component_by_type(sapien.render.RenderBodyComponent)
         if body is not None and _faces(body) > HEAVY and not _has_tangents(body):
             yield body
 

@@ -186,7 +186,7 @@ def _write(name: str, levels: tuple[Level, ...]) -> None:
         named = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "uvs": mesh.uvs}
         arrays |= {f"{part}{number}": array for part, array in named.items() if array is not None}
     content = io.BytesIO()
-    np.savez(content, **arrays)
+    np.savez(content, **arrays)  # type: ignore[arg-type]
     try:
         write_private(f"{name}.npz", content.getvalue(), _folder())
         _make_room()
