@@ -22,6 +22,7 @@ from workbench.authoring.loading.reference import split_reference
 from workbench.authoring.problem import definition_line
 from workbench.core.backends import BackendUnavailable, find_renderer
 from workbench.core.broken_rule import class_is_installed, is_installed
+from workbench.core.camera_data import PictureDegree
 from workbench.core.env.task_env import Backend, EnvOptions, build_env, default_reward_mode
 from workbench.core.rules import Degree
 
@@ -37,6 +38,7 @@ def make(
     max_episode_steps: int | None = None,
     threads: int | None = None,
     rules: Degree | None = None,
+    pictures: PictureDegree = "exact",
     **kwargs: Any,
 ) -> gym.Env:
     """A gymnasium env of `num_envs` envs, as ``gym.make`` gives it for a GPU.
@@ -67,6 +69,9 @@ def make(
         rules: of GPU simulation, checked on the CPU: ``stop`` raises where one is broken, ``warn`` warns, ``off``
             checks none. None stops if other envs' state is overwritten and warns otherwise; for an installed task it
             only warns.
+        pictures: ``exact``: those of stock ManiSkill, to the bit. ``fast``: several times as many a second on the CPU,
+            since robots and other heavy meshes are simplified to what the cameras can see of them; it warns that a policy
+            trained on them sees other pictures than on a GPU.
         kwargs: arguments of ``gym.make`` for the task: ``obs_mode``, ``reward_mode``, ``control_mode``,
             ``render_mode``, ``robot_uids``, ``sensor_configs``, ``reconfiguration_freq``, ``sim_config`` ...
 
@@ -93,7 +98,9 @@ def make(
         # As ``register_env`` does. This wrapper removes gymnasium's own limit, which gives one bool for all envs.
         entry = "mani_skill.utils.registration:TimeLimitWrapper"
         limits = (WrapperSpec("MSTimeLimit", entry_point=entry, kwargs={"max_episode_steps": limit}),)
-    options = EnvOptions(num_envs=int(num_envs), backend=backend, threads=threads, rules=rules)
+    if pictures == "fast":
+        warnings.warn(_FAST_PICTURES, stacklevel=2)
+    options = EnvOptions(int(num_envs), backend, threads=threads, rules=rules, pictures=pictures)
     spec = EnvSpec(
         id=found.env_id,
         entry_point=partial(_build, found.cls, found.asset_ids, options),
@@ -106,6 +113,12 @@ def make(
         return gym.make(spec, max_episode_steps=max_episode_steps, num_envs=int(num_envs), **kwargs)
     except _RaisedInConstructor as raised:
         raise raised.error from raised.error.__cause__
+
+
+_FAST_PICTURES = (
+    'pictures="fast" draws simplified meshes: a policy that is trained on these pictures sees others on a GPU, with stock '
+    "ManiSkill and with the default, exact. How much they differ is in `workbench help cameras`."
+)
 
 
 class _RaisedInConstructor(Exception):

@@ -26,6 +26,7 @@ from tests.recording.verify_rrd import verify_rrd
 from workbench.authoring.problem import TaskError
 from workbench.cli.main import main
 from workbench.cli.record import record_in_terminal
+from workbench.jobs.from_recording import options_of
 from workbench.jobs.pool import Deal, Executor, Processes, Work
 from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, Written, record
 from workbench.jobs.task import TaskOptions
@@ -84,6 +85,15 @@ def test_every_episode_is_three_files_that_stand_alone(recorded: Recorded) -> No
         "reward_mode": "normalized_dense",
         "control_mode": "pd_joint_delta_pos",
     }
+
+
+def test_a_recording_says_which_pictures_it_holds(recorded: Recorded, renderer: None, tmp_path: Path) -> None:
+    assert {episode.info.pictures for episode in read_all(recorded)} == {"exact"}
+    options = TaskOptions(num_envs=1)
+    fast = record(RecordOptions("PushCube-v1", tmp_path, 1, fast_pictures=True, max_steps=1, options=options))
+    (episode,) = read_all(fast)
+    assert episode.info.pictures == "fast"
+    assert options_of(episode.info, 1).pictures == "fast", "and is scored with the same"
 
 
 def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(recorded: Recorded) -> None:

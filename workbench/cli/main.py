@@ -28,7 +28,7 @@ from workbench.cli.arguments import (
     separated,
 )
 from workbench.cli.terminal import Exit, print_problem, print_text, refuse, warn
-from workbench.jobs.task import RecordArguments
+from workbench.jobs.task import RecordArguments, ShownPictures
 from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.software_vulkan import use_private_driver
@@ -104,6 +104,7 @@ def open_page(
     spare: bool = True,
     trust: bool = False,
     editor: str = "vscode",
+    pictures: ShownPictures = "auto",
     debug: bool = False,
     debug_port: int | None = None,
     debug_wait: bool = False,
@@ -122,6 +123,8 @@ def open_page(
         editor: what a press on a file's line opens: vscode, cursor, pycharm, none, or an address with {file} (an absolute
             path) and {line}. If the browser is on another machine than the file, VS Code opens it over ssh with
             vscode://vscode-remote/ssh-remote+HOST{file}:{line}, where HOST is the machine as your ssh config names it.
+        pictures: of the cameras, as the page shows them: exact; fast, of simplified meshes; or auto, which is fast while
+            something moves and exact when it stands still. Observations and recordings are exact.
         debug: let a debugger (debugpy, as of VS Code) attach to the task's process, from this machine only; breakpoint()
             stops for it. Anyone who can log in to this machine can attach too.
         debug_port: port for the debugger; 5678 if it is free, else any. Means --debug.
@@ -155,7 +158,7 @@ def open_page(
         address = parse_editor(editor)
     except ValueError as error:
         return refuse(str(error))
-    return open_in_terminal(task, options, at, worker, recordings, past, trust, address)
+    return open_in_terminal(task, options, at, worker, recordings, past, trust, address, pictures)
 
 
 @app.command

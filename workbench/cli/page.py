@@ -17,7 +17,7 @@ import workbench
 from workbench.authoring.loading.reference import TaskName, named_file
 from workbench.cli.terminal import out, print_addresses, print_event, print_line, print_text, refuse, warn
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN
-from workbench.jobs.task import TaskOptions
+from workbench.jobs.task import ShownPictures, TaskOptions
 from workbench.machine.kept_choices import kept_choices
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reader.reading import start_reading
@@ -41,12 +41,14 @@ def open_in_terminal(
     history_bytes: int,
     trust: bool = False,
     editor: str = "",
+    pictures: ShownPictures = "auto",
 ) -> int:
     """Serve the page of a task; returns (the exit code) only if the server cannot start.
 
     Args:
         trust: run code that recordings name without asking.
         editor: address of a line in the author's editor.
+        pictures: of the cameras, as the page shows them.
     """
     gated_server = _start_server(at, "Workbench")
     if isinstance(gated_server, int):
@@ -69,7 +71,7 @@ def open_in_terminal(
                 if begun == 2:  # the first step has found that the id exists
                     requests.show_address()
 
-    how = _HowToOpen(recordings, worker, history_bytes, RecentTasks())
+    how = _HowToOpen(recordings, worker, history_bytes, RecentTasks(), pictures)
     if waits_for_a_file:
         how.recents.add(task, options)
     session = how.open(task, options, on_event=on_event)
@@ -150,6 +152,7 @@ class _HowToOpen:
     worker: WorkerOptions
     history_bytes: int
     recents: RecentTasks
+    pictures: ShownPictures = "auto"
 
     def open(
         self,
@@ -188,7 +191,9 @@ class _HowToOpen:
         callbacks = {"on_event": on_event, "on_line": print_line, "on_notice": warn}
         check = kept_choices().check_after_save
         given = {"history_bytes": self.history_bytes, "worker": worker, "kept": kept, "check": check}
-        return Session(task, options, recordings=self.recordings, **given, **callbacks)
+        session = Session(task, options, recordings=self.recordings, **given, **callbacks)
+        session.change(pictures=self.pictures)
+        return session
 
 
 def _for_others(options: TaskOptions) -> TaskOptions:

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 CameraKind = Literal["sensor", "human"]
+PictureDegree = Literal["exact", "fast"]
+"""``exact``: SAPIEN's own, to the bit. ``fast``: heavy meshes are simplified, see `core.scene.fast_shapes`."""
 CameraKey = tuple[CameraKind, str]
 """Kind and name: a sensor and a camera for people may have the same name."""
 

@@ -215,7 +215,7 @@ def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None
     for name in (*HOW_IT_IS_RUN, "human_render_camera_configs"):
         kwargs.pop(name, None)
     base = base or TaskOptions()
-    return replace(base, num_envs=num_envs, seed=max(info.seed, 0), env_kwargs=kwargs)
+    return replace(base, num_envs=num_envs, seed=max(info.seed, 0), env_kwargs=kwargs, pictures=info.pictures)
 
 
 @contextmanager

@@ -294,6 +294,7 @@ def episode_info(
         max_episode_steps=task.max_episode_steps,
         side_files=side_files(task.file, task.source),
         acted_by=((0, acted_by),) if acted_by else (),
+        pictures=task.pictures,
     )
 
 

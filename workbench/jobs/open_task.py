@@ -183,6 +183,7 @@ def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Op
             EnvOptions(
                 num_envs=options.num_envs,
                 backend=options.backend,
+                pictures=options.pictures,
                 rules=_rules(loaded, options),
                 on_finding=opening.on_finding,
                 kwargs=constructor_arguments(loaded.cls, options.env_kwargs, BaseEnv),
@@ -258,6 +259,7 @@ def describe(
         source_hash=loaded.source_hash,
         source=dict(loaded.source),
         backend=simulation,
+        pictures=getattr(env.scene, "pictures", "exact"),
         device=f"{env.device}" + (f", pictures on {renderer.name}" if renderer else ", no pictures"),
         num_envs=task.num_envs,
         max_episode_steps=max_episode_steps,

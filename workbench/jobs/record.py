@@ -110,6 +110,8 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
     """
     given, env_kwargs = find_actions(what.actions, what.task)
     options = replace(what.options, env_kwargs={**env_kwargs, **what.options.env_kwargs})
+    if what.fast_pictures:
+        options = replace(options, pictures="fast")
     what = replace(what, options=options)
     if what.use_env_states and not (given and all(run.env_states for run in given)):
         raise ValueError("--use-env-states needs --actions FILE.h5 with env states in it")

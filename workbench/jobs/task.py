@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import CameraInfo, CameraKey, Picture
+from workbench.core.camera_data import CameraInfo, CameraKey, Picture, PictureDegree
 from workbench.core.cameras.report import ObjectToSee
 from workbench.core.env.keywords import HowMade
 from workbench.core.env.step_result import StepResult
@@ -20,6 +20,8 @@ from workbench.core.rules import Degree, Finding
 from workbench.core.scene.shapes import SceneGeometry
 
 Backend = Literal["auto", "cpu", "gpu"]
+ShownPictures = Literal["auto", "exact", "fast"]
+"""What the page shows of the cameras. ``auto``: fast pictures while something moves, exact ones when it stands still."""
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy", "solve"]
 """``solve``: planned by rollouts of the task; elsewhere than an `ActionChooser`."""
 
@@ -33,6 +35,8 @@ class TaskOptions:
     seed: int = 0
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
+    pictures: PictureDegree = "exact"
+    """Of what the envs draw for observations and recordings."""
     rules: Degree | None = None
     """The degree of all rules of GPU simulation; None for each rule's own, see `core.rules`."""
     imports: tuple[str, ...] = ()
@@ -118,6 +122,8 @@ class TaskDescription:
     segmentation: dict[int, str]
     """Segmentation id to body name."""
     can_render: bool
+    pictures: PictureDegree = "exact"
+    """What its envs draw for observations and recordings."""
     chosen: str = ""
     """Its name in the file: the class, or a robot that is shown in a scene."""
     others: tuple[str, ...] = ()
@@ -215,6 +221,8 @@ class RecordArguments:
             demonstrations, which begin from their own seeds.
         use_env_states: put every env state of a demonstration back after its step.
         pictures: record what every camera sees (--no-pictures is much faster).
+        fast_pictures: draw simplified meshes: several times as many pictures a second without a GPU, which differ a little
+            from a GPU's. The recordings say so.
         max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
         workers: processes, each with its share of the envs; the episodes are the same with any number.
     """
@@ -227,5 +235,6 @@ class RecordArguments:
     actions: str = "random"
     use_env_states: bool = False
     pictures: bool = True
+    fast_pictures: bool = False
     max_steps: int | None = None
     workers: int = 1

@@ -26,7 +26,7 @@ from workbench.core.camera_data import CameraInfo
 from workbench.core.scene.shapes import Visual
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun.layout import body_entities
+from workbench.recording.rerun.layout import VIEWER_TEXELS, body_entities
 from workbench.recording.rerun.read import read_properties
 
 Entities = dict[str, dict[str, Column]]
@@ -118,7 +118,12 @@ def test_every_mesh_lies_under_its_body(written: tuple[Made, Path, Entities]) ->
             if visual.material.texture is not None and visual.mesh.uvs is not None:
                 np.testing.assert_array_equal(mesh["Mesh3D:vertex_texcoords"].values[0], visual.mesh.uvs)
                 pixels = mesh["Mesh3D:albedo_texture_buffer"].values[0][0]
-                assert pixels == visual.material.texture[..., :3].tobytes()
+                small = max(visual.material.texture.shape[:2]) <= VIEWER_TEXELS
+                assert ("texture" in mesh) is not small, "a large one is a JPEG, and rerun shows it small"
+                if small:
+                    assert pixels == visual.material.texture[..., :3].tobytes()
+                else:
+                    assert len(pixels) <= 3 * VIEWER_TEXELS**2
 
 
 def test_all_of_it_is_read_back(written: tuple[Made, Path, Entities], recorded: Any) -> None:
@@ -147,7 +152,10 @@ def test_all_of_it_is_read_back(written: tuple[Made, Path, Entities], recorded: 
         if visual.mesh.uvs is not None and visual.material.texture is not None:
             np.testing.assert_array_equal(again.mesh.uvs, visual.mesh.uvs)
             assert again.material.texture is not None
-            np.testing.assert_array_equal(again.material.texture[..., :3], visual.material.texture[..., :3])
+            assert again.material.texture.shape == visual.material.texture.shape
+            off = again.material.texture[..., :3].astype(int) - visual.material.texture[..., :3]
+            large = max(visual.material.texture.shape[:2]) > VIEWER_TEXELS
+            assert np.abs(off).mean() <= (4 if large else 0)
     for track, again in zip(made.cameras, found.cameras, strict=True):
         assert again.info.key == track.info.key and again.info.mount == track.info.mount
         np.testing.assert_array_equal(again.info.intrinsic, track.info.intrinsic)
@@ -291,6 +299,7 @@ def test_properties_tell_the_episode(written: tuple[Made, Path, Entities]) -> No
         "source_file": "task.py",
         "source_hash": "0123456789ab",
         "acted_by": "random; from step 6 on: sliders",
+        "pictures": "exact",
         "max_episode_steps": 50,
         "recovered": False,
         "reset_options": "{}",

@@ -6,6 +6,7 @@ import mmap
 import os
 import pickle
 import socket
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -167,6 +168,29 @@ def test_a_picture_is_fetched_when_it_should_be_ready_by_what_the_last_ones_took
         desk.clock.now += expected + 0.001
         desk.cameras.make(may_block=False)
         assert shown(desk.heard()) == [BASE], "and was not waited for: the next is looked for earlier"
+
+
+def test_pictures_are_fast_while_something_moves_and_exact_when_it_stands_still(desk: Desk) -> None:
+    def next_picture() -> Any:
+        desk.makes()
+        (pictures,) = desk.makes()
+        return pictures.pictures[0].rgb.astype(int)
+
+    desk.cameras.watch(0, (SENSOR,))
+    exact = next_picture()
+    desk.cameras.watch(0, (SENSOR,), "auto")
+    next_picture()  # the meshes may have to be made first
+    for thread in threading.enumerate():
+        if thread.name == under_test.SIMPLIFYING:
+            thread.join()
+    desk.cameras.scene_changed()
+    desk.clock.now += 1.0
+    off = np.abs(next_picture() - exact)
+    assert off.any() and off.mean() < 2
+    assert desk.wait() == pytest.approx(0.3)
+    desk.clock.now += 0.31
+    np.testing.assert_array_equal(next_picture(), exact)
+    assert desk.wait() is None, "until something moves again"
 
 
 def test_what_is_watched_already_is_not_begun_again(desk: Desk) -> None:

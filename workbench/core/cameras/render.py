@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +14,9 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import maniskill_private
-from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
+from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture, PictureDegree
 from workbench.core.cameras.place import rows_of_pose, settings_of
+from workbench.core.env.cpu_scene import BatchedCpuScene
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.env_numbers import require_env
 from workbench.core.scene.scene_index import hidden_poses, scene_index
@@ -79,7 +80,11 @@ def segmentation_names(env: Any) -> dict[int, str]:
 
 
 def take_pictures(
-    env: Any, env_index: int, requests: Sequence[Request], poses: NDArray[np.float32] | None = None
+    env: Any,
+    env_index: int,
+    requests: Sequence[Request],
+    poses: NDArray[np.float32] | None = None,
+    degree: PictureDegree | None = None,
 ) -> tuple[Picture, ...]:
     """Render the requested cameras of env `env_index`, in the order of `requests`.
 
@@ -90,6 +95,7 @@ def take_pictures(
         poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where the
             tensors have them, applied or not (`drawn_poses`). Only what is drawn moves, so a past moment can be
             rendered without changing the simulation. A camera moves with its mount; colours and lights are today's.
+        degree: None for the one that the env was made with. Only a batch on the CPU has fast ones, others are exact.
 
     Raises:
         IndexError: there is no such env.
@@ -99,7 +105,7 @@ def take_pictures(
     pictures: dict[int, Picture] = {}
     for kind in KINDS:
         chosen = [i for i, request in enumerate(requests) if request[1] == kind]
-        begun = begin_pictures(env, env_index, [requests[i] for i in chosen], poses)
+        begun = begin_pictures(env, env_index, [requests[i] for i in chosen], poses, degree)
         pictures.update(zip(chosen, begun.finish(), strict=True))
     return tuple(pictures[i] for i in range(len(requests)))
 
@@ -116,7 +122,11 @@ class PendingPictures:
 
 
 def begin_pictures(
-    env: Any, env_index: int, requests: Sequence[Request], poses: NDArray[np.float32] | None = None
+    env: Any,
+    env_index: int,
+    requests: Sequence[Request],
+    poses: NDArray[np.float32] | None = None,
+    degree: PictureDegree | None = None,
 ) -> PendingPictures:
     """Start rendering the requested cameras, and return at once.
 
@@ -127,7 +137,7 @@ def begin_pictures(
 
     Args:
         requests: all of one kind, since sensors and human cameras see different objects.
-        poses: as in `take_pictures`.
+        poses, degree: as in `take_pictures`.
 
     Raises:
         As `take_pictures`.
@@ -150,6 +160,9 @@ def begin_pictures(
         maniskill_private.camera_components(cameras[kind, name])[env_index] for name, kind, _ in requests
     ]
     places = places_to_draw(env, env_index, poses)
+    for name, kind, _ in requests:
+        with _drawn(scene, env_index, (kind, name), degree):
+            pass  # what fast pictures draw is made before `update_render` puts it where it belongs
     with (
         show_hidden_objects(env, env_index, shown=kinds == {"human"}),
         drawn_at(places, components) as move_bodies,
@@ -157,11 +170,18 @@ def begin_pictures(
         sub_scene.update_render()
         move_bodies()
         for (name, kind, modalities), component in zip(requests, components, strict=True):
-            component.take_picture()
+            with _drawn(scene, env_index, (kind, name), degree):
+                component.take_picture()
             pose = component.get_global_pose()
             where = np.array([*pose.p, *pose.q], dtype=np.float32)
             taken.append((cameras[kind, name], name, kind, env_index, tuple(modalities), where))
     return PendingPictures(tuple(taken))
+
+
+def _drawn(
+    scene: Any, env_index: int, camera: CameraKey, degree: PictureDegree | None
+) -> AbstractContextManager[None]:
+    return scene.drawn(env_index, camera, degree) if isinstance(scene, BatchedCpuScene) else nullcontext()
 
 
 def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) -> Places:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -29,6 +29,7 @@ from workbench.core.broken_rule import (
     place_of_hook,
     warn_of,
 )
+from workbench.core.camera_data import CameraKey, CameraKind, PictureDegree
 from workbench.core.env.partial_reset import (
     KeptControllers,
     explain_reset_errors,
@@ -39,11 +40,13 @@ from workbench.core.env.partial_reset import (
 from workbench.core.env.strict import StrictMixin
 from workbench.core.maniskill_private import (
     asks_for_a_gpu,
+    camera_components,
     install_row_lookups,
     scene_of,
     substeps_are_unwatched,
 )
 from workbench.core.rules import Degree, Finding, degrees_of
+from workbench.core.scene.fast_shapes import Bodies, FastShapes, shown
 from workbench.core.simulation.accessors import install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
@@ -78,12 +81,15 @@ class BatchedSimDevice:
 class CpuCameraGroup:
     """One camera of every env, with the interface of SAPIEN's ``RenderCameraGroup``."""
 
-    def __init__(self, cameras: list[sapien.render.RenderCameraComponent]) -> None:
-        self._cameras = cameras
+    def __init__(
+        self, cameras: list[sapien.render.RenderCameraComponent], scene: BatchedCpuScene, key: CameraKey
+    ) -> None:
+        self._cameras, self._scene, self._key = cameras, scene, key
 
     def take_picture(self) -> None:
-        for camera in self._cameras:
-            camera.take_picture()
+        for env, camera in enumerate(self._cameras):
+            with self._scene.drawn(env, self._key):
+                camera.take_picture()
 
     def get_picture_cuda(self, name: str) -> CpuArray:
         """(N, H, W, C) texture `name` of every env, on the CPU."""
@@ -104,6 +110,30 @@ class BatchedCpuScene(ManiSkillScene):
         super().__init__(sub_scenes, **kwargs)
         self.px = system_class(sub_scenes, threads)  # type: ignore[assignment]
         self.gpu_sim_enabled = True
+        self.pictures: PictureDegree = "exact"
+        self._fast_shapes: FastShapes | None = None
+
+    def drawn(
+        self, env: int, camera: CameraKey, degree: PictureDegree | None = None
+    ) -> AbstractContextManager[None]:
+        """Within this, a camera's picture of an env is of this degree; None for the scene's own."""
+        if (degree or self.pictures) == "exact":
+            return nullcontext()
+        return shown(self.prepare_fast_shapes(camera)[env])
+
+    def prepare_fast_shapes(self, camera: CameraKey) -> list[Bodies]:
+        """Make what fast pictures of this camera draw, once; call it before ``update_render``."""
+        if self._fast_shapes is None:
+            self._fast_shapes = FastShapes(self.sub_scenes)
+        kind, name = camera
+        sensor = (self.sensors if kind == "sensor" else self.human_render_cameras)[name]
+        return self._fast_shapes.bodies(camera, camera_components(sensor))
+
+    def forget_fast_shapes(self) -> None:
+        """Make them anew for the next picture: the cameras are others now."""
+        if self._fast_shapes is not None:
+            self._fast_shapes.remove()
+            self._fast_shapes = None
 
     def create_actor_builder(self) -> Any:
         # ManiSkill adds a plane once a builder, since all envs of a GPU share one physics scene: here every env but
@@ -124,13 +154,17 @@ class BatchedCpuScene(ManiSkillScene):
     def _sapien_update_render(
         self, update_sensors: bool = True, update_human_render_cameras: bool = True
     ) -> None:
-        chosen: list[dict[str, Any]] = [self.sensors] * update_sensors + [
-            self.human_render_cameras
-        ] * update_human_render_cameras
-        for cameras in chosen:
+        chosen: list[tuple[CameraKind, dict[str, Any]]] = []
+        if update_sensors:
+            chosen.append(("sensor", self.sensors))
+        if update_human_render_cameras:
+            chosen.append(("human", self.human_render_cameras))
+        for kind, cameras in chosen:
             for name, sensor in cameras.items():
+                if self.pictures == "fast" and camera_components(sensor):
+                    self.prepare_fast_shapes((kind, name))
                 if sensor.camera.camera_group is None:
-                    group = CpuCameraGroup(sensor.camera._render_cameras)
+                    group = CpuCameraGroup(sensor.camera._render_cameras, self, (kind, name))
                     sensor.camera.camera_group = self.camera_groups[name] = group  # type: ignore
         px: BatchedCpuSystem = self.px  # type: ignore[assignment]
         every = [*self.sensors.values(), *self.human_render_cameras.values()]
@@ -171,6 +205,7 @@ class BatchedCpuMixin:
     """The author's class, without this mixin."""
     _workbench_threads: int | None
     """Threads that step the envs; None for one on each core."""
+    _workbench_pictures: PictureDegree
     _kept_controllers: KeptControllers | None = None
     begins_anew = False
     """Whether each reset is an exact point, from which an episode can be repeated to the last bit."""
@@ -300,6 +335,7 @@ class BatchedCpuMixin:
             device=self.device,
             backend=self.backend,  # type: ignore
         )
+        self.scene.pictures = self._workbench_pictures
         self.scene.px.timestep = 1.0 / self._sim_freq
 
 
@@ -308,12 +344,14 @@ def batched_class(
     threads: int | None = None,
     rules: Degree | None = None,
     on_finding: Callable[[Finding], None] = warn_of,
+    pictures: PictureDegree = "exact",
 ) -> type[BaseEnv]:
     """A subclass of `task` with the batched CPU simulation; `task` itself stays as it is.
 
     Args:
         rules: the degree of all rules of GPU simulation, or None for each rule's own; see `rules`.
         on_finding: called once for each place where a rule that does not stop the task is broken.
+        pictures: of which degree what the env itself draws is.
     """
     install_row_lookups(batched_system)
     install_struct_access()
@@ -323,6 +361,7 @@ def batched_class(
         "__qualname__": task.__qualname__,
         "_workbench_task": task,
         "_workbench_threads": threads,
+        "_workbench_pictures": pictures,
     }
     if all(degree == "off" for degree in degrees_of(rules).values()):
         return type(task.__name__, (BatchedCpuMixin, task), namespace)

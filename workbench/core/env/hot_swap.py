@@ -28,9 +28,12 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
         env.__class__ = task
         return
     if issubclass(own, StrictMixin):
-        env.__class__ = batched_class(task, own._workbench_threads, own._rule_choice, own._on_finding)
+        put = batched_class(
+            task, own._workbench_threads, own._rule_choice, own._on_finding, own._workbench_pictures
+        )
     else:
-        env.__class__ = batched_class(task, own._workbench_threads, "off")
+        put = batched_class(task, own._workbench_threads, "off", pictures=own._workbench_pictures)
+    env.__class__ = put
 
 
 def can_exchange_cameras(env: BaseEnv) -> bool:
@@ -52,6 +55,7 @@ def exchange_cameras(env: BaseEnv) -> None:
     """
     if not env.scene.can_render():
         return
+    env.scene.forget_fast_shapes()  # type: ignore[attr-defined]  # only a batched scene comes here
     for camera in maniskill_private.cameras(env).values():
         for component in maniskill_private.camera_components(camera):
             # The entity stays, empty: with one fewer, SAPIEN would renumber the others in the scene of a restored

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from workbench.core import maniskill_private
 from workbench.core.backends import Backend, BackendUnavailable, choose_backend, keep_render_device
 from workbench.core.broken_rule import BrokenRules, warn_of
+from workbench.core.camera_data import PictureDegree
 from workbench.core.env import actions
 from workbench.core.env.assets import refuse_downloads, require_assets, robots_of
 from workbench.core.env.cpu_scene import batched_class, refuse_unbuilt_env
@@ -46,6 +47,8 @@ class EnvOptions:
     """False makes no render system: no pictures, and no use of a graphics driver."""
     threads: int | None = None
     """Threads that step the envs on the CPU; None for one on each core that the process may use."""
+    pictures: PictureDegree = "exact"
+    """Of which degree the pictures are that the env itself draws: observations and ``render``."""
     rules: Degree | None = None
     """The degree of all rules of GPU simulation (on the CPU); None for each rule's own, see `rules`."""
     on_finding: Callable[[Finding], None] = warn_of
@@ -59,6 +62,10 @@ class EnvOptions:
             raise ValueError(f"num_envs must be at least 1, not {self.num_envs}")
         if self.backend not in get_args(Backend):
             raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, not {self.backend!r}")
+        if self.pictures not in get_args(PictureDegree):
+            raise ValueError(
+                f"pictures must be one of {', '.join(get_args(PictureDegree))}, not {self.pictures!r}"
+            )
         degrees_of(self.rules)  # raises for an unknown degree
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, not {self.threads}")
@@ -107,10 +114,19 @@ def build_env(
         keep_render_device(kwargs["render_backend"])
     with refuse_downloads(task.__name__):
         if backend.simulation == "gpu":
+            if options.pictures == "fast":
+                raise BackendUnavailable(_NO_FAST_PICTURES)
             env = task(sim_backend="physx_cuda", **kwargs)
             refuse_unbuilt_env(env, task, options.num_envs)
             return env
-        return batched_class(task, options.threads, options.rules, options.on_finding)(**kwargs)
+        made = batched_class(task, options.threads, options.rules, options.on_finding, options.pictures)
+        return made(**kwargs)
+
+
+_NO_FAST_PICTURES = (
+    "Fast pictures are for envs that are simulated on the CPU: a GPU draws exact ones as fast. Leave pictures out with "
+    "GPU simulation, or take the backend cpu."
+)
 
 
 def default_reward_mode(task: type[BaseEnv]) -> str:

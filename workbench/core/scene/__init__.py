@@ -1,1 +1,1 @@
-"""What a built scene is made of, and its shapes for a page."""
+"""What a built scene is made of, its shapes for a page, and simplified ones for fast pictures."""

@@ -18,13 +18,13 @@ from PIL import Image
 
 from workbench.core.scene.scene_index import scene_index
 from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual, srgb
-from workbench.core.scene.simplify import drop_uvs, flat_rectangle, reduce_mesh, with_normals
+from workbench.core.scene.simplify import drop_uvs, flat_rectangle, reduce_mesh, share_vertices, with_normals
 
 _FLAT_FACES = 100
 """Meshes with more faces are tested for being a flat rectangle."""
 _KEPT_MESHES = 1000
-MOST_FACES = 800
-"""Most faces of a visual: a Panda of 136,000 triangles becomes 14,000 and looks the same."""
+MOST_FACES = 400
+"""Most faces of a visual: a Panda of 136,000 triangles becomes 9,000 and looks the same."""
 MOST_TEXELS = 1024
 """On the longest side of a texture."""
 
@@ -260,6 +260,7 @@ def _material_key(material: Material) -> Hashable:
 
 
 _kept_meshes: OrderedDict[Hashable, Mesh] = OrderedDict()
+_kept_exact: OrderedDict[Hashable, Mesh] = OrderedDict()
 
 
 def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
@@ -274,12 +275,30 @@ def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
     if flat is not None:
         mesh = flat
     else:
-        mesh = reduce_mesh(mesh, max_faces)
+        mesh = share_vertices(reduce_mesh(mesh, max_faces))
     if source.keep:
         _kept_meshes[key] = mesh
         if len(_kept_meshes) > _KEPT_MESHES:
             _kept_meshes.popitem(last=False)
     return mesh
+
+
+def exact_part(shape: Any, part: Any, index: int) -> tuple[Mesh, tuple[float, float, float]]:
+    """A part of a render shape with all its triangles, and the scale that it is drawn with on its local pose.
+
+    Meshes of files are kept for the life of the process.
+    """
+    source = _source(shape, part, index)
+    scale = _Placement.of(shape).scale
+    if not source.keep:
+        return _read_part(source), scale
+    key = (source.key, "exact")
+    if key not in _kept_exact:
+        _kept_exact[key] = _read_part(source)
+        if len(_kept_exact) > _KEPT_MESHES:
+            _kept_exact.popitem(last=False)
+    _kept_exact.move_to_end(key)
+    return _kept_exact[key], scale
 
 
 def _read_part(source: _Source) -> Mesh:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import fast_simplification
 import numpy as np
@@ -22,7 +23,9 @@ _CLUSTER_CELLS = 64
 _COARSEST_CELLS = 16
 _WELD_CELLS = 1_000_000
 _MOST_PIECES = 200
-_LEAST_FACES = 48
+_LEAST_FACES = 24
+_GENTLE, _USUAL = 3, 7
+"""How fast the threshold of a collapse grows (the method's ``agg``): the slower, the more cheap edges go before dear ones."""
 
 
 def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
@@ -52,8 +55,47 @@ def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
         return mesh
     reduced = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
     if mesh.normals is None or len(mesh.faces) > _DENSE:
-        return reduced
-    return replace(reduced, normals=_normals_of_source(reduced, mesh))
+        return share_vertices(reduced)
+    return share_vertices(replace(reduced, normals=_normals_of_source(reduced, mesh)))
+
+
+def coarsen_mesh(mesh: Mesh, max_faces: int, source: Mesh, by_pieces: bool = False) -> Mesh:
+    """`mesh` with at least `max_faces` triangles, and more where fewer would be another shape; slower than `reduce_mesh`,
+    and nearer to the surface.
+
+    Args:
+        source: the exact mesh, which `mesh` is or was made of; normals are taken from it.
+        by_pieces: each connected piece by itself: small ones stay, where a whole one would otherwise be lost.
+    """
+    vertices, faces, uvs = _weld(mesh.vertices, mesh.faces, mesh.uvs, _WELD_CELLS)
+    if len(faces) > max_faces:
+        how = "by pieces" if by_pieces else "as a whole"
+        vertices, faces, uvs = _collapse(vertices, faces, uvs, max_faces, how)
+    if len(faces) == 0:
+        return mesh
+    coarse = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
+    if source.normals is not None:
+        coarse = replace(coarse, normals=_normals_of_source(coarse, source))
+    return share_vertices(coarse)
+
+
+def share_vertices(mesh: Mesh) -> Mesh:
+    """`mesh` with equal vertices only once: exporters give every triangle its own three. Normals that differ by half a
+    degree count as equal."""
+    rows = [np.ascontiguousarray(mesh.vertices)]
+    if mesh.normals is not None:
+        rows.append(np.round(mesh.normals, 2).astype(np.float32) + np.float32(0))
+    if mesh.uvs is not None:
+        rows.append(mesh.uvs)
+    _, first, inverse = np.unique(
+        np.concatenate(rows, axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    return Mesh(
+        mesh.vertices[first],
+        inverse.reshape(-1)[mesh.faces].astype(np.uint32),
+        None if mesh.normals is None else mesh.normals[first],
+        None if mesh.uvs is None else mesh.uvs[first],
+    )
 
 
 def with_normals(mesh: Mesh) -> Mesh:
@@ -181,13 +223,18 @@ def _collapse(
     faces: NDArray[np.int64],
     uvs: NDArray[np.float32] | None,
     max_faces: int,
+    how: Literal["fast", "as a whole", "by pieces"] = "fast",
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32] | None]:
     # The method's thresholds are absolute: a mesh of a few centimetres would be collapsed in any order.
     extent = float(np.ptp(vertices, axis=0).max())
     points = vertices.astype(np.float64) / extent
     triangles = np.ascontiguousarray(faces, dtype=np.int32)
     if uvs is None:
-        new_points, new_faces = _collapse_pieces(points, triangles, max_faces)
+        if how == "as a whole":
+            new_points, new_faces = _collapse_whole(points, triangles, max_faces)
+        else:
+            growth = _USUAL if how == "fast" else _GENTLE
+            new_points, new_faces = _collapse_pieces(points, triangles, max_faces, growth)
         # The optimum of a nearly singular quadric can be anywhere: a spike out of the surface.
         distance, nearest = (np.asarray(x) for x in KDTree(points).query(new_points))
         spike = distance > 0.04
@@ -195,7 +242,12 @@ def _collapse(
         return (new_points * extent).astype(np.float32), new_faces, None
     # The edge of a piece of texture is a border of the welded mesh; moved, it would open a gap.
     collapses = fast_simplification.simplify(
-        points, triangles, target_count=max_faces, return_collapses=True, preserve_border=True
+        points,
+        triangles,
+        target_count=max_faces,
+        agg=_USUAL if how == "fast" else _GENTLE,
+        return_collapses=True,
+        preserve_border=True,
     )[-1]
     new_points, new_faces, new_index = fast_simplification.replay_simplification(points, triangles, collapses)
     # The uv of the old vertex nearest to the new one.
@@ -205,8 +257,22 @@ def _collapse(
     return (new_points * extent).astype(np.float32), new_faces.astype(np.int64), new_uvs
 
 
-def _collapse_pieces(
+def _collapse_whole(
     points: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    # Losing a flat lid costs a quadric nothing, unless its border stays. Only what cannot be had so is had otherwise.
+    new_points, new_faces = points, faces
+    for growth, keep_borders in ((_GENTLE, True), (_GENTLE, False), (_USUAL, False)):
+        new_points, new_faces = fast_simplification.simplify(
+            points, faces, target_count=max_faces, agg=growth, preserve_border=keep_borders
+        )[:2]
+        if len(new_faces) <= 1.1 * max_faces:
+            break
+    return new_points, new_faces.astype(np.int64)
+
+
+def _collapse_pieces(
+    points: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int, growth: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Collapse each connected piece by itself, with a share of the triangles by its area.
 
@@ -228,7 +294,9 @@ def _collapse_pieces(
         index, flat = np.unique(own, return_inverse=True)
         vertices, triangles = points[index], flat.reshape(-1, 3).astype(np.int32)
         if len(triangles) > target:
-            simpler = fast_simplification.simplify(vertices, triangles, target_count=target)
+            simpler = fast_simplification.simplify(vertices, triangles, target_count=target, agg=_GENTLE)
+            if growth > _GENTLE and len(simpler[1]) > 1.2 * target:
+                simpler = fast_simplification.simplify(vertices, triangles, target_count=target, agg=growth)
             vertices, triangles = simpler[0], simpler[1]
         new_points.append(vertices)
         new_faces.append(triangles.astype(np.int64) + used)

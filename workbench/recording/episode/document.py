@@ -14,7 +14,7 @@ import numpy as np
 import xxhash
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from workbench.core.camera_data import CameraInfo, CameraKind
+from workbench.core.camera_data import CameraInfo, CameraKind, PictureDegree
 from workbench.core.scene.shapes import BodyKind
 from workbench.machine.files import (
     MOST_SOURCE_BYTES,
@@ -126,6 +126,7 @@ class Description(Struct, frozen=True, kw_only=True):
     side_files: dict[str, str] = {}
     """Other files that the task reads, not included: path relative to the task's folder, to hash."""
     acted_by: ActedBy = ()
+    pictures: PictureDegree = "exact"
     length: Whole
     total_reward: float = msgspec.field(name="return")
     success: bool | None
@@ -172,6 +173,7 @@ class Description(Struct, frozen=True, kw_only=True):
 SHARED = (
     "id", "task", "env_index", "control_dt", "control_mode", "backend", "versions", "env_kwargs", "reset_options",
     "max_episode_steps", "written_at", "recovered", "source_hash", "side_files", "acted_by",
+    "pictures",
 )  # fmt: skip
 """Fields that `EpisodeInfo` and `Description` share."""
 

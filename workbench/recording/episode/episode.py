@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import CameraInfo
+from workbench.core.camera_data import CameraInfo, PictureDegree
 from workbench.core.env.step_result import OtherEntry
 from workbench.core.scene.shapes import BodyKind, SceneGeometry
 from workbench.recording.episode.columns import TextTrack, entry_at
@@ -73,6 +73,8 @@ class EpisodeInfo:
     acted_by: tuple[tuple[int, str], ...] = ()
     """Source of the actions: index of its first action, and its name (``random``, ``policy act.py:act``). Empty if
     unknown."""
+    pictures: PictureDegree = "exact"
+    """What degree the pictures of its cameras are of. Recordings of earlier versions are exact."""
     seal: Seal | None = field(default=None, compare=False)
     """Set when read from a recording."""
 

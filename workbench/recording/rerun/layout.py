@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import threading
 import weakref
@@ -14,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
+from PIL import Image
 from rerun.chunk import Chunk
 from transforms3d.quaternions import qconjugate, qmult
 
@@ -178,6 +180,9 @@ def _world() -> Chunk:
     return static_chunk(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
 
+_TEXTURE_QUALITY = 75
+VIEWER_TEXELS = 128
+"""On the longest side of a texture as rerun shows it; the workbench reads the full one, beside it as a JPEG."""
 _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 """Results of `_mesh_chunk` by the visual's id, while the visual lives: the next episode of the scene reuses them, since
 textures are megabytes to convert."""
@@ -210,26 +215,49 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
     # Values that rerun's mesh lacks, for reading the scene back. Typed, because rerun applies the type of the first value
     # in the process to all: after a colour of integers every other would be truncated to 0 or 1.
     material = visual.material
-    extras = rr.AnyValues(
-        visual=visual.name,
-        base_color=pa.array(material.base_color, pa.float64()),
-        metallic=pa.array([material.metallic], pa.float64()),
-        roughness=pa.array([material.roughness], pa.float64()),
-    )
-    return static_chunk(entity, mesh, extras)
+    extras: dict[str, Any] = {
+        "visual": visual.name,
+        "base_color": pa.array(material.base_color, pa.float64()),
+        "metallic": pa.array([material.metallic], pa.float64()),
+        "roughness": pa.array([material.roughness], pa.float64()),
+    }
+    if material.texture is not None and visual.mesh.uvs is not None and _is_large(material.texture):
+        # Rerun's own texture is uncompressed: that of ManiSkill's table would be three quarters of most recordings.
+        extras["texture"] = pa.array(np.frombuffer(_jpeg(material.texture), np.uint8))
+    return static_chunk(entity, mesh, rr.AnyValues(**extras))
+
+
+def _is_large(texture: NDArray[np.uint8]) -> bool:
+    return max(texture.shape[:2]) > VIEWER_TEXELS
+
+
+def _jpeg(texture: NDArray[np.uint8]) -> bytes:
+    encoded = io.BytesIO()
+    image = Image.fromarray(np.ascontiguousarray(texture[..., :3]))
+    image.save(encoded, "JPEG", quality=_TEXTURE_QUALITY, optimize=True)
+    return encoded.getvalue()
+
+
+def _small(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3)"""
+    if not _is_large(texture):
+        return np.ascontiguousarray(texture[..., :3])
+    image = Image.fromarray(np.ascontiguousarray(texture[..., :3]))
+    image.thumbnail((VIEWER_TEXELS, VIEWER_TEXELS), Image.Resampling.BOX)
+    return np.asarray(image)
 
 
 def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
     if len(mesh.faces) == 0:
         return None
     # SAPIEN and rerun agree on uv: v = 0 is the first row of the texture, values beyond 0..1 repeat.
-    texture = None if material.texture is None or mesh.uvs is None else material.texture[..., :3]
+    texture = None if material.texture is None or mesh.uvs is None else _small(material.texture)
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
         triangle_indices=mesh.faces,
         vertex_normals=mesh.normals,
         vertex_texcoords=None if texture is None else mesh.uvs,
-        albedo_texture=None if texture is None else np.ascontiguousarray(texture),
+        albedo_texture=texture,
         albedo_factor=np.rint(np.clip(material.srgb_color, 0.0, 1.0) * 255).astype(np.uint8),
     )
 

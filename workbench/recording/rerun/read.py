@@ -18,7 +18,13 @@ from rerun.chunk import Chunk, LazyStore, RrdReader
 from workbench.core.camera_data import CameraInfo
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
 from workbench.machine.files import open_regular_file
-from workbench.recording.episode.encoded_pictures import EncodedPictures, LazyPictures, Modality, encode
+from workbench.recording.episode.encoded_pictures import (
+    EncodedPictures,
+    LazyPictures,
+    Modality,
+    decode,
+    encode,
+)
 from workbench.recording.rerun.chunks import STEP
 from workbench.recording.rerun.private_api import IndexedChunk, decode_chunk, index_of
 
@@ -207,6 +213,7 @@ class RerunTable:
         if buffer is not None:
             form = self._static[entity, "Mesh3D:albedo_texture_format"][0].as_py()
             rgb = _plain(buffer.flatten()).reshape(form["height"], form["width"], 3)
+            rgb = self._full_texture(entity, rgb)
             texture = np.concatenate([rgb, np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=-1)
         colors = self._static.get((entity, "base_color"))
         r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colors is None else colors.to_pylist()
@@ -216,6 +223,16 @@ class RerunTable:
             roughness=float(self._one(entity, "roughness", 1.0)),
             texture=texture,
         )
+
+    def _full_texture(self, entity: str, shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The texture (H, W, 3) of which rerun shows a small one; `shown` itself where there is no other."""
+        encoded = self._static.get((entity, "texture"))
+        if encoded is None:
+            return shown
+        try:
+            return decode("rgb", _plain(encoded).astype(np.uint8).tobytes())
+        except (OSError, ValueError):
+            return shown
 
     def _one(self, entity: str, component: str, default: Any) -> Any:
         values = self._static.get((entity, component))

@@ -134,7 +134,7 @@ def properties(episode: Episode) -> dict[str, dict[str, Any]]:
     """
     described = fields_of(describe(episode))
     words = ("task", "seed", "env_index", "length", "return", "control_mode", "control_dt", "backend", "id")
-    words += ("source_file", "source_hash", "max_episode_steps", "written_at", "recovered")
+    words += ("source_file", "source_hash", "max_episode_steps", "written_at", "recovered", "pictures")
     plain = {name: described[name] for name in words}
     for name in ("success", "success_once", "fail", "fail_once"):
         plain[name] = bool(described[name])

@@ -80,7 +80,9 @@ def header_from(text: str, visuals: tuple[Visual, ...]) -> Header:
 
 
 def _info_from(data: Mapping[str, Any]) -> EpisodeInfo:
-    return EpisodeInfo(**{**data, "acted_by": parse_acted_by(data.get("acted_by")), "seal": None})
+    acted_by = parse_acted_by(data.get("acted_by"))
+    pictures = "fast" if data.get("pictures") == "fast" else "exact"
+    return EpisodeInfo(**{**data, "acted_by": acted_by, "pictures": pictures, "seal": None})
 
 
 def mark_recovered(header: Header) -> Header:

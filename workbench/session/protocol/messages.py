@@ -16,7 +16,7 @@ from workbench.core.capture.inspection import Inspection, Section
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
-from workbench.jobs.task import ActionSource, Stepped, TaskDescription, TaskOptions
+from workbench.jobs.task import ActionSource, ShownPictures, Stepped, TaskDescription, TaskOptions
 from workbench.machine.processes.wire import Call, Question
 from workbench.planning.options import PlanOptions
 
@@ -106,6 +106,8 @@ class Settings:
     selected_env: int = 0
     cameras: tuple[CameraRequest, ...] = ()
     """Cameras to draw in the selected env; none while no page is open."""
+    pictures: ShownPictures = "auto"
+    """What is drawn of them."""
 
 
 @dataclass(frozen=True)

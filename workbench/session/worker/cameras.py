@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import os
 import pickle
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,7 +23,7 @@ from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import module_of
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core import maniskill_private
-from workbench.core.camera_data import CameraKey, Picture
+from workbench.core.camera_data import CameraKey, Picture, PictureDegree
 from workbench.core.cameras.place import PlacedCameras
 from workbench.core.cameras.render import (
     KINDS,
@@ -42,9 +44,14 @@ from workbench.core.cameras.visibility import (
     small_size,
 )
 from workbench.core.capture.state_columns import read_state_columns
+from workbench.core.env.cpu_scene import BatchedCpuScene
 from workbench.core.env.hot_swap import keep_observation_space, put_class, undone
 from workbench.core.env.task_env import TaskEnv
+from workbench.core.scene.fast_shapes import unknown_meshes
+from workbench.core.scene.mesh_levels import levels_of
+from workbench.core.scene.shapes import Mesh
 from workbench.jobs.open_task import OpenedTask
+from workbench.jobs.task import ShownPictures
 from workbench.session.protocol.messages import (
     CameraRequest,
     CannotAnswer,
@@ -68,6 +75,10 @@ from workbench.session.worker.pacing import throttled
 _PERIOD = 1 / 15
 _PAUSE_SHARE = 0.3
 """Of the time a round took."""
+SIMPLIFYING = "simplified meshes"
+"""Name of the thread that makes them."""
+_STILL = 0.3
+"""Seconds after the last fast picture until an exact one is drawn, if nothing moves."""
 
 
 @dataclass(frozen=True)
@@ -115,18 +126,26 @@ class WorkerCameras:
         self._expected: dict[tuple[CameraRequest, ...], float] = {}
         """Seconds that pictures take."""
         self._round_began = self._next_round = 0.0
+        self._round_degree: PictureDegree = "exact"
         self._may_block = False
         """No step is due, so the loop may block until a picture is ready."""
+        self._degree: ShownPictures = "exact"
+        self._exact_at: float | None = None
+        """When the shown pictures, which are fast, are to be drawn exactly; None if they are."""
+        self._fast_scene: Any = None
+        """For which `_simplifying` makes, or made, the meshes that this machine lacked: exact pictures are drawn meanwhile."""
+        self._may_be_fast = False
+        self._simplifying = threading.Thread()
         self._placed = PlacedCameras()
         self._to_place: dict[CameraKey, PlaceCamera] = {}
         self._renderer_ready = False
 
     # --- requests ------------------------------------------------------------------------------------
 
-    def watch(self, env: int, cameras: tuple[CameraRequest, ...]) -> None:
+    def watch(self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "exact") -> None:
         # Every `Settings` has it, changed or not.
-        if (env, cameras) != self._watched:
-            self._watched = env, cameras
+        if ((env, cameras), degree) != (self._watched, self._degree):
+            self._watched, self._degree = (env, cameras), degree
             self.update_watched()
 
     def place(self, request: PlaceCamera) -> None:
@@ -195,6 +214,7 @@ class WorkerCameras:
 
     def _watch(self, cameras: tuple[CameraRequest, ...]) -> None:
         self._there, self._wanted = cameras, bool(cameras)
+        self._exact_at = None
         self._hurried.clear()
         self._expected.clear()
         self._next_round = 0.0  # a person waits for these
@@ -234,7 +254,9 @@ class WorkerCameras:
             return 0.0 if self._may_block else max(0.0, self._begun.ready_at - now)
         if self._hurried:
             return 0.0
-        return max(0.0, self._next_round - now) if self._wanted else None
+        if self._wanted:
+            return max(0.0, self._next_round - now)
+        return None if self._exact_at is None else max(0.0, self._exact_at - now)
 
     @property
     def placing_due(self) -> bool:
@@ -260,7 +282,7 @@ class WorkerCameras:
         try:
             made = None if self._begun is None else self._fetch(self._begun)
             if made is None:
-                self._begin_round()
+                self._begin_round(opened.env)
             self._begin(opened.env)
         except RuntimeError as error:
             self._watch(())  # until other cameras are requested, or another version is loaded
@@ -275,12 +297,36 @@ class WorkerCameras:
 
     # --- private -------------------------------------------------------------------------------------
 
-    def _begin_round(self) -> None:
+    def _begin_round(self, env: TaskEnv) -> None:
+        self._round_degree = self._degree_of_round(env)
         chosen = tuple(camera for camera in self._there if camera.key in self._hurried) or self._there
         self._wanted = self._wanted and bool(self._hurried)
         self._hurried.clear()
         groups = (tuple(camera for camera in chosen if camera.kind == kind) for kind in KINDS)
         self._left, self._round_began = [group for group in groups if group], time.monotonic()
+
+    def _degree_of_round(self, env: TaskEnv) -> PictureDegree:
+        moves = self._wanted or bool(self._hurried)
+        self._exact_at = None
+        if self._degree == "exact" or (self._degree == "auto" and not moves):
+            return "exact"
+        return "fast" if self._has_fast(env.env.scene) else "exact"
+
+    def _has_fast(self, scene: Any) -> bool:
+        """Whether fast pictures can be drawn now; begins to make what is missing."""
+        if scene is not self._fast_scene:
+            self._fast_scene, meshes = scene, list[Mesh]()
+            # A GPU draws the exact ones as fast.
+            self._may_be_fast = (
+                isinstance(scene, BatchedCpuScene) and not scene.sub_scenes[0].render_system.device.is_cuda()
+            )
+            if self._may_be_fast:
+                meshes = unknown_meshes(scene.sub_scenes)
+            self._simplifying = threading.Thread(
+                target=_simplify, args=(meshes,), name=SIMPLIFYING, daemon=True
+            )
+            self._simplifying.start()
+        return self._may_be_fast and not self._simplifying.is_alive()
 
     def _fetch(self, begun: _Begun) -> Pictures:
         self._begun, asked_at = None, time.monotonic()
@@ -292,6 +338,8 @@ class WorkerCameras:
             min(took, 1.0) if waited else 0.9 * self._expected.get(begun.requested, 0.0)
         )
         if not self._left:
+            if self._round_degree == "fast" and self._degree == "auto":
+                self._exact_at = done + _STILL
             pause = _PAUSE_SHARE * (done - self._round_began)
             self._next_round = max(self._round_began + _PERIOD, done + pause)
         return Pictures(made, 1000 * took, begun.number)
@@ -300,7 +348,8 @@ class WorkerCameras:
         """Begin the next group of the round, if there is one."""
         if self._left:
             requested = self._left.pop(0)
-            pictures = begin_pictures(env.env, min(self._watched[0], env.num_envs - 1), requested)
+            selected = min(self._watched[0], env.num_envs - 1)
+            pictures = begin_pictures(env.env, selected, requested, degree=self._round_degree)
             at = time.monotonic()
             ready_at = at + self._expected.get(requested, 0.0)
             self._begun = _Begun(pictures, requested, self._task.steps.number, at, ready_at)
@@ -320,12 +369,21 @@ class WorkerCameras:
         )
         self._task.opened = replace(opened, description=replace(opened.description, cameras=infos))
         self.scene_changed()
+        if reshaped and isinstance(env.scene, BatchedCpuScene):
+            env.scene.forget_fast_shapes()  # they were chosen for pictures of another size
         # A person moves this camera: if it is watched, its picture comes first.
         self._hurried |= {key} & {camera.key for camera in self._there}
         if reshaped and key[0] == "sensor" and opened.env.observes_pictures:
             self._task.guarded(_observe_again)
         info = next((info for info in infos if info.key == key), None)
         return Placed(key, request.settings, info, reshaped)
+
+
+def _simplify(meshes: Sequence[Mesh]) -> None:
+    """On a thread of its own, which leaves the cores to the simulation."""
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 15)
+    for mesh in meshes:
+        levels_of(mesh)
 
 
 def _observe_again(opened: OpenedTask) -> None:

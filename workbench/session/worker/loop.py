@@ -350,7 +350,7 @@ class Worker:
             self._pacer.speed = new.speed
             self._pacer.start(time.monotonic())
         self._chooser.sliders = new.sliders
-        self._cameras.watch(new.selected_env, new.cameras)
+        self._cameras.watch(new.selected_env, new.cameras, new.pictures)
         if (new.action_source, new.solve_all, new.selected_env) != (
             old.action_source,
             old.solve_all,

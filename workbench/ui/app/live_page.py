@@ -7,10 +7,12 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import viser
 
+from workbench.jobs.task import ShownPictures
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
@@ -40,6 +42,7 @@ from workbench.ui.tasks.env_options import EnvOptionsPanel
 from workbench.ui.tasks.task_list import OPEN, Chooser, OpenDialog
 from workbench.ui.widgets.editor import editor_link
 from workbench.ui.widgets.hotkeys import Command, add_hints, register
+from workbench.ui.widgets.inputs import Control
 from workbench.ui.widgets.parts import Clock, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
@@ -143,6 +146,17 @@ class Page:
             version = VersionPanel(server, session, self._link)
             options = EnvOptionsPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
+            self._degree = Control(
+                server.gui.add_dropdown(
+                    "Pictures",
+                    get_args(ShownPictures),
+                    initial_value="auto",
+                    hint="Exact ones are SAPIEN's own; fast ones take a fraction of the time without a graphics card, of "
+                    "simplified meshes. Auto: fast while something moves, exact when it stands still. What is recorded "
+                    "is exact.",
+                ),
+                send=lambda degree: session.change(pictures=degree),
+            )
             self._cameras = CamerasPanel(
                 server,
                 lambda cameras: session.change(cameras=cameras),
@@ -215,6 +229,7 @@ class Page:
 
     def _draw_panels(self, view: SessionView) -> None:
         self._parts.draw(view)
+        self._degree.show(view.settings.pictures)
         self._cameras.draw(view.shown_cameras)
 
     def _toggle_envs(self) -> None:

@@ -1,0 +1,149 @@
+"""Fast pictures against exact ones of the same state, and what must not change by them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import mani_skill.envs  # noqa: F401 (registers the tasks)
+import numpy as np
+import pytest
+import sapien.render
+import torch
+
+import workbench
+from tests.core.drawn_envs import batched
+from workbench.core.cameras.render import take_pictures
+from workbench.core.env.hot_swap import exchange_cameras
+from workbench.core.env.task_env import BackendUnavailable, EnvOptions
+from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+
+pytestmark = pytest.mark.usefixtures("renderer")
+
+ALL = ("rgb", "depth", "segmentation")
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[Any]:
+    made = batched("PickCube-v1", obs_mode="rgb+depth+segmentation")
+    made.step(torch.from_numpy(made.action_space.sample()))
+    yield made
+    made.close()
+
+
+def observed(env: Any) -> dict[str, np.ndarray]:
+    return {
+        key: value.numpy() for key, value in env.get_obs(env.get_info())["sensor_data"]["base_camera"].items()
+    }
+
+
+def test_a_fast_picture_differs_little_and_an_exact_one_not_at_all(env: Any) -> None:
+    before = observed(env)
+    env.scene.pictures = "fast"
+    fast = observed(env)
+    env.scene.pictures = "exact"
+    after = observed(env)
+    for name, exact in before.items():
+        np.testing.assert_array_equal(after[name], exact)
+    off = np.abs(fast["rgb"].astype(int) - before["rgb"])
+    assert off.any(), "it is another picture"
+    assert off.mean() < 2 and (off.max(axis=-1) > 10).mean() < 0.03
+    assert (fast["segmentation"] != before["segmentation"]).mean() < 0.01
+    assert (np.abs(fast["depth"].astype(int) - before["depth"]) > 20).mean() < 0.01
+
+
+def test_pictures_of_one_camera_are_those_of_the_observation(env: Any) -> None:
+    env.scene.pictures = "fast"
+    seen = observed(env)
+    env.scene.pictures = "exact"
+    for index in range(env.num_envs):
+        (picture,) = take_pictures(env, index, [("base_camera", "sensor", ALL)], degree="fast")
+        np.testing.assert_array_equal(picture.rgb, seen["rgb"][index])
+        np.testing.assert_array_equal(picture.segmentation, seen["segmentation"][index, ..., 0])
+    (exact,) = take_pictures(env, 0, [("base_camera", "sensor", ALL)])
+    np.testing.assert_array_equal(exact.rgb, observed(env)["rgb"][0])
+
+
+def test_a_colour_that_is_changed_later_shows_in_both(env: Any) -> None:
+    link = env.agent.robot.links_map["panda_hand"]
+    materials = [part.material for shape in link.render_shapes[0] for part in shape.parts]
+    was = [list(material.base_color) for material in materials]
+    take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
+    try:
+        for material in materials:
+            material.base_color = [0.0, 1.0, 0.0, 1.0]
+        for degree in ("exact", "fast"):
+            (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ALL)], degree=degree)
+            assert picture.rgb is not None
+            hand = picture.rgb[picture.segmentation == link._objs[0].entity.per_scene_id].astype(int)
+            assert len(hand) > 50
+            assert (hand[:, 1] > hand[:, 0] + 20).mean() > 0.8
+    finally:
+        for material, color in zip(materials, was, strict=True):
+            material.base_color = color
+
+
+def test_a_body_that_is_hidden_is_hidden_in_both(env: Any) -> None:
+    entity = env.agent.robot.links_map["panda_hand"]._objs[0].entity
+    body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+    take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
+    body.visibility = 0.0
+    try:
+        for degree in ("exact", "fast"):
+            (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ALL)], degree=degree)
+            assert not (picture.segmentation == entity.per_scene_id).any()
+        assert body.visibility == 0.0
+    finally:
+        body.visibility = 1.0
+
+
+def test_what_maniskill_finds_of_a_link_stays_the_exact_shapes(env: Any) -> None:
+    take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
+    link = env.agent.robot.links_map["panda_link5"]
+    assert sum(len(part.triangles) for shape in link.render_shapes[0] for part in shape.parts) > 10_000
+
+
+def test_exchanged_cameras_draw_fast_pictures_too() -> None:
+    env: Any = batched("PickCube-v1", obs_mode="rgb", num_envs=1)
+    (before,) = take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
+    exchange_cameras(env)
+    (after,) = take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
+    np.testing.assert_array_equal(after.rgb, before.rgb)
+    env.close()
+
+
+def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
+    with pytest.warns(UserWarning, match="other"):
+        env: Any = workbench.make("PickCube-v1", 1, obs_mode="rgb", pictures="fast")
+    obs, _ = env.reset(seed=0)
+    inner = env.unwrapped
+    (exact,) = take_pictures(inner, 0, [("base_camera", "sensor", ["rgb"])], degree="exact")
+    off = np.abs(obs["sensor_data"]["base_camera"]["rgb"][0].numpy().astype(int) - exact.rgb)
+    assert 0 < off.mean() < 2
+    env.close()
+
+
+def test_exact_pictures_are_made_without_a_word() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        workbench.make("PickCube-v1", 1, obs_mode="rgb").close()
+
+
+def test_other_degrees_and_gpu_simulation_are_refused() -> None:
+    with pytest.raises(ValueError, match="exact, fast"):
+        EnvOptions(1, pictures="quick")  # type: ignore[arg-type]
+    with pytest.raises(BackendUnavailable), pytest.warns(UserWarning, match="other"):
+        workbench.make("PickCube-v1", 1, backend="gpu", pictures="fast")
+
+
+def test_after_a_restored_snapshot_both_are_what_they_were(env: Any) -> None:
+    def taken(degree: Any) -> Any:
+        return take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree=degree)[0].rgb
+
+    exact, fast = taken("exact"), taken("fast")
+    snapshot = take_snapshot(env)
+    env.step(torch.from_numpy(env.action_space.sample()))
+    restore_snapshot(env, snapshot)
+    np.testing.assert_array_equal(taken("exact"), exact)
+    np.testing.assert_array_equal(taken("fast"), fast)
