@@ -5,11 +5,12 @@ of an episode, with each of the two ways to restore; *bare*, the same actions fr
 `workbench.make` gives them, which are restored before the clock starts. Printed are the medians and their ratios.
 
     python tests/benchmarks/solve.py --write    # also into web_assets/docs/reference/benchmarks.md
-    python tests/benchmarks/solve.py --demonstrations 20
+    python tests/benchmarks/solve.py --demonstrations 20 --packages numpy1
 
 With ``--demonstrations``, in place of that: successes an hour of ``workbench record --actions solve --successes`` and of
-ManiSkill's motion-planning scripts (`mani_skill.examples.motionplanning.panda.run`, which need mplib), each one run with as
-many processes as cores, start included.
+ManiSkill's motion-planning scripts (`mani_skill.examples.motionplanning.panda.run`), each one run with as many processes as
+cores, start included. The scripts need mplib; 0.1.1, the one that ManiSkill pins, ends in a segmentation fault with numpy 2, so
+theirs is run with another numpy: ``pip install --no-deps --target numpy1 numpy==1.26.4``.
 """
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
@@ -43,6 +44,7 @@ from workbench.planning.rollouts import RolloutPlanner, make_rollout_env
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "web_assets" / "docs" / "reference" / "benchmarks.md"
+_LONGEST = 3600.0
 HEAD = "## Planning (`tests/benchmarks/solve.py`)"
 
 
@@ -58,6 +60,8 @@ class Options:
     """Take the processor's time of all threads in place of the wall's: on a machine that others use, only that says something."""
     demonstrations: int = 0
     """Successes of each side, in place of the table of plans."""
+    packages: Path | None = None
+    """A folder whose packages the motion-planning scripts import before others."""
     write: bool = False
     """Put the table of plans into the docs page too."""
 
@@ -155,8 +159,16 @@ def factory_table(options: Options) -> Iterator[str]:
         with tempfile.TemporaryDirectory() as folder:
             for side, command in factories(env_id, options.demonstrations, Path(folder)).items():
                 used, began = _children_seconds(), time.perf_counter()
+                environment = dict(os.environ)
+                if side != "solve" and options.packages is not None:
+                    environment["PYTHONPATH"] = str(options.packages.resolve())
                 subprocess.run(
-                    [sys.executable, "-m", *command], check=True, cwd=ROOT, stdout=subprocess.DEVNULL
+                    [sys.executable, "-m", *command],
+                    check=True,
+                    cwd=ROOT,
+                    env=environment,
+                    stdout=subprocess.DEVNULL,
+                    timeout=_LONGEST,  # a process of theirs that crashes is waited for without end
                 )
                 wall, processor = time.perf_counter() - began, _children_seconds() - used
                 count = sum(map(_successes, Path(folder).rglob("*.json")))
