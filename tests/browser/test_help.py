@@ -72,6 +72,7 @@ def test_a_link_to_a_part_of_a_page_shows_that_part(served: GatedServer, browser
         assert errors == []
 
 
+@pytest.mark.slow
 def test_help_opens_the_documents_from_both_pages(example_without_pictures: At, browser: Browser) -> None:
     with example_without_pictures(browser) as desk:
 

@@ -13,7 +13,7 @@ from tests.drive.page import page_on
 from tests.drive.waiting import until
 from tests.session.hazards import calm, provoke, write_task
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ARGUMENTS = "--num-envs 2 --env render_backend=none".split()
 """Without pictures there are no shaders to wait for."""
 
@@ -25,7 +25,6 @@ def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator
         yield Desk(page, errors, file, opened)
 
 
-@pytest.mark.slow
 def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> None:
     desk.tab("Run")
     provoke(desk.file, "evaluate", "loop")
@@ -47,7 +46,6 @@ def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> No
     expect(desk.page.get_by_text(re.compile("was interrupted in evaluate"))).to_have_count(0)
 
 
-@pytest.mark.slow
 def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
     desk.tab("Run")
     provoke(desk.file, "evaluate", "native")

@@ -199,6 +199,7 @@ def test_long_work_is_told_again_and_again_and_that_it_is_over() -> None:
         assert one.busy[-1] is None and one.busy.count(None) == 1
 
 
+@pytest.mark.slow
 def test_drawing_may_take_longer() -> None:
     with minded() as one:
         one.worker.send(do("draw 1.2"))
@@ -222,6 +223,7 @@ def test_an_interrupt_leaves_work_and_nothing_that_is_idle_or_held() -> None:
         assert one.deaths == []
 
 
+@pytest.mark.slow
 def test_who_does_not_listen_to_an_interrupt_is_told_deaf() -> None:
     with minded() as one:
         one.worker.send(do("work_on 3"))
@@ -332,6 +334,7 @@ def test_a_greeting_that_fails_loses_the_worker_and_is_tried_again(caplog: pytes
     assert "nothing to say" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_greeting_that_fails_three_times_in_a_row_is_tried_again_when_somebody_asks() -> None:
     with minded() as one:
         first_requests = one.worker._first_requests
