@@ -32,8 +32,17 @@ def unsolved(
 ) -> PlannedEpisode:
     rewards = row(reward)
     best = HORIZON * rewards + gain
+    evaluate = {"success": 0.0}
     return PlannedEpisode(
-        seed, HORIZON, rewards, row(0, bool), row(0, bool), best, best - gain, best - spread
+        seed,
+        HORIZON,
+        rewards,
+        row(0, bool),
+        row(0, bool),
+        best,
+        best - gain,
+        best - spread,
+        evaluate=evaluate,
     )
 
 
@@ -85,9 +94,23 @@ def test_a_sparse_reward_is_told_as_what_planning_cannot_find() -> None:
 
 
 def test_where_nothing_earns_more_than_holding_still_it_is_stuck() -> None:
-    (verdict,) = of_episodes([rises(0), unsolved(0.6, seed=4, gain=0.0)])
+    still = unsolved(0.6, seed=4, gain=0.0)
+    (verdict,) = of_episodes([rises(0), still])
     assert (verdict.rule, verdict.seeds) == ("reward-stuck", (4,))
     assert "--horizon" in verdict.message
+    # Where there is no success, what earns most stays there.
+    assert rules(replace(still, evaluate={"speed": 1.0})) == []
+
+
+def test_it_is_stuck_where_holding_still_lets_fall_what_is_held() -> None:
+    slips = unsolved(0.6, seed=4, gain=0.0)
+    slips = replace(slips, hold=slips.hold - 3, worst=slips.worst - 3)
+    assert rules(rises(0), slips) == ["reward-stuck"]
+    assert (
+        in_the_way(slips, [rises(0), slips]) == "nothing earned more than was earned already from step 2 on"
+    )
+    going_on = unsolved(np.linspace(0, 0.7, STEPS).tolist())
+    assert rules(rises(0), replace(going_on, hold=going_on.hold - 3)) == []
 
 
 def test_a_reward_that_falls_on_the_way_to_success_is_against() -> None:

@@ -439,7 +439,7 @@ _TABLE = (
     Rule(
         "reward-stuck",
         "warn",
-        "While the task is unsolved, some actions earn more than holding still.",
+        "While the task is unsolved, some actions earn more than is earned already.",
         "A policy learns to stop there: what leads on costs reward first.",
         "compute_dense_reward",
     ),

@@ -138,9 +138,7 @@ def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> s
     if _is_flat(every, episode):
         return f"all rollouts earned the same from step {_since(_spread_a_step(episode), every.same)} on"
     if _is_stuck(every, episode):
-        return (
-            f"nothing earned more than holding still from step {_since(_gain_a_step(episode), every.same)} on"
-        )
+        return f"nothing earned more than was earned already from step {_since(_gain_a_step(episode), every.same)} on"
     return "not solved when the time was up"
 
 
@@ -192,11 +190,12 @@ def flat(episodes: Episodes) -> Verdict | None:
 
 
 def stuck(episodes: Episodes) -> Verdict | None:
-    """Unsolved episodes at whose end no rollout earned more than one that holds still."""
+    """Unsolved episodes at whose end no rollout earned more than one that holds still, nor than the episode did already."""
     found = [
         one
         for one in episodes.unsolved
         if not _ended_early(one)
+        and "success" in one.evaluate  # without one, what earns most stays there
         and not _earns_like_success(episodes, one)
         and not _is_flat(episodes, one)
         and _is_stuck(episodes, one)
@@ -207,8 +206,8 @@ def stuck(episodes: Episodes) -> Verdict | None:
     since = _since(_gain_a_step(first), episodes.same)
     return Verdict(
         "reward-stuck",
-        f"at the end of {len(found)} of {len(episodes.all)} episodes nothing earned more than holding still within "
-        f"{first.horizon} steps: seed {first.seed} from step {since} on, at {first.reward[-1]:.3f} a step. What leads on costs "
+        f"at the end of {len(found)} of {len(episodes.all)} episodes nothing earned more than was earned already, "
+        f"within {first.horizon} steps: seed {first.seed} from step {since} on, at {first.reward[-1]:.3f} a step. What leads on costs "
         "reward first, or is further away than a plan looks (--horizon)",
         _seeds(found),
     )
@@ -299,7 +298,9 @@ def _spread_a_step(episode: PlannedEpisode) -> NDArray[Any]:
 
 
 def _gain_a_step(episode: PlannedEpisode) -> NDArray[Any]:
-    return (episode.best - episode.hold) / episode.horizon
+    """(T,) what the best rollout earned a step more than holding still, or than the step before it: what is held may slip."""
+    before = np.concatenate([[-np.inf], episode.reward[:-1]])
+    return episode.best / episode.horizon - np.maximum(episode.hold / episode.horizon, before)
 
 
 def _least(episodes: Episodes, episode: PlannedEpisode) -> float:
