@@ -18,6 +18,7 @@ from workbench.core.cameras.render import recorded_pictures, step_pictures
 from workbench.core.capture.recorded_run import RecordedRun, states_of
 from workbench.core.capture.recorded_state import state_distance
 from workbench.core.capture.state_columns import read_state_columns
+from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
 from workbench.jobs.actions import (
@@ -252,14 +253,21 @@ def _record_items(what: RecordOptions, queue: ItemQueue, given: Sequence[Recorde
 
 
 def _opened(what: RecordOptions, queue: ItemQueue) -> OpenedTask:
-    opened = open_task(what.task, what.options, on_activity=queue.send_update, on_finding=queue.send_update)
+    opened = _open(what, what.options, queue)
     given = {**opened.loaded.default_kwargs, **what.options.env_kwargs}
     if what.actions != SOLVE or not (mode := control_mode_to_plan(opened.env.env, given)):
         return opened
     opened.env.close()
     undo_load(opened.loaded)
-    options = replace(what.options, env_kwargs={**what.options.env_kwargs, **mode})
-    return open_task(what.task, options, on_activity=queue.send_update, on_finding=queue.send_update)
+    return _open(what, replace(what.options, env_kwargs={**what.options.env_kwargs, **mode}), queue)
+
+
+def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> OpenedTask:
+    opened = open_task(what.task, options, on_activity=queue.send_update, on_finding=queue.send_update)
+    if isinstance(opened.env.env, BatchedCpuMixin):
+        # Else an episode depends, by its last bits, on those that the same process made before.
+        opened.env.env.begins_anew = True
+    return opened
 
 
 class _Episodes:

@@ -55,7 +55,7 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     """After a reset, and again after resets and steps of other seeds."""
     task, seeds = checkup.task, next(checkup.batches())
     # Else a touch sensor reads the contacts of the last episode.
-    with _without_past(task):
+    with without_past(task):
         first = _seen(task, checkup.reset(task, seeds))
     # Others that have their own generators may be at an equal place after a reset.
     checkup.reset(task, [seed + 5000 for seed in seeds])
@@ -64,7 +64,7 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
         checkup.step(task, random_action(task.parts, task.num_envs, rng))
     if checkup.num_envs > 1:
         checkup.reset(task, None, [checkup.num_envs - 1])
-    with _without_past(task):
+    with without_past(task):
         again = _seen(task, checkup.reset(task, seeds))
     differing = _differing(first, again, SAME)
     if differing:
@@ -143,7 +143,7 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
     task = checkup.task
     if not task.parts:
         raise CannotCheck("it takes no actions")
-    with _without_past(task):
+    with without_past(task):
         first, second = (_episode(checkup, task, seeds) for _ in range(2))
     for step, (one, other) in enumerate(zip(first, second, strict=True)):
         if not (differing := _differing(one, other, SAME)):
@@ -170,7 +170,7 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 @contextmanager
-def _without_past(task: TaskEnv) -> Iterator[None]:
+def without_past(task: TaskEnv) -> Iterator[None]:
     """Within this, physics begins at each reset without contacts or an order of solving them from before."""
     if not isinstance(task.env, BatchedCpuMixin):
         yield

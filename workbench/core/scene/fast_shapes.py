@@ -17,7 +17,8 @@ from workbench.core.scene.shapes import Mesh
 from workbench.core.scene.simplify import drop_uvs
 
 HEAVY = 500
-"""Bodies with more triangles are simplified; the others stay exact."""
+"""Bodies with meshes of more triangles are simplified; the others stay exact, and so do cylinders, spheres and the like: what
+is layered of thin discs, as ManiSkill's targets are, would lose a layer."""
 TOLERANCE = 0.6
 """Pixels that a surface may be off in a picture of `_SMALL` pixels; in larger ones more, since fewer of all pixels are edges."""
 _SMALL = 128
@@ -125,7 +126,7 @@ def unknown_meshes(sub_scenes: Sequence[sapien.Scene]) -> list[Mesh]:
     found: dict[int, Mesh] = {}
     for sub_scene in sub_scenes:
         for body in heavy_bodies(sub_scene):
-            for shape in body.render_shapes:
+            for shape in filter(_is_mesh, body.render_shapes):
                 for index, part in enumerate(shape.parts):
                     mesh = exact_part(shape, part, index)[0]
                     found[id(mesh)] = mesh if _is_textured(part.material) else drop_uvs(mesh)
@@ -166,7 +167,7 @@ def _simplified(body: Any, tolerance: float, chosen: _Chosen) -> sapien.render.R
             exact, scale = exact_part(shape, part, index)
             largest = max(map(abs, scale))
             mesh = exact
-            if largest > 0:
+            if largest > 0 and _is_mesh(shape):
                 mesh = chosen.mesh(exact, _is_textured(part.material), tolerance / largest)
             fewer |= len(mesh.faces) < len(exact.faces)
             shapes.append(_shape(mesh, scale, shape, part.material))
@@ -193,7 +194,11 @@ def _shape(mesh: Mesh, scale: tuple[float, float, float], like: Any, material: A
 
 
 def _faces(body: Any) -> int:
-    return sum(len(part.triangles) for shape in body.render_shapes for part in shape.parts)
+    return sum(len(part.triangles) for shape in body.render_shapes if _is_mesh(shape) for part in shape.parts)
+
+
+def _is_mesh(shape: Any) -> bool:
+    return isinstance(shape, sapien.render.RenderShapeTriangleMesh)
 
 
 def _shared_name(entity: Any, env: int) -> str:
