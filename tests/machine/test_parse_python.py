@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import sys
 import threading
 import time
 from pathlib import Path
@@ -11,27 +12,37 @@ import pytest
 
 from workbench.machine.parse_python import parse_python
 
+PACKAGE = Path(__file__).parents[2] / "workbench"
 
-def test_threads_parse_at_once_while_garbage_is_collected(monkeypatch: pytest.MonkeyPatch) -> None:
-    text, failures = Path(__file__).read_text() * 20, []
+
+def test_threads_parse_at_once_while_garbage_is_collected() -> None:
+    text, failures = (PACKAGE / "core" / "maniskill_private.py").read_text(), []
 
     def parse(depth: int) -> None:
         if depth:
             return parse(depth - 1)
-        for _ in range(20):
+        for _ in range(60):
             try:
                 parse_python(text)
             except SystemError as error:
                 failures.append(error)
 
-    # What a finalizer does, and hypothesis: another thread may go on in the middle of a tree.
-    callbacks = [*gc.callbacks, lambda phase, info: time.sleep(0)]
-    monkeypatch.setattr(gc, "callbacks", callbacks)
-    threads = [threading.Thread(target=parse, args=(depth,)) for depth in (0, 40, 80, 120)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    def go_on(phase: str, info: dict[str, int]) -> None:
+        """As a finalizer may, and what hypothesis does: another thread goes on in the middle of a tree."""
+        time.sleep(0)
+
+    threads = [threading.Thread(target=parse, args=(depth,)) for depth in (0, 30, 60, 90)]
+    before = sys.getswitchinterval()
+    gc.callbacks.append(go_on)
+    sys.setswitchinterval(1e-5)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(before)
+        gc.callbacks.remove(go_on)
     assert failures == []
 
 
