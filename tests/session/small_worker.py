@@ -15,7 +15,6 @@ import time
 import types
 from typing import Any, get_args
 
-from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
 from workbench.machine.processes.wire import Call, Unpacker, pack_message
 from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, HeartbeatWriter, Interrupts
@@ -76,6 +75,9 @@ class SmallWorker:
         self.line.send_bytes(pack_message(Loading(text)))
 
     def loaded(self, _: str) -> None:
+        # Here: it takes more than a second, and nearly no worker needs it.
+        from tests.ui.scenes import description, step_of, table_scene
+
         geometry, poses = table_scene(1)
         self.line.send_bytes(pack_message(Loaded(description(geometry, ()), step_of(poses), {})))
 

@@ -146,7 +146,6 @@ def run(row: Row, options: Options, known: Known) -> None:
         row.mode = row.mode or read_episode(written.path).info.control_mode or ""
         while len(row.episodes) in ended:
             row.episodes.append(ended.pop(len(row.episodes)))
-        row.seconds = before + _processor_seconds() - began
         row.day = date.today().isoformat()
         known.save()
         print(f"{task} seed {written.seed}: {_said(written.planned)}", flush=True)
@@ -158,6 +157,8 @@ def run(row: Row, options: Options, known: Known) -> None:
                 task, Path(folder), most - first, options.workers, False, steps, options=plain
             )
             record(what.recording(), on_progress=on_progress)
+            # Here: a process that is not over is not in the sum.
+            row.seconds = before + _processor_seconds() - began
         for actions in ("random", "zero") if control and not row.returns else ():
             envs = TaskOptions(num_envs=most, env_kwargs=PLAIN)
             out = Path(folder, actions)
