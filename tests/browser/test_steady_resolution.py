@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, Page
 from tests.drive.waiting import until
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 A_CARD = """
 const ask = WebGL2RenderingContext.prototype.getParameter, UNMASKED_RENDERER = 0x9246;
 WebGL2RenderingContext.prototype.getParameter = function (what) {

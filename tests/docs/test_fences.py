@@ -115,7 +115,11 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("page", TYPED, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [page if page.stem == "README" else pytest.param(page, marks=pytest.mark.slow) for page in TYPED],
+    ids=lambda page: page.stem,
+)
 def test_what_a_page_says_to_type_works(page: Path, desk: Path, renderer: None, child_process: None) -> None:
     printed = type_all(page, desk, ("", "wrong"))
     if page.stem in PRINTS:
