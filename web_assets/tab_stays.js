@@ -9,6 +9,7 @@
   const LOOKS = 50;
   let which = "";
   let looking = 0;
+  let opening = false;
 
   const marker = () => document.querySelector("[data-which]");
   // Without the number of findings behind it.
@@ -18,20 +19,28 @@
     return panel ? [...panel.querySelectorAll("[role=tab]")] : [];
   };
 
-  window.addEventListener("click", (event) => {
-    const tab = event.isTrusted && event.target instanceof Element && event.target.closest("[role=tab]");
+  function keep(event) {
+    const tab = event.target instanceof Element && event.target.closest("[role=tab]");
     const mark = marker();
     if (!tab || !mark || !tabsOf(mark).includes(tab)) return;
     clearTimeout(looking);
     sessionStorage.setItem(KEEPS + mark.dataset.which, nameOf(tab));
-  });
+  }
+
+  window.addEventListener("click", (event) => event.isTrusted && keep(event));
+  // A tab is opened by Enter too, and so by the page (openTab), whose choice would be taken back by what is looked for here.
+  window.addEventListener("keydown", (event) => event.key === "Enter" && !opening && keep(event));
 
   // The tabs come one by one, a moment after the mark, and until all are there viser opens the first again.
   function openAgain(kept, looks) {
     const tab = tabsOf(marker()).find((one) => nameOf(one) === kept);
     // viser's tabs hear a key and a pointer that goes down and up, and no click.
     const enter = { key: "Enter", code: "Enter", bubbles: true };
-    if (tab && tab.getAttribute("aria-selected") !== "true") tab.dispatchEvent(new KeyboardEvent("keydown", enter));
+    if (tab && tab.getAttribute("aria-selected") !== "true") {
+      opening = true;
+      tab.dispatchEvent(new KeyboardEvent("keydown", enter));
+      opening = false;
+    }
     if (looks > 0) looking = setTimeout(() => openAgain(kept, tab ? Math.min(looks, 10) - 1 : looks - 1), LOOK);
   }
 

@@ -12,6 +12,7 @@ from playwright.sync_api import Browser, expect
 
 from tests.drive.desk import Desk
 from tests.drive.page import TASK, page_on
+from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
 GOOD, BAD = "(distance < GOAL_RADIUS)", "(distance < 1)"
@@ -67,3 +68,21 @@ def test_a_check_can_be_stopped_and_asked_for_and_nothing_went_wrong_in_the_cons
     desk.button("Check now").click()
     expect(desk.page.locator(RULE)).to_be_visible()
     assert desk.errors == []
+
+
+def test_a_tab_that_a_key_opens_while_the_page_comes_back_stays_open(desk: Desk) -> None:
+    """The page opens the tab again that was pressed last, and looks for it for a second."""
+    page = desk.page
+    page.get_by_role("tab", name="Run").click()
+    page.reload()
+    expect(page.get_by_role("tab", name="Run")).to_be_visible()
+    checks = page.get_by_role("tab", name=re.compile("^Checks"))
+
+    def opened() -> bool:
+        # The page does not say when it listens to keys.
+        desk.press("w")
+        return checks.get_attribute("aria-selected") == "true"
+
+    until(opened, "the tab")
+    page.wait_for_timeout(1500)
+    expect(checks).to_have_attribute("aria-selected", "true")

@@ -136,6 +136,20 @@ def test_cells_say_what_there_is_and_nothing_where_nothing_is_known() -> None:
 
 
 @pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        ({"length": 12}, "no"),
+        ({"length": 50, "max_episode_steps": 50}, "no"),
+        ({"length": 12, "max_episode_steps": 50}, "stopped"),
+        ({"length": 12, "max_episode_steps": 50, "fail": True}, "fail"),
+        ({"length": 12, "max_episode_steps": 50, "success_once": True}, "once"),
+    ],
+)
+def test_an_episode_that_was_cut_off_is_not_said_to_have_failed(facts: dict[str, Any], said: str) -> None:
+    assert cells(row("a", success=False, **facts), {}, NOW)["outcome"] == said
+
+
+@pytest.mark.parametrize(
     ("written", "said"),
     [
         (NOW, "12:00:00"),

@@ -7,7 +7,7 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import EMPTY, problem, running
-from workbench.ui.live.banners import DOING, FILL, Banner, banner_html
+from workbench.ui.live.banners import DOING, FILL, REBUILD, Banner, banner_html
 
 RESTART = "Restart the worker"
 EVIL = "<img src=x onerror=alert(1)><script>alert(2)</script>\"'&"
@@ -38,7 +38,7 @@ def test_problem_without_file_line_or_traceback_is_shown_too() -> None:
 
 
 def test_comes_with_the_problem_and_leaves_with_it(panels: Panels) -> None:
-    banner = Banner(panels.server, lambda: None, lambda: None)
+    banner = Banner(panels.server, lambda: None, lambda: None, lambda: None)
     part = panels.part("Problem")
     banner.draw(running(2))
     assert not part.seen
@@ -49,8 +49,24 @@ def test_comes_with_the_problem_and_leaves_with_it(panels: Panels) -> None:
     assert not part.seen
 
 
+@pytest.mark.parametrize(
+    ("stage", "offered"), [("evaluate", True), ("reset", True), ("syntax", False), ("policy", False)]
+)
+def test_a_rebuild_is_offered_where_a_patch_may_lack_what_building_makes(
+    panels: Panels, stage: str, offered: bool
+) -> None:
+    asked: list[str] = []
+    banner = Banner(panels.server, lambda: None, lambda: asked.append("rebuild"), lambda: None)
+    failed = replace(problem(), stage=stage)
+    banner.draw(running(2, problem=failed, problem_serial=1, state="error"))
+    assert panels.shows(REBUILD) is offered
+    if offered:
+        panels.press(REBUILD)
+        assert asked == ["rebuild"]
+
+
 def test_traceback_that_someone_opened_is_not_written_again(panels: Panels) -> None:
-    banner = Banner(panels.server, lambda: None, lambda: None)
+    banner = Banner(panels.server, lambda: None, lambda: None, lambda: None)
     view = running(2, problem=problem(), problem_serial=1, state="error")
     banner.draw(view)
     panels.htmls()[0].content = "opened"
@@ -62,7 +78,7 @@ def test_traceback_that_someone_opened_is_not_written_again(panels: Panels) -> N
 
 def test_dead_worker_can_be_started_again(panels: Panels) -> None:
     asked: list[str] = []
-    banner = Banner(panels.server, lambda: None, lambda: asked.append("restart"))
+    banner = Banner(panels.server, lambda: None, lambda: None, lambda: asked.append("restart"))
     banner.draw(replace(EMPTY, problem=problem(), problem_serial=1, state="stopped"))
     panels.press(RESTART)
     assert asked == ["restart"]
@@ -73,7 +89,7 @@ def test_an_empty_file_is_filled_by_a_press_and_only_while_it_is_empty(
 ) -> None:
     file = tmp_path / "stack_two.py"
     file.write_text("# mine\n\n")
-    banner = Banner(panels.server, lambda: None, lambda: None, is_own=str(file).__eq__)
+    banner = Banner(panels.server, lambda: None, lambda: None, lambda: None, is_own=str(file).__eq__)
     view = replace(EMPTY, problem=replace(problem(), file=str(file)), problem_serial=1, state="error")
     banner.draw(view)
     assert panels.shows(FILL) and file.read_text() == "# mine\n\n"

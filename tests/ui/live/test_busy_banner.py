@@ -51,7 +51,7 @@ def test_what_cannot_be_interrupted_offers_no_interrupt_and_shows_where_it_is(
 
 
 def test_stands_instead_of_the_banner_of_a_problem(panels: Panels) -> None:
-    banner = Banner(panels.server, lambda: None, lambda: None)
+    banner = Banner(panels.server, lambda: None, lambda: None, lambda: None)
     view = running(2, problem=problem(), problem_serial=1, state="error")
     banner.draw(replace(view, busy=LOOP))
     assert not panels.part("Problem").seen
@@ -65,7 +65,7 @@ def test_a_worker_that_gets_ready_is_not_the_author_s_and_leaves_the_reason_in_s
     ready = busy_at(21.0, "warming up", "", (), ignores_interrupt=False)
     view = running(2, busy=ready, problem=problem(), problem_serial=1, state="starting", playing=False)
     busy, _ = a_banner(panels)
-    died = Banner(panels.server, lambda: None, lambda: None)
+    died = Banner(panels.server, lambda: None, lambda: None, lambda: None)
     busy.draw(view)
     died.draw(view)
     assert not panels.part("Busy").seen and panels.part("Problem").seen
@@ -84,7 +84,7 @@ def test_an_interrupt_is_not_called_a_failure() -> None:
 
 
 def test_a_worker_s_death_says_when_all_is_back(panels: Panels) -> None:
-    banner = Banner(panels.server, lambda: None, lambda: None)
+    banner = Banner(panels.server, lambda: None, lambda: None, lambda: None)
     died = replace(problem("the worker process was killed by SIGSEGV"), stage="worker")
     view = running(2, problem=died, problem_serial=1, state="starting", playing=False)
     banner.draw(view)

@@ -65,6 +65,8 @@ class Facts:
     env_index: int | None = None
     length: int | None = None
     """Actions."""
+    max_episode_steps: int | None = None
+    """The task's time limit, if it is known."""
     total_reward: float | None = None
     success: bool | None = None
     """In the last state; None for a task without success."""

@@ -129,6 +129,7 @@ def _episode(kind: RecordingKind, data: dict[str, Any], if_undated: float) -> Fa
         seed=None if seed is None or seed < 0 else seed,
         env_index=integer(data.get("env_index")),
         length=integer(data.get("length")),
+        max_episode_steps=integer(data.get("max_episode_steps")),
         total_reward=total(data.get("return")),
         success=boolean(data.get("success")),
         success_once=boolean(data.get("success_once")),

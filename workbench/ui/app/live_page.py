@@ -115,7 +115,14 @@ class Page:
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
         versions = session.versions
-        banner = Banner(server, versions.reload, versions.restart_worker, self._link, self._is_own)
+        banner = Banner(
+            server,
+            versions.reload,
+            lambda: versions.reload("rebuilt"),
+            versions.restart_worker,
+            self._link,
+            self._is_own,
+        )
         busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker, self._link)
         floating = self._envs, self._timeline, banner, busy_banner
         opening = () if self._opening is None else (self._opening,)

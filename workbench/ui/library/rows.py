@@ -21,7 +21,7 @@ HINTS: dict[Column, str] = {
     "seed": "Seed of the reset that began it",
     "steps": "Control steps",
     "return": "Sum of the rewards",
-    "success": "At the last step; 'once' if only at an earlier step",
+    "success": "At the last step; 'once' if only at an earlier step, 'stopped' if it was cut off before its end",
     "version": "Hash of the task's source; orange where it differs from the newest recording of the task",
     "tags": "Tags",
     "note": "Note",
@@ -123,7 +123,7 @@ def _key(row: LibraryRow, column: Column) -> float | str | None:
         known = row.total_reward
         return known if known is not None and math.isfinite(known) else None
     if column == "success":
-        return {"success": 3.0, "once": 2.0, "no": 1.0, "fail": 0.0}.get(_outcome(row))
+        return {"success": 4.0, "once": 3.0, "stopped": 2.0, "no": 1.0, "fail": 0.0}.get(_outcome(row))
     texts = {"task": row.task, "version": row.source_hash, "note": row.note, "name": row.name}
     text = " ".join(sorted(row.tags)) if column == "tags" else texts[column]
     return text.lower() or None
@@ -168,7 +168,12 @@ def _outcome(row: LibraryRow) -> str:
         return "fail"
     if row.success is None:
         return ""
-    return "once" if row.success_once else "no"
+    if row.success_once:
+        return "once"
+    # By hand, or by --max-steps: it says nothing of what would have come.
+    if row.length is None or row.max_episode_steps is None or row.length >= row.max_episode_steps:
+        return "no"
+    return "stopped"
 
 
 def _short_date(when: datetime.datetime, now: datetime.datetime) -> str:

@@ -22,6 +22,9 @@ version is still used."""
 
 FILL = "Write the minimal task into it"
 RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Restart the worker"
+REBUILD = "Rebuild the scene"
+_MAY_BE_OLD = ("reset", "step", "evaluate", "reward", "observation", "returns")
+"""Stages that use what the scene's building made: a patch keeps it, and may lack what the new code expects of it."""
 SHOWN_AFTER = 4.0
 """Seconds. The status line shows it earlier; a banner is for code that one may want to end."""
 
@@ -62,6 +65,7 @@ class Banner(PagePart[SessionView]):
     Args:
         server: The page.
         reload: Asks the session to load the file again.
+        rebuild: Likewise, with a scene built anew.
         restart: Asks the session for a new worker process.
         link: Links the line in the file.
         is_own: Whether a file may be written into: the task's, and named by a person, not by a recording.
@@ -70,8 +74,9 @@ class Banner(PagePart[SessionView]):
     def __init__(
         self,
         server: viser.ViserServer,
-        reload,
-        restart,
+        reload: Callable[[], None],
+        rebuild: Callable[[], None],
+        restart: Callable[[], None],
         link: LinkTo = no_links,
         is_own: Callable[[str], bool] = lambda file: False,
     ) -> None:
@@ -83,6 +88,14 @@ class Banner(PagePart[SessionView]):
             self._html = server.gui.add_html("")
             self._fill = server.gui.add_button(FILL, icon=viser.Icon.FILE_PLUS, visible=False)
             self._reload = server.gui.add_button(RELOAD, icon=viser.Icon.REFRESH, color="gray")
+            self._rebuild = server.gui.add_button(
+                REBUILD,
+                icon=viser.Icon.CUBE,
+                color="gray",
+                visible=False,
+                hint="Where the new code needs what building the scene makes, such as a body or an attribute of "
+                "_load_scene: a patch keeps the old scene. The moment is restored.",
+            )
             self._restart = server.gui.add_button(
                 "Restart the worker", icon=viser.Icon.POWER, color="gray", visible=False
             )
@@ -90,6 +103,7 @@ class Banner(PagePart[SessionView]):
         self._panel.float(x=-GAP, y=GAP, width=WIDEST)
         self._fill.on_click(self._on_fill)
         self._reload.on_click(lambda _: reload())
+        self._rebuild.on_click(lambda _: rebuild())
         self._restart.on_click(lambda _: restart())
         self._drawn: tuple[int, str] | None = None
 
@@ -102,6 +116,7 @@ class Banner(PagePart[SessionView]):
             return
         stopped = view.state == "stopped"
         self._restart.visible = stopped
+        self._rebuild.visible = view.task is not None and not stopped and problem.stage in _MAY_BE_OLD
         # Written once for each problem: a new text would close an open traceback.
         drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
         if drawn != self._drawn:
