@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,8 +16,8 @@ from workbench.core.camera_data import CameraInfo
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
-from workbench.recording.reader.reading import find_all_sources
-from workbench.ui.share.make import MakeRequest, Making, MakingView
+from workbench.recording.reader.reading import find_all_sources, read_recording
+from workbench.ui.share.make import MakeRequest, Making, MakingView, make
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -122,3 +124,39 @@ def test_recordings_are_found_in_folders_and_by_any_of_their_files(recordings: P
     (tmp_path / "notes.txt").write_text("")
     with pytest.raises(ValueError, match="no recording in"):
         find_all_sources([tmp_path])
+
+
+def test_an_archive_unpacked_is_the_recording_again(recordings: Path, tmp_path: Path) -> None:
+    (source,) = find_all_sources([recordings])
+    made = make(MakeRequest("zip", (source,), tmp_path))
+    assert made.words == "3 files of 1 recording" and made.paths == (tmp_path / f"{source.stem}.zip",)
+    with zipfile.ZipFile(made.paths[0]) as archive:
+        archive.extractall(tmp_path / "elsewhere")
+    (again,) = find_all_sources([tmp_path / "elsewhere"])
+    before, after = read_recording(source), read_recording(again)
+    assert after.info.id == before.info.id and after.length == before.length and not after.broken_files
+
+
+def test_an_archive_of_several_has_each_file_once_and_nothing_that_a_link_names(
+    recordings: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(recordings, tmp_path / "copy"))
+    (tmp_path / "secret.h5").write_text("of somebody")
+    for name in ("other.json", "other.rrd"):
+        shutil.copy(next(folder.glob(f"*{Path(name).suffix}")), folder / name)
+    (folder / "other.h5").symlink_to(tmp_path / "secret.h5")
+    first = next(folder.glob("Made*.json"))
+    sources = (Source(first), Source(folder / "other.json"), Source(first))
+    made = make(MakeRequest("zip", sources, tmp_path))
+    assert made.paths[0].name == f"{first.stem}_and_2_more.zip"
+    with zipfile.ZipFile(made.paths[0]) as archive:
+        names = archive.namelist()
+    assert sorted(names) == sorted(
+        [f"{first.stem}{suffix}" for suffix in (".json", ".h5", ".rrd")] + ["other.json", "other.rrd"]
+    )
+
+
+def test_files_that_are_gone_make_no_archive(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="lost: its files are gone"):
+        make(MakeRequest("zip", (Source(tmp_path / "lost.json"),), tmp_path))
+    assert list(tmp_path.iterdir()) == []

@@ -9,7 +9,8 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -37,10 +38,11 @@ from workbench.recording.films import (
 from workbench.recording.lerobot.export import ExportOptions, export_lerobot
 from workbench.recording.maniskill.export import export_maniskill
 from workbench.recording.reader.reading import read_recording
+from workbench.recording.reader.scan import SUFFIXES
 from workbench.ui.share.scene_html import seconds_a_step, write_scene_html
 from workbench.ui.widgets.templates import counted, sentence
 
-What = Literal["film", "scene", "page", "sheet", "lerobot", "maniskill"]
+What = Literal["film", "scene", "page", "sheet", "zip", "lerobot", "maniskill"]
 MOST_SAID = 5
 """Sentences about recordings that were left out."""
 EVERY_CAMERA = ""
@@ -91,6 +93,8 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
         return _dataset(wanted, on_progress)
     if wanted.what == "maniskill":
         return _demonstrations(wanted, on_progress)
+    if wanted.what == "zip":
+        return _zip(wanted, on_progress)
     paths: list[Path] = []
     not_made: list[str] = []
     for number, source in enumerate(wanted.sources):
@@ -186,6 +190,38 @@ def _demonstrations(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     if made.not_fitting:
         words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
     return Made((made.file,), " ".join([words + ".", *made.not_fitting[:MOST_SAID]]))
+
+
+def zip_name(names: Sequence[str]) -> str:
+    """Of the archive of recordings with these names."""
+    return f"{names[0]}.zip" if len(names) == 1 else f"{names[0]}_and_{len(names) - 1}_more.zip"
+
+
+def _zip(wanted: MakeRequest, on_progress: OnProgress) -> Made:
+    """The recordings' own files in one archive: unpacked they are recordings again."""
+    files = [file for source in wanted.sources for file in _files_of(source)]
+    files = list(dict.fromkeys(files))  # of several recordings in one file
+    path = wanted.folder / zip_name([source.stem for source in wanted.sources])
+    with new_file(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for number, (file, name) in enumerate(files):
+            on_progress(number / len(files), name)
+            # What takes space in it, meshes and pictures, is compressed already.
+            archive.write(file, name, zipfile.ZIP_STORED)
+    on_progress(1.0, "done")
+    return Made((path,), f"{counted(len(files), 'file')} of {counted(len(wanted.sources), 'recording')}")
+
+
+def _files_of(source: Source) -> list[tuple[Path, str]]:
+    """The files of a recording, with their names in an archive. Raises ValueError if there are none."""
+    if source.kind == "lerobot":
+        found = [file for file in sorted(source.path.rglob("*")) if file.is_file() and not file.is_symlink()]
+        named = [(file, str(file.relative_to(source.path.parent))) for file in found]
+    else:
+        found = [source.path.with_suffix(suffix) for suffix in SUFFIXES]
+        named = [(file, file.name) for file in found if file.is_file() and not file.is_symlink()]
+    if not named:
+        raise ValueError(f"{source.stem}: its files are gone")
+    return named
 
 
 def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:

@@ -21,7 +21,16 @@ from workbench.session.review.view import ReviewView
 from workbench.ui.library.panel import LibraryPanel
 from workbench.ui.server.file_response import Downloads
 from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView, What, file_name
+from workbench.ui.share.make import (
+    EVERY_CAMERA,
+    Made,
+    MakeRequest,
+    Making,
+    MakingView,
+    What,
+    file_name,
+    zip_name,
+)
 from workbench.ui.share.rerun_view import RerunPages, RerunView
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import counted, render
@@ -31,6 +40,7 @@ WHAT: dict[str, What] = {
     "Video of the 3D view (mp4)": "scene",
     "Animated 3D page (html)": "page",
     "Sheet of pictures (png)": "sheet",
+    "The recording itself (zip)": "zip",
     "LeRobot dataset": "lerobot",
     "ManiSkill demonstrations (h5)": "maniskill",
 }
@@ -195,6 +205,10 @@ def will_make(
             of = f"of the {known} of these {len(names)} recordings that reach success"
         one = "one dataset" if what == "lerobot" else "one file of demonstrations, and its .json,"
         return {"what": f"{one} {of}", "files": (), "where": where, "note": note}
+    if what == "zip":
+        archive = zip_name(names)
+        named = list(zip([archive], short_names([archive])))
+        return {"what": f"one archive {of}", "files": named, "where": "", "note": ""}
     if what != "film":
         files = [file_name(what, name) for name in names]
     elif camera in chosen.cameras:
