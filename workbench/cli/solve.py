@@ -36,7 +36,7 @@ from workbench.jobs.solve import SolveOptions, solve
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text
-from workbench.planning.verdicts import SolvedSeed, SolveReport, Verdict
+from workbench.planning.verdicts import RewardVerdict, SolvedSeed, SolveReport
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
 
@@ -126,7 +126,7 @@ def _cells(one: SolvedSeed) -> Iterator[str]:
     yield one.in_the_way
 
 
-def _print_verdict(verdict: Verdict) -> None:
+def _print_verdict(verdict: RewardVerdict) -> None:
     rule = RULES[verdict.rule]
     out.print(f"\n[yellow]{rule.id}[/] ({rule.degree})", soft_wrap=True)
     out.print(f"  {escape(plain_text(verdict.message))}", soft_wrap=True)

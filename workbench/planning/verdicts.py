@@ -24,7 +24,7 @@ _LAST = 10
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RewardVerdict:
     """What some episodes show."""
 
     rule: str
@@ -91,7 +91,7 @@ class SolveReport:
     """What came of all seeds that were tried to the end."""
 
     seeds: tuple[SolvedSeed, ...]
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[RewardVerdict, ...]
     seconds: float
     """Wall time, opening the task included."""
     stopped: bool
@@ -118,7 +118,7 @@ class SolveReport:
         return f"Solved {len(self.solved)} of {len(self.seeds)} seeds{steps}. {self.seconds:.0f} s."
 
 
-def of_episodes(episodes: Sequence[PlannedEpisode]) -> list[Verdict]:
+def of_episodes(episodes: Sequence[PlannedEpisode]) -> list[RewardVerdict]:
     """The verdicts on a task's reward, each at most once."""
     every = Episodes(tuple(episodes))
     return [verdict for find in RULES.values() if (verdict := find(every)) is not None]
@@ -145,7 +145,7 @@ def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> s
 # --- one function each -----------------------------------------------------------------------------------
 
 
-def exploited(episodes: Episodes) -> Verdict | None:
+def exploited(episodes: Episodes) -> RewardVerdict | None:
     """Episodes without success that earn at their end at least what successful ones earn when they succeed."""
     found = [one for one in episodes.unsolved if _earns_like_success(episodes, one)]
     if not found:
@@ -153,7 +153,7 @@ def exploited(episodes: Episodes) -> Verdict | None:
     told = ", ".join(f"{name} {value:.4g}" for name, value in found[0].evaluate.items())
     said = f"; evaluate said at the end of seed {found[0].seed}: {told}" if told else ""
     rate = float(np.median([_end(one).mean() for one in found]))
-    return Verdict(
+    return RewardVerdict(
         "reward-exploited",
         f"{len(found)} of {len(episodes.all)} episodes earned {rate:.3f} a step at their end without success, and successful "
         f"ones {episodes.at_success:.3f} at theirs{said}",
@@ -161,10 +161,10 @@ def exploited(episodes: Episodes) -> Verdict | None:
     )
 
 
-def flat(episodes: Episodes) -> Verdict | None:
+def flat(episodes: Episodes) -> RewardVerdict | None:
     """Unsolved episodes at whose end all rollouts earned the same, so that nothing leads on."""
     if episodes.without_reward and episodes.unsolved:
-        return Verdict(
+        return RewardVerdict(
             "reward-flat",
             "no rollout earned more than another before success: with a sparse reward planning finds only what it happens on. "
             "Give the task a dense reward, or record demonstrations in another way (workbench record --actions FILE)",
@@ -181,7 +181,7 @@ def flat(episodes: Episodes) -> Verdict | None:
         if not (_end(first, spread) > _least(episodes, first)).any()
     ]
     named = f"; flat are {', '.join(still)}" if still else ""
-    return Verdict(
+    return RewardVerdict(
         "reward-flat",
         f"at the end of {len(found)} of {len(episodes.all)} episodes all rollouts earned the same, whatever they did: seed "
         f"{first.seed} from step {since} on, at {first.reward[-1]:.3f} a step{named}",
@@ -189,7 +189,7 @@ def flat(episodes: Episodes) -> Verdict | None:
     )
 
 
-def stuck(episodes: Episodes) -> Verdict | None:
+def stuck(episodes: Episodes) -> RewardVerdict | None:
     """Unsolved episodes at whose end no rollout earned more than one that holds still, nor than the episode did already."""
     found = [
         one
@@ -204,7 +204,7 @@ def stuck(episodes: Episodes) -> Verdict | None:
         return None
     first = found[0]
     since = _since(_gain_a_step(first), episodes.same)
-    return Verdict(
+    return RewardVerdict(
         "reward-stuck",
         f"at the end of {len(found)} of {len(episodes.all)} episodes nothing earned more than was earned already, "
         f"within {first.horizon} steps: seed {first.seed} from step {since} on, at {first.reward[-1]:.3f} a step. What leads on costs "
@@ -213,7 +213,7 @@ def stuck(episodes: Episodes) -> Verdict | None:
     )
 
 
-def against(episodes: Episodes) -> Verdict | None:
+def against(episodes: Episodes) -> RewardVerdict | None:
     """Solved episodes on whose way the reward fell."""
     falls = [(one, *_largest_fall(one.reward[: one.solved_at])) for one in episodes.solved]
     found = [
@@ -225,7 +225,7 @@ def against(episodes: Episodes) -> Verdict | None:
     if not found or 2 * len(found) <= len(episodes.solved):
         return None
     one, high, low = found[0]
-    return Verdict(
+    return RewardVerdict(
         "reward-against",
         f"on the way to success the reward falls, in {len(found)} of {len(episodes.solved)} solved episodes: seed {one.seed} "
         f"from {one.reward[high]:.3f} at step {high + 1} to {one.reward[low]:.3f} at step {low + 1}, success at step "
@@ -234,14 +234,14 @@ def against(episodes: Episodes) -> Verdict | None:
     )
 
 
-def lost(episodes: Episodes) -> Verdict | None:
+def lost(episodes: Episodes) -> RewardVerdict | None:
     """Solved episodes that were not solved any more a few steps later, though the reward was sought all the time."""
     found = [one for one in episodes.solved if not one.success[one.solved_at - 1 :].all()]
     if not found or 2 * len(found) <= len(episodes.solved):
         return None
     first = found[0]
     again = int(first.success[first.solved_at - 1 :].argmin())
-    return Verdict(
+    return RewardVerdict(
         "success-lost",
         f"success comes and goes in {len(found)} of {len(episodes.solved)} solved episodes: seed {first.seed} had it at step "
         f"{first.solved_at} and not {again} {'step' if again == 1 else 'steps'} later, while it was after reward",
@@ -249,13 +249,13 @@ def lost(episodes: Episodes) -> Verdict | None:
     )
 
 
-def failing_pays(episodes: Episodes) -> Verdict | None:
+def failing_pays(episodes: Episodes) -> RewardVerdict | None:
     """Episodes that failed where each step costs, so that an early end earns more than going on."""
     found = [one for one in episodes.unsolved if one.failed_at and float(one.reward.mean()) < 0]
     if not found or 2 * len(found) <= len(episodes.all):
         return None
     first = found[0]
-    return Verdict(
+    return RewardVerdict(
         "failing-pays",
         f"{len(found)} of {len(episodes.all)} episodes end by failing, and rewards are below 0: seed {first.seed} failed at "
         f"step {first.failed_at}, with {first.reward.mean():.3f} a step until then. Nothing is paid after a fail, so that the "
@@ -264,7 +264,7 @@ def failing_pays(episodes: Episodes) -> Verdict | None:
     )
 
 
-RULES: dict[str, Callable[[Episodes], Verdict | None]] = {
+RULES: dict[str, Callable[[Episodes], RewardVerdict | None]] = {
     "reward-exploited": exploited,
     "reward-flat": flat,
     "reward-stuck": stuck,

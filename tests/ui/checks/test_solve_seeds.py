@@ -11,7 +11,7 @@ import viser
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import problem, running
-from workbench.planning.verdicts import SolvedSeed, SolveReport, Verdict
+from workbench.planning.verdicts import RewardVerdict, SolvedSeed, SolveReport
 from workbench.session.checks.solve_seeds import SeedsView
 from workbench.ui.checks.solve_seeds import SOLVE, STOP_SOLVING, SolveSeedsPanel, seeds_html, verdict_cards
 
@@ -20,7 +20,7 @@ REPORT = SolveReport(
         SolvedSeed(0, 8, 13, 9.25, 3.2, "", Path("/r/seed0.rrd")),
         SolvedSeed(1, 0, 50, 21.5, 12.5, "earned <0.9> a step without success", Path("/r/seed1.rrd")),
     ),
-    (Verdict("reward-exploited", "1 of 2 episodes earned more", (1,)),),
+    (RewardVerdict("reward-exploited", "1 of 2 episodes earned more", (1,)),),
     20.0,
     False,
 )

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 from workbench.authoring.problem import Problem
 from workbench.checks.results import RuleResult, by_rule
 from workbench.checks.rules import degree_of_each
 from workbench.core.rules import Finding
 from workbench.session.process.askers import WAITING, Background, Priority
+from workbench.session.process.held_view import HeldView
 from workbench.session.process.job_lane import Job, JobFailed, JobLane
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup
@@ -72,10 +72,8 @@ class Checks:
             process: where it runs; other jobs come first.
             after_each_save: whether `loaded` begins to check.
         """
-        self._on_change, self._process = on_change, process
-        self._lock = threading.Lock()
-        """Of `view`: updates of a stopped job are dropped under it."""
-        self._view = ChecksView(after_each_save=after_each_save)
+        self._process = process
+        self._held = HeldView(ChecksView(after_each_save=after_each_save), on_change)
         self._of: object = None
         """The version that `view` belongs to."""
         self._lane = JobLane("checks", on_change, self._failed)
@@ -83,7 +81,7 @@ class Checks:
     @property
     def view(self) -> ChecksView:
         progress = self._lane.progress
-        return replace(self._view, waits=progress is not None and progress.what == WAITING)
+        return replace(self._held.now, waits=progress is not None and progress.what == WAITING)
 
     def loaded(self, load: Load, same_task: bool) -> None:
         """A version runs in the worker that plays.
@@ -93,10 +91,10 @@ class Checks:
             same_task: whether it is another version of the task that ran.
         """
         if not same_task:
-            self._change(before=(), results=())
-        if self._of == _version(load) and self._view.state in ("done", "off"):
+            self._held.change(before=(), results=())
+        if self._of == _version(load) and self._held.now.state in ("done", "off"):
             return
-        if self._view.after_each_save:
+        if self._held.now.after_each_save:
             self.check(load)
         else:
             self._lane.stop()
@@ -108,24 +106,24 @@ class Checks:
             self._lane.stop()
             self._begin(load, "off")
             return
-        with self._lock:
+        with self._held.lock:
             # Under the lock, or the job's first update might come before the view.
             self._lane.start("checks", lambda job: self._check(job, load))
-            self._set_begun(load, "loading")
-        self._on_change()
+            self._put_begun(load, "loading")
+        self._held.changed()
 
     def check_after_each_save(self, wanted: bool) -> None:
         """Whether `loaded` begins to check, from now on."""
-        self._change(after_each_save=wanted)
+        self._held.change(after_each_save=wanted)
 
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
         """End the check; results so far stay."""
-        with self._lock:
+        with self._held.lock:
             self._lane.stop()
-            if self._view.state not in RUNNING:
+            if self._held.now.state not in RUNNING:
                 return
-            self._set(state="stopped", stopped_by=why, why=why.value, looks_at="")
-        self._on_change()
+            self._held.set(state="stopped", stopped_by=why, why=why.value, looks_at="")
+        self._held.changed()
 
     def close(self) -> None:
         """Stop; returns when the thread has ended."""
@@ -142,8 +140,8 @@ class Checks:
             nonlocal began
             load_version(self._process, job, load)
             began = began or time.monotonic()
-            self._update(job, state="checking")
-            known = tuple(result.rule for result in self._view.results)
+            self._held.update(job, state="checking")
+            known = tuple(result.rule for result in self._held.now.results)
             question = CheckGroup(group, degrees, known)
             return self._process.ask(job.check, question, partial(self._take, job, began))
 
@@ -153,51 +151,37 @@ class Checks:
             priority: Priority = "low" if ahead else "lowest"
             answer = self._process.in_turns(job, partial(ask, group), priority)
             group, groups = group + 1, answer.groups
-            self._update(job, total=answer.rules, looks_at=answer.next)
-        self._update(job, state="done", before=(), looks_at="")
+            self._held.update(job, total=answer.rules, looks_at=answer.next)
+        self._held.update(job, state="done", before=(), looks_at="")
 
     def _take(self, job: Job, began: float, done: int, total: int, result: RuleResult) -> None:
-        results = by_rule((*self._view.results, result))
-        before = tuple(finding for finding in self._view.before if finding.rule != result.rule)
+        results = by_rule((*self._held.now.results, result))
+        before = tuple(finding for finding in self._held.now.before if finding.rule != result.rule)
         seconds = time.monotonic() - began
-        self._update(job, results=tuple(results.values()), before=before, total=total, seconds=seconds)
+        self._held.update(job, results=tuple(results.values()), before=before, total=total, seconds=seconds)
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
-        self._update(job, state="failed", why=str(failure), problem=failure.problem, looks_at="")
+        self._held.update(job, state="failed", why=str(failure), problem=failure.problem, looks_at="")
 
     # --- the view ------------------------------------------------------------------------------------
 
     def _begin(self, load: Load, state: ChecksState) -> None:
-        with self._lock:
-            self._set_begun(load, state)
-        self._on_change()
+        with self._held.lock:
+            self._put_begun(load, state)
+        self._held.changed()
 
-    def _set_begun(self, load: Load, state: ChecksState) -> None:
+    def _put_begun(self, load: Load, state: ChecksState) -> None:
         """Nothing is known of this version yet."""
-        self._of, view = _version(load), self._view
+        self._of, view = _version(load), self._held.now
         before = {finding.key: finding for finding in (*view.before, *view.findings)}
-        self._view = ChecksView(
-            state,
-            view.serial + 1,
-            before=() if state == "off" else tuple(before.values()),
-            total=view.total,
-            after_each_save=view.after_each_save,
+        self._held.put(
+            ChecksView(
+                state,
+                before=() if state == "off" else tuple(before.values()),
+                total=view.total,
+                after_each_save=view.after_each_save,
+            )
         )
-
-    def _update(self, job: Job, **values: Any) -> None:
-        with self._lock:
-            if job.stopped:
-                return
-            self._set(**values)
-        self._on_change()
-
-    def _change(self, **values: Any) -> None:
-        with self._lock:
-            self._set(**values)
-        self._on_change()
-
-    def _set(self, **values: Any) -> None:
-        self._view = replace(self._view, serial=self._view.serial + 1, **values)
 
 
 def load_version(process: Background, job: Job, load: Load) -> None:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 from workbench.authoring.problem import Problem
 from workbench.checks.results import StepProfile
 from workbench.session.checks.checks import load_version
 from workbench.session.process.askers import Background
+from workbench.session.process.held_view import HeldView
 from workbench.session.process.job_lane import Job, JobFailed, JobLane
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import ProfileStep
@@ -44,38 +44,39 @@ class StepProfiler:
             on_change: called when `view` has changed.
             process: where it runs.
         """
-        self._on_change, self._process = on_change, process
-        self._lock = threading.Lock()
-        self._view = ProfileView()
+        self._process = process
+        self._held = HeldView(ProfileView(), on_change)
         self._lane = JobLane("profile", on_change, self._failed)
 
     @property
     def view(self) -> ProfileView:
-        return self._view
+        return self._held.now
 
     def profile(self, load: Load) -> None:
         """Time a step of this version."""
-        with self._lock:
+        with self._held.lock:
             self._lane.start("profile", lambda job: self._profile(job, load))
-            self._set(state="running", why="", problem=None)
-        self._on_change()
+            self._held.set(state="running", why="", problem=None)
+        self._held.changed()
 
     def loaded(self) -> None:
         """Another version runs: a running profile ends, and the last one is of an earlier version."""
-        with self._lock:
+        with self._held.lock:
             self._lane.stop()
-            stopped = self._view.state == "running"
-            self._set(state="stopped" if stopped else self._view.state, stale=self._view.profile is not None)
-        self._on_change()
+            stopped = self._held.now.state == "running"
+            self._held.set(
+                state="stopped" if stopped else self._held.now.state, stale=self._held.now.profile is not None
+            )
+        self._held.changed()
 
     def stop(self) -> None:
         """End a running profile."""
-        with self._lock:
+        with self._held.lock:
             self._lane.stop()
-            if self._view.state != "running":
+            if self._held.now.state != "running":
                 return
-            self._set(state="stopped")
-        self._on_change()
+            self._held.set(state="stopped")
+        self._held.changed()
 
     def close(self) -> None:
         """Stop; returns when the thread has ended."""
@@ -87,17 +88,7 @@ class StepProfiler:
             load_version(self._process, job, load)
             return self._process.ask(job.check, ProfileStep())
 
-        self._update(job, state="done", profile=self._process.in_turns(job, ask), stale=False)
+        self._held.update(job, state="done", profile=self._process.in_turns(job, ask), stale=False)
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
-        self._update(job, state="failed", why=str(failure), problem=failure.problem)
-
-    def _update(self, job: Job, **values: Any) -> None:
-        with self._lock:
-            if job.stopped:
-                return
-            self._set(**values)
-        self._on_change()
-
-    def _set(self, **values: Any) -> None:
-        self._view = replace(self._view, serial=self._view.serial + 1, **values)
+        self._held.update(job, state="failed", why=str(failure), problem=failure.problem)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from workbench.authoring.problem import Problem, TaskError
 from workbench.jobs.pool import Deal, ItemQueue, PoolError, Processes, Work
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.planning.verdicts import SolveReport
+from workbench.session.process.held_view import HeldView
 from workbench.session.process.job_lane import Job, JobFailed, JobLane
 from workbench.session.protocol.messages import Load
 
@@ -65,14 +65,13 @@ class SeedsSolver:
             on_change: called when `view` has changed.
             recordings: the folder for the episodes.
         """
-        self._on_change, self._recordings = on_change, recordings.absolute()
-        self._lock = threading.Lock()
-        self._view = SeedsView()
+        self._recordings = recordings.absolute()
+        self._held = HeldView(SeedsView(), on_change)
         self._lane = JobLane("solve-seeds", on_change, self._failed)
 
     @property
     def view(self) -> SeedsView:
-        return self._view
+        return self._held.now
 
     def solve(self, load: Load, seeds: int, plan: PlanOptions) -> None:
         """Solve so many seeds; a running job ends, and keeps what is done.
@@ -82,32 +81,34 @@ class SeedsSolver:
         """
         if not isinstance(load.task, str):
             # Only the texts of a recording's task were cleared, not the file that bears its name.
-            self._change(state="failed", why="this task comes from a recording: open its file to solve it")
+            self._held.change(
+                state="failed", why="this task comes from a recording: open its file to solve it"
+            )
             return
         workers = max(1, min(seeds, len(os.sched_getaffinity(0)) // 2))
         setup = _Setup(load.task, self._recordings, seeds, workers, plan, replace(load.options, seed=0))
-        with self._lock:
+        with self._held.lock:
             self._lane.start("solving seeds", lambda job: self._solve(job, setup))
-            self._set(
+            self._held.set(
                 state="starting", report=None, total=seeds, activity="", stale=False, why="", problem=None
             )
-        self._on_change()
+        self._held.changed()
 
     def loaded(self) -> None:
         """Another version runs: what is known is of an earlier one."""
-        with self._lock:
-            if self._view.report is not None:
-                self._set(stale=True)
-        self._on_change()
+        with self._held.lock:
+            if self._held.now.report is not None:
+                self._held.set(stale=True)
+        self._held.changed()
 
     def stop(self) -> None:
         """End it; seeds that are done stay, with their recordings."""
-        with self._lock:
+        with self._held.lock:
             self._lane.stop()
-            if self._view.state not in RUNNING:
+            if self._held.now.state not in RUNNING:
                 return
-            self._set(state="stopped", activity="")
-        self._on_change()
+            self._held.set(state="stopped", activity="")
+        self._held.changed()
 
     def close(self) -> None:
         """Stop; returns when the processes have ended."""
@@ -132,33 +133,16 @@ class SeedsSolver:
             raise JobFailed(f"no process could be started: {error}") from error
         except PoolError as error:
             raise JobFailed(str(error)) from error
-        self._update(job, state="done")
+        self._held.update(job, state="done")
 
     def _take(self, job: Job, news: SolveReport | str) -> None:
         if isinstance(news, str):
-            self._update(job, activity=news)
+            self._held.update(job, activity=news)
         else:
-            self._update(job, state="solving", report=news, activity="")
+            self._held.update(job, state="solving", report=news, activity="")
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
-        self._update(job, state="failed", why=str(failure), problem=failure.problem, activity="")
-
-    # --- the view ------------------------------------------------------------------------------------
-
-    def _update(self, job: Job, **values: Any) -> None:
-        with self._lock:
-            if job.stopped:
-                return
-            self._set(**values)
-        self._on_change()
-
-    def _change(self, **values: Any) -> None:
-        with self._lock:
-            self._set(**values)
-        self._on_change()
-
-    def _set(self, **values: Any) -> None:
-        self._view = replace(self._view, serial=self._view.serial + 1, **values)
+        self._held.update(job, state="failed", why=str(failure), problem=failure.problem, activity="")
 
 
 def _run(setup: _Setup, queue: ItemQueue) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
 from workbench.jobs.rescore.verdict import Verdict
+from workbench.session.process.held_view import HeldView
 from workbench.session.process.job_lane import Job, JobFailed, JobLane
 
 
@@ -74,15 +74,12 @@ class Rescoring:
             name: of the thread.
             on_change: called when `view` has changed.
         """
-        self._on_change = on_change
-        self._lock = threading.Lock()
-        """Of `view`: updates of a stopped job are dropped under it."""
-        self._view = RescoreView()
+        self._held = HeldView(RescoreView(), on_change)
         self._job_lane = JobLane(name, on_change, self._failed)
 
     @property
     def view(self) -> RescoreView:
-        return self._view
+        return self._held.now
 
     def begin(self, view: RescoreView, work: Callable[[Job], None]) -> None:
         """Start `work`, cancelling the job before; `view` is shown first."""
@@ -91,36 +88,30 @@ class Rescoring:
             work(job)
             self.update(job, state="done")
 
-        with self._lock:
-            # Under the lock, or the job's first update might come before `view`.
+        with self._held.lock:
             self._job_lane.start("rescoring", run)
-            self._view = replace(view, serial=self._view.serial + 1)
-        self._on_change()
+            self._held.put(view)
+        self._held.changed()
 
     def update(self, job: Job, **values: Any) -> None:
         """Change fields of `view`, unless the job was stopped."""
-        with self._lock:
-            if job.stopped:
-                return
-            self._view = replace(self._view, serial=self._view.serial + 1, **values)
-        self._on_change()
+        self._held.update(job, **values)
 
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
         """Cancel the running job; results so far stay."""
-        with self._lock:
+        with self._held.lock:
             self._job_lane.stop()
-            if self._view.state not in RUNNING:
+            if self._held.now.state not in RUNNING:
                 return
-            stopped = replace(self._view, state="stopped", stopped_by=why, why=why.value)
-            self._view = replace(stopped, serial=self._view.serial + 1)
-        self._on_change()
+            self._held.set(state="stopped", stopped_by=why, why=why.value)
+        self._held.changed()
 
     def forget(self) -> None:
         """Cancel the running job and clear the view."""
         self.stop(StoppedBy.LOSS)
-        with self._lock:
-            self._view = RescoreView(serial=self._view.serial + 1)
-        self._on_change()
+        with self._held.lock:
+            self._held.put(RescoreView())
+        self._held.changed()
 
     def close(self) -> None:
         """Stop; returns when the thread has ended."""
