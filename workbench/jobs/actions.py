@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
@@ -21,9 +20,8 @@ from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import TaskError, is_ctrl_c
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env import actions
-from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.step_result import StepResult
-from workbench.core.env.task_env import TaskEnv
+from workbench.core.env.task_env import TaskEnv, given_arguments
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.policy import Policy, find_policy, load_policy, policy_problem
 from workbench.jobs.task import ActionSource
@@ -205,7 +203,7 @@ class PlannedActions:
             ValueError: it has no actions.
         """
         self._loaded, self._task = loaded, task
-        made_with = {**loaded.default_kwargs, **constructor_arguments(loaded.cls, env_kwargs, BaseEnv)}
+        made_with = given_arguments(loaded.cls, env_kwargs, loaded.default_kwargs)
         with blamed("build", loaded):
             self._planner = Planner(task.env, made_with=made_with, **vars(plan))
         self._rolled = TaskEnv(self._planner.rollout_env)

@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
@@ -34,9 +33,8 @@ from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
 from workbench.core.backends import find_renderer, keep_render_device
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env.assets import require_assets, robots_of
-from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.step_result import StepResult
-from workbench.core.env.task_env import TaskEnv
+from workbench.core.env.task_env import TaskEnv, given_arguments
 from workbench.core.rules import DEGREES, Degree, Finding
 from workbench.jobs.actions import (
     SOLVE,
@@ -342,7 +340,7 @@ def _check_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree], 
 
 def _require_assets(loaded: LoadedTask, what: CheckOptions) -> None:
     """Raise TaskError for a download that is missing: no line of the task is at fault."""
-    given = {**loaded.default_kwargs, **constructor_arguments(loaded.cls, what.options.env_kwargs, BaseEnv)}
+    given = given_arguments(loaded.cls, what.options.env_kwargs, loaded.default_kwargs)
     with blamed("build", loaded):
         require_assets(loaded.cls.__name__, loaded.asset_ids, robots_of(loaded.cls, given))
 

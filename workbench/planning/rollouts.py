@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -169,9 +170,16 @@ class RolloutPlanner:
         scene, known = self._alike
         if scene is not live.scene:
             self._alike = scene, known = live.scene, set()
-        if env in known:
-            return
-        wanted = bodies_of(live)[env]
+        if env not in known:
+            self.require_bodies(bodies_of(live)[env])
+            known.add(env)
+
+    def require_bodies(self, wanted: Mapping[str, bytes]) -> None:
+        """As `require_alike`, of a live env in another process.
+
+        Args:
+            wanted: of that env, from `bodies_of`.
+        """
         for bodies in bodies_of(self.env):
             if bodies == wanted:
                 continue
@@ -180,7 +188,6 @@ class RolloutPlanner:
                 f"{', '.join(other)}: another one in each env. A plan is tried in envs that are built alike, so a task whose "
                 "scene is built at random has none: build the same bodies in each env, and place them at random"
             )
-        known.add(env)
 
     def plan(self, snapshot: Snapshot, env: int, traced: int | None = None) -> Plan:
         """Plan from the state that this env has in the snapshot, going on from its last plan.
@@ -292,8 +299,9 @@ def _noise_scale(part: actions.ActionPart) -> float:
 
 
 @once_a_scene
-def bodies_of(env: BaseEnv) -> list[dict[str, tuple[Any, ...]]]:
-    """Of each env, by name: what decides how a body moves and collides, apart from its state."""
+def bodies_of(env: BaseEnv) -> list[dict[str, bytes]]:
+    """Of each env, by name: a hash of what decides how a body moves and collides, apart from its state. It is the same in
+    every process."""
     index = scene_index(env)
     return [
         {
@@ -305,19 +313,17 @@ def bodies_of(env: BaseEnv) -> list[dict[str, tuple[Any, ...]]]:
     ]
 
 
-def _body(entity: Any) -> tuple[Any, ...]:
-    parts: list[Any] = []
+def _body(entity: Any) -> bytes:
+    digest = hashlib.blake2b(digest_size=16)
     for component in entity.components:
         shapes = getattr(component, "collision_shapes", None)
         if shapes is None:
             continue
-        parts.append(getattr(component, "mass", 0.0))
+        digest.update(repr(float(getattr(component, "mass", 0.0))).encode())
         for shape in shapes:
-            sizes = [
-                np.asarray(value).tobytes()
-                for name in ("half_size", "radius", "half_length", "scale", "vertices")
-                if (value := getattr(shape, name, None)) is not None
-            ]
-            pose = shape.local_pose
-            parts.append((type(shape).__name__, *sizes, pose.p.tobytes(), pose.q.tobytes()))
-    return tuple(parts)
+            digest.update(type(shape).__name__.encode())
+            for name in ("half_size", "radius", "half_length", "scale", "vertices"):
+                if (value := getattr(shape, name, None)) is not None:
+                    digest.update(name.encode() + np.asarray(value).tobytes())
+            digest.update(shape.local_pose.p.tobytes() + shape.local_pose.q.tobytes())
+    return digest.digest()

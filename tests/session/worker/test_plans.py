@@ -14,6 +14,7 @@ from workbench.authoring.loading.load import load_task
 from workbench.jobs.open_task import OpenedTask, Opening, build_task
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
+from workbench.planning.rollouts import bodies_of
 from workbench.session.protocol.messages import CannotAnswer, FollowPlan, PlanWanted, Settings
 from workbench.session.protocol.questions import PlanActions, PlannedEnv
 from workbench.session.worker.plans import MOST_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
@@ -36,12 +37,16 @@ def opened_with(file: Path, num_envs: int, **env_kwargs: object) -> OpenedTask:
     return build_task(load_task(str(file)), options, Opening(on_finding=lambda finding: None))
 
 
+def bodies_in(opened: OpenedTask, envs: list[int]) -> tuple[dict[str, bytes], ...]:
+    return tuple(bodies_of(opened.env.env)[env] for env in envs)
+
+
 @pytest.fixture
 def plan(push: OpenedTask) -> Iterator[Callable[..., tuple[PlannedEnv, ...]]]:
     plans = WorkerPlans(lambda: False)
 
     def ask(envs: list[int], options: PlanOptions = SMALL, traced: str = "") -> tuple[PlannedEnv, ...]:
-        question = PlanActions(pickle.dumps(push.env.snapshot(envs)), options, traced)
+        question = PlanActions(pickle.dumps(push.env.snapshot(envs)), bodies_in(push, envs), options, traced)
         return plans.answer(push, MADE, question, lambda done, total: None).envs
 
     yield ask
@@ -86,11 +91,20 @@ def test_another_number_of_rollouts_and_another_body_count_from_the_next_plan_on
 def test_a_task_with_other_bodies_in_each_env_has_no_plan_and_says_what_to_do() -> None:
     opened = opened_with(TASKS / "different_objects.py", 2, render_backend="none")
     plans = WorkerPlans(lambda: False)
-    question = PlanActions(pickle.dumps(opened.env.snapshot([0])), SMALL)
+    question = PlanActions(pickle.dumps(opened.env.snapshot([0])), bodies_in(opened, [0]), SMALL)
     with pytest.raises(CannotAnswer, match="build the same bodies in each env"):
         plans.answer(opened, {"render_backend": "none"}, question, lambda done, total: None)
     plans.close()
     opened.env.close()
+
+
+def test_a_live_env_with_other_bodies_than_the_rollouts_have_gets_no_plan(push: OpenedTask) -> None:
+    plans = WorkerPlans(lambda: False)
+    (bodies,) = bodies_in(push, [0])
+    question = PlanActions(pickle.dumps(push.env.snapshot([0])), ({**bodies, "cube": b"larger"},), SMALL)
+    with pytest.raises(CannotAnswer, match="^cube: another one"):
+        plans.answer(push, MADE, question, lambda done, total: None)
+    plans.close()
 
 
 def test_a_plan_is_asked_for_once_and_dropped_if_anything_else_moved_the_envs(push: OpenedTask) -> None:
@@ -99,6 +113,7 @@ def test_a_plan_is_asked_for_once_and_dropped_if_anything_else_moved_the_envs(pu
     assert not followed.ready(push, 5, [1]) and not followed.ready(push, 5, [1])
     assert [(one.number, one.env_idx) for one in asked] == [(5, (1,))] and followed.awaited
     assert pickle.loads(asked[0].snapshot).env_idx == (1,)
+    assert asked[0].bodies == bodies_in(push, [1]) and "cube" in asked[0].bodies[0]
     actions = np.full((2, 1, 7), 0.25, np.float32)
     followed.take(FollowPlan(4, (1,), actions))
     assert followed.awaited, "a plan of another moment"

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.checks.by_hook.reproduce import without_past
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
-from workbench.core.env.keywords import constructor_arguments
-from workbench.core.env.task_env import TaskEnv
+from workbench.core.env.task_env import TaskEnv, given_arguments
 from workbench.planning.episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
 from workbench.planning.rollouts import NotAlike, control_mode_to_plan
@@ -42,10 +40,7 @@ def solved_episodes(checkup: Checkup) -> Episodes:
             raise CannotCheck("it has no reward")
         if not live.parts:
             raise CannotCheck("there is nothing to plan: it has no robot with a controller")
-        made_with = {
-            **checkup.loaded.default_kwargs,
-            **constructor_arguments(cls, checkup.env_kwargs, BaseEnv),
-        }
+        made_with = given_arguments(cls, checkup.env_kwargs, checkup.loaded.default_kwargs)
         with blamed("build", checkup.loaded):
             planner = Planner(live.env, made_with=made_with)  # type: ignore[arg-type]
         try:

@@ -20,6 +20,7 @@ from workbench.core.env import actions
 from workbench.core.env.assets import refuse_downloads, require_assets, robots_of
 from workbench.core.env.cpu_scene import batched_class, refuse_unbuilt_env
 from workbench.core.env.evaluate_entries import FLAGS, flat_entries, split_entries
+from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.partial_reset import in_ascending_order, seeded
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.strict import StrictMixin
@@ -69,6 +70,18 @@ class EnvOptions:
         degrees_of(self.rules)  # raises for an unknown degree
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, not {self.threads}")
+
+
+def given_arguments(
+    task: type[BaseEnv], env_kwargs: Mapping[str, Any], default_kwargs: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The keyword arguments that the task class is made with, apart from those of `EnvOptions`.
+
+    Args:
+        env_kwargs: as a person gave them, in JSON.
+        default_kwargs: those that it was registered with, for which a person's stand in.
+    """
+    return {**default_kwargs, **constructor_arguments(task, env_kwargs, BaseEnv)}
 
 
 def make_env(

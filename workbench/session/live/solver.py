@@ -177,7 +177,7 @@ class Solver:
 
         def ask() -> Planned:
             load_version(self._process, job, load)
-            question = PlanActions(wanted.snapshot, settings.plan, settings.traced)
+            question = PlanActions(wanted.snapshot, wanted.bodies, settings.plan, settings.traced)
             return self._process.ask(job.check, question, partial(self._far, job))
 
         planned = self._process.in_turns(job, ask)

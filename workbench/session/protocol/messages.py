@@ -335,6 +335,8 @@ class PlanWanted:
     """The envs to plan for."""
     snapshot: bytes = b""
     """A pickled `core.snapshots.snapshot.Snapshot` of these envs at that moment."""
+    bodies: tuple[dict[str, bytes], ...] = ()
+    """What each of them is built of, from `planning.rollouts.bodies_of`."""
     why_not: str = ""
     """Why there is no snapshot; empty if there is one."""
 

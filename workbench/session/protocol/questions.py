@@ -156,6 +156,8 @@ class PlanActions(Question[Planned]):
 
     snapshot: bytes
     """A pickled `core.snapshots.snapshot.Snapshot` of these envs."""
+    bodies: tuple[dict[str, bytes], ...]
+    """What each of them is built of, from `planning.rollouts.bodies_of`."""
     options: PlanArguments
     traced: str = ""
     """As `Settings.traced`."""

@@ -7,21 +7,19 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.core.env import actions
 from workbench.core.env.hot_swap import put_class
-from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.step_result import StepResult
-from workbench.core.env.task_env import TaskEnv
+from workbench.core.env.task_env import TaskEnv, given_arguments
 from workbench.core.maniskill_private import objects_of
 from workbench.core.scene.scene_index import scene_index
 from workbench.core.snapshots.snapshot import Snapshot
 from workbench.jobs.open_task import OpenedTask
 from workbench.planning.options import PlanOptions
-from workbench.planning.rollouts import NotAlike, Plan, RolloutPlanner, make_rollout_env
+from workbench.planning.rollouts import NotAlike, Plan, RolloutPlanner, bodies_of, make_rollout_env
 from workbench.session.protocol.messages import (
     SCENE_KEPT,
     CannotAnswer,
@@ -109,12 +107,14 @@ def succeeded(step: StepResult) -> NDArray[np.bool_]:
 
 def _wanted(opened: OpenedTask, moment: int, envs: tuple[int, ...]) -> PlanWanted:
     try:
-        return PlanWanted(moment, envs, pickle.dumps(opened.env.snapshot(list(envs))))
+        snapshot = pickle.dumps(opened.env.snapshot(list(envs)))
     except Exception as error:
         # A task may keep anything on itself: as for the history (`step_events`), that must not end it.
         return PlanWanted(
             moment, envs, why_not=f"its state cannot be copied: {type(error).__name__}: {error}"
         )
+    bodies = bodies_of(opened.env.env)
+    return PlanWanted(moment, envs, snapshot, tuple(bodies[env] for env in envs))
 
 
 class WorkerPlans:
@@ -130,7 +130,7 @@ class WorkerPlans:
             waits: whether a request waits, which ends the planning.
         """
         self._waits = waits
-        self._env: BaseEnv | None = None
+        self._rolled: TaskEnv | None = None
         self._planner: RolloutPlanner | None = None
         self._options = PlanOptions()
         self._next: dict[int, tuple[int, int]] = {}
@@ -152,13 +152,14 @@ class WorkerPlans:
             CannotAnswer: a request came, or the task cannot be planned for.
             TaskError: it raised in a rollout, or while the envs were built.
         """
-        planner = self._made(opened, env_kwargs, PlanOptions(**vars(question.options)))
+        rolled, planner = self._made(opened, env_kwargs, PlanOptions(**vars(question.options)))
         try:
-            planner.require_alike(opened.env.env, 0)
+            for bodies in question.bodies:
+                planner.require_bodies(bodies)
         except NotAlike as error:
             raise CannotAnswer(str(error)) from None
         snapshot: Snapshot = pickle.loads(question.snapshot)
-        traced = _body_to_trace(planner.env, question.traced)
+        traced = _body_to_trace(rolled, question.traced)
         planned: list[PlannedEnv] = []
         for place, env in enumerate(snapshot.env_idx):
             if self._waits():
@@ -168,46 +169,45 @@ class WorkerPlans:
             seed, elapsed = int(memory.episode_seeds[place]), int(memory.elapsed_steps[place])
             if self._next.get(env) != (seed, elapsed):
                 planner.begin(env, max(seed, 0))
-            with blamed("step", opened.loaded, TaskEnv(planner.env)):
+            with blamed("step", opened.loaded, rolled):
                 plan = planner.plan(snapshot, env, traced)
             self._next[env] = seed, elapsed + question.options.every
-            name = "" if traced is None else scene_index(planner.env).names[traced]
+            name = "" if traced is None else scene_index(rolled.env).names[traced]
             planned.append(_for_page(env, plan, question.options.every, name))
         return Planned(tuple(planned))
 
     def loaded(self, opened: OpenedTask, level: ReloadLevel | None) -> None:
         """Another version of the task runs in this process."""
-        if self._env is not None and level in SCENE_KEPT:
-            put_class(self._env, opened.loaded.cls)
+        if self._rolled is not None and level in SCENE_KEPT:
+            put_class(self._rolled.env, opened.loaded.cls)
         else:
             self.close()
 
     def close(self) -> None:
         """Close the rollouts' envs."""
-        if self._env is not None:
-            self._env.close()
-        self._env = self._planner = None
+        if self._rolled is not None:
+            self._rolled.close()
+        self._rolled = self._planner = None
         self._next = {}
 
     def _made(
         self, opened: OpenedTask, env_kwargs: dict[str, object], options: PlanOptions
-    ) -> RolloutPlanner:
-        if self._env is not None and self._env.num_envs != options.rollouts:
+    ) -> tuple[TaskEnv, RolloutPlanner]:
+        if self._rolled is not None and self._rolled.num_envs != options.rollouts:
             self.close()
-        if self._env is None:
-            kwargs = constructor_arguments(opened.loaded.cls, env_kwargs, BaseEnv)
-            with blamed("build", opened.loaded):
-                self._env = make_rollout_env(
-                    opened.env.env, {**opened.loaded.default_kwargs, **kwargs}, options.rollouts
-                )
+        if self._rolled is None:
+            loaded = opened.loaded
+            made_with = given_arguments(loaded.cls, env_kwargs, loaded.default_kwargs)
+            with blamed("build", loaded):
+                self._rolled = TaskEnv(make_rollout_env(opened.env.env, made_with, options.rollouts))
         if self._planner is None or self._options != options:
             self._next = {}
             try:
                 # Quickly restored: a person who waits sees no difference in the last bit of a contact.
-                self._planner, self._options = RolloutPlanner(self._env, options, exact=False), options
+                self._planner, self._options = RolloutPlanner(self._rolled.env, options, exact=False), options
             except ValueError as error:
                 raise CannotAnswer(str(error)) from None
-        return self._planner
+        return self._rolled, self._planner
 
 
 def _for_page(env: int, plan: Plan, steps: int, traced: str) -> PlannedEnv:
@@ -231,8 +231,9 @@ def _for_page(env: int, plan: Plan, steps: int, traced: str) -> PlannedEnv:
     )
 
 
-def _body_to_trace(env: BaseEnv, name: str) -> int | None:
+def _body_to_trace(rolled: TaskEnv, name: str) -> int | None:
     """The place of this body, or of the robot's tool if it has one, else of its last link; None if there is neither."""
+    env = rolled.env
     names = scene_index(env).names
     if name in names:
         return names.index(name)
