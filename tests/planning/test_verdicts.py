@@ -116,8 +116,9 @@ def test_it_is_stuck_where_holding_still_lets_fall_what_is_held() -> None:
 def test_a_reward_that_falls_on_the_way_to_success_is_against() -> None:
     dip = rises(5)
     dip.reward[6:11] = [0.4, 0.2, 0.0, 0.1, 0.5]
-    (verdict,) = of_episodes([dip])
-    assert (verdict.rule, verdict.seeds) == ("reward-against", (5,))
+    (verdict,) = of_episodes([dip, dip, rises(0)])
+    assert (verdict.rule, verdict.seeds) == ("reward-against", (5, 5))
+    assert rules(dip, dip) == [], "most of two says nothing"
     assert (
         "from 0.400 at step 6 to 0.000 at step 9, success at step 15" in verdict.message
         or "step 7" in verdict.message
@@ -132,8 +133,8 @@ def test_a_reward_that_falls_on_the_way_to_success_is_against() -> None:
 def test_success_that_does_not_stay_is_lost() -> None:
     blinking = rises(6)
     blinking.success[16] = False
-    (verdict,) = of_episodes([blinking])
-    assert (verdict.rule, verdict.seeds) == ("success-lost", (6,))
+    (verdict,) = of_episodes([blinking, blinking, rises(0)])
+    assert (verdict.rule, verdict.seeds) == ("success-lost", (6, 6))
     assert "at step 15 and not 2 steps later" in verdict.message
     assert rules(blinking, rises(0)) == []
 
@@ -141,11 +142,19 @@ def test_success_that_does_not_stay_is_lost() -> None:
 def test_an_early_fail_where_every_step_costs_pays() -> None:
     ended = unsolved(-0.5, seed=8)
     ended.fail[-1] = True
-    (verdict,) = of_episodes([ended])
-    assert (verdict.rule, verdict.seeds) == ("failing-pays", (8,))
+    (verdict,) = of_episodes([ended, ended, unsolved(-0.5)])
+    assert (verdict.rule, verdict.seeds) == ("failing-pays", (8, 8))
     assert in_the_way(ended, [ended]) == "failed at step 20"
     paid = replace(ended, reward=row(0.5))
-    assert rules(paid) == []
+    assert rules(paid, paid, paid) == []
+
+
+def test_an_episode_that_was_cut_off_by_the_clock_breaks_no_rule() -> None:
+    for one in (unsolved(1.0), unsolved(0.4, gain=0.0, spread=0.0), unsolved(0.6, gain=0.0)):
+        assert rules(rises(0), one) != []
+        cut = replace(one, cut_off=True)
+        assert rules(rises(0), cut) == []
+        assert in_the_way(cut, [rises(0), cut]) == "its time was up after 20 steps (--seconds-per-seed)"
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

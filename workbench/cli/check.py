@@ -18,12 +18,11 @@ from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
 from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
 from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
-from workbench.core.rules import Finding
+from workbench.core.rules import FailOn, Finding
 from workbench.jobs.check import (
     CheckedTask,
     CheckOptions,
     CheckReport,
-    FailOn,
     check,
     count_rules,
     degrees_of_request,

@@ -17,8 +17,8 @@ from xml.etree import ElementTree
 from workbench.authoring.problem import Problem
 from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
-from workbench.core.rules import DEGREES, Finding
-from workbench.jobs.check import CheckOptions, CheckReport, FailOn
+from workbench.core.rules import FailOn, Finding, fails
+from workbench.jobs.check import CheckOptions, CheckReport
 from workbench.ui.app.help_pages import find_topic
 
 DISTRIBUTION = "maniskill-workbench"
@@ -43,7 +43,7 @@ class Reported:
     """Why nothing was checked; the report then has no result."""
 
     def fails(self, finding: Finding) -> bool:
-        return self.fail_on != "never" and DEGREES.index(finding.degree) <= DEGREES.index(self.fail_on)
+        return fails(finding.degree, self.fail_on)
 
     @property
     def place_of_error(self) -> tuple[str, int] | None:

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -28,6 +28,7 @@ from workbench.cli.arguments import (
     separated,
 )
 from workbench.cli.terminal import Exit, print_problem, print_text, refuse, warn
+from workbench.core.rules import FailOn
 from workbench.jobs.task import RecordArguments, ShownPictures
 from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
 from workbench.machine.processes.child_python import quick_imports
@@ -226,7 +227,7 @@ def check(
     ignore: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     actions: str = "random",
     solve: bool = False,
-    fail_on: Literal["stop", "warn", "never"] = "stop",
+    fail_on: FailOn = "stop",
     json: bool = False,
     json_file: Path | None = None,
     junit: Path | None = None,
@@ -290,10 +291,12 @@ def solve(
     seed: int = 0,
     workers: int | None = None,
     max_steps: int | None = None,
+    seconds_per_seed: float | None = None,
     pictures: bool = False,
     out: Path = Path("recordings"),
     imports: Imports = (),
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    fail_on: FailOn = "stop",
     json: bool = False,
     json_file: Path | None = None,
     csv: bool = False,
@@ -301,24 +304,29 @@ def solve(
     junit: Path | None = None,
 ) -> int:
     """Solve a task by planning with its own reward, before anyone trains on it: how many seeds, in how many steps, and what
-    the rollouts tell of the reward. Episodes are recorded. The exit code is 1 where the reward breaks a rule, or no seed is
-    solved.
+    the rollouts tell of the reward. Episodes are recorded. The exit code is 1 where no seed is solved, or where the reward
+    breaks a rule of the degree that --fail-on names, as of workbench check --solve.
 
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
-        seeds: how many seeds are tried.
+        seeds: how many seeds are tried. That no rule is broken says something from 8 on.
         seed: the first of them; each further one counts up.
         workers: processes, as many as cores if it is not given; the result is the same with any number.
         max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
+        seconds_per_seed: wall time after which a seed ends at its next step, solved or not. What that cuts off depends on
+            the machine and on what else it does, so that a second run may come to another result.
         pictures: record what every camera sees.
         out: folder for the recordings.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
         env: further arguments of the task class, as name=value (value in JSON, or text), such as
             control_mode=pd_ee_delta_pose; repeatable.
+        fail_on: lowest degree of a broken rule that makes the exit code 1, as of workbench check; the rules of the reward
+            are of the degree warn. never: nor does it where no seed is solved.
         json: print the result as JSON in place of text.
         json_file: also write the result to this file, as JSON.
-        csv: print a row for each seed as CSV in place of text.
+        csv: print a row for each seed as CSV in place of text, with the rules that it is an example of; what is said of
+            them is in the JSON.
         csv_file: also write the rows to this file, as CSV.
         junit: also write the result to this file as JUnit's XML.
     """
@@ -350,8 +358,8 @@ def solve(
         from workbench.jobs.solve import SolveOptions
 
     processes = min(seeds, cores if workers is None else workers)
-    what = SolveOptions(task, out, seeds, processes, pictures, max_steps, planned, options)
-    return solve_in_terminal(what, SolveOutput(json, json_file, csv, csv_file, junit))
+    what = SolveOptions(task, out, seeds, processes, pictures, max_steps, planned, options, seconds_per_seed)
+    return solve_in_terminal(what, SolveOutput(json, json_file, csv, csv_file, junit, fail_on))
 
 
 @app.command

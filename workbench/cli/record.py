@@ -15,8 +15,10 @@ from rich.progress import Progress as Bar
 from workbench.authoring.problem import TaskError
 from workbench.cli.terminal import err, print_finding, print_problem, print_text, progress_bar, refuse, warn
 from workbench.core.backends import unused_gpu_text
+from workbench.jobs.actions import SOLVE
 from workbench.jobs.pool import PoolError
 from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, Written, record, with_given_actions
+from workbench.planning.report import underway_text
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
 from workbench.session.rescore.recordings import hidden_modules_text
@@ -25,13 +27,17 @@ from workbench.session.rescore.recordings import hidden_modules_text
 class RecordBar:
     """The progress bar, and Ctrl-C: the first ends the recording after the current step; before it, or again, at once."""
 
-    def __init__(self, bar: Bar, total: int | None, doing: str = "recording") -> None:
+    def __init__(
+        self, bar: Bar, total: int | None, doing: str = "recording", first_seed: int | None = None
+    ) -> None:
         """
         Args:
             total: episodes that are wanted, if it is known.
             doing: what the bar says while episodes run.
+            first_seed: where actions are planned, of the first episode: a control step takes long then, so it is said at
+                which one each seed is.
         """
-        self._doing = doing
+        self._doing, self._first_seed = doing, first_seed
         self._bar, self._row = bar, bar.add_task("opening", total=total)
         self._total = total
         self.stop_requested = False
@@ -58,20 +64,24 @@ class RecordBar:
     def show(self, now: RecordProgress) -> None:
         self._began = self._began or time.monotonic()
         seconds = max(time.monotonic() - self._began, 1e-3)
-        self._bar.update(self._row, completed=now.kept)
+        self._bar.update(self._row, completed=now.done)
         if not self.stop_requested:
-            self.describe(f"{self._doing}, {now.steps / seconds:.0f} steps a second")
+            rate = f"{now.steps / seconds:.0f} steps a second"
+            at = "" if self._first_seed is None else underway_text(now.by_seed(self._first_seed), now.limit)
+            self.describe(f"{self._doing}, {at or rate}")
         if now.over is not None and not err.is_terminal:
             # A bar in a file or a pipe is drawn once, at the end: a job's log would say nothing for hours.
-            err.print(escape(_episode_line(*now.over, now.kept, self._total)), soft_wrap=True)
+            number, kept = now.over
+            named = f"episode {number}" if self._first_seed is None else f"seed {self._first_seed + number}"
+            line = f"{named}: {_ended_text(kept)}, {now.kept} of {self._total} kept"
+            err.print(escape(line), soft_wrap=True)
 
 
-def _episode_line(number: int, kept: Written | None, count: int, total: int | None) -> str:
-    so_far = f"{count} of {total} kept"
+def _ended_text(kept: Written | None) -> str:
     if kept is None:
-        return f"episode {number}: not kept, {so_far}"
+        return "not kept"
     ended = {None: "", True: ", success", False: ", no success"}[kept.success]
-    return f"episode {number}: {kept.steps} steps, return {kept.total_reward:.3f}{ended}, {so_far}"
+    return f"{kept.steps} steps, return {kept.total_reward:.3f}{ended}"
 
 
 def record_in_terminal(what: RecordOptions) -> int:
@@ -88,7 +98,9 @@ def record_in_terminal(what: RecordOptions) -> int:
             warn(left_alone)
         left = (TextColumn("left"), TimeRemainingColumn())
         with progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:
-            with RecordBar(bar, requested.successes or requested.episodes) as record_bar:
+            first_seed = what.options.seed if what.actions == SOLVE else None
+            wanted = requested.successes or requested.episodes
+            with RecordBar(bar, wanted, first_seed=first_seed) as record_bar:
                 recorded = record(
                     what,
                     record_bar.describe,

@@ -30,17 +30,19 @@ from workbench.cli.terminal import (
     refuse,
     stdout_to_stderr,
 )
+from workbench.core.rules import FailOn, fails
 from workbench.jobs.pool import PoolError
 from workbench.jobs.record import with_given_actions
 from workbench.jobs.solve import SolveOptions, solve
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text
-from workbench.planning.verdicts import RewardVerdict, SolvedSeed, SolveReport
+from workbench.planning.report import SolvedSeed, SolveReport
+from workbench.planning.verdicts import RewardVerdict
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
 
-_COLUMNS = ("seed", "solved_at", "steps", "return", "seconds", "in_the_way", "recording")
+_COLUMNS = ("seed", "solved_at", "steps", "return", "seconds", "in_the_way", "rules", "recording")
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,17 @@ class SolveOutput:
     """Print CSV in place of the text."""
     csv_file: Path | None = None
     junit: Path | None = None
+    fail_on: FailOn = "stop"
+    """The lowest degree of a broken rule that makes the exit code 1."""
+
+    def fails(self, report: SolveReport) -> bool:
+        """Whether the exit code is 1: the reward breaks a rule of that degree, or no seed was solved."""
+        if self.fail_on == "never":
+            return False
+        return not report.solved or any(self.fails_by(verdict) for verdict in report.verdicts)
+
+    def fails_by(self, verdict: RewardVerdict) -> bool:
+        return fails(RULES[verdict.rule].degree, self.fail_on)
 
 
 def solve_in_terminal(what: SolveOptions, output: SolveOutput) -> int:
@@ -65,7 +78,7 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput) -> int:
         recover_confined(what.out)
         left = (TextColumn("left"), TimeRemainingColumn())
         with stdout_to_stderr(), progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:
-            with RecordBar(bar, what.seeds, "solving") as shown:
+            with RecordBar(bar, what.seeds, "solving", what.options.seed) as shown:
                 report = solve(what, shown.describe, shown.show, lambda: shown.stop_requested, print_finding)
             shown.describe("solved", len(report.seeds))
     except TaskError as error:
@@ -83,16 +96,16 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput) -> int:
                 (output.junit, as_junit),
             ):
                 if path is not None:
-                    replace_file(path, made(report, what).encode())
+                    replace_file(path, made(report, what, output).encode())
     except OSError as error:
         return refuse(str(error))
     if output.json or output.csv:
-        print((as_json if output.json else as_csv)(report, what), end="", flush=True)
+        print((as_json if output.json else as_csv)(report, what, output), end="", flush=True)
     else:
         print_report(report)
     if report.stopped:
         return refuse("interrupted; finished episodes were kept")
-    return Exit.FAILED if report.fails else Exit.DONE
+    return Exit.FAILED if output.fails(report) else Exit.DONE
 
 
 # --- text ------------------------------------------------------------------------------------------------
@@ -112,6 +125,8 @@ def print_report(report: SolveReport) -> None:
         out.print(table)
     for verdict in report.verdicts:
         _print_verdict(verdict)
+    for note in report.notes:
+        out.print(f"[dim]note[/] {escape(note)}", soft_wrap=True)
     print_text(report.summary)
     if report.seeds:
         print_text(f"Look at them with: workbench review {shlex.quote(str(report.seeds[0].path.parent))}")
@@ -138,7 +153,7 @@ def _print_verdict(verdict: RewardVerdict) -> None:
 # --- for programs ----------------------------------------------------------------------------------------
 
 
-def as_json(report: SolveReport, what: SolveOptions) -> str:
+def as_json(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
     """All that is known, as one object."""
     return json_text(
         {
@@ -151,41 +166,48 @@ def as_json(report: SolveReport, what: SolveOptions) -> str:
             "median_steps": report.median_steps,
             "seconds": round(report.seconds, 3),
             "stopped": report.stopped,
-            "fails": report.fails,
+            "fail_on": output.fail_on,
+            "fails": output.fails(report),
+            "notes": list(report.notes),
             "verdicts": [
                 {"rule": one.rule, "message": one.message, "seeds": list(one.seeds)}
                 for one in report.verdicts
             ],
-            "seeds": [_row(one) for one in report.seeds],
+            "seeds": [_row(one, report) for one in report.seeds],
         }
     )
 
 
-def as_csv(report: SolveReport, what: SolveOptions) -> str:
+def as_csv(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
     """A row for each seed."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list[str](_COLUMNS), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(_row(one) for one in report.seeds)
+    for one in report.seeds:
+        row = _row(one, report)
+        writer.writerow({**row, "rules": " ".join(row["rules"])})
     return text.getvalue()
 
 
-def as_junit(report: SolveReport, what: SolveOptions) -> str:
-    """A test case for each rule of `planning.verdicts` that is broken, and one for each seed: skipped where it was not solved,
-    which is no fault of the task by itself."""
+def as_junit(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
+    """A test case for each rule of `planning.verdicts` that is broken, which fails as the command does, and one for each seed:
+    skipped where it was not solved, which is no fault of the task by itself."""
     cases = [_case(what, f"seed {one.seed}", one.seconds) for one in report.seeds]
     for case, one in zip(cases, report.seeds, strict=True):
         if not one.solved_at:
             ElementTree.SubElement(case, "skipped", message=xml_text(one.in_the_way))
     broken = [_case(what, verdict.rule, 0) for verdict in report.verdicts]
     for case, verdict in zip(broken, report.verdicts, strict=True):
-        ElementTree.SubElement(case, "failure", type=verdict.rule, message=xml_text(verdict.message))
-    if not report.solved:
+        if output.fails_by(verdict):
+            ElementTree.SubElement(case, "failure", type=verdict.rule, message=xml_text(verdict.message))
+        else:
+            ElementTree.SubElement(case, "system-out").text = xml_text(verdict.message)
+    if not report.solved and output.fails(report):
         broken.append(_case(what, "solved", 0))
         ElementTree.SubElement(broken[-1], "failure", type="solved", message="no seed was solved")
     totals = {
         "tests": str(len(cases) + len(broken)),
-        "failures": str(len(broken)),
+        "failures": str(sum(case.find("failure") is not None for case in broken)),
         "skipped": str(len(report.seeds) - len(report.solved)),
         "time": f"{report.seconds:.3f}",
     }
@@ -204,7 +226,7 @@ def _case(what: SolveOptions, name: str, seconds: float) -> ElementTree.Element:
     return ElementTree.Element("testcase", classname=classname, name=name, time=f"{seconds:.3f}")
 
 
-def _row(one: SolvedSeed) -> dict[str, Any]:
+def _row(one: SolvedSeed, report: SolveReport) -> dict[str, Any]:
     values = (
         one.seed,
         one.solved_at or None,
@@ -212,6 +234,7 @@ def _row(one: SolvedSeed) -> dict[str, Any]:
         round(one.total_reward, 6),
         round(one.seconds, 3),
         one.in_the_way,
+        [verdict.rule for verdict in report.verdicts if one.seed in verdict.seeds],
         str(one.path),
     )
     return dict(zip(_COLUMNS, values, strict=True))

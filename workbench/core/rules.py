@@ -17,6 +17,13 @@ Degree = Literal["stop", "warn", "off"]
 """*stop* raises at the line that broke the rule; *warn* reports the line, and the operation continues as without rules, to the
 last bit. By default a rule stops where the state of other envs is overwritten, since every number after that is wrong."""
 DEGREES: tuple[Degree, ...] = get_args(Degree)
+FailOn = Literal["stop", "warn", "never"]
+"""The lowest degree of a finding that makes a command's exit code 1."""
+
+
+def fails(degree: Degree, fail_on: FailOn) -> bool:
+    """Whether a finding of this degree makes the exit code 1."""
+    return fail_on != "never" and DEGREES.index(degree) <= DEGREES.index(fail_on)
 
 
 @dataclass(frozen=True)

@@ -236,6 +236,10 @@ class PlannedActions:
         for env in env_idx:
             self._logs[env].add_step(step, env)
 
+    def cut_off(self, env: int) -> None:
+        """Note that the episode of this env ends now because its wall time is up."""
+        self._logs[env].cut_off = True
+
     def episode(self, env: int) -> PlannedEpisode:
         """The episode of this env so far."""
         return self._logs[env].episode()

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -35,7 +34,7 @@ from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv, given_arguments
-from workbench.core.rules import DEGREES, Degree, Finding
+from workbench.core.rules import DEGREES, Degree, FailOn, Finding, fails
 from workbench.jobs.actions import (
     SOLVE,
     STEPS_WITHOUT_LIMIT,
@@ -49,8 +48,6 @@ from workbench.jobs.replay import begin_run
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import CurrentFolder
 
-FailOn = Literal["stop", "warn", "never"]
-"""The lowest degree of a finding that fails a check."""
 _ORDER: tuple[State, ...] = ("broken", "silenced", "failed", "kept", "skipped")
 """Of the states that one rule has in several processes, the first counts."""
 
@@ -137,8 +134,7 @@ class CheckReport:
         ``never``."""
         if fail_on == "never":
             return False
-        highest = DEGREES.index(fail_on)
-        if any(DEGREES.index(finding.degree) <= highest for finding in self.findings):
+        if any(fails(finding.degree, fail_on) for finding in self.findings):
             return True
         accepted = any(result.rule == "runs" for result in self.of_state("silenced"))
         return bool(self.of_state("failed")) and not accepted

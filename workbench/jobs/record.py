@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -59,6 +61,18 @@ class RecordOptions(RecordArguments):
 
 
 @dataclass(frozen=True)
+class Underway:
+    """The episodes that one process runs at the moment."""
+
+    steps: tuple[tuple[int, int], ...]
+    """Number and control steps so far, of each."""
+    limit: int
+    """Control steps after which an episode ends at the latest."""
+    made: int
+    """Control steps since the last of these messages, over all envs with an episode."""
+
+
+@dataclass(frozen=True)
 class Written:
     """An episode on disk."""
 
@@ -86,6 +100,16 @@ class RecordProgress:
     """Control steps so far, over all envs with an episode."""
     over: tuple[int, Written | None] | None = None
     """The episode that has just ended: its number, and what was kept of it; None where none has."""
+    running: Mapping[int, int] = field(default_factory=dict)
+    """Control steps so far of the episodes under way, by number, in all processes."""
+    limit: int = 0
+    """Control steps after which one of them ends at the latest."""
+    done: float = 0.0
+    """As `kept`; where every episode is kept, those under way count in part."""
+
+    def by_seed(self, first: int) -> dict[int, int]:
+        """`running` by seed, where episode 0 has seed `first`."""
+        return {first + number: steps for number, steps in self.running.items()}
 
 
 @dataclass(frozen=True)
@@ -127,6 +151,8 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[Rec
     ):
         if number is not None and number < 1:
             raise ValueError(f"--{name} must be at least 1, not {number}")
+    if what.seconds_per_seed is not None and not 0 < what.seconds_per_seed < math.inf:
+        raise ValueError(f"--seconds-per-seed must be above 0, not {what.seconds_per_seed:g}")
     several = len(given) if len(given) > 1 else 0
     if what.successes is None:
         episodes = what.episodes or len(given) or 4
@@ -169,7 +195,7 @@ def record(
     run = _record_items
     if executor is None and len(setups) == 1:
         executor, run = ThisProcess(), partial(_record_items, given=given)
-    work = Work(run, setups, result=Written | None, update=str | int | Finding, name="that records")
+    work = Work(run, setups, result=Written | None, update=str | Underway | Finding, name="that records")
     (executor or Processes()).run(work, recording.deal)
     return recording.so_far(stop())
 
@@ -192,12 +218,13 @@ class _Recording:
         self._folder, self._wanted = what.out.absolute(), what.successes
         self._on_activity, self._on_progress, self._on_finding = on_activity, on_progress, on_finding
         self._kept: dict[int, Written] = {}
-        self._ended = self._steps = 0
+        self._ended = self._steps = self._step_limit = 0
+        self._running: dict[int, int] = {}
         self._found: set[object] = set()
         """Findings of all processes, to report each once."""
         most = what.episodes if what.successes is None else what.tries
         assert most is not None
-        self.deal: Deal[Written | None, str | int | Finding] = Deal(
+        self.deal: Deal[Written | None, str | Underway | Finding] = Deal(
             range(most), self._over, self._on_update, stop
         )
 
@@ -209,6 +236,7 @@ class _Recording:
 
     def _over(self, number: int, written: Written | None) -> None:
         self._ended += 1
+        self._running.pop(number, None)
         if written is not None:
             self._kept[number] = written
         if self._wanted is not None and len(self._kept) >= self._wanted:
@@ -216,17 +244,26 @@ class _Recording:
             self.deal.lower(last + 1)
             for surplus in [number for number in self._kept if number > last]:
                 self._remove(self._kept.pop(surplus))
-        self._on_progress(RecordProgress(len(self._kept), self._steps, (number, self._kept.get(number))))
+        self._tell((number, self._kept.get(number)))
 
-    def _on_update(self, update: str | int | Finding) -> None:
+    def _on_update(self, update: str | Underway | Finding) -> None:
         if isinstance(update, str):
             self._on_activity(update)
-        elif isinstance(update, int):
-            self._steps += update
-            self._on_progress(RecordProgress(len(self._kept), self._steps))
+        elif isinstance(update, Underway):
+            self._steps, self._step_limit = self._steps + update.made, update.limit
+            self._running.update(update.steps)
+            self._tell()
         elif update.key not in self._found:
             self._found.add(update.key)
             self._on_finding(update)
+
+    def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
+        limit = self.deal.limit()
+        running = {number: steps for number, steps in self._running.items() if number < limit}
+        part = sum(min(steps / max(self._step_limit, 1), 1.0) for steps in running.values())
+        kept = len(self._kept)
+        done = kept + (part if self._wanted is None else 0.0)
+        self._on_progress(RecordProgress(kept, self._steps, over, running, self._step_limit, done))
 
     def _remove(self, episode: Written) -> None:
         for suffix in (".json", ".h5", ".rrd"):  # the .json first: without it there is no episode
@@ -298,6 +335,8 @@ class _Episodes:
         self._running: dict[int, int] = {}
         """Number of the episode in each env that has one."""
         self._steps: dict[int, int] = {}
+        self._began: dict[int, float] = {}
+        """Of each env with an episode, ``time.monotonic()`` at its begin."""
         self._start_corrected: set[int] = set()
         """Numbers of the episodes with `Written.start_corrected`."""
         self._succeeded: dict[int, int] = {}
@@ -322,10 +361,19 @@ class _Episodes:
     def _begin_free(self) -> bool:
         """Begin episodes in free envs. Returns whether any env has one."""
         self._drop_from(self._queue.limit())
+        begun = False
         for env in self._envs:
             if env not in self._running and (index := self._queue.next()) is not None:
                 self._begin(env, index)
+                begun = True
+        if begun:
+            self._tell(0)
         return bool(self._running)
+
+    def _tell(self, made: int) -> None:
+        """Send how far the episodes are, after so many control steps more."""
+        at = tuple((index, self._steps[env]) for env, index in self._running.items())
+        self._queue.send_update(Underway(at, self._limit, made))
 
     def _drop_from(self, limit: int) -> None:
         for env in [env for env, index in self._running.items() if index >= limit]:
@@ -376,6 +424,7 @@ class _Episodes:
         with blamed("reset", self._opened.loaded, task):
             step = task.reset(seed, [env])
         self._running[env], self._steps[env], self._succeeded[env] = index, 0, 0
+        self._began[env] = time.monotonic()
         if given is not None and given.env_states:
             step = self._correct_start(env, given, step)
         self._gatherer.acted_by = self._chooser.begin(env, seed, given)
@@ -405,21 +454,39 @@ class _Episodes:
             step = restore_recorded(self._opened, states, action)
         none = np.zeros(task.num_envs, bool)
         self._gatherer.take(self._stepped(step, none, sorted(self._running)))
-        self._queue.send_update(len(self._running))
         if self._planned is not None:
             self._planned.add_step(step, sorted(self._running))
-        for env in list(self._running):
+        for env in self._running:
             self._steps[env] += 1
-            if self._is_over(env, step):
+        self._tell(len(self._running))
+        for env in list(self._running):
+            over = self._is_over(env, step)
+            if not over and self._out_of_time(env):
+                over = True
+                if self._planned is not None:
+                    self._planned.cut_off(env)
+            if over:
                 self._gatherer.end(env)
                 self._free(env)
+
+    @property
+    def _limit(self) -> int:
+        """Control steps after which an episode ends at the latest."""
+        most = self._what.max_steps
+        if self._given:
+            longest = max(run.length for run in self._given)
+            return longest if most is None else min(longest, most)
+        return most or self._opened.description.max_episode_steps or STEPS_WITHOUT_LIMIT
+
+    def _out_of_time(self, env: int) -> bool:
+        most = self._what.seconds_per_seed
+        return most is not None and time.monotonic() - self._began[env] > most
 
     def _is_over(self, env: int, step: StepResult) -> bool:
         given = self._given_of(self._running[env])
         if given is not None:
             return self._steps[env] >= min(given.length, self._what.max_steps or 10**9)
-        limit = self._what.max_steps or self._opened.description.max_episode_steps or STEPS_WITHOUT_LIMIT
-        if step.truncated[env] or self._steps[env] >= limit:
+        if step.truncated[env] or self._steps[env] >= self._limit:
             return True
         success = "success" in step.evaluate and bool(step.evaluate["success"][env])
         failed = "fail" in step.evaluate and bool(step.evaluate["fail"][env])

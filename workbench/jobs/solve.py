@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from workbench.core.broken_rule import warn_of
@@ -15,7 +15,8 @@ from workbench.jobs.record import RecordOptions, RecordProgress, Written, record
 from workbench.jobs.task import TaskOptions
 from workbench.planning.episodes import PlannedEpisode
 from workbench.planning.options import PlanOptions
-from workbench.planning.verdicts import SolvedSeed, SolveReport, in_the_way, of_episodes
+from workbench.planning.report import SolvedSeed, SolveReport
+from workbench.planning.verdicts import in_the_way, of_episodes
 
 _AFTER_SUCCESS = 5
 """Control steps that an episode goes on after its success: does it stay solved?"""
@@ -38,6 +39,8 @@ class SolveOptions:
     plan: PlanOptions = PlanOptions()
     options: TaskOptions = field(default_factory=TaskOptions)
     """Its number of envs counts for nothing: each process has one."""
+    seconds_per_seed: float | None = None
+    """As `RecordArguments.seconds_per_seed`."""
 
     def recording(self) -> RecordOptions:
         """The recording that solves it."""
@@ -48,6 +51,7 @@ class SolveOptions:
             actions=SOLVE,
             pictures=self.pictures,
             max_steps=self.max_steps,
+            seconds_per_seed=self.seconds_per_seed,
             workers=self.workers,
             options=TaskOptions(**{**vars(self.options), "num_envs": self.workers}),
             plan=self.plan,
@@ -79,13 +83,13 @@ def solve(
         if progress.over is not None and progress.over[1] is not None:
             done[progress.over[0]] = progress.over[1]
             so_far = [done[number] for number in sorted(done)]
-            on_report(_report(so_far, time.monotonic() - began, stopped=False))
+            on_report(_report(what, so_far, time.monotonic() - began, stopped=False))
 
     recorded = record(what.recording(), on_activity, noted, stop, on_finding, executor)
-    return _report(recorded.written, time.monotonic() - began, recorded.stopped)
+    return _report(what, recorded.written, time.monotonic() - began, recorded.stopped)
 
 
-def _report(recorded: Sequence[Written], seconds: float, stopped: bool) -> SolveReport:
+def _report(what: SolveOptions, recorded: Sequence[Written], seconds: float, stopped: bool) -> SolveReport:
     planned: list[PlannedEpisode] = []
     for written in recorded:
         assert written.planned is not None
@@ -99,7 +103,9 @@ def _report(recorded: Sequence[Written], seconds: float, stopped: bool) -> Solve
             episode.plan_seconds,
             in_the_way(episode, planned),
             written.path,
+            episode.cut_off,
         )
         for written, episode in zip(recorded, planned, strict=True)
     ]
-    return SolveReport(tuple(rows), tuple(of_episodes(planned)), seconds, stopped)
+    report = SolveReport(tuple(rows), (), seconds, stopped, what.seeds)
+    return replace(report, verdicts=tuple(of_episodes(planned))) if report.tells else report

@@ -224,6 +224,8 @@ class RecordArguments:
         fast_pictures: draw simplified meshes: several times as many pictures a second without a GPU, which differ a little
             from a GPU's. The recordings say so.
         max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
+        seconds_per_seed: wall time after which an episode ends at its next step, solved or not. Which ones that cuts off
+            depends on the machine and on what else it does, so a second run may record others.
         workers: processes, each with its share of the envs; the episodes are the same with any number.
     """
 
@@ -237,4 +239,5 @@ class RecordArguments:
     pictures: bool = True
     fast_pictures: bool = False
     max_steps: int | None = None
+    seconds_per_seed: float | None = None
     workers: int = 1

@@ -42,6 +42,8 @@ class PlannedEpisode:
     """What ``evaluate`` said at the last step, as far as it is one number an env."""
     plan_seconds: float = 0.0
     """Wall time of all plans."""
+    cut_off: bool = False
+    """It was ended because its wall time was up, which says nothing of the task."""
 
     @property
     def steps(self) -> int:
@@ -69,6 +71,8 @@ class EpisodeLog:
         self._evaluate: dict[str, float] = {}
         self._last: Plan | None = None
         self._seconds = 0.0
+        self.cut_off = False
+        """As of the episode."""
 
     def add_plan(self, plan: Plan) -> None:
         """Note the plan whose action comes next."""
@@ -110,6 +114,7 @@ class EpisodeLog:
             },
             self._evaluate,
             self._seconds,
+            self.cut_off,
         )
 
 

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,11 @@ _SAME = 0.002
 """Of the range of rewards that were seen: what differs by less is the same."""
 _FALL = 0.25
 """Of the rise from the first reward to that at success: a fall on the way that counts."""
+MOST_OF = 3
+"""Episodes from which on it says something that most of them show it."""
+ENOUGH_SEEDS = 8
+"""Seeds from which on it says something that no verdict came: what pays without success is known only where some of them
+are solved and others are not."""
 _LAST = 10
 """Control steps at the end of an episode that are looked at, but no more than half of them."""
 
@@ -68,56 +71,6 @@ class Episodes:
         return bool(self.all) and all(not len(each) or float(each.max()) == 0 for each in flat)
 
 
-@dataclass(frozen=True)
-class SolvedSeed:
-    """What came of one seed."""
-
-    seed: int
-    solved_at: int
-    """The control step of its success, from 1 on; 0 without one."""
-    steps: int
-    total_reward: float
-    """Over all steps, those after its success too."""
-    seconds: float
-    """Wall time of its plans."""
-    in_the_way: str
-    """Why it was not solved; empty if it was."""
-    path: Path
-    """Its recording."""
-
-
-@dataclass(frozen=True)
-class SolveReport:
-    """What came of all seeds that were tried to the end."""
-
-    seeds: tuple[SolvedSeed, ...]
-    verdicts: tuple[RewardVerdict, ...]
-    seconds: float
-    """Wall time, opening the task included."""
-    stopped: bool
-    """It was stopped before all seeds were tried."""
-
-    @property
-    def solved(self) -> tuple[SolvedSeed, ...]:
-        return tuple(one for one in self.seeds if one.solved_at)
-
-    @property
-    def median_steps(self) -> float | None:
-        """Of the solved seeds, to their success; None without one."""
-        return median(one.solved_at for one in self.solved) if self.solved else None
-
-    @property
-    def fails(self) -> bool:
-        """Whether the reward breaks a rule, or no seed was solved."""
-        return bool(self.verdicts) or not self.solved
-
-    @property
-    def summary(self) -> str:
-        """``Solved 14 of 16 seeds, in 9 control steps (median). 61 s.``"""
-        steps = "" if self.median_steps is None else f", in {self.median_steps:g} control steps (median)"
-        return f"Solved {len(self.solved)} of {len(self.seeds)} seeds{steps}. {self.seconds:.0f} s."
-
-
 def of_episodes(episodes: Sequence[PlannedEpisode]) -> list[RewardVerdict]:
     """The verdicts on a task's reward, each at most once."""
     every = Episodes(tuple(episodes))
@@ -130,6 +83,8 @@ def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> s
         return ""
     if episode.failed_at:
         return f"failed at step {episode.failed_at}"
+    if episode.cut_off:
+        return f"its time was up after {episode.steps} steps (--seconds-per-seed)"
     every = Episodes(tuple(episodes))
     if every.without_reward:
         return "no rollout earned more than another"
@@ -222,7 +177,7 @@ def against(episodes: Episodes) -> RewardVerdict | None:
         if one.reward[high] - one.reward[low]
         > max(_FALL * abs(one.reward[one.solved_at - 1] - one.reward[0]), episodes.same)
     ]
-    if not found or 2 * len(found) <= len(episodes.solved):
+    if not _are_most([each for each, *_ in found], episodes.solved):
         return None
     one, high, low = found[0]
     return RewardVerdict(
@@ -237,7 +192,7 @@ def against(episodes: Episodes) -> RewardVerdict | None:
 def lost(episodes: Episodes) -> RewardVerdict | None:
     """Solved episodes that were not solved any more a few steps later, though the reward was sought all the time."""
     found = [one for one in episodes.solved if not one.success[one.solved_at - 1 :].all()]
-    if not found or 2 * len(found) <= len(episodes.solved):
+    if not _are_most(found, episodes.solved):
         return None
     first = found[0]
     again = int(first.success[first.solved_at - 1 :].argmin())
@@ -252,7 +207,7 @@ def lost(episodes: Episodes) -> RewardVerdict | None:
 def failing_pays(episodes: Episodes) -> RewardVerdict | None:
     """Episodes that failed where each step costs, so that an early end earns more than going on."""
     found = [one for one in episodes.unsolved if one.failed_at and float(one.reward.mean()) < 0]
-    if not found or 2 * len(found) <= len(episodes.all):
+    if not _are_most(found, episodes.all):
         return None
     first = found[0]
     return RewardVerdict(
@@ -284,8 +239,12 @@ def _end(episode: PlannedEpisode, row: NDArray[Any] | None = None) -> NDArray[An
     return row[-max(1, min(_LAST, episode.steps // 2)) :]
 
 
+def _are_most(found: Sequence[PlannedEpisode], among: Sequence[PlannedEpisode]) -> bool:
+    return len(among) >= MOST_OF and 2 * len(found) > len(among)
+
+
 def _ended_early(episode: PlannedEpisode) -> bool:
-    return episode.failed_at > 0
+    return episode.failed_at > 0 or episode.cut_off
 
 
 def _earns_like_success(episodes: Episodes, episode: PlannedEpisode) -> bool:

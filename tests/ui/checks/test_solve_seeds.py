@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import viser
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import problem, running
-from workbench.planning.verdicts import RewardVerdict, SolvedSeed, SolveReport
+from workbench.planning.report import SolvedSeed, SolveReport
+from workbench.planning.verdicts import RewardVerdict
 from workbench.session.checks.solve_seeds import SeedsView
 from workbench.ui.checks.solve_seeds import SOLVE, STOP_SOLVING, SolveSeedsPanel, seeds_html, verdict_cards
 
@@ -23,6 +25,7 @@ REPORT = SolveReport(
     (RewardVerdict("reward-exploited", "1 of 2 episodes earned more", (1,)),),
     20.0,
     False,
+    2,
 )
 DONE = SeedsView("done", 4, REPORT, total=2)
 
@@ -69,8 +72,10 @@ def test_so_many_seeds_as_are_typed_are_solved_and_it_can_be_stopped(shown: Show
     shown.panels.set("Seeds", 12)
     shown.panels.press(SOLVE)
     shown.draw(SeedsView("starting", 1, total=12, activity="importing push_cube.py"))
-    assert "0 of 12 seeds" in shown.panels.html() and "importing push_cube.py" in shown.panels.html()
+    assert "0 of 12 seeds are done" in shown.panels.html() and "importing push_cube.py" in shown.panels.html()
     assert not shown.panels.shows(SOLVE, "button")
+    shown.draw(SeedsView("solving", 2, total=12, done=0.6, activity="seed 0 at step 30 of 50"))
+    assert "seed 0 at step 30 of 50" in shown.panels.html() and "width: 5%" in shown.panels.html()
     shown.panels.press(STOP_SOLVING)
     assert shown.session.asked == [12, "stop"]
 
@@ -103,4 +108,21 @@ def test_it_says_why_it_failed_where_it_was_stopped_and_of_which_version_it_is()
     failed = html(SeedsView("failed", why="the task failed", problem=problem()))
     assert "the task failed: KeyError" in failed and "push.py:88" in failed
     stopped = html(SeedsView("stopped", report=REPORT, total=9, stale=True))
-    assert "stopped by hand after 2 seeds" in stopped and "of the version before" in stopped
+    assert "stopped by hand" in stopped and "of the version before" in stopped
+    assert "0 of 9 seeds are done" in html(SeedsView("stopped", total=9))
+
+
+def test_what_the_first_seeds_tell_says_how_many_they_are() -> None:
+    def html(state: Any, wanted: int, **changes: Any) -> str:
+        report = replace(REPORT, wanted=wanted, **changes)
+        return seeds_html(SeedsView(state, report=report, total=wanted), lambda seed: str(seed))
+
+    third = replace(REPORT.seeds[0], seed=2)
+    solving = html("solving", 9, seeds=(*REPORT.seeds, third))
+    assert "3 of 9 seeds are done, 2 solved" in solving and "Solved 1" not in solving
+    assert "What the seeds tell of the reward after 3 of 9 seeds; further ones may change that:" in solving
+    assert "No rule of the reward is broken after 3 of 9 seeds." in html(
+        "stopped", 9, seeds=(*REPORT.seeds, third), verdicts=()
+    )
+    assert "is said from 3 seeds on" in html("solving", 9, verdicts=())
+    assert "2 seeds may all miss what is wrong" in html("done", 2)

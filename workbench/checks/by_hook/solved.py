@@ -12,11 +12,12 @@ from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found
 from workbench.core.env.task_env import TaskEnv, given_arguments
 from workbench.planning.episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
+from workbench.planning.report import few_seeds_text
 from workbench.planning.rollouts import NotAlike, control_mode_to_plan
+from workbench.planning.verdicts import ENOUGH_SEEDS, Episodes
 from workbench.planning.verdicts import RULES as VERDICTS
-from workbench.planning.verdicts import Episodes
 
-SEEDS = 8
+SEEDS = ENOUGH_SEEDS
 """Most seeds that are solved: each takes seconds."""
 STEPS = 200
 """Of an episode whose task has no time limit."""
@@ -82,6 +83,8 @@ def _check_of(rule: str) -> Check:
             solved = [one.solved_at for one in episodes.solved]
             steps = f", in {np.median(solved):g} control steps (median)" if solved else ""
             yield Note(f"planning solved {len(solved)} of {len(episodes.all)} seeds{steps}")
+            if len(episodes.all) < ENOUGH_SEEDS:
+                yield Note(few_seeds_text(len(episodes.all)))
         if verdict is not None:
             hook = HOOK.get(rule, "compute_dense_reward")
             place = checkup.places.hook(hook, "compute_normalized_dense_reward", "evaluate")

@@ -12,7 +12,7 @@ from workbench.authoring.problem import Problem, TaskError
 from workbench.jobs.pool import Deal, ItemQueue, PoolError, Processes, Work
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
-from workbench.planning.verdicts import SolveReport
+from workbench.planning.report import SolveReport, underway_text
 from workbench.session.process.held_view import HeldView
 from workbench.session.process.job_lane import Job, JobFailed, JobLane
 from workbench.session.protocol.messages import Load
@@ -34,14 +34,24 @@ class SeedsView:
     """Of the seeds that are done; of an earlier version if `stale`."""
     total: int = 0
     """Seeds that were asked for."""
+    done: float = 0.0
+    """Seeds that are done, those under way in part."""
     activity: str = ""
-    """What is done before the first seed."""
+    """What is done at the moment: before the first seed, or which seed is at which step."""
     stale: bool = False
     """Another version runs since."""
     why: str = ""
     """Why it failed, as text."""
     problem: Problem | None = None
     """What the author's code raised."""
+
+
+@dataclass(frozen=True)
+class _Far:
+    """How far the seeds are, from the other process."""
+
+    done: float
+    underway: str
 
 
 @dataclass(frozen=True)
@@ -90,7 +100,14 @@ class SeedsSolver:
         with self._held.lock:
             self._lane.start("solving seeds", lambda job: self._solve(job, setup))
             self._held.set(
-                state="starting", report=None, total=seeds, activity="", stale=False, why="", problem=None
+                state="starting",
+                report=None,
+                total=seeds,
+                done=0.0,
+                activity="",
+                stale=False,
+                why="",
+                problem=None,
             )
         self._held.changed()
 
@@ -118,8 +135,8 @@ class SeedsSolver:
     # --- on the lane ---------------------------------------------------------------------------------
 
     def _solve(self, job: Job, setup: _Setup) -> None:
-        work = Work(_run, (setup,), SolveReport, SolveReport | str, "that solves")
-        deal: Deal[SolveReport, SolveReport | str] = Deal(
+        work = Work(_run, (setup,), SolveReport, SolveReport | _Far | str, "that solves")
+        deal: Deal[SolveReport, SolveReport | _Far | str] = Deal(
             range(1),
             lambda number, report: self._take(job, report),
             lambda news: self._take(job, news),
@@ -133,13 +150,15 @@ class SeedsSolver:
             raise JobFailed(f"no process could be started: {error}") from error
         except PoolError as error:
             raise JobFailed(str(error)) from error
-        self._held.update(job, state="done")
+        self._held.update(job, state="done", activity="")
 
-    def _take(self, job: Job, news: SolveReport | str) -> None:
+    def _take(self, job: Job, news: SolveReport | _Far | str) -> None:
         if isinstance(news, str):
             self._held.update(job, activity=news)
+        elif isinstance(news, _Far):
+            self._held.update(job, state="solving", done=news.done, activity=news.underway)
         else:
-            self._held.update(job, state="solving", report=news, activity="")
+            self._held.update(job, state="solving", report=news)
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
         self._held.update(job, state="failed", why=str(failure), problem=failure.problem, activity="")
@@ -158,6 +177,7 @@ def _run(setup: _Setup, queue: ItemQueue) -> None:
     report = solve(
         what,
         on_activity=queue.send_update,
+        on_progress=lambda now: queue.send_update(_Far(now.done, underway_text(now.by_seed(0), now.limit))),
         stop=lambda: queue.limit() == 0,
         on_finding=lambda finding: None,
         on_report=queue.send_update,

@@ -9,7 +9,8 @@ import viser
 
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
-from workbench.planning.verdicts import SolveReport
+from workbench.planning.report import SolveReport
+from workbench.planning.verdicts import ENOUGH_SEEDS
 from workbench.session.checks.checks import ChecksView
 from workbench.session.checks.solve_seeds import RUNNING, SeedsView
 from workbench.session.live.session import Session
@@ -23,7 +24,7 @@ from workbench.ui.widgets.templates import render
 
 TITLE = "Solve many seeds"
 SOLVE, STOP_SOLVING = "Solve", "Stop solving"
-USUAL_SEEDS, MOST_SEEDS = 8, 256
+MOST_SEEDS = 256
 
 
 class SolveSeedsPanel(PagePart[SessionView]):
@@ -51,7 +52,12 @@ class SolveSeedsPanel(PagePart[SessionView]):
         self._presses = Presses(server)
         with server.gui.add_folder(TITLE, expand_by_default=False):
             self._seeds = server.gui.add_number(
-                "Seeds", USUAL_SEEDS, min=1, max=MOST_SEEDS, step=1, hint="From 0 on."
+                "Seeds",
+                ENOUGH_SEEDS,
+                min=1,
+                max=MOST_SEEDS,
+                step=1,
+                hint=f"From 0 on. That no rule is broken says something from {ENOUGH_SEEDS} seeds on.",
             )
             self._start = server.gui.add_button(
                 SOLVE,
@@ -115,4 +121,5 @@ def seeds_html(seeds: SeedsView, id_of: Callable[[int], str], link: LinkTo = no_
     Args:
         id_of: the id of the button that opens a seed's recording.
     """
-    return render("solve_seeds", seeds=seeds, running=seeds.state in RUNNING, id_of=id_of, link=link)
+    running = seeds.state in RUNNING
+    return render("solve_seeds", seeds=seeds, running=running, id_of=id_of, link=link)

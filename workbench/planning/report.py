@@ -1,0 +1,119 @@
+"""What came of a task's seeds that were solved by planning, as far as they are done.
+
+Imports no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+from workbench.planning.verdicts import ENOUGH_SEEDS, MOST_OF, RewardVerdict
+
+
+@dataclass(frozen=True)
+class SolvedSeed:
+    """What came of one seed."""
+
+    seed: int
+    solved_at: int
+    """The control step of its success, from 1 on; 0 without one."""
+    steps: int
+    total_reward: float
+    """Over all steps, those after its success too."""
+    seconds: float
+    """Wall time of its plans."""
+    in_the_way: str
+    """Why it was not solved; empty if it was."""
+    path: Path
+    """Its recording."""
+    cut_off: bool = False
+    """Its wall time was up."""
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """What came of all seeds that were tried to the end."""
+
+    seeds: tuple[SolvedSeed, ...]
+    verdicts: tuple[RewardVerdict, ...]
+    """Of these seeds, if that `tells`: with further ones, one may come or go."""
+    seconds: float
+    """Wall time, opening the task included."""
+    stopped: bool
+    """It was stopped before all seeds were tried."""
+    wanted: int
+    """Seeds that were asked for."""
+
+    @property
+    def solved(self) -> tuple[SolvedSeed, ...]:
+        return tuple(one for one in self.seeds if one.solved_at)
+
+    @property
+    def median_steps(self) -> float | None:
+        """Of the solved seeds, to their success; None without one."""
+        return median(one.solved_at for one in self.solved) if self.solved else None
+
+    @property
+    def tells(self) -> bool:
+        """Whether there are seeds enough for verdicts: what the first ones show, the next may refute."""
+        return len(self.seeds) >= min(MOST_OF, self.wanted)
+
+    @property
+    def so_far(self) -> str:
+        """``after 3 of 8 seeds``; empty once all are done."""
+        done = len(self.seeds)
+        return f"after {done} of {self.wanted} seeds" if done < self.wanted else ""
+
+    @property
+    def summary(self) -> str:
+        """``Solved 14 of 16 seeds, in 9 control steps (median). 61 s.``; ``3 of 16 seeds are done, 2 of them solved ...``."""
+        done, solved = len(self.seeds), len(self.solved)
+        steps = "" if self.median_steps is None else f", in {self.median_steps:g} control steps (median)"
+        what = f"Solved {solved} of {_seeds(done)}"
+        if done < self.wanted:
+            what = f"{done} of {_seeds(self.wanted)} {'is' if done == 1 else 'are'} done, {solved} solved"
+        return f"{what}{steps}. {self.seconds:.0f} s."
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence each: what the result leaves open."""
+        found = []
+        if not self.tells:
+            found.append(f"What the seeds tell of the reward is said from {MOST_OF} seeds on.")
+        if self.wanted < ENOUGH_SEEDS:
+            found.append(few_seeds_text(self.wanted))
+        if cut := sum(one.cut_off for one in self.seeds):
+            found.append(
+                f"{_seeds(cut)} ended because {'its' if cut == 1 else 'their'} time was up: on another machine, or in "
+                "another run, others may be solved."
+            )
+        return tuple(found)
+
+
+def few_seeds_text(count: int) -> str:
+    """What so few seeds leave open: fewer than `verdicts.ENOUGH_SEEDS`."""
+    return (
+        f"{_seeds(count)} may all miss what is wrong with a reward: that no rule is broken says something from "
+        f"{ENOUGH_SEEDS} seeds on."
+    )
+
+
+def underway_text(running: Mapping[int, int], limit: int) -> str:
+    """``seed 2 at step 12 of 50``; ``seeds 2 and 3 at steps 12 and 7 of 50``; empty where none runs.
+
+    Args:
+        running: control steps so far, by seed.
+    """
+    seeds = sorted(running)
+    plural = "" if len(seeds) == 1 else "s"
+    named, steps = (
+        " and ".join(", ".join(map(str, each)).rsplit(", ", 1))
+        for each in (seeds, [running[seed] for seed in seeds])
+    )
+    return f"seed{plural} {named} at step{plural} {steps} of {limit}" if seeds else ""
+
+
+def _seeds(count: int) -> str:
+    return f"{count} seed{'' if count == 1 else 's'}"
