@@ -17,14 +17,21 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from rich.progress import Progress
 
 from tests.drive.waiting import until
+from workbench.checks.results import RuleResult
 from workbench.cli.main import main
-from workbench.jobs.record import RecordProgress
+from workbench.cli.record import RecordBar
+from workbench.cli.solve import SolveOutput, as_csv, as_json, as_junit
+from workbench.core.rules import FailOn, Finding
+from workbench.jobs.check import CheckedTask, CheckReport
+from workbench.jobs.record import RecordProgress, Written
 from workbench.jobs.solve import SolveOptions, solve
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
-from workbench.planning.report import SolveReport
+from workbench.planning.report import SolvedSeed, SolveReport
+from workbench.planning.verdicts import RewardVerdict
 from workbench.recording.reader.read_episode import read_episode
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -95,6 +102,66 @@ def test_what_pays_without_success_is_told_with_its_seeds(lift: Path) -> None:
     unsolved = [one.seed for one in report.seeds if not one.solved_at]
     assert unsolved and set(verdict.seeds) <= set(unsolved)
     assert "height" in verdict.message
+
+
+def test_a_seed_whose_time_is_up_ends_at_its_next_step_and_its_progress_is_told(lift: Path) -> None:
+    seen: list[RecordProgress] = []
+    what = replace(options_of(lift, seeds=2), seconds_per_seed=1e-6)
+    report = solve(what, on_progress=seen.append)
+    assert [one.steps for one in report.seeds] == [1, 1] and all(one.cut_off for one in report.seeds)
+    assert "its time was up after 1 steps" in report.seeds[0].in_the_way and report.verdicts == ()
+    # The first plan is still to be made, and nothing is done.
+    assert (seen[0].by_seed(4), seen[0].limit, seen[0].done) == ({4: 0}, 8, 0)
+    assert (seen[1].by_seed(4), seen[1].done) == ({4: 1}, 1 / 8)
+    assert (seen[-1].running, seen[-1].done, seen[-1].steps) == ({}, 2, 2)
+
+
+FOUND = SolveReport(
+    (
+        SolvedSeed(2, 8, 13, 9.25, 3.2, "", Path("2.rrd")),
+        SolvedSeed(3, 0, 50, 21.5, 9.0, "it pays", Path("3.rrd")),
+    ),
+    (RewardVerdict("reward-exploited", "1 of 2 episodes earned more", (3,)),),
+    20.0,
+    False,
+    2,
+)
+
+
+@pytest.mark.parametrize(
+    ("fail_on", "found", "unsolved"), [("stop", False, True), ("warn", True, True), ("never", False, False)]
+)
+def test_the_exit_code_has_the_degrees_of_the_checks(fail_on: FailOn, found: bool, unsolved: bool) -> None:
+    output = SolveOutput(fail_on=fail_on)
+    assert output.fails(FOUND) == found
+    rule = RuleResult(
+        "reward-exploited", "broken", (Finding("reward-exploited", "warn", "", None, None, "", "", 1, 0),)
+    )
+    checked = CheckReport(CheckedTask("x", "", None), (rule,), 1.0, 1.0)
+    assert checked.fails(fail_on) == found
+    assert output.fails(replace(FOUND, seeds=FOUND.seeds[1:], verdicts=())) == unsolved
+    suite = ElementTree.fromstring(as_junit(FOUND, SolveOptions("x"), output))
+    assert suite.get("failures") == str(int(found))
+
+
+def test_each_row_names_the_rules_that_it_is_an_example_of() -> None:
+    rows = list(csv.DictReader(io.StringIO(as_csv(FOUND, SolveOptions("x"), SolveOutput()))))
+    assert [row["rules"] for row in rows] == ["", "reward-exploited"]
+    told = json.loads(as_json(FOUND, SolveOptions("x"), SolveOutput()))
+    assert [row["rules"] for row in told["seeds"]] == [[], ["reward-exploited"]]
+    assert told["verdicts"][0]["message"] == "1 of 2 episodes earned more" and told["notes"]
+
+
+def test_the_bar_moves_within_a_seed_and_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines: list[str] = []
+    monkeypatch.setattr("workbench.cli.record.err.print", lambda line, **how: lines.append(line))
+    bar = Progress()
+    shown = RecordBar(bar, 4, "solving", first_seed=2)
+    written = Written(0, Path("2.rrd"), 2, 13, 9.25, True)
+    shown.show(RecordProgress(0, 12, None, {0: 12}, 50, 0.24))
+    assert (bar.tasks[0].description, bar.tasks[0].completed) == ("solving, seed 2 at step 12 of 50", 0.24)
+    shown.show(RecordProgress(1, 13, (0, written), {}, 50, 1.0))
+    assert lines == ["seed 2: 13 steps, return 9.250, success, 1 of 4 kept"]
 
 
 @pytest.mark.slow
@@ -190,6 +257,7 @@ def test_the_command_prints_and_writes_reports(lift: Path, capsys: pytest.Captur
         ("--seeds 0", "--seeds must be at least 1"),
         ("--rollouts 1", "--rollouts must be at least 4"),
         ("--horizon -1", "--horizon is a time in seconds"),
+        ("--seconds-per-seed 0", "--seconds-per-seed must be above 0"),
         ("--json --csv", "both print the result"),
         ("--junit .", "is a folder"),
     ],

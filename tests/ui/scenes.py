@@ -16,6 +16,7 @@ from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry,
 from workbench.jobs.task import ActionDimension, TaskDescription
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import Settings
+from workbench.session.protocol.questions import PlannedEnv
 from workbench.session.record.live import RecordingStatus
 
 
@@ -113,6 +114,23 @@ def description(geometry: SceneGeometry, cameras: tuple[CameraInfo, ...] = ()) -
 
 EMPTY = SessionView(activity="a worker process", recording=RecordingStatus(folder="recordings"))
 """A session that has just begun."""
+
+
+_WAYS = np.broadcast_to(np.arange(5, dtype=np.float32)[:, None] / 10, (3, 5, 3)).astype(np.float32)
+PLAN = PlannedEnv(
+    env=0,
+    actions=np.zeros((1, 2), np.float32),
+    horizon=4,
+    returns=np.array([3.5, 2.0, 1.25, 1.0, 0.5], np.float32),
+    plan=1,
+    hold=3,
+    success_at=np.array([3, 0, 0, 0, 0], np.int32),
+    paths=_WAYS,
+    drawn=(0, 2, 4),
+    traced="arm/hand",
+    seconds=0.25,
+)
+"""Five rollouts of four steps, of which three are drawn."""
 
 
 def running(num_envs: int, *, selected_env: int = 0, speed: float = 1.0, **changes: object) -> SessionView:

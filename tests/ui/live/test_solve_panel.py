@@ -11,14 +11,16 @@ import pytest
 import viser
 
 from tests.drive.panels import Panels
-from tests.ui.scenes import problem, running
+from tests.ui.scenes import PLAN, problem, running
 from workbench.core.env.keywords import HowMade, Keyword
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.session.live.solver import SolveView
 from workbench.session.live.view import SessionView
+from workbench.session.process.job_lane import JobProgress
 from workbench.session.protocol.messages import Settings
-from workbench.session.protocol.questions import PlannedEnv
+from workbench.session.record.live import RecordingStatus
+from workbench.session.record.save_past import SaveStatus
 from workbench.ui.live.solve_panel import (
     ALL_ENVS,
     SAVE_SOLVED,
@@ -30,20 +32,6 @@ from workbench.ui.live.solve_panel import (
     solve_html,
 )
 
-PATHS = np.broadcast_to(np.arange(5, dtype=np.float32)[:, None] / 10, (3, 5, 3)).astype(np.float32)
-PLAN = PlannedEnv(
-    env=0,
-    actions=np.zeros((1, 2), np.float32),
-    horizon=4,
-    returns=np.array([3.5, 2.0, 1.25, 1.0, 0.5], np.float32),
-    plan=1,
-    hold=3,
-    success_at=np.array([3, 0, 0, 0, 0], np.int32),
-    paths=PATHS,
-    drawn=(0, 2, 4),
-    traced="arm/hand",
-    seconds=0.25,
-)
 SOLVED = SolveView(
     "planning",
     3,
@@ -109,7 +97,14 @@ def test_it_is_there_only_while_actions_are_planned(shown: Shown) -> None:
 def test_it_tells_what_the_rollouts_earned_and_what_came_of_it(shown: Shown) -> None:
     shown.draw()
     said = shown.panels.html()
-    for told in ("Env 0 is solved at step 3", "3.5", "1.8", "5 rollouts in 0.25 s", "5 125 env-steps/s"):
+    for told in (
+        "Env 0 is solved at step 3",
+        "3.5",
+        "has earned <b>1.8</b> in 3 steps",
+        "last plan, carried on",
+        "5 rollouts in 0.25 s",
+        "5 125 env-steps/s",
+    ):
         assert told in said
     (chart,) = shown.panels.charts()
     assert [list(line) for line in chart.data[1:]] == [
@@ -135,7 +130,7 @@ def test_sliders_ask_for_other_plans(shown: Shown) -> None:
     shown.draw()
     shown.panels.set("Method", "CEM")
     shown.panels.set("Plan for", ALL_ENVS)
-    shown.panels.set("Trace", "cube")
+    shown.panels.set("Lines follow", "cube")
     plan = PlanOptions(rollouts=32)
     assert shown.session.asked == [
         {"plan": replace(plan, method="cem")},
@@ -148,8 +143,18 @@ def test_a_solved_episode_is_saved_and_a_playing_one_is_not_offered(shown: Shown
     shown.draw(playing=True)
     assert not shown.panels.shows(SAVE_SOLVED)
     shown.draw()
+    assert "saving" not in shown.panels.html()
     shown.panels.press(SAVE_SOLVED)
     assert shown.session.asked == [("save", (0,))]
+    # Before the session has answered.
+    assert ">saving<" in shown.panels.html() and shown.panels.control(SAVE_SOLVED).disabled
+    under_way = SaveStatus(progress=JobProgress("rendering it again", 2, 8))
+    shown.draw(recording=RecordingStatus(saving=under_way))
+    assert "rendering it again, 2 of 8 moments" in shown.panels.html()
+    shown.draw(recording=RecordingStatus(saving=SaveStatus("saved 1 episode, 7 steps")))
+    assert (
+        "saved 1 episode, 7 steps" in shown.panels.html() and not shown.panels.control(SAVE_SOLVED).disabled
+    )
 
 
 def test_a_success_is_told_once_whichever_tab_is_open(shown: Shown, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from tests.drive.panels import Panels
 from tests.ui.env_rows import rows_of
-from tests.ui.scenes import EMPTY, problem, running
+from tests.ui.scenes import EMPTY, PLAN, problem, running
 from workbench.core.capture.outliers import Outlier, OutlierKind
+from workbench.session.live.solver import SolveView
 from workbench.ui.live.status_line import StatusLine, flagged_text, status_values
 from workbench.ui.widgets.templates import render
 
@@ -20,6 +22,18 @@ def test_running_says_rates_envs_and_backend() -> None:
         word in text
         for word in ("running", "16 envs", "cpu (batched)", "<b>20</b> steps/s", "1.00 × real time")
     )
+
+
+def test_while_actions_are_planned_it_says_so_and_how_long_a_plan_takes() -> None:
+    def planning(**solve: Any) -> str:
+        view = running(4, steps_per_second=0.3, real_time_factor=0.01, solve=SolveView(**solve))
+        return html(replace(view, settings=replace(view.settings, action_source="solve")))
+
+    said = planning(state="planning", plan=PLAN)
+    assert "<b>planning</b>" in said and "<b>0.25</b> s a plan" in said
+    assert "running</b>" not in said and "real time" not in said and "wb-warn-text" not in said
+    begun = planning(state="starting", activity="building 1 env")
+    assert "<b>planning</b>" in begun and "building 1 env" in begun and "steps/s" not in begun
 
 
 def test_one_env_is_one_env() -> None:

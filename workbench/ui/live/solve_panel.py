@@ -15,7 +15,6 @@ from workbench.session.live.session import Session
 from workbench.session.live.solver import SolveView
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.questions import PlannedEnv
-from workbench.session.record.save_past import SaveStatus
 from workbench.ui.scene.rollout_traces import RolloutTraces
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.inputs import Control, tell_all
@@ -37,7 +36,6 @@ MOST_ROLLOUTS, LONGEST_HORIZON = 256, 3.0
 MOST_TOLD = 4
 """Solved envs that are named."""
 CHART_HEIGHT = 150
-NOT_SAVED = SaveStatus()
 PREDICTED, ACHIEVED = "#228be6", "#f08c00"
 SETTLE = 0.5
 """Seconds: other rollouts are other envs, which are not built for each place of a slider that is passed."""
@@ -66,6 +64,7 @@ class SolvePanel(PagePart[SessionView]):
                 visible=False,
                 hint="Into the recordings, like any other episode: from there it can be exported as a demonstration",
             )
+            self._saving = gui.add_html("", visible=False)
             self._mode = gui.add_button(
                 USE_MODE,
                 color="gray",
@@ -114,11 +113,16 @@ class SolvePanel(PagePart[SessionView]):
                 "Plan every", "every", 1, 10, 1, "Control steps that are taken before the next plan."
             )
             self._shows = gui.add_checkbox(
-                "Show rollouts", True, hint="Their ways in the 3-D view: the best is bright."
+                "Show rollouts",
+                True,
+                hint="What was tried, as lines in the 3-D view: each is the way that a body takes in one rollout. The best is "
+                "bright.",
             )
             add_dropdown: Any = gui.add_dropdown  # viser infers the type of the options from the first
             self._traced = Control(
-                add_dropdown("Trace", (TOOL,), hint="The body whose ways are shown, from the next plan on."),
+                add_dropdown(
+                    "Lines follow", (TOOL,), hint="The body whose ways are drawn, from the next plan on."
+                ),
                 send=lambda name: session.change(traced="" if name == TOOL else name),
             )
             self._look_at = gui.add_slider(
@@ -150,6 +154,9 @@ class SolvePanel(PagePart[SessionView]):
         self._session.change(plan=replace(self._session.view().settings.plan, **changes))
 
     def _save_solved(self) -> None:
+        # At once: the episode is in the history, and it may take a second until its first moment is saved.
+        self._save.disabled, self._saving.visible = True, True
+        self._saving.content = render("note", text="saving")
         view = self._session.view()
         self._session.save_past(tuple(env for env, _ in view.solve.solved) or (view.selected_env,))
 
@@ -170,9 +177,11 @@ class SolvePanel(PagePart[SessionView]):
             return
         plan = view.settings.plan
         saving = view.recording.saving
-        self._status.content = solve_html(solve, task.num_envs, saving, self._link)
+        self._status.content = solve_html(solve, task.num_envs, self._link)
         self._save.visible = bool(solve.solved) and not view.playing
         self._save.disabled = saving.progress is not None
+        self._saving.visible = self._save.visible and (self._save.disabled or bool(saving.message))
+        self._saving.content = render("saving", saving=saving)
         self._mode.visible = offers_better_mode(view)
         self._envs.handle.visible = task.num_envs > 1
         self._envs.show(view.settings.solve_all)
@@ -226,10 +235,10 @@ class SolvePanel(PagePart[SessionView]):
         there = part_round(len(solve.predicted), None)
         steps = np.arange(len(solve.predicted))[there] + solve.begins
         lines = (
-            ChartLine("predicted", solve.predicted[there], PREDICTED),
-            ChartLine("achieved", solve.achieved[there], ACHIEVED),
+            ChartLine("best rollout", solve.predicted[there], PREDICTED),
+            ChartLine("what came", solve.achieved[there], ACHIEVED),
         )
-        self._chart.draw("Reward a step, over the horizon", steps, lines)
+        self._chart.draw("Reward a step, of the steps that a plan looks ahead", steps, lines)
 
     def _tell(self, view: SessionView) -> None:
         """Whichever tab is open: a person may not look at this one while it plans."""
@@ -265,7 +274,7 @@ def in_words(plan: PlannedEnv, place: int) -> str:
     which = "The best rollout" if number == 0 else f"Rollout {number + 1} of {len(plan.returns)}"
     told = f"{which}: return {plan.returns[number]:.4g}"
     if number in (plan.plan, plan.hold):
-        told += ", the plan as it was before" if number == plan.plan else ", which holds still"
+        told += ", the last plan carried on" if number == plan.plan else ", which holds still"
     return told + (f", success at step {plan.success_at[number]}" if plan.success_at[number] else "")
 
 
@@ -274,29 +283,30 @@ def is_flat(plan: PlannedEnv) -> bool:
     return bool(np.ptp(plan.returns) == 0 and not plan.success_at.any())
 
 
-def solve_html(
-    solve: SolveView, num_envs: int, saving: SaveStatus = NOT_SAVED, link: LinkTo = no_links
-) -> str:
+def solve_html(solve: SolveView, num_envs: int, link: LinkTo = no_links) -> str:
     """What the plan came to, or what to do for one."""
     plan = solve.plan
-    returns: list[tuple[str, float]] = []
+    returns: list[tuple[str, str, float]] = []
     if plan is not None:
         returns = [
-            ("best rollout", plan.returns[0]),
-            ("the plan before", plan.returns[plan.plan]),
-            ("holding still", plan.returns[plan.hold]),
-            ("worst rollout", plan.returns[-1]),
+            ("best rollout", "Of all that were tried, the one that earns most", plan.returns[0]),
+            (
+                "last plan, carried on",
+                "What was planned a step ago, without what was learned since: it is always tried too",
+                plan.returns[plan.plan],
+            ),
+            ("holding still", "The robot stays as it is: that is always tried too", plan.returns[plan.hold]),
+            ("worst rollout", "Of all that were tried, the one that earns least", plan.returns[-1]),
         ]
     return render(
         "solve",
         solve=solve,
-        saving=saving.message if saving.progress is None and solve.solved else "",
-        failed=saving.failed,
         solved=solve.solved[:MOST_TOLD],
         more=max(0, len(solve.solved) - MOST_TOLD),
         several=num_envs > 1,
         flat=plan is not None and is_flat(plan),
         returns=returns,
+        steps=len(solve.achieved),
         per_second=f"{solve.steps_per_second:,.0f}".replace(",", " "),
         link=link,
     )

@@ -33,6 +33,7 @@ STATE_WORDS = {
     "busy": "busy",
     "held": "held",
     "awaited": "waiting",
+    "planning": "planning",
 }
 
 
@@ -115,16 +116,20 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
     # While the renderer works, the session's activity says more than "busy".
     busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
     moving = view.playing and view.state in ("running", "error") and task is not None and busy is None
+    # A plan takes what it takes: rates of single steps would only say that it is slow.
+    planning = moving and view.settings.action_source == "solve"
+    starting = planning and view.solve.state == "starting"
     slow = view.real_time_factor < 0.85 * view.settings.speed and view.settings.speed != float("inf")
     return {
         "view": view,
         "state": view.state if busy is None else "loading",
-        "word": STATE_WORDS[_state(view, busy)],
+        "word": STATE_WORDS["planning" if planning else _state(view, busy)],
         "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
-        "activity": view.activity if busy is None else _doing(busy),
+        "activity": (view.solve.activity if starting else view.activity) if busy is None else _doing(busy),
         "news": _news(view) if fresh else "",
         "at": step_in_words(view),
-        "moving": moving,
+        "moving": moving and not planning,
+        "plan": view.solve.plan if planning and not starting else None,
         "behind": moving and slow,
         "marked": marked,
         "robot": "" if task is None else robot_text(task),
