@@ -49,6 +49,8 @@
     if (now === which) return;
     which = now;
     clearTimeout(looking);
+    // Somebody was led here to watch something, which is in the first tab.
+    if (marker()?.hasAttribute("data-anew")) sessionStorage.removeItem(KEEPS + now);
     const kept = sessionStorage.getItem(KEEPS + now);
     if (now && kept) openAgain(kept, LOOKS);
   }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-which"] });

@@ -60,10 +60,11 @@ def _list_topics() -> None:
 def _not_found(name: str) -> str:
     said = plain_text(name.strip())
     names = [topic.name for topic in topics()]
-    close = difflib.get_close_matches(said.lower(), names, 1)
+    about = [topic.name for topic in topics_about(said)]
+    # Several words are no name that was mistyped.
+    close = difflib.get_close_matches(said.lower(), names, 1) if len(said.split()) == 1 or not about else []
     if close:
         return f"There is no topic {said!r}. Did you mean {close[0]!r}? workbench help lists all."
-    about = [topic.name for topic in topics_about(said)]
     if about:
         return f"There is no topic {said!r}. These mention it: {', '.join(about)}"
     return f"There is no topic {said!r}, and no topic mentions it. workbench help lists all."

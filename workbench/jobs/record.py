@@ -73,6 +73,16 @@ class Underway:
 
 
 @dataclass(frozen=True)
+class RecordUpdate:
+    """One thing that a process which records has to say."""
+
+    activity: str = ""
+    """What it does before its first episode."""
+    underway: Underway | None = None
+    finding: Finding | None = None
+
+
+@dataclass(frozen=True)
 class Written:
     """An episode on disk."""
 
@@ -195,7 +205,7 @@ def record(
     run = _record_items
     if executor is None and len(setups) == 1:
         executor, run = ThisProcess(), partial(_record_items, given=given)
-    work = Work(run, setups, result=Written | None, update=str | Underway | Finding, name="that records")
+    work = Work(run, setups, result=Written | None, update=RecordUpdate, name="that records")
     (executor or Processes()).run(work, recording.deal)
     return recording.so_far(stop())
 
@@ -224,9 +234,7 @@ class _Recording:
         """Findings of all processes, to report each once."""
         most = what.episodes if what.successes is None else what.tries
         assert most is not None
-        self.deal: Deal[Written | None, str | Underway | Finding] = Deal(
-            range(most), self._over, self._on_update, stop
-        )
+        self.deal: Deal[Written | None, RecordUpdate] = Deal(range(most), self._over, self._on_update, stop)
 
     def so_far(self, stopped: bool) -> Recorded:
         enough = self._wanted is not None and len(self._kept) == self._wanted
@@ -246,16 +254,16 @@ class _Recording:
                 self._remove(self._kept.pop(surplus))
         self._tell((number, self._kept.get(number)))
 
-    def _on_update(self, update: str | Underway | Finding) -> None:
-        if isinstance(update, str):
-            self._on_activity(update)
-        elif isinstance(update, Underway):
-            self._steps, self._step_limit = self._steps + update.made, update.limit
-            self._running.update(update.steps)
+    def _on_update(self, update: RecordUpdate) -> None:
+        if update.activity:
+            self._on_activity(update.activity)
+        if (underway := update.underway) is not None:
+            self._steps, self._step_limit = self._steps + underway.made, underway.limit
+            self._running.update(underway.steps)
             self._tell()
-        elif update.key not in self._found:
-            self._found.add(update.key)
-            self._on_finding(update)
+        if (finding := update.finding) is not None and finding.key not in self._found:
+            self._found.add(finding.key)
+            self._on_finding(finding)
 
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
         limit = self.deal.limit()
@@ -300,7 +308,12 @@ def _opened(what: RecordOptions, queue: ItemQueue) -> OpenedTask:
 
 
 def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> OpenedTask:
-    opened = open_task(what.task, options, on_activity=queue.send_update, on_finding=queue.send_update)
+    opened = open_task(
+        what.task,
+        options,
+        on_activity=lambda activity: queue.send_update(RecordUpdate(activity)),
+        on_finding=lambda finding: queue.send_update(RecordUpdate(finding=finding)),
+    )
     if isinstance(opened.env.env, BatchedCpuMixin):
         # Else an episode depends, by its last bits, on those that the same process made before.
         opened.env.env.begins_anew = True
@@ -325,7 +338,7 @@ class _Episodes:
         self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
         self._planned: PlannedActions | None = None
         if what.actions == SOLVE:
-            queue.send_update("building the envs of the rollouts")
+            queue.send_update(RecordUpdate("building the envs of the rollouts"))
             self._planned = PlannedActions(opened.loaded, opened.env, what.options.env_kwargs, what.plan)
         plain = not given and what.actions not in ("random", SOLVE)
         self._chooser = RecordActionChooser(
@@ -373,7 +386,7 @@ class _Episodes:
     def _tell(self, made: int) -> None:
         """Send how far the episodes are, after so many control steps more."""
         at = tuple((index, self._steps[env]) for env, index in self._running.items())
-        self._queue.send_update(Underway(at, self._limit, made))
+        self._queue.send_update(RecordUpdate(underway=Underway(at, self._limit, made)))
 
     def _drop_from(self, limit: int) -> None:
         for env in [env for env, index in self._running.items() if index >= limit]:

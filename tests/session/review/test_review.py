@@ -189,7 +189,11 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
         and "ZeroDivisionError: oh" in said
         and "file d was not opened. gone" in said
     )
-    assert "no longer in the folder" in said
+    assert "no longer in the folder" in said and view.not_opened == ("b", "c", "d")
+    review.open_again()
+    assert review.view().not_opened == () and review.view().loading
+    view = reach(review, lambda view: len(view.not_opened) == 3 and not view.loading, "the second try")
+    assert [o.id for o in view.opened] == ["a"]
     review.open(["b"])
     view = reach(review, lambda view: not view.loading and len(view.problems) == 1, "its problem")
     assert [o.id for o in view.opened] == ["a"], "what was open stays"

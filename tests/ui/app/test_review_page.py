@@ -21,7 +21,7 @@ from workbench.session.live.session import Session
 from workbench.session.review.review import Review
 from workbench.ui.app.review_page import ReviewPage, walk
 from workbench.ui.app.workplace import Workplace
-from workbench.ui.review.panel import GHOSTS, GO_LIVE
+from workbench.ui.review.panel import GHOSTS, GO_LIVE, TRY_AGAIN
 from workbench.ui.review.scene import MOST_NAMED
 from workbench.ui.server.gated_server import GatedServer
 
@@ -135,6 +135,39 @@ def test_two_recordings_are_compared_and_aligned(shown: Shown, monkeypatch: pyte
     shown.draw()
     assert "B has no success" in shown.panels.part("Review").html()
     assert shown.panels.control(SLIDER).min == -7
+
+
+def test_what_could_not_be_read_is_tried_again_with_a_press(shown: Shown, folder: Path) -> None:
+    write(folder, made(4, seed=3))
+    shown.library.refresh()
+    (row,) = (row for row in shown.library.view().rows if row.seed == 3)
+    files = {path: path.read_bytes() for path in row.paths}
+    for path in files:
+        path.write_bytes(b"cut off")
+    shown.review.open([row.id])
+    until(lambda: not shown.review.view().loading, "that it cannot be read")
+    shown.draw()
+    assert "was not opened" in shown.panels.part("Review").html() and shown.panels.shows(TRY_AGAIN)
+    for path, content in files.items():
+        path.write_bytes(content)
+    shown.panels.press(TRY_AGAIN)
+    until(lambda: len(shown.review.view().opened) == 1, "the recording")
+    until(lambda: not shown.review.view().loading, "the end of it")
+    shown.draw()
+    assert not shown.panels.shows(TRY_AGAIN)
+    for path in files:
+        path.unlink()
+    shown.library.refresh()
+
+
+def test_who_was_led_to_a_recording_begins_in_the_tab_where_it_is_watched(
+    child_process: None, folder: Path, gated_server: GatedServer, panels: Panels
+) -> None:
+    place = Workplace(gated_server, folder, no_session, TaskOptions())
+    place.wanted = folder / "push.rrd"
+    ReviewPage(place)
+    assert "data-anew" in panels.html()
+    place.close()
 
 
 def strip_of(shown: Shown) -> dict[str, list[tuple[str, ...]]]:

@@ -15,7 +15,14 @@ from tests.ui.scenes import problem, running
 from workbench.planning.report import SolvedSeed, SolveReport
 from workbench.planning.verdicts import RewardVerdict
 from workbench.session.checks.solve_seeds import SeedsView
-from workbench.ui.checks.solve_seeds import SOLVE, STOP_SOLVING, SolveSeedsPanel, seeds_html, verdict_cards
+from workbench.ui.checks.solve_seeds import (
+    SOLVE,
+    STOP_SOLVING,
+    TITLE,
+    SolveSeedsPanel,
+    seeds_html,
+    verdict_cards,
+)
 
 REPORT = SolveReport(
     (
@@ -78,6 +85,17 @@ def test_so_many_seeds_as_are_typed_are_solved_and_it_can_be_stopped(shown: Show
     assert "seed 0 at step 30 of 50" in shown.panels.html() and "width: 5%" in shown.panels.html()
     shown.panels.press(STOP_SOLVING)
     assert shown.session.asked == [12, "stop"]
+
+
+def test_who_comes_back_from_a_recording_finds_the_folder_open(server: viser.ViserServer) -> None:
+    SolveSeedsPanel(server, RecordedSession(SeedsView()), lambda path: None)  # type: ignore[arg-type]
+    SolveSeedsPanel(server, RecordedSession(DONE), lambda path: None)  # type: ignore[arg-type]
+    folders = [
+        one
+        for one in server.gui._container_handle_from_uuid.values()
+        if isinstance(one, viser.GuiFolderHandle)
+    ]
+    assert [one.expand_by_default for one in folders if one.label == TITLE] == [False, True]
 
 
 def test_each_seed_has_a_row_that_opens_its_recording(shown: Shown) -> None:

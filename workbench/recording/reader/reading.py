@@ -240,8 +240,7 @@ def _entries(found: RecordingFiles, answered: Answered | ReaderEnded) -> list[Li
     if isinstance(answer, ReadFailed):
         why = answer.message
     elif isinstance(answer, ReaderEnded):
-        # It is read again when it changes or is opened.
-        why = f"{answer}, and is left alone until it changes"
+        why = f"{answer}, and is read again when it is opened or changes"
     # Any of the files may be the cause.
     suffixes = ", ".join(suffix for suffix in found.sizes if suffix != NOTES)
     return [broken(found, f"{Path(found.key).name} ({suffixes}) {why}.")]

@@ -47,11 +47,14 @@ class SeedsView:
 
 
 @dataclass(frozen=True)
-class _Far:
-    """How far the seeds are, from the other process."""
+class _Update:
+    """One thing that the other process has to say."""
 
-    done: float
-    underway: str
+    activity: str = ""
+    """As of `SeedsView`."""
+    done: float | None = None
+    """As of `SeedsView`; None before the first seed."""
+    report: SolveReport | None = None
 
 
 @dataclass(frozen=True)
@@ -135,10 +138,10 @@ class SeedsSolver:
     # --- on the lane ---------------------------------------------------------------------------------
 
     def _solve(self, job: Job, setup: _Setup) -> None:
-        work = Work(_run, (setup,), SolveReport, SolveReport | _Far | str, "that solves")
-        deal: Deal[SolveReport, SolveReport | _Far | str] = Deal(
+        work = Work(_run, (setup,), SolveReport, _Update, "that solves")
+        deal: Deal[SolveReport, _Update] = Deal(
             range(1),
-            lambda number, report: self._take(job, report),
+            lambda number, report: self._take(job, _Update(report=report)),
             lambda news: self._take(job, news),
             lambda: job.stopped,
         )
@@ -152,13 +155,13 @@ class SeedsSolver:
             raise JobFailed(str(error)) from error
         self._held.update(job, state="done", activity="")
 
-    def _take(self, job: Job, news: SolveReport | _Far | str) -> None:
-        if isinstance(news, str):
-            self._held.update(job, activity=news)
-        elif isinstance(news, _Far):
-            self._held.update(job, state="solving", done=news.done, activity=news.underway)
+    def _take(self, job: Job, news: _Update) -> None:
+        if news.report is not None:
+            self._held.update(job, state="solving", report=news.report)
+        elif news.done is not None:
+            self._held.update(job, state="solving", done=news.done, activity=news.activity)
         else:
-            self._held.update(job, state="solving", report=news)
+            self._held.update(job, activity=news.activity)
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
         self._held.update(job, state="failed", why=str(failure), problem=failure.problem, activity="")
@@ -176,10 +179,12 @@ def _run(setup: _Setup, queue: ItemQueue) -> None:
     )
     report = solve(
         what,
-        on_activity=queue.send_update,
-        on_progress=lambda now: queue.send_update(_Far(now.done, underway_text(now.by_seed(0), now.limit))),
+        on_activity=lambda activity: queue.send_update(_Update(activity)),
+        on_progress=lambda now: queue.send_update(
+            _Update(underway_text(now.by_seed(0), now.limit), now.done)
+        ),
         stop=lambda: queue.limit() == 0,
         on_finding=lambda finding: None,
-        on_report=queue.send_update,
+        on_report=lambda report: queue.send_update(_Update(report=report)),
     )
     queue.send_result(0, report)

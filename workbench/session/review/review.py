@@ -155,16 +155,22 @@ class Review:
             self._partly_shown = False
             self._closed.clear()
             if not wanted:
-                self._change(problems=tuple(problems), loading="")
+                self._change(problems=tuple(problems), not_opened=(), loading="")
                 return
             # The library lists the newest first, but a comparison asks what became of the oldest. It is also read first:
             # the recording that is shown first stays selected when others arrive.
             wanted.sort(key=lambda row: (row.date is None, row.date or _NEVER))
-            self._change(loading=_opening_text(wanted, 0), problems=tuple(problems))
+            self._change(loading=_opening_text(wanted, 0), problems=tuple(problems), not_opened=())
             self._thread = threading.Thread(
                 target=self._open, args=(number, wanted, problems, state), name="review-open", daemon=True
             )
             self._thread.start()
+
+    def open_again(self) -> None:
+        """Try once more what could not be read, beside what is open: a busy machine may have been too slow."""
+        with self._changed:
+            ids = (*(one.id for one in self._view.opened), *self._view.not_opened)
+        self.open(ids)
 
     def close_one(self, index: int) -> None:
         """Close one of the open recordings."""
@@ -200,6 +206,7 @@ class Review:
 
     def _open(self, number: int, rows: list[LibraryRow], problems: list[str], state: int | None) -> None:
         opened: list[Opened] = []
+        failed: list[str] = []
         shapes = SharedShapes()
         files: dict[Path, _Stamp] = {}
         shown_at, wait = time.monotonic(), FIRST_SHOWN
@@ -227,10 +234,12 @@ class Review:
                 problems += [broken.sentence for broken in episode.broken_files]
             except (OSError, UnreadableRecording) as error:
                 problems.append(f"{row.name} was not opened. {error}")
+                failed.append(row.id)
             except Exception as error:
                 # The file may hold anything. Without this the page would stay on "opening" without a reason.
                 log.exception("%s could not be opened.", row.name)
                 problems.append(f"{row.name} could not be opened ({type(error).__name__}: {error}).")
+                failed.append(row.id)
         opened.sort(key=lambda one: one.episode.info.written_at)
         with self._changed:
             if number != self._opening:
@@ -238,7 +247,7 @@ class Review:
             self._open_problems = tuple(problems)
             if opened:
                 self._show(opened, files, state)
-            self._change(loading="", problems=self._open_problems)
+            self._change(loading="", problems=self._open_problems, not_opened=tuple(failed))
         self._give_scenes(number, [one for one in opened if not one.has_scene], shapes)
 
     def _show(self, opened: Sequence[Opened], files: Mapping[Path, _Stamp], state: int | None) -> None:

@@ -98,6 +98,8 @@ class ReviewView:
     """What is being opened."""
     problems: tuple[str, ...] = ()
     """Recordings that could not be opened, and files that changed since; a sentence each."""
+    not_opened: tuple[str, ...] = ()
+    """Ids of the recordings that the last opening could not read."""
 
     @property
     def states(self) -> tuple[int, ...]:

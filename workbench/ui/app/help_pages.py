@@ -27,6 +27,9 @@ HEADERS = {
     "frame-ancestors 'self'",
     "Cache-Control": "no-cache",
 }
+_BEGINNING = 1000
+"""Characters of a page that say what it is about."""
+_LITTLE_WORDS = frozenset("a an and for how i in is it my of on or the to with your".split())
 OVERVIEW = "overview"
 """The topic that is README."""
 GROUPS = (
@@ -108,9 +111,18 @@ def _as_named(name: str) -> str:
 
 
 def topics_about(words: str) -> list[Topic]:
-    """Topics whose text holds these words, whatever their case; pages of rules only where no other does."""
-    found = [topic for topic in topics() if words.lower() in topic.text.lower()]
-    return [topic for topic in found if topic.group != RULE_PAGES] or found
+    """Topics whose text holds each of these words, whatever their case and order; first those that begin with them. Pages of
+    rules only where no other does."""
+    wanted = [word for word in re.findall(r"[\w-]+", words.lower()) if word not in _LITTLE_WORDS]
+    if not wanted:
+        return []
+
+    def holds(text: str) -> bool:
+        return all(word in text.lower() for word in wanted)
+
+    found = [topic for topic in topics() if holds(topic.text)]
+    found = [topic for topic in found if topic.group != RULE_PAGES] or found
+    return sorted(found, key=lambda topic: not holds(topic.text[:_BEGINNING]))
 
 
 def by_path(path: str) -> Topic | None:

@@ -110,7 +110,7 @@ class Page:
             self._opening.add_button()
         # For `tab_stays.js`: not the path itself, which may be long.
         which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
-        server.gui.add_html(render("which", which=which))
+        server.gui.add_html(render("which", which=which, anew=False))
         run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()

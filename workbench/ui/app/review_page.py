@@ -93,7 +93,7 @@ class ReviewPage:
             server, place.open_task, lambda asking: self._library.leave_keys(asking), clock
         )
         self._opening.add_button()
-        server.gui.add_html(render("which", which="review"))
+        server.gui.add_html(render("which", which="review", anew=place.wanted is not None))
         self._add_way_back()
         review_tab, in_tabs = self._add_tabs(dark)
         self._timeline = ReviewTimeline(server, review, clock)

@@ -50,7 +50,9 @@ class SolveSeedsPanel(PagePart[SessionView]):
         self._open: set[str] = set()
         """Ids of rules that are folded out."""
         self._presses = Presses(server)
-        with server.gui.add_folder(TITLE, expand_by_default=False):
+        # Who comes back from a recording finds the rows that led there.
+        used = session.seeds_solver.view.state != "none"
+        with server.gui.add_folder(TITLE, expand_by_default=used):
             self._seeds = server.gui.add_number(
                 "Seeds",
                 ENOUGH_SEEDS,

@@ -21,6 +21,7 @@ MOST_OF_CODE = 200_000
 """Characters of one file."""
 SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 GHOSTS, GRID = "overlaid", "side by side"
+TRY_AGAIN = "Try again"
 GO_LIVE, STAY = "Continue live from here", "Stay here"
 
 
@@ -65,6 +66,14 @@ class ReviewPanel(PagePart[ReviewView]):
             send=review.set_loop,
         )
         self._problems = gui.add_html("")
+        self._again = gui.add_button(
+            TRY_AGAIN,
+            icon=viser.Icon.REFRESH,
+            color="gray",
+            visible=False,
+            hint="Reads once more what could not be opened: it may only have taken too long",
+        )
+        self._again.on_click(lambda _: review.open_again())
         self._list = gui.add_html("")
         self._arrange = gui.add_dropdown(
             "Layout", (GHOSTS, GRID), initial_value=GHOSTS, visible=False, hint="The O key switches."
@@ -117,6 +126,7 @@ class ReviewPanel(PagePart[ReviewView]):
         self._speed.show(view.speed)
         self._loop.show(view.loop)
         self._problems.content = render("review_problems", problems=view.problems, loading=view.loading)
+        self._again.visible = bool(view.not_opened) and not view.loading
         listed = (view.opened, view.selected, bool(view.loading))
         if self._listed != listed:
             # Not at every position: with many recordings it would be most of a frame's cost.
