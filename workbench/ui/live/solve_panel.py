@@ -306,7 +306,7 @@ def solve_html(solve: SolveView, num_envs: int, link: LinkTo = no_links) -> str:
         several=num_envs > 1,
         flat=plan is not None and is_flat(plan),
         returns=returns,
-        steps=len(solve.achieved),
+        steps=int(np.isfinite(solve.achieved).sum()),
         per_second=f"{solve.steps_per_second:,.0f}".replace(",", " "),
         link=link,
     )
