@@ -63,3 +63,23 @@ def test_a_task_is_solved_saved_and_exported_with_the_mouse_alone(desk: Desk) ->
     assert steps == told["episodes"][0]["elapsed_steps"] > 0
     expect(page.get_by_text(re.compile(f"^1 episode, {steps} steps"))).to_be_visible()
     assert desk.errors == []
+
+
+@pytest.mark.slow
+def test_a_pressed_seed_is_watched_in_the_review_and_the_way_back_leads_to_its_row(desk: Desk) -> None:
+    """The review was left at its Share tab, with another episode."""
+    page = desk.page
+    desk.button("Back to the live env").click()
+    page.get_by_role("tab", name=re.compile("^Checks")).click()
+    page.get_by_text("Solve many seeds", exact=True).click()
+    page.get_by_label("Seeds", exact=True).locator("visible=true").fill("1")
+    desk.button("Solve").click()
+    expect(page.get_by_text(re.compile(r"^seed 0 at step \d+ of \d+$"))).to_be_visible(timeout=120_000)
+    summary = page.get_by_text(re.compile(r"^Solved [01] of 1 seed"))
+    expect(summary).to_be_visible(timeout=240_000)
+    page.locator(".wb-seeds tbody tr").first.click()
+    expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
+    expect(page.get_by_role("tab", name="Review", exact=True)).to_have_attribute("aria-selected", "true")
+    desk.button("Back to the live env").click()
+    expect(summary).to_be_visible()
+    assert desk.errors == []

@@ -333,6 +333,11 @@ class _Episodes:
         queue: ItemQueue,
     ) -> None:
         self._opened, self._what, self._given, self._queue = opened, what, given, queue
+        limit = what.max_steps or opened.description.max_episode_steps or STEPS_WITHOUT_LIMIT
+        if given:
+            limit = min(max(run.length for run in given), what.max_steps or 10**9)
+        self._limit = limit
+        """Control steps after which an episode ends at the latest."""
         self._finisher = EpisodeFinisher()
         self._envs = list(range(opened.env.num_envs))
         self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
@@ -481,15 +486,6 @@ class _Episodes:
             if over:
                 self._gatherer.end(env)
                 self._free(env)
-
-    @property
-    def _limit(self) -> int:
-        """Control steps after which an episode ends at the latest."""
-        most = self._what.max_steps
-        if self._given:
-            longest = max(run.length for run in self._given)
-            return longest if most is None else min(longest, most)
-        return most or self._opened.description.max_episode_steps or STEPS_WITHOUT_LIMIT
 
     def _out_of_time(self, env: int) -> bool:
         most = self._what.seconds_per_seed

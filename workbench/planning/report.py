@@ -84,7 +84,7 @@ class SolveReport:
             found.append(f"What the seeds tell of the reward is said from {MOST_OF} seeds on.")
         if self.wanted < ENOUGH_SEEDS:
             found.append(few_seeds_text(self.wanted))
-        if cut := sum(one.cut_off for one in self.seeds):
+        if cut := sum(one.cut_off and not one.solved_at for one in self.seeds):
             found.append(
                 f"{_seeds(cut)} ended because {'its' if cut == 1 else 'their'} time was up: on another machine, or in "
                 "another run, others may be solved."

@@ -84,7 +84,8 @@ def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> s
     if episode.failed_at:
         return f"failed at step {episode.failed_at}"
     if episode.cut_off:
-        return f"its time was up after {episode.steps} steps (--seconds-per-seed)"
+        steps = f"{episode.steps} step{'' if episode.steps == 1 else 's'}"
+        return f"its time was up after {steps} (--seconds-per-seed)"
     every = Episodes(tuple(episodes))
     if every.without_reward:
         return "no rollout earned more than another"
