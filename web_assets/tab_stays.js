@@ -23,13 +23,17 @@
     const tab = event.target instanceof Element && event.target.closest("[role=tab]");
     const mark = marker();
     if (!tab || !mark || !tabsOf(mark).includes(tab)) return;
+    const name = nameOf(tab);
+    sessionStorage.setItem(KEEPS + mark.dataset.which, name);
+    if (!looking) return;
     clearTimeout(looking);
-    sessionStorage.setItem(KEEPS + mark.dataset.which, nameOf(tab));
+    looking = setTimeout(() => openAgain(name, 10), LOOK);
   }
 
   window.addEventListener("click", (event) => event.isTrusted && keep(event));
-  // A tab is opened by Enter too, and so by the page (openTab), whose choice would be taken back by what is looked for here.
-  window.addEventListener("keydown", (event) => event.key === "Enter" && !opening && keep(event));
+  // Enter opens a tab too, also that of the page (openTab): what is looked for here would take it back. Captured, since
+  // viser lets no such key through.
+  window.addEventListener("keydown", (event) => event.key === "Enter" && !opening && keep(event), true);
 
   // The tabs come one by one, a moment after the mark, and until all are there viser opens the first again.
   function openAgain(kept, looks) {
@@ -41,7 +45,8 @@
       tab.dispatchEvent(new KeyboardEvent("keydown", enter));
       opening = false;
     }
-    if (looks > 0) looking = setTimeout(() => openAgain(kept, tab ? Math.min(looks, 10) - 1 : looks - 1), LOOK);
+    const left = tab ? Math.min(looks, 10) - 1 : looks - 1;
+    looking = looks > 0 ? setTimeout(() => openAgain(kept, left), LOOK) : 0;
   }
 
   new MutationObserver(() => {
@@ -49,6 +54,7 @@
     if (now === which) return;
     which = now;
     clearTimeout(looking);
+    looking = 0;
     // Somebody was led here to watch something, which is in the first tab.
     if (marker()?.hasAttribute("data-anew")) sessionStorage.removeItem(KEEPS + now);
     const kept = sessionStorage.getItem(KEEPS + now);
