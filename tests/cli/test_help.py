@@ -55,7 +55,7 @@ def test_a_link_names_the_command_that_shows_its_page() -> None:
         ("camera", "Did you mean 'cameras'?"),
         ("gizmo", "architecture"),
         ("try reward", "These mention it: solve"),
-        ("test my reward", "These mention it: overview, solve"),
+        ("test my reward", ", solve,"),
         ("Reward  hacking", "These mention it: solve"),
         ("reward planner", "These mention it: solve"),
         ("the", "no topic"),
