@@ -26,7 +26,7 @@ def test_the_summary_has_one_total_while_seeds_come_in_and_at_the_end() -> None:
 def test_few_seeds_and_seeds_whose_time_was_up_are_told() -> None:
     assert report(*[8] * 8, wanted=8).notes == ()
     few = report(8, 8, wanted=2)
-    assert few.tells and few.notes[0].startswith("2 seeds may all miss") and "from 8 seeds on" in few.notes[0]
+    assert few.tells and few.notes[0].startswith("2 seeds are few:") and "fewer than 8" in few.notes[0]
     begun = report(8, wanted=9)
     assert not begun.tells and "from 3 seeds on" in begun.notes[0]
     (cut,) = report(*[8] * 8, 0, wanted=9, cut_off=True).notes

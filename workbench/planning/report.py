@@ -94,9 +94,9 @@ class SolveReport:
 
 def few_seeds_text(count: int) -> str:
     """What so few seeds leave open: fewer than `verdicts.ENOUGH_SEEDS`."""
+    be = "is" if count == 1 else "are"
     return (
-        f"{_seeds(count)} may all miss what is wrong with a reward: that no rule is broken says something from "
-        f"{ENOUGH_SEEDS} seeds on."
+        f"{_seeds(count)} {be} few: what is wrong with a reward may not show with fewer than {ENOUGH_SEEDS}."
     )
 
 

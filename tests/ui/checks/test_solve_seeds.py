@@ -143,4 +143,4 @@ def test_what_the_first_seeds_tell_says_how_many_they_are() -> None:
         "stopped", 9, seeds=(*REPORT.seeds, third), verdicts=()
     )
     assert "is said from 3 seeds on" in html("solving", 9, verdicts=())
-    assert "2 seeds may all miss what is wrong" in html("done", 2)
+    assert "2 seeds are few: what is wrong" in html("done", 2)
