@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import viser
 
-from tests.drive.panels import Panels
+from tests.drive.panels import Panels, inputs_of
 from tests.ui.scenes import problem, running
 from workbench.planning.report import SolvedSeed, SolveReport
-from workbench.planning.verdicts import RewardVerdict
+from workbench.planning.verdicts import ENOUGH_SEEDS, RewardVerdict
 from workbench.session.checks.solve_seeds import SeedsView
 from workbench.ui.checks.solve_seeds import (
     SOLVE,
@@ -96,6 +96,8 @@ def test_who_comes_back_from_a_recording_finds_the_folder_open(server: viser.Vis
         if isinstance(one, viser.GuiFolderHandle)
     ]
     assert [one.expand_by_default for one in folders if one.label == TITLE] == [False, True]
+    numbers = [one.value for one in inputs_of(server.gui) if isinstance(one, viser.GuiNumberHandle)]
+    assert numbers == [ENOUGH_SEEDS, DONE.total]
 
 
 def test_each_seed_has_a_row_that_opens_its_recording(shown: Shown) -> None:
@@ -143,4 +145,5 @@ def test_what_the_first_seeds_tell_says_how_many_they_are() -> None:
         "stopped", 9, seeds=(*REPORT.seeds, third), verdicts=()
     )
     assert "is said from 3 seeds on" in html("solving", 9, verdicts=())
+    assert "further ones" not in html("solving", 2) and "finishing" in html("solving", 2)
     assert "2 seeds are few: what is wrong" in html("done", 2)

@@ -51,11 +51,11 @@ class SolveSeedsPanel(PagePart[SessionView]):
         """Ids of rules that are folded out."""
         self._presses = Presses(server)
         # Who comes back from a recording finds the rows that led there.
-        used = session.seeds_solver.view.state != "none"
-        with server.gui.add_folder(TITLE, expand_by_default=used):
+        before = session.seeds_solver.view
+        with server.gui.add_folder(TITLE, expand_by_default=before.state != "none"):
             self._seeds = server.gui.add_number(
                 "Seeds",
-                ENOUGH_SEEDS,
+                before.total or ENOUGH_SEEDS,
                 min=1,
                 max=MOST_SEEDS,
                 step=1,
