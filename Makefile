@@ -104,7 +104,7 @@ lint: set-up-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 # The types are those of the release.
-	$(if $(filter release,$(MANISKILL)),$(BIN)/pyright)
+	$(if $(filter release,$(MANISKILL)),$(BIN)/pyright --threads $(WORKERS))
 
 wheel: set-up-test
 	$(BIN)/python -m build --wheel
