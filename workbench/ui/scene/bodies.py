@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,6 +14,8 @@ from workbench.core.scene.shapes import SceneGeometry, fingerprint
 from workbench.core.scene.simplify import reduce_mesh
 from workbench.ui.scene.env_grid import EnvLayout, InView, place_of_plane, plane_normal
 from workbench.ui.scene.glb import VisualGroup, as_glb, face_limit, group_visuals, lightened
+from workbench.ui.scene.pixels import Eye, SentPoses, eyes_of
+from workbench.ui.widgets.parts import Clock
 
 NAMES = ("/envs", "/floor")
 """Roots of its nodes in viser's tree."""
@@ -37,11 +40,13 @@ class SceneView:
     that moves in the same frame makes them shake.
 
     Showing one env sends one env: a batch's arrays may change their length. Bodies that an env lacks (NaN) are left out
-    the same way. Triangles limit a browser, so fewer envs are drawn with finer shapes.
+    the same way. Triangles limit a browser, so fewer envs are drawn with finer shapes. What moves by less than a pixel is
+    not sent (`pixels`).
     """
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
+    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
+        self._server, self._clock = server, clock
+        self._rows: _Rows | None = None
         self._drawn: dict[tuple[str, int, bool, int], _DrawnGroup] = {}
         self._number = 0
         look = {"cell_size": 0.5, "section_size": 1.0}
@@ -68,7 +73,7 @@ class SceneView:
         """
         shown_envs = geometry.num_envs if only_env is None else 1
         limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, looks.triangles)
-        before, self._drawn = self._drawn, {}
+        before, self._drawn, self._rows = self._drawn, {}, None
         for group in group_visuals(geometry):
             shape = fingerprint(group.visuals)
             first = group.visuals[0]
@@ -95,20 +100,22 @@ class SceneView:
         self.move(poses, layout, only_env)
 
     def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
-        """Move every body to its pose.
+        """Move every body to its pose. To be called again while nothing moves, for the exact poses at rest.
 
         Args:
             poses: (N, B, 7) in env frames.
             layout: The grid of the envs.
             only_env: Show this env alone, at the origin; None shows all, on the grid.
         """
-        for group in self._drawn.values():
-            group.move(poses, layout, only_env)
+        if self._rows is None or not self._rows.is_for(layout, only_env):
+            self._rows = _Rows(tuple(self._drawn.values()), layout, only_env)
+        self._rows.move(poses, eyes_of(self._server), self._clock())
 
     def clear(self) -> None:
         for group in self._drawn.values():
             group.handle.remove()
         self._drawn.clear()
+        self._rows = None
         self._grid.draw()
 
     @property
@@ -138,25 +145,56 @@ class _DrawnGroup:
     def set_instances(self, group: VisualGroup, once: NDArray[np.float32] | None) -> None:
         """Set the (env, body) pairs that it is drawn for; a floor or wall is drawn once, moved by `once` (3,)."""
         self._group, self._once = group, once
+        corners = [np.abs(visual.mesh.vertices).max(axis=0) for visual in group.visuals]
+        self.reach = float(max(np.linalg.norm(corner) for corner in corners))
+        """Metres around its frame within which it lies."""
 
-    def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
+    def rows(
+        self, layout: EnvLayout, only_env: int | None
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+        """Envs (K,) and bodies (K,) of what is drawn, and what is added to their positions (K, 3)."""
         envs, bodies = self._group.envs, self._group.bodies
         if self._once is not None:
             envs, bodies = envs[:1], bodies[:1]
-            instances = poses[envs, bodies]
-            positions = instances[:, :3] + (self._once if only_env is None else 0)
-        elif only_env is None:
-            instances = poses[envs, bodies]
-            positions = instances[:, :3] + layout.offsets[envs]
-        else:
-            mine = envs == only_env
-            instances = poses[envs[mine], bodies[mine]]
-            positions = instances[:, :3]
+            return envs, bodies, self._once[None] if only_env is None else np.zeros((1, 3), np.float32)
+        if only_env is None:
+            return envs, bodies, layout.offsets[envs]
+        mine = envs == only_env
+        return envs[mine], bodies[mine], np.zeros((int(mine.sum()), 3), np.float32)
+
+    def draw(self, instances: NDArray[np.float32]) -> None:
+        """Draw it at these poses (K, 7); rows of absent bodies are NaN."""
         there = np.isfinite(instances).all(axis=1)
         if not there.all():
-            instances, positions = instances[there], positions[there]
-        self.handle.visible = bool(len(positions))
-        if len(positions):
+            instances = instances[there]
+        self.handle.visible = bool(len(instances))
+        if len(instances):
             # Equal arrays are not sent again (viser compares), so bodies at rest cost no bytes.
-            self.handle.batched_positions = np.ascontiguousarray(positions)
+            self.handle.batched_positions = np.ascontiguousarray(instances[:, :3])
             self.handle.batched_wxyzs = np.ascontiguousarray(instances[:, 3:])
+
+
+class _Rows:
+    """All instances of all groups as one array: a call of numpy costs more than its work on one group."""
+
+    def __init__(self, groups: tuple[_DrawnGroup, ...], layout: EnvLayout, only_env: int | None) -> None:
+        self._layout, self._only_env = layout, only_env
+        parts = [group.rows(layout, only_env) for group in groups]
+        ends = np.cumsum([0, *(len(envs) for envs, _, _ in parts)])
+        self._groups = [(group, slice(a, b)) for group, a, b in zip(groups, ends[:-1], ends[1:], strict=True)]
+        nothing = np.zeros(0, np.int32)
+        self._envs = np.concatenate([nothing, *(envs for envs, _, _ in parts)])
+        self._bodies = np.concatenate([nothing, *(bodies for _, bodies, _ in parts)])
+        self._offsets = np.concatenate([np.zeros((0, 3), np.float32), *(offset for _, _, offset in parts)])
+        self._sent = SentPoses(np.repeat([np.float32(group.reach) for group in groups], np.diff(ends)))
+
+    def is_for(self, layout: EnvLayout, only_env: int | None) -> bool:
+        return self._layout is layout and self._only_env == only_env
+
+    def move(self, poses: NDArray[np.float32], eyes: tuple[Eye, ...], now: float) -> None:
+        instances = poses[self._envs, self._bodies]
+        instances[:, :3] += self._offsets
+        sent, changed = self._sent.update(instances, eyes, now)
+        for group, rows in self._groups:
+            if changed[rows].any() or rows.start == rows.stop:
+                group.draw(sent[rows])

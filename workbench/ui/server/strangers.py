@@ -151,7 +151,9 @@ def unsent(connection: ServerConnection) -> int:
     return waiting + in_kernel
 
 
-async def close_when_stalled(connection: ServerConnection) -> None:
+async def close_when_stalled(
+    connection: ServerConnection, unanswered: Callable[[], int] = lambda: 0
+) -> None:
     """Close the connection when its client has read nothing for `READ_WITHIN` seconds. A task of the connection.
 
     A suspended browser or a sleeping laptop behind ``ssh -L`` keeps its connection open for hours. What waits for it is
@@ -160,11 +162,14 @@ async def close_when_stalled(connection: ServerConnection) -> None:
 
     The client is stalled if bytes wait and no look finds fewer than the one before; new bytes written meanwhile do not
     matter. A slow line takes some now and then. A page that wakes up reconnects and gets the present state.
+
+    Args:
+        unanswered: Bytes that the machine may have taken and the page has not read, as `Line.unanswered`.
     """
     before = silent = 0
     while silent < _LOOKS:
         await asyncio.sleep(READ_WITHIN / _LOOKS)
-        left = unsent(connection)
+        left = unsent(connection) + unanswered()
         # Looks are counted, not seconds: while this machine sleeps no client can read.
         silent = 0 if left == 0 or left < before else silent + 1
         before = left

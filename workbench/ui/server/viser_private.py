@@ -30,6 +30,7 @@ from websockets.http11 import Request, Response
 
 from workbench.machine.versions import command_for_tested_versions
 from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
+from workbench.ui.server.line import CompressWhenFar, Line
 from workbench.ui.server.listening import ServerError
 from workbench.ui.server.page_guard import PageGuard
 from workbench.ui.server.strangers import Connection, RareLog, Strangers, close_when_stalled
@@ -249,8 +250,10 @@ def _watched(
                 if guard.admits(raw):
                     return raw
 
+        line = Line(connection)
         connection.recv = receive_checked  # type: ignore[method-assign,assignment]
-        listening = asyncio.create_task(close_when_stalled(connection))
+        connection.send = line.send  # type: ignore[method-assign,assignment]
+        listening = asyncio.create_task(close_when_stalled(connection, lambda: line.unanswered))
         try:
             await handler(connection)
         except MalformedMessage as error:
@@ -348,8 +351,8 @@ def make_viser(
     viser serves page and websocket from one ``websockets`` server that it starts in ``viser/infra/_infra.py``, with no
     way to check a request first, choose the socket, refuse a message or keep quiet. So while the server is made, the
     name ``websockets`` in that module is a look-alike whose ``serve`` is ours. It passes viser's arguments on with
-    three changed: the socket, ``process_request``, and the handler, which checks every message first and closes
-    stalled clients. `missing_names` is asked before, and `gated_server` tests the result with a forbidden request.
+    four changed: the socket, ``process_request``, compression, and the handler, which checks every message first, sends
+    as fast as the page answers and closes stalled clients. `missing_names` is asked before, and `gated_server` tests the result with a forbidden request.
 
     Args:
         listening: bound and listening; the server owns it from here on.
@@ -378,6 +381,7 @@ def make_viser(
         options.update(
             process_request=wrap(options["process_request"]),
             max_size=MAX_BYTES,
+            extensions=[CompressWhenFar()],
             open_timeout=response_seconds,
             server_header=None,
             create_connection=strangers.connection,
