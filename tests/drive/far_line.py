@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -91,7 +92,9 @@ class FarLine:
 
         async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             back, out = await asyncio.open_connection("127.0.0.1", port)
-            await asyncio.gather(carry(reader, out, "up"), carry(back, writer, "down"))
+            # At the end, asyncio's own callback would print that the task was cancelled.
+            with contextlib.suppress(asyncio.CancelledError):
+                await asyncio.gather(carry(reader, out, "up"), carry(back, writer, "down"))
 
         server = await asyncio.start_server(accept, "127.0.0.1", 0)
         self.port = server.sockets[0].getsockname()[1]

@@ -1,0 +1,37 @@
+"""A page at the far end of a slow line stays usable while many envs play."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.drive.far_line import line_to
+from tests.drive.page import TASK, open_workbench, page_at
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+BITS, DELAY = 2e6, 0.04
+
+
+def test_play_and_pause_answer_and_nothing_queues_for_a_second(tmp_path: Path, browser: Browser) -> None:
+    file = shutil.copy(TASK, tmp_path)
+    with (
+        open_workbench(file, "--num-envs", "64", "--no-spare", cwd=tmp_path) as opened,
+        line_to(opened.url, BITS, DELAY) as line,
+        page_at(browser, line.address(opened.url)) as (page, errors),
+    ):
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+        most, before = 0, line.down
+        for _ in range(3):
+            page.get_by_role("button", name="Play", exact=True).click()
+            for _ in range(100):
+                page.wait_for_timeout(10)  # a look at the line
+                most = max(most, line.waiting)
+            expect(page.get_by_role("button", name="Pause", exact=True)).to_be_visible()
+            page.get_by_role("button", name="Pause", exact=True).click()
+            expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+        assert line.down - before > 20_000, "it played"
+        assert most < BITS / 8, f"{8 * most / BITS:.1f} s of the line waited in it"
+        assert not errors
