@@ -41,12 +41,14 @@ def handshake(url: str) -> tuple[str, dict[str, Any]]:
     }
 
 
-def camera_message(position: Sequence[float] = (3.0, 3.0, 3.0), width: int = 800) -> bytes:
+def camera_message(
+    position: Sequence[float] = (3.0, 3.0, 3.0), width: int = 800, fov: float = 0.8
+) -> bytes:
     """What a page says when it has drawn itself for the first time: where it looks from, and how large its view is."""
     message = viser._messages.ViewerCameraMessage(
         wxyz=(1.0, 0.0, 0.0, 0.0),
         position=(position[0], position[1], position[2]),
-        fov=0.8,
+        fov=fov,
         near=0.05,
         far=300.0,
         image_height=720,

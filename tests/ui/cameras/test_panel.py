@@ -29,9 +29,11 @@ class RequestParts:
 BASE, TOP = "base · sensor", "top · sensor"
 
 
-def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> ShownCameras | None:
+def seen(
+    serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True, width: int = 8
+) -> ShownCameras | None:
     pictures = {
-        (c.kind, c.name): Picture(c.name, c.kind, 0, POSE, np.zeros((6, 8, 3), np.uint8)) for c in cameras
+        (c.kind, c.name): Picture(c.name, c.kind, 0, POSE, np.zeros((6, width, 3), np.uint8)) for c in cameras
     }
     view = running(
         1,
@@ -73,3 +75,32 @@ def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:
     assert "another moment" in panels.html() and "wb-other-moment" in panels.html()
     panel.draw(seen(1, cameras))
     assert "another moment" not in panels.html()
+
+
+def test_pictures_that_follow_each_other_are_as_wide_as_the_panel_and_the_last_is_whole(
+    panels: Panels, clock: Clock
+) -> None:
+    panel = CamerasPanel(panels.server, RequestParts(), clock=clock)
+
+    def drawn(serial: int) -> int:
+        panel.draw(replace(moving, pictures_serial=serial, pictures=dict.fromkeys(moving.pictures, anew())))
+        (image,) = panels.part(BASE).images()
+        return image.image.shape[1]
+
+    def anew() -> Picture:
+        return Picture("base", "sensor", 0, POSE, np.zeros((600, 1000, 3), np.uint8))
+
+    moving = seen(1, (camera("base"),), width=1000)
+    assert moving is not None
+    assert drawn(1) == 1000, "the first"
+    clock.passes(0.1)
+    assert drawn(2) == 400
+    clock.passes(0.1)
+    assert drawn(3) == 400
+    (image,) = panels.part(BASE).images()
+    clock.passes(0.2)
+    panel.draw(replace(moving, pictures_serial=3))
+    assert image.image.shape == (240, 400, 3)
+    clock.passes(0.3)
+    panel.draw(replace(moving, pictures_serial=3))
+    assert image.image.shape == (600, 1000, 3)

@@ -19,24 +19,47 @@ from workbench.session.live.view import SessionView, ShownCameras
 from workbench.session.protocol.messages import CameraRequest
 from workbench.ui.scene.env_grid import line_set, view_label
 from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.images import COLOUR, MODALITIES, DepthRange, depth_span, image_format, in_colours
+from workbench.ui.widgets.images import (
+    COLOUR,
+    MODALITIES,
+    DepthRange,
+    depth_span,
+    image_format,
+    in_colours,
+    narrowed,
+)
 from workbench.ui.widgets.parts import Clock, DrawDue
 from workbench.ui.widgets.templates import render
 
 PICTURE_PERIOD = 1 / 15
 """Seconds between two pictures of one camera. A picture that is replaced before the browser has loaded it is never seen
 (measured: at 1,000 a second the page shows one in five seconds)."""
+SHOWN_WIDTH = 400
+"""Pixels; a panel is some 340 wide."""
+FOLLOWS = 0.4
+"""Seconds within which a picture follows another."""
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "human view"}
 
 
 class CameraImage:
-    """A picture of a camera in a container, made with the first picture."""
+    """A picture of a camera in a container, made with the first picture.
+
+    Pictures that follow each other are sent at the size in which the panel shows them, and the last of them then whole:
+    for one that is opened large, and for who looks closely.
+    """
 
     def __init__(
-        self, server: viser.ViserServer, container: viser.GuiFolderHandle, order: float | None = None
+        self,
+        server: viser.ViserServer,
+        container: viser.GuiFolderHandle,
+        order: float | None = None,
+        clock: Clock = time.monotonic,
     ) -> None:
-        self._server, self._container, self._order = server, container, order
+        self._server, self._container, self._order, self._clock = server, container, order, clock
         self._handle: viser.GuiImageHandle | None = None
+        self._drawn_at = -math.inf
+        self._whole: tuple[str, NDArray[np.uint8]] | None = None
+        """What is shown smaller than it is."""
 
     @property
     def visible(self) -> bool:
@@ -48,6 +71,19 @@ class CameraImage:
             self._handle.visible = shown
 
     def draw(self, kind: str, pixels: NDArray[np.uint8]) -> None:
+        follows = self._clock() - self._drawn_at < FOLLOWS
+        self._drawn_at = self._clock()
+        smaller = narrowed(pixels, SHOWN_WIDTH, smooth=kind != "segmentation") if follows else pixels
+        self._whole = None if smaller is pixels else (kind, pixels)
+        self._send(kind, smaller)
+
+    def settle(self) -> None:
+        """Send the last picture whole, when no other has followed it."""
+        if self._whole is not None and self.visible and self._clock() - self._drawn_at >= FOLLOWS:
+            self._send(*self._whole)
+            self._whole = None
+
+    def _send(self, kind: str, pixels: NDArray[np.uint8]) -> None:
         if self._handle is None:
             with self._container:
                 self._handle = self._server.gui.add_image(
@@ -96,7 +132,7 @@ class CamerasPanel:
         clock: Clock = time.monotonic,
     ) -> None:
         self._no_camera, self._studio_shows = no_camera, studio_shows
-        self._server, self._ask_for = server, ask
+        self._server, self._ask_for, self._clock = server, ask, clock
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._remembered: dict[tuple[CameraKind, str, str], bool] = {}
         self._cameras_serial = -1
@@ -123,6 +159,9 @@ class CamerasPanel:
             self._build(seen)
         self._ask(seen)
         self._mark_stale(seen)
+        for camera in self._cameras.values():
+            for image in camera.images.values():
+                image.settle()
         if not self._due.is_due((seen.pictures_serial, seen.env)):
             return
         for key, camera in self._cameras.items():
@@ -191,7 +230,7 @@ class CamerasPanel:
             for order, modality in enumerate(modalities_of(info)):
                 on = self._remembered.get((info.kind, info.name, modality), first and modality == "rgb")
                 ticks[modality] = gui.add_checkbox(modality, on, order=10.0 * order + 10)
-                images[modality] = CameraImage(self._server, folder, order=10.0 * order + 11)
+                images[modality] = CameraImage(self._server, folder, 10.0 * order + 11, self._clock)
                 captions[modality] = gui.add_html("", order=10.0 * order + 12)
         camera = _Camera(info, ticks, captions, folder, about, images)
         about.content = facts(camera)
@@ -260,7 +299,7 @@ class StudioPicture:
         self.folder = server.gui.add_folder(None)
         with self.folder:
             server.gui.add_html(render("studio_picture"))
-        self._picture = CameraImage(server, self.folder)
+        self._picture = CameraImage(server, self.folder, clock=clock)
         self._caption = server.gui.add_html("", visible=False)
 
     @property
@@ -285,6 +324,7 @@ class StudioPicture:
         if preview:
             picture = studio.preview
             self._session.studio.draw_preview()
+        self._picture.settle()
         # The last picture stays until the next comes; another camera's does not.
         self._picture.show(self._drawn is not None and self._drawn[0] == key)
         self._caption.visible = self.visible and bool(self._caption.content)

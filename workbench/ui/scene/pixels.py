@@ -28,16 +28,11 @@ class Eye:
 
 def eyes_of(server: viser.ViserServer) -> tuple[Eye, ...]:
     """Where the open pages look from."""
-    eyes = []
-    for client in server.get_clients().values():
-        camera = client.camera
-        pixel = 2 * np.tan(camera.fov / 2) / max(camera.image_height, 1)
-        # A page sends what it likes.
-        if np.isfinite(camera.position).all() and np.isfinite(pixel) and pixel > 0:
-            eyes.append(Eye(np.asarray(camera.position, np.float64), float(pixel)))
-        else:
-            eyes.append(Eye(np.zeros(3), 0.0))
-    return tuple(eyes)
+    cameras = [client.camera for client in server.get_clients().values()]
+    # A page whose view is folded away has no height.
+    return tuple(
+        Eye(camera.position, 2 * float(np.tan(camera.fov / 2)) / max(camera.image_height, 1)) for camera in cameras
+    )
 
 
 def pixel_sizes(
@@ -52,7 +47,7 @@ def pixel_sizes(
     """
     sizes = np.full(len(positions), np.inf if eyes else 0.0, np.float32)
     for eye in eyes:
-        away = np.linalg.norm(positions - eye.position.astype(np.float32), axis=1) - reach
+        away = np.linalg.norm(positions - eye.position, axis=1) - reach
         np.minimum(sizes, eye.pixel * np.maximum(away, NEAREST), out=sizes)
     return sizes
 

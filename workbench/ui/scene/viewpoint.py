@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ from workbench.ui.scene.bodies import NAMES as BODIES
 from workbench.ui.scene.bodies import Looks, SceneView
 from workbench.ui.scene.env_grid import EnvLayout, box_corners
 from workbench.ui.server.viser_private import remove_nodes_but
-from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.parts import Clock, PagePart
 
 FOV = 0.75
 """Vertical, radians. viser's own 75 degrees distorts the edges of a grid."""
@@ -214,7 +215,7 @@ class Stage:
     is never empty. Labels, frustums, marks and handles go with their page.
     """
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         self._server = server
         server.scene.set_up_direction("+z")
         light(server)
@@ -223,7 +224,7 @@ class Stage:
         # from a few metres on.
         server.initial_camera.near = 0.05
         server.initial_camera.far = 300.0
-        self.scene = SceneView(server)
+        self.scene = SceneView(server, clock)
         self.framing = Framing(server)
 
     def clear(self) -> None:

@@ -176,6 +176,19 @@ def in_colours(
     return None
 
 
+def narrowed(pixels: NDArray[np.uint8], width: int, smooth: bool) -> NDArray[np.uint8]:
+    """A picture at most so many pixels wide.
+
+    Args:
+        smooth: Mean colours; else colours that are in the picture.
+    """
+    high, wide = pixels.shape[:2]
+    if wide <= width:
+        return pixels
+    how = Image.Resampling.BOX if smooth else Image.Resampling.NEAREST
+    return np.asarray(Image.fromarray(pixels).resize((width, max(1, round(high * width / wide))), how))
+
+
 def image_format(modality: str) -> Literal["png", "jpeg"]:
     """PNG for a segmentation, whose flat colours would get halos from JPEG."""
     return "png" if modality == "segmentation" else "jpeg"

@@ -1,0 +1,243 @@
+"""Bytes of an update of the page while the task plays: python tests/benchmarks/page_bytes.py [--num-envs 16 64 256]
+
+The whole live page of the example task, on its real server, in this process: the envs make random steps, and
+at 30 Hz and four times real time an update shows each 2.67th of them. The page's clock moves a thirtieth of a
+second an update, so the figures do not depend on how fast this machine is; a client without a browser reads
+what is sent, behind a relay that counts it.
+
+Both sides play the same steps. *Exact*: a client with so narrow a lens that it sees every motion, and that takes no compression: every pose as it is, which was all that there was before. *As sent*: a view of
+1280 x 720, far away. Prints the kilobytes of an update, the panels' and the poses' part of it before
+compression, and what that is a second at 30 Hz.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from websockets.asyncio.client import connect
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.drive.far_line import FarLine, line_to
+from tests.drive.panels import Clock
+from tests.drive.scripted import ScriptedWorker, no_success
+from tests.drive.session import wait_until
+from tests.ui.tabs import camera_message, handshake, messages_in
+from workbench.core.env import actions
+from workbench.core.env.step_result import StepResult
+from workbench.jobs.open_task import open_task
+from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
+from workbench.session.live.session import Session
+from workbench.session.protocol.messages import Status
+from workbench.ui.app.live_page import Page
+from workbench.ui.scene.viewpoint import FOV, Stage
+from workbench.ui.server.gated_server import ServerOptions, open_server
+
+TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+HERTZ, SPEED, EPISODE = 30, 4.0, 50
+FAR = 0.01
+"""Seconds one way."""
+
+
+@dataclass
+class Options:
+    num_envs: tuple[int, ...] = (16, 64, 256)
+    updates: int = 90
+    settle: int = 15
+    """Updates before those that count: the page's charts fill."""
+
+
+@dataclass
+class Played:
+    task: TaskDescription
+    first: StepResult
+    steps: list[tuple[StepResult, bool]]
+    """And whether it is a reset of all."""
+
+
+def play(num_envs: int, count: int) -> Played:
+    opened = open_task(str(TASK), TaskOptions(num_envs=num_envs, env_kwargs={"render_backend": "none"}))
+    rng = np.random.default_rng(0)
+    steps: list[tuple[StepResult, bool]] = []
+    while len(steps) < count:
+        for _ in range(EPISODE):
+            steps.append((opened.env.step(actions.random_action(opened.env.parts, num_envs, rng)), False))
+        steps.append((opened.env.reset(), True))
+    played = Played(opened.description, opened.first, steps)
+    opened.env.close()
+    return played
+
+
+class Player(ScriptedWorker):
+    """A worker that shows the next of these steps when it is told to."""
+
+    def __init__(self, played: Played, made: list[Player], *arguments: Any, **named: Any) -> None:
+        super().__init__(played.task, played.first.poses, no_success, *arguments, **named)
+        self._played = played
+        made.append(self)
+
+    def show(self, number: int) -> None:
+        step, begins = self._played.steps[number]
+        count = self._played.task.num_envs
+        self._tell(
+            Stepped(
+                step,
+                np.full(count, begins),
+                seeds=np.arange(count) if begins else None,
+                snapshot=b"a moment",
+                part_keys=(),
+                number=number + 10,
+            )
+        )
+        if number % 20 == 0:
+            self._tell(Status(True, 80.0, SPEED))
+
+    def _at(self, poses: np.ndarray, elapsed: np.ndarray) -> StepResult:
+        return self._played.first
+
+
+@dataclass
+class Client:
+    """A page without a browser."""
+
+    metadata: int = 0
+    """Bytes, as packed by viser."""
+    arrays: int = 0
+    has: queue.Queue[str] = field(default_factory=queue.Queue)
+    """The marks that it has had."""
+
+    async def read(self, address: str, options: dict[str, Any], greeting: bytes) -> None:
+        async with connect(address, **options) as connection:
+            await connection.send(greeting)
+            async for frame in connection:
+                assert isinstance(frame, bytes)
+                packed = 16 + int.from_bytes(frame[8:16], "little")
+                self.metadata += packed
+                self.arrays += len(frame) - packed
+                for message in messages_in(frame):
+                    if message["type"] == "GuiUpdateMessage":
+                        value = message["updates"].get("value")
+                        if isinstance(value, str) and value.startswith("mark "):
+                            self.has.put(value)
+
+
+@dataclass(frozen=True)
+class Update:
+    """Means of the updates, in bytes."""
+
+    wire: float
+    metadata: float
+    arrays: float
+    rest: float
+    """The same with nothing new to show."""
+
+
+def measure(played: Played, options: Options, exact: bool) -> Update:
+    clock, made, client = Clock(), [], Client()
+    gated = open_server(ServerOptions(port=0))
+    stage = Stage(gated.server, clock)
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session(
+            str(Path(folder) / "push.py"),
+            TaskOptions(num_envs=played.task.num_envs),
+            recordings=Path(folder) / "kept",
+            make_worker=partial(Player, played, made),
+        )
+        page = Page(gated.server, session, stage=stage, clock=clock)
+        mark = gated.server.gui.add_text("mark", "")
+        wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
+        page.redraw()
+        with line_to(gated.url, delay=0.0 if exact else FAR) as line:
+            address, how = handshake(line.address(gated.url))
+            how["compression"] = None if exact else "deflate"
+            eye = gated.server.initial_camera.position
+            greeting = camera_message(tuple(eye), width=1280, fov=1e-6 if exact else FOV)
+            thread = threading.Thread(target=_run, args=(client, address, how, greeting), daemon=True)
+            thread.start()
+            while not gated.server.get_clients():
+                time.sleep(0.01)
+            update = _updates(page, session, made[0], clock, mark, client, line, options)
+    session.close()
+    gated.close()
+    thread.join(10.0)
+    return update
+
+
+def _run(client: Client, address: str, how: dict[str, Any], greeting: bytes) -> None:
+    try:
+        asyncio.run(client.read(address, how, greeting))
+    except Exception as error:  # the server has closed
+        client.has.put(f"closed: {error}")
+
+
+def _updates(
+    page: Page,
+    session: Session,
+    player: Player,
+    clock: Clock,
+    mark: Any,
+    client: Client,
+    line: FarLine,
+    options: Options,
+) -> Update:
+    shown, updates, begun = 0, 0, session.view().step_serial
+
+    def update(plays: bool) -> None:
+        nonlocal shown, updates
+        updates += 1
+        clock.passes(1 / HERTZ)
+        while plays and shown < updates * SPEED / HERTZ / played_dt:
+            player.show(shown)
+            shown += 1
+        if plays:
+            wait_until(session, lambda view: view.step_serial >= begun + shown, "the step")
+        page.redraw()
+        mark.value = f"mark {updates}"
+        while client.has.get(timeout=60.0) != f"mark {updates}":
+            pass
+
+    played_dt = player._played.task.control_dt
+    for _ in range(options.settle):
+        update(plays=True)
+    before = line.down, client.metadata, client.arrays
+    for _ in range(options.updates):
+        update(plays=True)
+    each = [(b - a) / options.updates for a, b in zip(before, (line.down, client.metadata, client.arrays), strict=True)]
+    for _ in range(HERTZ):
+        update(plays=False)
+    before = line.down, client.metadata, client.arrays
+    for _ in range(HERTZ):
+        update(plays=False)
+    return Update(*each, (line.down - before[0]) / HERTZ)
+
+
+def main(options: Options) -> None:
+    torch.set_num_threads(1)
+    print("| envs | | kB an update | panels, kB | poses, kB | at 30 Hz, MB a second | paused, kB an update |")
+    print("|---|---|---|---|---|---|---|")
+    count = int((options.updates + options.settle) * SPEED / HERTZ / 0.05) + 2
+    for num_envs in options.num_envs:
+        played = play(num_envs, count)
+        for what, exact in (("exact", True), ("as sent", False)):
+            found = measure(played, options, exact)
+            parts = found.wire, found.metadata, found.arrays
+            print(
+                f"| {num_envs} | {what} | {' | '.join(f'{part / 1e3:.1f}' for part in parts)} "
+                f"| {HERTZ * found.wire / 1e6:.3f} | {found.rest / 1e3:.2f} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
