@@ -1,96 +1,104 @@
-"""Bytes that a page takes while the task plays, and how a page far away answers.
+"""How a page at the end of a slow line answers: python tests/benchmarks/far_page.py [--num-envs 16 64] [--against CHECKOUT]
 
-    python tests/benchmarks/far_page.py [--num-envs 16 64 256] [--against CHECKOUT] [--line]
+The live page of the example task, on its real server, plays in this process behind a relay of 2 Mbit/s and a
+round trip of 80 ms, with room for 2 MB on the way (as ``ssh -L`` has). A client without a browser answers pings
+as a browser does. It presses Play or Pause, and waits until the button's new label has arrived; the most bytes
+that wait in the relay are told in seconds of the line.
 
-``workbench open`` on the example task, with Chromium behind a relay on loopback that counts what passes
-(all of it: websocket frames, their headers, panels and poses). *A second at 30 Hz* is the bytes of an applied
-update times 30: a machine that cannot play so many envs fast enough sends fewer.
-
-``--line`` puts the page behind 2 Mbit/s and a round trip of 80 ms, with room for 2 MB in the line (as
-``ssh -L`` has), and measures the time from a click on Play or Pause to the button's answer, while playing,
-and how many bytes wait in the line.
-
-``--against`` measures another checkout (an older version) in turn, in the same run.
+``--against`` measures another checkout (an older version) first, in the same run.
 """
 
 from __future__ import annotations
 
-import shutil
+import asyncio
+import os
+import queue
 import statistics
+import subprocess
 import sys
 import tempfile
+import threading
 import time
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import msgspec
+import torch
 import tyro
-from playwright.sync_api import Browser, Page, sync_playwright
+import viser._messages
+from websockets.asyncio.client import ClientConnection, connect
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.benchmarks.page_rate import COUNT, TASK, Options, prepare, timed_click
+# Last: the checkout that is measured may be another one.
+sys.path.append(str(Path(__file__).parents[2]))
+from tests.benchmarks.page_bytes import Played, Player, play
 from tests.drive.far_line import FarLine, line_to
-from tests.drive.page import launch, new_page, open_workbench
-from workbench.machine.doctor import find_chromium, how_to_get_chromium
+from tests.drive.session import wait_until
+from tests.ui.tabs import camera_message, handshake, messages_in
+from workbench.jobs.task import TaskOptions
+from workbench.session.live.session import Session
+from workbench.ui.app.live_page import Page
+from workbench.ui.scene.viewpoint import FOV, Stage
+from workbench.ui.server.gated_server import ServerOptions, open_server
 
-HERE = Path(__file__).parents[2]
 BITS, DELAY = 2e6, 0.04
+COMMAND = "Play or pause"
 
 
-@dataclass(frozen=True)
-class FarOptions:
+@dataclass
+class Options:
     num_envs: tuple[int, ...] = (16, 64, 256)
     against: Path | None = None
-    """Another checkout, measured first."""
-    speed: str = "4 ×"
-    seconds: float = 10.0
-    clicks: int = 10
-    line: bool = False
-    """Also measure behind 2 Mbit/s and 80 ms."""
-    cameras: bool = False
-    """Leave the default pictures on."""
+    presses: int = 12
+    side: str = "now"
+    """How the rows are called."""
 
 
-def play(page: Page, options: FarOptions, num_envs: int, url: str) -> None:
-    prepare(page, Options(num_envs, options.speed, cameras=options.cameras), url)
-    timed_click(page, "Play", "Pause")
-    time.sleep(3.0)
+class Playing(Player):
+    """Plays its steps, again and again."""
+
+    shown = 0
+
+    def _step(self) -> None:
+        self.show(self.shown % len(self._played.steps))
+        self.shown += 1
 
 
-def bytes_a_second(browser: Browser, options: FarOptions, num_envs: int, url: str) -> str:
-    with line_to(url) as line:
-        page, _ = new_page(browser)
-        play(page, options, num_envs, line.address(url))
-        before, start = line.down, time.monotonic()
-        applied, _ = page.evaluate(COUNT, options.seconds)
-        rate = (line.down - before) / (time.monotonic() - start)
-        timed_click(page, "Pause", "Play")
-        time.sleep(2.0)
-        before = line.down
-        time.sleep(3.0)
-        still = (line.down - before) / 3.0
-        page.close()
-    each = rate / max(applied, 0.1)
-    return (
-        f"| {rate / 1e6:.3f} | {applied:.1f} | {each / 1e3:.1f} | {30 * each / 1e6:.3f} | {still / 1e3:.1f} |"
-    )
+@dataclass
+class Client:
+    commands: dict[str, str] = field(default_factory=dict)
+    labels: queue.Queue[str] = field(default_factory=queue.Queue)
+    counts: Counter[str] = field(default_factory=Counter)
+    connection: ClientConnection | None = None
+    loop: asyncio.AbstractEventLoop | None = None
 
+    async def read(self, address: str, options: dict[str, Any], greeting: bytes) -> None:
+        self.loop = asyncio.get_running_loop()
+        async with connect(address, **options) as self.connection:
+            await self.connection.send(greeting)
+            async for frame in self.connection:
+                assert isinstance(frame, bytes)
+                for message in messages_in(frame):
+                    kind = message["type"]
+                    if kind == "RegisterCommandMessage":
+                        self.commands[message["props"]["label"]] = message["uuid"]
+                    elif kind == "GuiUpdateMessage" and message["updates"].get("label") in ("Play", "Pause"):
+                        self.labels.put(message["updates"]["label"])
+                    elif "panda_hand" in str(message.get("name")):
+                        self.counts["poses"] += 1
 
-def answers(browser: Browser, options: FarOptions, num_envs: int, url: str) -> str:
-    with line_to(url, BITS, DELAY) as line:
-        page, _ = new_page(browser)
-        play(page, options, num_envs, line.address(url))
-        applied, _ = page.evaluate(COUNT, options.seconds)
-        times, most = [], 0
-        for _ in range(options.clicks):
-            times.append(timed_click(page, "Pause", "Play"))
-            most = max(most, watched(line, 0.5))
-            times.append(timed_click(page, "Play", "Pause"))
-            most = max(most, watched(line, 1.0))
-        page.close()
-    return (
-        f"| {1000 * statistics.median(times):.0f} | {1000 * max(times):.0f} | {applied:.1f} "
-        f"| {8 * most / BITS:.2f} |"
-    )
+    def press(self, expected: str) -> float:
+        """Seconds until the button has that label."""
+        message = viser._messages.CommandTriggerMessage(self.commands[COMMAND])
+        began = time.perf_counter()
+        assert self.connection is not None and self.loop is not None
+        said = self.connection.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+        asyncio.run_coroutine_threadsafe(said, self.loop)
+        while self.labels.get(timeout=60.0) != expected:
+            pass
+        return time.perf_counter() - began
 
 
 def watched(line: FarLine, seconds: float) -> int:
@@ -102,35 +110,70 @@ def watched(line: FarLine, seconds: float) -> int:
     return most
 
 
-def main(options: FarOptions) -> None:
-    chromium = find_chromium()
-    if chromium is None:
-        sys.exit(how_to_get_chromium())
-    sides = [("now", HERE)] if options.against is None else [("before", options.against), ("now", HERE)]
-    rows = []
-    with sync_playwright() as playwright:
-        browser = launch(playwright, chromium)
-        for num_envs in options.num_envs:
-            for side, checkout in sides:
-                with tempfile.TemporaryDirectory() as name:
-                    file = Path(shutil.copy(TASK, Path(name) / "push_cube.py"))
-                    with open_workbench(
-                        *(str(file), "--num-envs", str(num_envs), "--no-spare"),
-                        cwd=Path(name),
-                        env={"PYTHONPATH": str(checkout.resolve())},
-                    ) as opened:
-                        cells = bytes_a_second(browser, options, num_envs, opened.url)
-                        if options.line:
-                            cells += answers(browser, options, num_envs, opened.url)[1:]
-                        rows.append(f"| {num_envs} | {side} {cells}")
-                        print(rows[-1], file=sys.stderr, flush=True)
-    head = "| envs | | MB a second | applied updates a second | kB an update | MB a second at 30 Hz | paused, kB a second |"
-    if options.line:
-        head += (
-            " Play or Pause, ms: median | worst | applied updates a second | most that waits in the line, s |"
+def measure(played: Played, options: Options) -> str:
+    made: list[Player] = []
+    client = Client()
+    gated = open_server(ServerOptions(port=0))
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session(
+            str(Path(folder) / "push.py"),
+            TaskOptions(num_envs=played.task.num_envs),
+            recordings=Path(folder) / "kept",
+            make_worker=partial(Playing, played, made),
         )
-    print(head, "|" + "---|" * (head.count("|") - 1), *rows, sep="\n")
+        page = Page(gated.server, session, stage=Stage(gated.server))
+        wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
+        page.redraw()
+        page.start()
+        with line_to(gated.url, BITS, DELAY) as line:
+            address, how = handshake(line.address(gated.url))
+            how["compression"] = "deflate"
+            greeting = camera_message(tuple(gated.server.initial_camera.position), width=1280, fov=FOV)
+            coming = client.read(address, how, greeting)
+            threading.Thread(target=lambda: asyncio.run(coming), daemon=True).start()
+            while COMMAND not in client.commands or line.waiting:
+                time.sleep(0.1)
+            time.sleep(2.0)
+            times, most = [client.press("Pause")], 0
+            time.sleep(3.0)
+            poses, began = client.counts["poses"], time.monotonic()
+            for _ in range(options.presses // 2):
+                most = max(most, watched(line, 1.5))
+                times.append(client.press("Play"))
+                most = max(most, watched(line, 0.3))
+                times.append(client.press("Pause"))
+            # Two messages an update, of positions and of rotations.
+            rate = (client.counts["poses"] - poses) / 2 / (time.monotonic() - began)
+        page.stop()
+    session.close()
+    gated.close()
+    return (
+        f"| {played.task.num_envs} | {options.side} | {1000 * statistics.median(times):.0f} "
+        f"| {1000 * max(times):.0f} | {8 * most / BITS:.2f} | {rate:.1f} |"
+    )
+
+
+def _measure_other(checkout: Path, num_envs: int, presses: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        # Not its tests: this script needs those that belong to it.
+        for name in ("workbench", "web_assets"):
+            (Path(folder) / name).symlink_to(checkout / name)
+        arguments = ["--num-envs", str(num_envs), "--side", "before", "--presses", str(presses)]
+        subprocess.run(
+            [sys.executable, __file__, *arguments], env={**os.environ, "PYTHONPATH": folder}, check=True
+        )
+
+
+def main(options: Options) -> None:
+    torch.set_num_threads(1)
+    if options.side == "now":
+        print("| envs | | Play or Pause, ms: median | worst | most that waits, s of the line | updates a second |")
+        print("|---|---|---|---|---|---|", flush=True)
+    for num_envs in options.num_envs:
+        if options.against is not None:
+            _measure_other(options.against.resolve(), num_envs, options.presses)
+        print(measure(play(num_envs, 102), options), flush=True)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(FarOptions))
+    main(tyro.cli(Options))

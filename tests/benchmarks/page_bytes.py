@@ -28,7 +28,7 @@ import torch
 import tyro
 from websockets.asyncio.client import connect
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.append(str(Path(__file__).parents[2]))
 from tests.drive.far_line import FarLine, line_to
 from tests.drive.panels import Clock
 from tests.drive.scripted import ScriptedWorker, no_success
