@@ -119,7 +119,7 @@ def measure(played: Played, options: Options) -> str:
             str(Path(folder) / "push.py"),
             TaskOptions(num_envs=played.task.num_envs),
             recordings=Path(folder) / "kept",
-            make_worker=partial(Playing, played, made),
+            make_worker=partial(Playing, played, made),  # type: ignore[arg-type]
         )
         page = Page(gated.server, session, stage=Stage(gated.server))
         wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
@@ -167,7 +167,9 @@ def _measure_other(checkout: Path, num_envs: int, presses: int) -> None:
 def main(options: Options) -> None:
     torch.set_num_threads(1)
     if options.side == "now":
-        print("| envs | | Play or Pause, ms: median | worst | most that waits, s of the line | updates a second |")
+        print(
+            "| envs | | Play or Pause, ms: median | worst | most that waits, s of the line | updates a second |"
+        )
         print("|---|---|---|---|---|---|", flush=True)
     for num_envs in options.num_envs:
         if options.against is not None:

@@ -152,7 +152,7 @@ def measure(played: Played, options: Options, exact: bool) -> Update:
             str(Path(folder) / "push.py"),
             TaskOptions(num_envs=played.task.num_envs),
             recordings=Path(folder) / "kept",
-            make_worker=partial(Player, played, made),
+            make_worker=partial(Player, played, made),  # type: ignore[arg-type]
         )
         page = Page(gated.server, session, stage=stage, clock=clock)
         mark = gated.server.gui.add_text("mark", "")
@@ -213,13 +213,16 @@ def _updates(
     before = line.down, client.metadata, client.arrays
     for _ in range(options.updates):
         update(plays=True)
-    each = [(b - a) / options.updates for a, b in zip(before, (line.down, client.metadata, client.arrays), strict=True)]
+    wire, metadata, arrays = (
+        (b - a) / options.updates
+        for a, b in zip(before, (line.down, client.metadata, client.arrays), strict=True)
+    )
     for _ in range(HERTZ):
         update(plays=False)
-    before = line.down, client.metadata, client.arrays
+    at_rest = line.down
     for _ in range(HERTZ):
         update(plays=False)
-    return Update(*each, (line.down - before[0]) / HERTZ)
+    return Update(wire, metadata, arrays, (line.down - at_rest) / HERTZ)
 
 
 def main(options: Options) -> None:

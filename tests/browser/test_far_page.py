@@ -18,7 +18,7 @@ BITS, DELAY = 2e6, 0.04
 def test_play_and_pause_answer_and_nothing_queues_for_a_second(tmp_path: Path, browser: Browser) -> None:
     file = shutil.copy(TASK, tmp_path)
     with (
-        open_workbench(file, "--num-envs", "64", "--no-spare", cwd=tmp_path) as opened,
+        open_workbench(str(file), "--num-envs", "64", "--no-spare", cwd=tmp_path) as opened,
         line_to(opened.url, BITS, DELAY) as line,
         page_at(browser, line.address(opened.url)) as (page, errors),
     ):

@@ -41,9 +41,7 @@ def handshake(url: str) -> tuple[str, dict[str, Any]]:
     }
 
 
-def camera_message(
-    position: Sequence[float] = (3.0, 3.0, 3.0), width: int = 800, fov: float = 0.8
-) -> bytes:
+def camera_message(position: Sequence[float] = (3.0, 3.0, 3.0), width: int = 800, fov: float = 0.8) -> bytes:
     """What a page says when it has drawn itself for the first time: where it looks from, and how large its view is."""
     message = viser._messages.ViewerCameraMessage(
         wxyz=(1.0, 0.0, 0.0, 0.0),

@@ -29,11 +29,9 @@ class RequestParts:
 BASE, TOP = "base · sensor", "top · sensor"
 
 
-def seen(
-    serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True, width: int = 8
-) -> ShownCameras | None:
+def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> ShownCameras | None:
     pictures = {
-        (c.kind, c.name): Picture(c.name, c.kind, 0, POSE, np.zeros((6, width, 3), np.uint8)) for c in cameras
+        (c.kind, c.name): Picture(c.name, c.kind, 0, POSE, np.zeros((6, 8, 3), np.uint8)) for c in cameras
     }
     view = running(
         1,
@@ -82,7 +80,10 @@ def test_pictures_that_follow_each_other_are_as_wide_as_the_panel_and_the_last_i
 ) -> None:
     panel = CamerasPanel(panels.server, RequestParts(), clock=clock)
 
-    def drawn(serial: int) -> int:
+    moving = seen(1, (camera("base"),))
+    assert moving is not None
+
+    def drawn(serial: int, moving: ShownCameras = moving) -> int:
         panel.draw(replace(moving, pictures_serial=serial, pictures=dict.fromkeys(moving.pictures, anew())))
         (image,) = panels.part(BASE).images()
         return image.image.shape[1]
@@ -90,8 +91,6 @@ def test_pictures_that_follow_each_other_are_as_wide_as_the_panel_and_the_last_i
     def anew() -> Picture:
         return Picture("base", "sensor", 0, POSE, np.zeros((600, 1000, 3), np.uint8))
 
-    moving = seen(1, (camera("base"),), width=1000)
-    assert moving is not None
     assert drawn(1) == 1000, "the first"
     clock.passes(0.1)
     assert drawn(2) == 400

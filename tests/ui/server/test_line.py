@@ -166,10 +166,22 @@ def test_a_page_on_a_slow_line_is_given_the_newest_and_no_queue(gated_server: Ga
         reading.start()
         until(lambda: line.down > 0 and len(server.get_clients()) == 1, "the page")
         for number in range(1, 121):
-            points.points = rng.normal(size=(1500, 3))
+            points.points = rng.normal(size=(1500, 3)).astype(np.float32)
             text.value = str(number)
             time.sleep(1 / 60)
             most = max(most, line.waiting)
         reading.join()
     assert newest == "120"
     assert most < 250_000, "a second of the line"
+
+
+def test_a_message_that_unpacks_to_megabytes_ends_the_connection(gated_server: GatedServer) -> None:
+    async def send() -> int | None:
+        address, options = handshake(gated_server.url)
+        async with connect(address, **{**options, "compression": "deflate"}) as client:
+            await client.send(camera_message())
+            await client.send(bytes(50 << 20))
+            await client.wait_closed()
+            return client.close_code
+
+    assert asyncio.run(asyncio.wait_for(send(), 60)) == 1009

@@ -31,7 +31,8 @@ def eyes_of(server: viser.ViserServer) -> tuple[Eye, ...]:
     cameras = [client.camera for client in server.get_clients().values()]
     # A page whose view is folded away has no height.
     return tuple(
-        Eye(camera.position, 2 * float(np.tan(camera.fov / 2)) / max(camera.image_height, 1)) for camera in cameras
+        Eye(camera.position, 2 * float(np.tan(camera.fov / 2)) / max(camera.image_height, 1))
+        for camera in cameras
     )
 
 

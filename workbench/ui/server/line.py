@@ -137,5 +137,3 @@ class CompressWhenFar(ServerPerMessageDeflateFactory):
             agreed.local_max_window_bits,
             agreed.compress_settings,
         )
-
-

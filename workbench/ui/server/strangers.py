@@ -151,9 +151,7 @@ def unsent(connection: ServerConnection) -> int:
     return waiting + in_kernel
 
 
-async def close_when_stalled(
-    connection: ServerConnection, unanswered: Callable[[], int] = lambda: 0
-) -> None:
+async def close_when_stalled(connection: ServerConnection, unanswered: Callable[[], int] = lambda: 0) -> None:
     """Close the connection when its client has read nothing for `READ_WITHIN` seconds. A task of the connection.
 
     A suspended browser or a sleeping laptop behind ``ssh -L`` keeps its connection open for hours. What waits for it is
