@@ -11,6 +11,7 @@ that wait in the relay are told in seconds of the line.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import queue
 import statistics
@@ -30,6 +31,7 @@ import torch
 import tyro
 import viser._messages
 from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
 
 # Last: the checkout that is measured may be another one.
 sys.path.append(str(Path(__file__).parents[2]))
@@ -78,16 +80,21 @@ class Client:
         self.loop = asyncio.get_running_loop()
         async with connect(address, **options) as self.connection:
             await self.connection.send(greeting)
-            async for frame in self.connection:
-                assert isinstance(frame, bytes)
-                for message in messages_in(frame):
-                    kind = message["type"]
-                    if kind == "RegisterCommandMessage":
-                        self.commands[message["props"]["label"]] = message["uuid"]
-                    elif kind == "GuiUpdateMessage" and message["updates"].get("label") in ("Play", "Pause"):
-                        self.labels.put(message["updates"]["label"])
-                    elif "panda_hand" in str(message.get("name")):
-                        self.counts["poses"] += 1
+            # Ends when the server closes, also without a handshake.
+            with contextlib.suppress(ConnectionClosed):
+                await self._take_all(self.connection)
+
+    async def _take_all(self, connection: ClientConnection) -> None:
+        async for frame in connection:
+            assert isinstance(frame, bytes)
+            for message in messages_in(frame):
+                kind = message["type"]
+                if kind == "RegisterCommandMessage":
+                    self.commands[message["props"]["label"]] = message["uuid"]
+                elif kind == "GuiUpdateMessage" and message["updates"].get("label") in ("Play", "Pause"):
+                    self.labels.put(message["updates"]["label"])
+                elif "panda_hand" in str(message.get("name")):
+                    self.counts["poses"] += 1
 
     def press(self, expected: str) -> float:
         """Seconds until the button has that label."""
@@ -130,7 +137,8 @@ def measure(played: Played, options: Options) -> str:
             how["compression"] = "deflate"
             greeting = camera_message(tuple(gated.server.initial_camera.position), width=1280, fov=FOV)
             coming = client.read(address, how, greeting)
-            threading.Thread(target=lambda: asyncio.run(coming), daemon=True).start()
+            thread = threading.Thread(target=lambda: asyncio.run(coming), daemon=True)
+            thread.start()
             while COMMAND not in client.commands or line.waiting:
                 time.sleep(0.1)
             time.sleep(2.0)
@@ -144,9 +152,10 @@ def measure(played: Played, options: Options) -> str:
                 times.append(client.press("Pause"))
             # Two messages an update, of positions and of rotations.
             rate = (client.counts["poses"] - poses) / 2 / (time.monotonic() - began)
-        page.stop()
-    session.close()
-    gated.close()
+            page.stop()
+            session.close()
+            gated.close()
+            thread.join(20.0)
     return (
         f"| {played.task.num_envs} | {options.side} | {1000 * statistics.median(times):.0f} "
         f"| {1000 * max(times):.0f} | {8 * most / BITS:.2f} | {rate:.1f} |"
