@@ -22,7 +22,8 @@ def test_play_and_pause_answer_and_nothing_queues_for_a_second(tmp_path: Path, b
         line_to(opened.url, BITS, DELAY) as line,
         page_at(browser, line.address(opened.url)) as (page, errors),
     ):
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+        # A slow line has the page itself and all meshes to carry first.
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=240_000)
         most, before = 0, line.down
         for _ in range(3):
             page.get_by_role("button", name="Play", exact=True).click()

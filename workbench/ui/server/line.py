@@ -58,11 +58,7 @@ class Line:
         """Bytes that were sent and that the page has not answered."""
 
     async def send(self, message: bytes) -> None:
-        """Send a message, as soon as there is room for it.
-
-        Raises:
-            ConnectionClosed: the page has left.
-        """
+        """Send a message, as soon as there is room for it; ends with `websockets`' error when the page has left."""
         async with self._turn:
             if math.isinf(self._trip):
                 # Before the first message, which may be the largest.
