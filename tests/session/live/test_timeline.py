@@ -14,7 +14,7 @@ from workbench.core.camera_data import CameraKind, Picture
 from workbench.jobs.task import Restored, Stepped
 from workbench.session.history.history import RESET, SUCCESS
 from workbench.session.live.timeline import Timeline
-from workbench.session.protocol.messages import CameraRequest, PastPictures
+from workbench.session.protocol.messages import CameraRequest, PastPictures, Pictures
 
 EYE, HAND = CameraRequest("eye", "sensor", ("rgb",)), CameraRequest("hand", "sensor", ("rgb",))
 PEOPLE = CameraRequest("eye", "human", ("rgb",))
@@ -56,6 +56,20 @@ def test_every_env_is_asked_for_its_own_pictures_of_a_past_moment_and_once() -> 
     assert timeline.draw(0, (EYE, HAND)).origin == 3
     timeline.seek(None)
     assert timeline.draw(0, (EYE,)) is None
+
+
+def test_a_moment_that_was_drawn_fast_is_drawn_exactly_unless_fast_pictures_are_chosen() -> None:
+    timeline = played(3)
+    number = timeline.history.at(1).number
+    timeline.history.add_pictures(Pictures((picture(1),), 5.0, number, "fast"))
+    timeline.seek(1)
+    assert not timeline.view(1, (EYE,), "fast").wants_pictures and timeline.draw(1, (EYE,), "fast") is None
+    assert timeline.view(1, (EYE,)).wants_pictures
+    assert list(timeline.pictures(1)) == [("sensor", "eye")], "the fast one is seen meanwhile"
+    asked = timeline.draw(1, (EYE,))
+    assert asked is not None and (asked.origin, asked.cameras) == (1, (EYE,))
+    timeline.history.add_pictures(PastPictures(1, (picture(1),)))
+    assert not timeline.view(1, (EYE,)).wants_pictures and timeline.draw(1, (EYE,)) is None
 
 
 def test_only_what_is_lacking_is_asked_for() -> None:

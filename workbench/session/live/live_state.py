@@ -444,7 +444,8 @@ class LiveState:
         if timeline is None:
             return replace(now, refused=refused, **known)
         env, moment = now.settings.selected_env, timeline.shown
-        past, curves = timeline.view(env, now.settings.cameras), timeline.history.steps.curves(env)
+        past = timeline.view(env, now.settings.cameras, now.settings.pictures)
+        curves = timeline.history.steps.curves(env)
         odd = timeline.history.findings
         view = replace(now, refused=refused, curves=curves, timeline=past, odd=odd, **known)
         if moment is None:

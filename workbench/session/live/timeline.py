@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraKind, Picture
-from workbench.jobs.task import Restored, Stepped
+from workbench.jobs.task import Restored, ShownPictures, Stepped
 from workbench.session.history.env_table import EnvTable
 from workbench.session.history.history import EnvMoment, History, Moment, ShownMoment
 from workbench.session.protocol.messages import CameraRequest, DrawPast, Request, Restore
@@ -159,7 +159,9 @@ class Timeline:
             return {}
         return {(kind, name): p for (of, kind, name), p in moment.pictures.items() if of == env}
 
-    def view(self, env: int, cameras: tuple[CameraRequest, ...]) -> TimelineView:
+    def view(
+        self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "auto"
+    ) -> TimelineView:
         history, moment = self.history, self.shown
         at = moment if moment is not None else history.at(history.last)
         jump = history.last_jump(env)
@@ -177,7 +179,7 @@ class Timeline:
             not_carried=tuple(f"{what}: {why}" for what, why in missed.items()),
             arrived=how,
             entered=self._entered,
-            wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras)),
+            wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras, degree)),
         )
 
     def strip(self, env: int, low: int, high: int) -> Strip:
@@ -237,12 +239,17 @@ class Timeline:
         starts = {at: taken for at in beginnings if (taken := history.snapshot_at(at)) is not None}
         return Restore(snapshot, envs, source, origin, undoes, ways, starts)
 
-    def draw(self, env: int, cameras: tuple[CameraRequest, ...]) -> DrawPast | None:
-        """Request the missing pictures of the shown moment; only once for each moment, env and set of cameras."""
+    def draw(
+        self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "auto"
+    ) -> DrawPast | None:
+        """Request the missing pictures of the shown moment; only once for each moment, env and set of cameras.
+
+        Fast ones are missing too, as exact ones, unless fast ones are asked for: they were drawn while something moved.
+        """
         moment = self.shown
         if moment is None:
             return None
-        lacking = self._lacking(moment, env, cameras)
+        lacking = self._lacking(moment, env, cameras, degree)
         requested = (moment.serial, env, lacking)
         if not lacking or requested == self._requested:
             return None
@@ -250,7 +257,7 @@ class Timeline:
         return DrawPast(moment.step.poses[env].copy(), env, lacking, moment.serial)
 
     def _lacking(
-        self, moment: Moment, env: int, cameras: tuple[CameraRequest, ...]
+        self, moment: Moment, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures
     ) -> tuple[CameraRequest, ...]:
         def lacks(camera: CameraRequest) -> bool:
             key = (env, camera.kind, camera.name)
@@ -258,6 +265,7 @@ class Timeline:
             return (
                 picture is None
                 or key in moment.outdated
+                or (key in moment.fast and degree != "fast")
                 or any(getattr(picture, m) is None for m in camera.modalities)
             )
 
@@ -317,7 +325,9 @@ class TimeTravel:
         """Request pictures of the shown moment, if some of the watched cameras lack one."""
         with self._lock:
             s = self._state
-            request = None if s.timeline is None else s.timeline.draw(self._env, s.now.settings.cameras)
+            request = None if s.timeline is None else s.timeline.draw(
+                self._env, s.now.settings.cameras, s.now.settings.pictures
+            )
         if request is not None:
             self._send(request)
 

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import Problem
-from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, CameraSettings, Picture
+from workbench.core.camera_data import (
+    CameraInfo,
+    CameraKey,
+    CameraKind,
+    CameraSettings,
+    Picture,
+    PictureDegree,
+)
 from workbench.core.capture.inspection import Inspection, Section
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env.step_result import StepResult
@@ -349,6 +356,7 @@ class Pictures:
     milliseconds: float
     number: int
     """`Stepped.number` of the moment that they show."""
+    degree: PictureDegree = "exact"
 
 
 @dataclass(frozen=True)
