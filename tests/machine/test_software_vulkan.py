@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+from pathlib import Path
+
+import msgspec
 import pytest
 
 from workbench.machine.apt import PackageVersion, parse_madison
-from workbench.machine.software_vulkan import first_good_mesa, mesa_version
+from workbench.machine.render_probe import RenderProbe
+from workbench.machine.software_vulkan import first_good_mesa, known_render_device, mesa_version
 
 DEBIAN_12_WITH_BACKPORTS = """\
 mesa-vulkan-drivers | 25.0.7-2~bpo12+1 | http://mirror/debian bookworm-backports/main amd64 Packages
@@ -36,3 +40,23 @@ def test_a_mesa_that_sapien_renders_on_is_chosen(listing: str, wanted: PackageVe
 )
 def test_versions_are_read_as_debian_writes_them(version: str, wanted: tuple[int, int]) -> None:
     assert mesa_version(version) == wanted
+
+
+@pytest.mark.usefixtures("child_process")
+def test_a_device_that_was_found_is_not_asked_for_again_until_its_driver_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    found = known_render_device(install=False)
+    if not found.ok:
+        pytest.skip("nothing renders here")
+    (kept,) = (tmp_path / "workbench").glob("render-device-*.json")
+    kept.write_bytes(msgspec.json.encode(RenderProbe(ok=True, name="as it was kept")))
+    assert known_render_device(install=False).name == "as it was kept"
+    kept.write_bytes(b"{")
+    assert known_render_device(install=False) == found
+    broken = tmp_path / "broken.json"
+    broken.write_text("{}")
+    monkeypatch.setenv("VK_DRIVER_FILES", str(broken))
+    assert not known_render_device(install=False).ok
+    assert len([*kept.parent.glob("render-device-*.json")]) == 1, "only what works is kept"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import os
+import platform
 import re
 import shlex
 import shutil
@@ -13,6 +16,8 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import msgspec
 
 from workbench.machine.apt import (
     AptFailed,
@@ -26,13 +31,15 @@ from workbench.machine.apt import (
     os_release,
     read_apt_sources,
 )
-from workbench.machine.folders import cache_folder
+from workbench.machine.folders import cache_folder, read_private, write_private
 from workbench.machine.render_probe import (
     DRIVER_VARIABLES,
     SYSTEM_LIBRARIES,
     RenderProbe,
+    driver_files,
     probe_render_device,
 )
+from workbench.machine.versions import installed
 
 
 def private_mesa_folder() -> Path:
@@ -222,7 +229,41 @@ def ensure_render_device(install: bool) -> RenderProbe:
 
 def use_private_driver() -> None:
     """Let SAPIEN in this process and its children find a driver that was unpacked for this user."""
-    os.environ.update(ensure_render_device(install=False).env)
+    os.environ.update(known_render_device(install=False).env)
+
+
+def known_render_device(install: bool) -> RenderProbe:
+    """As `ensure_render_device`, from what it found last if nothing that decides it has changed since.
+
+    A probe imports SAPIEN and makes a Vulkan device, and `make open` asks twice before the worker starts. A device that
+    fails although nothing changed is reported by the worker, which is a process of its own too.
+    """
+    # One file for each answer: with a driver of the user's own, `make open` asks with its variables the second time.
+    name = f"render-device-{hashlib.blake2b(repr(_what_decides()).encode(), digest_size=8).hexdigest()}.json"
+    with contextlib.suppress(OSError, msgspec.MsgspecError):
+        if (kept := read_private(name, cache_folder())) is not None:
+            return msgspec.json.decode(kept, type=RenderProbe)
+    probe = ensure_render_device(install)
+    if probe.ok:
+        # A full disk, or another user's folder: the next process probes again.
+        with contextlib.suppress(OSError):
+            write_private(name, msgspec.json.encode(probe), cache_folder())
+    return probe
+
+
+def _what_decides() -> list[str]:
+    """Versions, the environment's variables, driver files with their age, and the devices of this machine."""
+    named = (*DRIVER_VARIABLES, "LD_LIBRARY_PATH", "SAPIEN_VULKAN_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES")
+    files = [*driver_files(), *_manifests(private_mesa_folder())]
+    devices = [*Path("/dev").glob("nvidia*"), *Path("/dev/dri").glob("*")]
+    return [
+        platform.release(),
+        sys.executable,
+        *(f"{name}={os.environ.get(name, '')}" for name in named),
+        *(f"{file} {file.stat().st_mtime_ns}" for file in files if file.exists()),
+        *sorted(map(str, devices)),
+        *(f"{name} {installed(name)}" for name in ("sapien", "torch")),
+    ]
 
 
 def _install_libraries(probe: RenderProbe) -> RenderProbe:
@@ -302,9 +343,10 @@ def _command_to_type() -> str:
 
 def main() -> None:
     """Provide a render device if there is none; ``--export`` prints only shell lines for its variables."""
-    probe = ensure_render_device(install=True)
+    export = "--export" in sys.argv[1:]
+    probe = known_render_device(install=True) if export else ensure_render_device(install=True)
     if probe.ok:
-        if "--export" not in sys.argv[1:]:
+        if not export:
             print(f"SAPIEN renders on {probe.name} ({probe.driver or 'driver unknown'})")
         for name, value in probe.env.items():
             print(f"export {name}={shlex.quote(value)}")

@@ -119,7 +119,7 @@ def test_every_mesh_lies_under_its_body(written: tuple[Made, Path, Entities]) ->
                 np.testing.assert_array_equal(mesh["Mesh3D:vertex_texcoords"].values[0], visual.mesh.uvs)
                 pixels = mesh["Mesh3D:albedo_texture_buffer"].values[0][0]
                 small = max(visual.material.texture.shape[:2]) <= VIEWER_TEXELS
-                assert ("texture" in mesh) is not small, "a large one is a JPEG, and rerun shows it small"
+                assert ("texture" in mesh) is not small, "a large one is WebP, and rerun shows it small"
                 if small:
                     assert pixels == visual.material.texture[..., :3].tobytes()
                 else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -114,7 +114,7 @@ def take_pictures(
 class PendingPictures:
     """Pictures that the renderer is drawing; see `begin_pictures`."""
 
-    _taken: tuple[tuple[Any, str, CameraKind, int, tuple[str, ...], NDArray[np.float32]], ...]
+    _taken: tuple[tuple[Any, Any, str, CameraKind, int, tuple[str, ...], NDArray[np.float32]], ...]
 
     def finish(self) -> tuple[Picture, ...]:
         """The pictures, in the order asked; waits until the renderer is done."""
@@ -160,28 +160,33 @@ def begin_pictures(
         maniskill_private.camera_components(cameras[kind, name])[env_index] for name, kind, _ in requests
     ]
     places = places_to_draw(env, env_index, poses)
-    for name, kind, _ in requests:
-        with _drawn(scene, env_index, (kind, name), degree):
-            pass  # what fast pictures draw is made before `update_render` puts it where it belongs
     with (
         show_hidden_objects(env, env_index, shown=kinds == {"human"}),
         drawn_at(places, components) as move_bodies,
     ):
+        batched = scene if isinstance(scene, BatchedCpuScene) else None
+        needed = [_textures(cameras[kind, name], modalities) for name, kind, modalities in requests]
+        if batched is not None and (degree or batched.pictures) == "fast":
+            for (name, kind, _), textures in zip(requests, needed, strict=True):
+                batched.prepare_fast(env_index, (kind, name), textures)
         sub_scene.update_render()
         move_bodies()
-        for (name, kind, modalities), component in zip(requests, components, strict=True):
-            with _drawn(scene, env_index, (kind, name), degree):
+        for (name, kind, modalities), component, textures in zip(requests, components, needed, strict=True):
+            drawing = component
+            if batched is None:
                 component.take_picture()
+            else:
+                drawing = batched.take_picture(env_index, (kind, name), component, textures, degree)
             pose = component.get_global_pose()
             where = np.array([*pose.p, *pose.q], dtype=np.float32)
-            taken.append((cameras[kind, name], name, kind, env_index, tuple(modalities), where))
+            taken.append((cameras[kind, name], drawing, name, kind, env_index, tuple(modalities), where))
     return PendingPictures(tuple(taken))
 
 
-def _drawn(
-    scene: Any, env_index: int, camera: CameraKey, degree: PictureDegree | None
-) -> AbstractContextManager[None]:
-    return scene.drawn(env_index, camera, degree) if isinstance(scene, BatchedCpuScene) else nullcontext()
+def _textures(camera: Any, modalities: Sequence[str]) -> set[str]:
+    """Those of its shader that give the modalities."""
+    of = camera.config.shader_config.texture_names
+    return {texture for texture, gives in of.items() if set(gives) & set(modalities)}
 
 
 def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) -> Places:
@@ -264,13 +269,13 @@ def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]
 
 def _read(
     camera: Any,
+    component: Any,
     name: str,
     kind: CameraKind,
     env_index: int,
     modalities: tuple[str, ...],
     pose: NDArray[np.float32],
 ) -> Picture:
-    component = maniskill_private.camera_components(camera)[env_index]
     config = camera.config.shader_config
     made: dict[str, torch.Tensor] = {}
     depth = None

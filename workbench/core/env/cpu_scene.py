@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Collection
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -46,7 +46,8 @@ from workbench.core.maniskill_private import (
     substeps_are_unwatched,
 )
 from workbench.core.rules import Degree, Finding, degrees_of
-from workbench.core.scene.fast_shapes import Bodies, FastShapes, shown
+from workbench.core.scene.fast_shader import FastCameras
+from workbench.core.scene.fast_shapes import FastShapes, shown
 from workbench.core.simulation.accessors import install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
@@ -86,14 +87,28 @@ class CpuCameraGroup:
     ) -> None:
         self._cameras, self._scene, self._key = cameras, scene, key
 
+        self.textures = {"Color"}
+        """Those of a fast picture: what was ever read."""
+        self._drawn = cameras
+        """By the last `take_picture`, with `_has`."""
+        self._has: set[str] = set()
+
     def take_picture(self) -> None:
-        for env, camera in enumerate(self._cameras):
-            with self._scene.drawn(env, self._key):
-                camera.take_picture()
+        self._has = {*self.textures}
+        self._drawn = [
+            self._scene.take_picture(env, self._key, camera, self._has)
+            for env, camera in enumerate(self._cameras)
+        ]
 
     def get_picture_cuda(self, name: str) -> CpuArray:
         """(N, H, W, C) texture `name` of every env, on the CPU."""
-        pictures = [torch.from_numpy(camera.get_picture(name)) for camera in self._cameras]
+        self.textures.add(name)
+        if name not in self._has and self._drawn != self._cameras:
+            # For this once by the exact cameras, which the last `update_render` has moved too.
+            for env, camera in enumerate(self._cameras):
+                self._scene.take_picture(env, self._key, camera, None)
+            self._drawn = self._cameras
+        pictures = [torch.from_numpy(camera.get_picture(name)) for camera in self._drawn]
         return CpuArray(torch.stack(pictures))
 
 
@@ -111,29 +126,54 @@ class BatchedCpuScene(ManiSkillScene):
         self.px = system_class(sub_scenes, threads)  # type: ignore[assignment]
         self.gpu_sim_enabled = True
         self.pictures: PictureDegree = "exact"
-        self._fast_shapes: FastShapes | None = None
+        self._fast: tuple[FastShapes, FastCameras] | None = None
 
-    def drawn(
-        self, env: int, camera: CameraKey, degree: PictureDegree | None = None
-    ) -> AbstractContextManager[None]:
-        """Within this, a camera's picture of an env is of this degree; None for the scene's own."""
+    def take_picture(
+        self,
+        env: int,
+        key: CameraKey,
+        camera: sapien.render.RenderCameraComponent,
+        textures: Collection[str] | None,
+        degree: PictureDegree | None = None,
+    ) -> sapien.render.RenderCameraComponent:
+        """Begin to draw; returns what the textures are to be read from.
+
+        Args:
+            camera: the one of this key in this env.
+            textures: those that a fast picture needs; None for all of `camera`'s own, by `camera` itself.
+            degree: None for the scene's own. A fast one needs `prepare_fast` before ``update_render``.
+        """
         if (degree or self.pictures) == "exact":
-            return nullcontext()
-        return shown(self.prepare_fast_shapes(camera)[env])
+            camera.take_picture()
+            return camera
+        shapes, cameras = self._fast_parts()
+        drawing = camera if textures is None else cameras.beside(camera, textures)
+        with shown(shapes.bodies(key, camera_components(self._sensor(key)))[env]):
+            drawing.take_picture()
+        return drawing
 
-    def prepare_fast_shapes(self, camera: CameraKey) -> list[Bodies]:
-        """Make what fast pictures of this camera draw, once; call it before ``update_render``."""
-        if self._fast_shapes is None:
-            self._fast_shapes = FastShapes(self.sub_scenes)
-        kind, name = camera
-        sensor = (self.sensors if kind == "sensor" else self.human_render_cameras)[name]
-        return self._fast_shapes.bodies(camera, camera_components(sensor))
+    def prepare_fast(self, env: int, key: CameraKey, textures: Collection[str]) -> None:
+        """Make what a fast picture of this camera draws, once, and move it to where the camera is now."""
+        sensor = self._sensor(key)
+        components = camera_components(sensor)
+        shapes, cameras = self._fast_parts()
+        shapes.bodies(key, components)
+        cameras.follow(env, sensor.config, components[env], textures)
 
     def forget_fast_shapes(self) -> None:
         """Make them anew for the next picture: the cameras are others now."""
-        if self._fast_shapes is not None:
-            self._fast_shapes.remove()
-            self._fast_shapes = None
+        if self._fast is not None:
+            self._fast[0].remove()
+            self._fast = None
+
+    def _fast_parts(self) -> tuple[FastShapes, FastCameras]:
+        if self._fast is None:
+            self._fast = FastShapes(self.sub_scenes), FastCameras(self.sub_scenes)
+        return self._fast
+
+    def _sensor(self, key: CameraKey) -> Any:
+        kind, name = key
+        return (self.sensors if kind == "sensor" else self.human_render_cameras)[name]
 
     def create_actor_builder(self) -> Any:
         # ManiSkill adds a plane once a builder, since all envs of a GPU share one physics scene: here every env but
@@ -161,8 +201,6 @@ class BatchedCpuScene(ManiSkillScene):
             chosen.append(("human", self.human_render_cameras))
         for kind, cameras in chosen:
             for name, sensor in cameras.items():
-                if self.pictures == "fast" and camera_components(sensor):
-                    self.prepare_fast_shapes((kind, name))
                 if sensor.camera.camera_group is None:
                     group = CpuCameraGroup(sensor.camera._render_cameras, self, (kind, name))
                     sensor.camera.camera_group = self.camera_groups[name] = group  # type: ignore
@@ -172,6 +210,10 @@ class BatchedCpuScene(ManiSkillScene):
         for env, sub_scene in enumerate(self.sub_scenes):
             components = (sensor.camera._render_cameras[env] for sensor in every)
             with drawn_at(elsewhere.get(env, NOWHERE_ELSE), components) as move_bodies:
+                for kind, cameras in chosen if self.pictures == "fast" else ():
+                    for name, sensor in cameras.items():
+                        if isinstance(group := sensor.camera.camera_group, CpuCameraGroup):
+                            self.prepare_fast(env, (kind, name), group.textures)
                 sub_scene.update_render()
                 move_bodies()
 

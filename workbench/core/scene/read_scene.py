@@ -18,7 +18,14 @@ from PIL import Image
 
 from workbench.core.scene.scene_index import scene_index
 from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual, srgb
-from workbench.core.scene.simplify import drop_uvs, flat_rectangle, reduce_mesh, share_vertices, with_normals
+from workbench.core.scene.simplify import (
+    drop_uvs,
+    flat_rectangle,
+    reduce_mesh,
+    rounded,
+    share_vertices,
+    with_normals,
+)
 
 _FLAT_FACES = 100
 """Meshes with more faces are tested for being a flat rectangle."""
@@ -275,7 +282,8 @@ def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
     if flat is not None:
         mesh = flat
     else:
-        mesh = share_vertices(reduce_mesh(mesh, max_faces))
+        reduced = reduce_mesh(mesh, max_faces)
+        mesh = share_vertices(reduced if reduced is mesh else rounded(reduced))
     if source.keep:
         _kept_meshes[key] = mesh
         if len(_kept_meshes) > _KEPT_MESHES:

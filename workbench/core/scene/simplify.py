@@ -98,6 +98,20 @@ def share_vertices(mesh: Mesh) -> Mesh:
     )
 
 
+def rounded(mesh: Mesh) -> Mesh:
+    """`mesh` with positions on a grid of some 4000 cells along each axis, and normals within half a degree of their own.
+
+    Files compress the numbers to two thirds.
+    """
+    extent = np.ptp(mesh.vertices, axis=0)
+    cell = np.exp2(np.floor(np.log2(np.where(extent > 0, extent, 1.0) / 4096)))
+    on_grid = (np.round(mesh.vertices / cell) * cell).astype(np.float32)
+    # Flat along an axis, it stays where it is.
+    vertices = np.where(extent > 0, on_grid, mesh.vertices)
+    normals = None if mesh.normals is None else (np.round(mesh.normals * 64) / 64).astype(np.float32)
+    return replace(mesh, vertices=vertices, normals=normals)
+
+
 def with_normals(mesh: Mesh) -> Mesh:
     """`mesh` with normals made from its faces: smooth, but sharp at edges of more than 40 degrees.
 

@@ -100,9 +100,9 @@ def decode(modality: Modality, blob: bytes) -> NDArray:
 
 @contextlib.contextmanager
 def open_picture(blob: bytes) -> Iterator[Image.Image]:
-    """Open a JPEG or PNG of at most `MOST_PIXELS`. Raises OSError when it is invalid, also while the block decodes it."""
+    """Open a JPEG, PNG or WebP of at most `MOST_PIXELS`. Raises OSError when it is invalid, also while the block decodes it."""
     try:
-        with Image.open(io.BytesIO(blob), formats=("JPEG", "PNG")) as image:
+        with Image.open(io.BytesIO(blob), formats=("JPEG", "PNG", "WEBP")) as image:
             if image.width * image.height > MOST_PIXELS:
                 raise OSError(f"it claims {image.width} x {image.height} pixels")
             yield image

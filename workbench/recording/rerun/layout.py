@@ -23,7 +23,7 @@ from workbench.core.camera_data import CameraInfo
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode.encoded_pictures import MILLIMETRES_PER_METRE, Modality, decode
 from workbench.recording.episode.episode import CameraTrack, Episode, camera_names
-from workbench.recording.rerun.chunks import TimedChunks, series_chunk, static_chunk, static_pose
+from workbench.recording.rerun.chunks import SURFACE, TimedChunks, series_chunk, static_chunk, static_pose
 
 WORLD = "/world"
 CAMERAS = "/world/cameras"
@@ -182,7 +182,7 @@ def _world() -> Chunk:
 
 _TEXTURE_QUALITY = 75
 VIEWER_TEXELS = 128
-"""On the longest side of a texture as rerun shows it; the workbench reads the full one, beside it as a JPEG."""
+"""On the longest side of a texture as rerun shows it; the workbench reads the full one, beside it as WebP."""
 _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 """Results of `_mesh_chunk` by the visual's id, while the visual lives: the next episode of the scene reuses them, since
 textures are megabytes to convert."""
@@ -213,17 +213,14 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
     if mesh is None:
         return None
     # Values that rerun's mesh lacks, for reading the scene back. Typed, because rerun applies the type of the first value
-    # in the process to all: after a colour of integers every other would be truncated to 0 or 1.
+    # in the process to all: after a colour of integers every other would be truncated to 0 or 1. In one component, since
+    # the file's index has half a kilobyte, which cannot be compressed, for each of an entity.
     material = visual.material
-    extras: dict[str, Any] = {
-        "visual": visual.name,
-        "base_color": pa.array(material.base_color, pa.float64()),
-        "metallic": pa.array([material.metallic], pa.float64()),
-        "roughness": pa.array([material.roughness], pa.float64()),
-    }
+    surface = [*material.base_color, material.metallic, material.roughness]
+    extras: dict[str, Any] = {"visual": visual.name, SURFACE: pa.array(surface, pa.float64())}
     if material.texture is not None and visual.mesh.uvs is not None and _is_large(material.texture):
         # Rerun's own texture is uncompressed: that of ManiSkill's table would be three quarters of most recordings.
-        extras["texture"] = pa.array(np.frombuffer(_jpeg(material.texture), np.uint8))
+        extras["texture"] = pa.array(np.frombuffer(_webp(material.texture), np.uint8))
     return static_chunk(entity, mesh, rr.AnyValues(**extras))
 
 
@@ -231,10 +228,10 @@ def _is_large(texture: NDArray[np.uint8]) -> bool:
     return max(texture.shape[:2]) > VIEWER_TEXELS
 
 
-def _jpeg(texture: NDArray[np.uint8]) -> bytes:
+def _webp(texture: NDArray[np.uint8]) -> bytes:
     encoded = io.BytesIO()
     image = Image.fromarray(np.ascontiguousarray(texture[..., :3]))
-    image.save(encoded, "JPEG", quality=_TEXTURE_QUALITY, optimize=True)
+    image.save(encoded, "WEBP", quality=_TEXTURE_QUALITY)
     return encoded.getvalue()
 
 

@@ -25,7 +25,7 @@ from workbench.recording.episode.encoded_pictures import (
     decode,
     encode,
 )
-from workbench.recording.rerun.chunks import STEP
+from workbench.recording.rerun.chunks import STEP, SURFACE
 from workbench.recording.rerun.private_api import IndexedChunk, decode_chunk, index_of
 
 _PROPERTIES = "/__properties"
@@ -215,6 +215,11 @@ class RerunTable:
             rgb = _plain(buffer.flatten()).reshape(form["height"], form["width"], 3)
             rgb = self._full_texture(entity, rgb)
             texture = np.concatenate([rgb, np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=-1)
+        surface = self._static.get((entity, SURFACE))
+        if surface is not None:
+            r, g, b, a, metallic, roughness = surface.to_pylist()
+            return Material((r, g, b, a), metallic, roughness, texture)
+        # Files of versions before have a component of each.
         colors = self._static.get((entity, "base_color"))
         r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colors is None else colors.to_pylist()
         return Material(
