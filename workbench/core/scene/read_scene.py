@@ -16,16 +16,10 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
+from workbench.core.scene.mesh_levels import reduced_mesh
 from workbench.core.scene.scene_index import scene_index
 from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual, srgb
-from workbench.core.scene.simplify import (
-    drop_uvs,
-    flat_rectangle,
-    reduce_mesh,
-    rounded,
-    share_vertices,
-    with_normals,
-)
+from workbench.core.scene.simplify import drop_uvs, flat_rectangle, share_vertices, with_normals
 
 _FLAT_FACES = 100
 """Meshes with more faces are tested for being a flat rectangle."""
@@ -282,8 +276,7 @@ def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
     if flat is not None:
         mesh = flat
     else:
-        reduced = reduce_mesh(mesh, max_faces)
-        mesh = share_vertices(reduced if reduced is mesh else rounded(reduced))
+        mesh = share_vertices(mesh) if len(mesh.faces) <= max_faces else reduced_mesh(mesh, max_faces)
     if source.keep:
         _kept_meshes[key] = mesh
         if len(_kept_meshes) > _KEPT_MESHES:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import inspect
-import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -20,7 +18,7 @@ from mani_skill.utils.structs.pose import Pose
 
 from workbench.core.maniskill_private import task_class
 from workbench.core.simulation.strict_system import TENSORS
-from workbench.machine.parse_python import parse_python
+from workbench.machine.versions import stored_names
 
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 """Immutable values, which need no copy."""
@@ -172,18 +170,17 @@ def _is_ignored(cls: type, author: str) -> bool:
 
 @lru_cache(maxsize=1)
 def base_env_members() -> frozenset[str]:
-    """The attributes that ManiSkill's BaseEnv sets on itself: read off its source, ``self.NAME = ...``.
+    """The attributes that ManiSkill's BaseEnv sets on itself: read off its code, ``self.NAME = ...``.
 
     Options, spaces, sensors, last observation and generators: no state, or restored by name (elapsed steps, generators).
     ``agent`` is entered.
     """
-    tree = parse_python(textwrap.dedent(inspect.getsource(BaseEnv)))
-    targets = (node for node in ast.walk(tree) if isinstance(node, ast.Attribute))
-    names = {
-        node.attr
-        for node in targets
-        if isinstance(node.ctx, ast.Store) and isinstance(node.value, ast.Name) and node.value.id == "self"
-    }
+    names: set[str] = set()
+    for member in vars(BaseEnv).values():
+        accessors = (member.fget, member.fset) if isinstance(member, property) else (member,)
+        codes = (getattr(inspect.unwrap(f), "__code__", None) for f in accessors if callable(f))
+        for code in codes:
+            names |= set() if code is None else stored_names(code, "self")
     ours = {
         "_kept_controllers",
         "_to_begin",

@@ -325,8 +325,10 @@ class TimeTravel:
         """Request pictures of the shown moment, if some of the watched cameras lack one."""
         with self._lock:
             s = self._state
-            request = None if s.timeline is None else s.timeline.draw(
-                self._env, s.now.settings.cameras, s.now.settings.pictures
+            request = (
+                None
+                if s.timeline is None
+                else s.timeline.draw(self._env, s.now.settings.cameras, s.now.settings.pictures)
             )
         if request is not None:
             self._send(request)
