@@ -4,7 +4,10 @@
 
 from __future__ import annotations
 
+import ast
 import collections
+import inspect
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +16,7 @@ import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
 import torch
+from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PUSH_CUBE, batched
@@ -285,3 +289,14 @@ def test_what_is_not_set_yet_but_by_its_class_is_set_when_all_envs_go_back() -> 
 def test_base_envs_own_members_are_known() -> None:
     assert {"_elapsed_steps", "_last_obs", "scene", "_batched_episode_rng", "num_envs"} <= base_env_members()
     assert "agent" not in base_env_members()
+    assert base_env_members() > assigned_in_the_source() - {"agent"}
+
+
+def assigned_in_the_source() -> set[str]:
+    tree = ast.parse(textwrap.dedent(inspect.getsource(BaseEnv)))
+    targets = (node for node in ast.walk(tree) if isinstance(node, ast.Attribute))
+    return {
+        node.attr
+        for node in targets
+        if isinstance(node.ctx, ast.Store) and isinstance(node.value, ast.Name) and node.value.id == "self"
+    }

@@ -188,7 +188,7 @@ def _read(name: str) -> tuple[Level, ...] | None:
             levels = tuple(_level(file, number) for number in range(len(file["errors"])))
         os.utime(_folder() / f"{name}.npz")
         return levels
-    except (OSError, ValueError, KeyError, IndexError, zipfile.BadZipFile):
+    except (OSError, EOFError, ValueError, KeyError, IndexError, zipfile.BadZipFile):
         return None
 
 

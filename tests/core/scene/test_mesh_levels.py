@@ -1,0 +1,36 @@
+"""Meshes that are kept on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from workbench.core.scene.mesh_levels import reduced_mesh
+from workbench.core.scene.shapes import Mesh
+
+
+def test_a_reduced_mesh_is_read_from_disk_the_next_time_and_made_again_from_a_broken_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    mesh = Mesh(
+        sphere.vertices.astype(np.float32), sphere.faces.astype(np.uint32), sphere.vertices.astype(np.float32)
+    )
+    made = reduced_mesh(mesh, 400)
+    assert 200 < len(made.faces) <= 800
+    assert np.abs(np.linalg.norm(made.vertices, axis=1) - 1).max() < 0.05
+    assert made.normals is not None
+    np.testing.assert_allclose(np.linalg.norm(made.normals, axis=1), 1, atol=0.02)
+    (file,) = tmp_path.rglob("*.npz")
+    written = file.read_bytes()
+    for content in (written, b"no file of ours", b""):
+        file.write_bytes(content)
+        again = reduced_mesh(mesh, 400)
+        np.testing.assert_array_equal(again.vertices, made.vertices)
+        np.testing.assert_array_equal(again.faces, made.faces)
+        np.testing.assert_array_equal(again.normals, made.normals)
+    assert reduced_mesh(mesh, 100) is not None and len(list(tmp_path.rglob("*.npz"))) == 2
