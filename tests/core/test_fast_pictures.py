@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import mani_skill.envs  # noqa: F401 (registers the tasks)
 import numpy as np
 import pytest
+import sapien
 import sapien.render
 import torch
+from PIL import Image
 
 import workbench
 from tests.core.drawn_envs import batched
 from workbench.core.cameras.render import take_pictures
 from workbench.core.env.hot_swap import exchange_cameras
 from workbench.core.env.task_env import BackendUnavailable, EnvOptions
+from workbench.core.maniskill_private import camera_components
+from workbench.core.scene.fast_shader import ALL, COLOR, shader_folder
 from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
 
 pytestmark = pytest.mark.usefixtures("renderer")
 
-ALL = ("rgb", "depth", "segmentation")
+ALL_THREE = ("rgb", "depth", "segmentation")
 
 
 @pytest.fixture(scope="module")
@@ -58,10 +63,10 @@ def test_pictures_of_one_camera_are_those_of_the_observation(env: Any) -> None:
     seen = observed(env)
     env.scene.pictures = "exact"
     for index in range(env.num_envs):
-        (picture,) = take_pictures(env, index, [("base_camera", "sensor", ALL)], degree="fast")
+        (picture,) = take_pictures(env, index, [("base_camera", "sensor", ALL_THREE)], degree="fast")
         np.testing.assert_array_equal(picture.rgb, seen["rgb"][index])
         np.testing.assert_array_equal(picture.segmentation, seen["segmentation"][index, ..., 0])
-    (exact,) = take_pictures(env, 0, [("base_camera", "sensor", ALL)])
+    (exact,) = take_pictures(env, 0, [("base_camera", "sensor", ALL_THREE)])
     np.testing.assert_array_equal(exact.rgb, observed(env)["rgb"][0])
 
 
@@ -74,7 +79,7 @@ def test_a_colour_that_is_changed_later_shows_in_both(env: Any) -> None:
         for material in materials:
             material.base_color = [0.0, 1.0, 0.0, 1.0]
         for degree in ("exact", "fast"):
-            (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ALL)], degree=degree)
+            (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ALL_THREE)], degree=degree)
             assert picture.rgb is not None
             hand = picture.rgb[picture.segmentation == link._objs[0].entity.per_scene_id].astype(int)
             assert len(hand) > 50
@@ -91,7 +96,7 @@ def test_a_body_that_is_hidden_is_hidden_in_both(env: Any) -> None:
     body.visibility = 0.0
     try:
         for degree in ("exact", "fast"):
-            (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ALL)], degree=degree)
+            (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ALL_THREE)], degree=degree)
             assert not (picture.segmentation == entity.per_scene_id).any()
         assert body.visibility == 0.0
     finally:
@@ -102,6 +107,49 @@ def test_what_maniskill_finds_of_a_link_stays_the_exact_shapes(env: Any) -> None
     take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
     link = env.agent.robot.links_map["panda_link5"]
     assert sum(len(part.triangles) for shape in link.render_shapes[0] for part in shape.parts) > 10_000
+
+
+def test_the_installed_sapien_has_the_shader_that_is_cut_down() -> None:
+    for textures in (COLOR, ALL):
+        folder = shader_folder(textures)
+        assert folder is not None and (folder / "gbuffer.frag").exists()
+
+
+def test_a_fast_picture_follows_its_camera(env: Any) -> None:
+    (still,) = take_pictures(env, 0, [("base_camera", "sensor", ALL_THREE)], degree="fast")
+    component = camera_components(env._sensors["base_camera"])[0]
+    was = component.local_pose
+    component.local_pose = was * sapien.Pose([0.1, 0.05, 0])
+    try:
+        exact, fast = (
+            take_pictures(env, 0, [("base_camera", "sensor", ALL_THREE)], degree=degree)[0]
+            for degree in ("exact", "fast")
+        )
+    finally:
+        component.local_pose = was
+    assert (
+        (fast.segmentation != exact.segmentation).mean()
+        < 0.01
+        < (fast.segmentation != still.segmentation).mean()
+    )
+    assert np.abs(fast.rgb.astype(int) - exact.rgb).mean() < 2
+    np.testing.assert_array_equal(fast.pose, exact.pose)
+
+
+def test_an_environment_map_is_in_both(env: Any, tmp_path: Path) -> None:
+    Image.fromarray(np.full((8, 8, 4), (250, 30, 30, 255), np.uint8)).save(tmp_path / "side.png")
+    system = env.scene.sub_scenes[0].render_system
+    take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
+    system.cubemap = sapien.render.RenderCubemap(*6 * [str(tmp_path / "side.png")])
+    try:
+        exact, fast = (
+            take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree=degree)[0].rgb
+            for degree in ("exact", "fast")
+        )
+    finally:
+        system.cubemap = None
+    (without,) = take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
+    assert np.abs(fast.astype(int) - exact).mean() < 2 < np.abs(fast.astype(int) - without.rgb).mean()
 
 
 def test_exchanged_cameras_draw_fast_pictures_too() -> None:

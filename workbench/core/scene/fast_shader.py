@@ -120,7 +120,7 @@ class FastCameras:
         Args:
             config: ManiSkill's, of the camera.
         """
-        chosen = COLOR if COLOR.issuperset(textures) else ALL
+        chosen = _smallest(textures)
         system = self._sub_scenes[env].render_system
         folder = shader_folder(chosen) if ALL.issuperset(textures) else None
         if folder is None or config.shader_config is not _SHADER or system.cubemap is not None:
@@ -140,10 +140,12 @@ class FastCameras:
         self, exact: sapien.render.RenderCameraComponent, textures: Collection[str]
     ) -> sapien.render.RenderCameraComponent:
         """The camera to draw these textures with, which is `exact` where no other follows it."""
-        for has in (COLOR, ALL):
-            if has.issuperset(textures) and (id(exact), has) in self._made:
-                return self._made[id(exact), has].component
-        return exact
+        fast = self._made.get((id(exact), _smallest(textures)))
+        return exact if fast is None else fast.component
+
+
+def _smallest(textures: Collection[str]) -> frozenset[str]:
+    return COLOR if COLOR.issuperset(textures) else ALL
 
 
 def _beside(exact: sapien.render.RenderCameraComponent, system: Any) -> _Fast:
