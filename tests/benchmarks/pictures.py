@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import psutil
 import tyro
 from core import in_own_process, table
 from core_sides import make_batched, random_stepper
@@ -209,17 +210,25 @@ def _row(task: str, got: dict[str, float]) -> list[str]:
 # --- what a learner gets ------------------------------------------------------------------------------
 
 
-def rate(step: Callable[[], object], num_envs: int, seconds: float) -> float:
-    """Env-steps a second."""
+def rate(step: Callable[[], object], num_envs: int, seconds: float) -> tuple[float, float]:
+    """Env-steps a second, and the processor's milliseconds of each in all processes."""
     step()
-    count, start = 0, time.perf_counter()
+    count, start, before = 0, time.perf_counter(), _processor()
     while time.perf_counter() - start < seconds or count < 3:
         step()
         count += 1
-    return num_envs * count / (time.perf_counter() - start)
+    done = num_envs * count
+    return done / (time.perf_counter() - start), 1e3 * (_processor() - before) / done
 
 
-def made_rate(num_envs: int, degree: Literal["exact", "fast"], seconds: float) -> float:
+def _processor() -> float:
+    """Seconds of this process and those that it started."""
+    this = psutil.Process()
+    every = (process.cpu_times() for process in (this, *this.children(recursive=True)))
+    return sum(times.user + times.system for times in every)
+
+
+def made_rate(num_envs: int, degree: Literal["exact", "fast"], seconds: float) -> tuple[float, float]:
     import torch
 
     import workbench
@@ -230,7 +239,7 @@ def made_rate(num_envs: int, degree: Literal["exact", "fast"], seconds: float) -
     return rate(lambda: env.step(env.action_space.sample()), num_envs, seconds)
 
 
-def async_rate(num_envs: int, seconds: float) -> float:
+def async_rate(num_envs: int, seconds: float) -> tuple[float, float]:
     import gymnasium as gym
     import mani_skill.envs  # noqa: F401
     import torch
@@ -257,12 +266,12 @@ def steps(options: Options) -> Iterator[str]:
     stock = in_own_process(async_rate, n, seconds)
     yield f'## `make("PushCube-v1", {n}, obs_mode="rgb", pictures=...)`, 128 x 128'
     yield ""
+    sides = {"fast": fast, "exact": exact, f"stock AsyncVectorEnv of {n}": stock}
     rows = [
-        ["fast", f"{fast:.0f}", f"{fast / stock:.1f}"],
-        ["exact", f"{exact:.0f}", f"{exact / stock:.1f}"],
-        [f"stock AsyncVectorEnv of {n}", f"{stock:.0f}", "1"],
+        [name, f"{a_second:.0f}", f"{took:.1f}", f"{stock[1] / took:.1f}"]
+        for name, (a_second, took) in sides.items()
     ]
-    yield from table(["", "env-steps a second", "to stock"], rows)
+    yield from table(["", "env-steps a second", "processor, ms an env-step", "stock / this"], rows)
 
 
 def main(options: Options) -> None:
