@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -57,7 +58,12 @@ def compare(task: str, size: int, num_envs: int, steps: int, turns: int) -> dict
         obs_mode="rgb+depth+segmentation",
         sensor_configs={"width": size, "height": size},
     )
-    step = random_stepper(env, episode=10**6)
+    if hasattr(env.single_action_space, "low"):
+        step = random_stepper(env, episode=10**6)
+    else:
+        # Several robots stand still.
+        env.reset(seed=0)
+        step = partial(env.step, None)
     env.scene.pictures = "fast"  # or the steps would draw exact ones
     for _ in range(steps):
         step()
