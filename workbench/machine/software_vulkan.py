@@ -258,7 +258,7 @@ def _what_decides() -> list[str]:
     devices = [*Path("/dev").glob("nvidia*"), *Path("/dev/dri").glob("*")]
     return [
         platform.release(),
-        sys.executable,
+        sys.prefix,
         *(f"{name}={os.environ.get(name, '')}" for name in named),
         *(f"{file} {file.stat().st_mtime_ns}" for file in files if file.exists()),
         *sorted(map(str, devices)),
