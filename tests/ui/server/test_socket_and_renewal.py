@@ -59,11 +59,21 @@ def get(gated_server: GatedServer, path: str = "/", host: str = "localhost:8080"
         connection.close()
 
 
-def test_only_its_owner_can_connect_and_no_port_is_open(gated_server, folder):
+def listening_ports() -> set[int]:
+    own = psutil.Process().net_connections(kind="tcp")
+    return {one.laddr.port for one in own if one.status == psutil.CONN_LISTEN}
+
+
+@pytest.fixture
+def before() -> set[int]:
+    """Ports that other tests in this process left open."""
+    return listening_ports()
+
+
+def test_only_its_owner_can_connect_and_no_port_is_open(before, gated_server, folder):
     found = (folder / "page.sock").lstat()
     assert stat.S_ISSOCK(found.st_mode) and stat.S_IMODE(found.st_mode) == 0o600
-    own = psutil.Process().net_connections(kind="tcp")
-    assert not [one for one in own if one.status == psutil.CONN_LISTEN]
+    assert listening_ports() <= before
 
 
 def test_the_printed_line_and_address_lead_to_it(gated_server, folder):
