@@ -19,6 +19,7 @@ import re
 import resource
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import date
 from importlib.metadata import version
@@ -84,6 +85,7 @@ def tasks() -> list[str]:
     from mani_skill.envs.sapien_env import BaseEnv
     from mani_skill.utils.registration import REGISTERED_ENVS
 
+    from workbench.core.env.assets import MissingAssets, require_assets, robots_of
     from workbench.core.env.task_env import default_reward_mode
 
     found: dict[str, list[str]] = {"tabletop": [], "control": []}
@@ -92,7 +94,10 @@ def tasks() -> list[str]:
         # ManiSkill's humanoids declare a dense reward and have none.
         has_one = spec.cls.compute_dense_reward is not BaseEnv.compute_dense_reward
         dense = has_one and default_reward_mode(spec.cls) in ("dense", "normalized_dense")
-        if kind in found and dense and not spec.asset_download_ids:
+        if kind not in found or not dense or spec.asset_download_ids:
+            continue
+        with suppress(MissingAssets):
+            require_assets(env_id, (), robots_of(spec.cls, spec.default_kwargs))
             found[kind].append(env_id)
     files = [
         file
