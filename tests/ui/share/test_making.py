@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import zipfile
 from collections.abc import Callable
@@ -154,6 +155,22 @@ def test_an_archive_of_several_has_each_file_once_and_nothing_that_a_link_names(
     assert sorted(names) == sorted(
         [f"{first.stem}{suffix}" for suffix in (".json", ".h5", ".rrd")] + ["other.json", "other.rrd"]
     )
+
+
+def test_an_archive_keeps_recordings_of_one_name_in_two_folders_apart(
+    recordings: Path, tmp_path: Path
+) -> None:
+    for name in ("before", "after"):
+        shutil.copytree(recordings, tmp_path / "kept" / name)
+    (old,) = (tmp_path / "kept" / "before").glob("*.rrd")
+    os.utime(old, (0, 0))  # 1970
+    sources = tuple(Source(path) for path in sorted((tmp_path / "kept").rglob("*.json")))
+    made = make(MakeRequest("zip", sources, tmp_path))
+    with zipfile.ZipFile(made.paths[0]) as archive:
+        archive.extractall(tmp_path / "elsewhere")
+    for name in ("before", "after"):
+        (again,) = find_all_sources([tmp_path / "elsewhere" / name])
+        assert not read_recording(again).broken_files
 
 
 def test_files_that_are_gone_make_no_archive(tmp_path: Path) -> None:

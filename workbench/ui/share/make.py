@@ -199,29 +199,31 @@ def zip_name(names: Sequence[str]) -> str:
 
 def _zip(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     """The recordings' own files in one archive: unpacked they are recordings again."""
-    files = [file for source in wanted.sources for file in _files_of(source)]
-    files = list(dict.fromkeys(files))  # of several recordings in one file
+    # Of several recordings in one file, once.
+    files = list(dict.fromkeys(file for source in wanted.sources for file in _files_of(source)))
+    # Below what all have in common: recordings in two folders may have the same name.
+    root = Path(os.path.commonpath([source.path.parent for source in wanted.sources]))
     path = wanted.folder / zip_name([source.stem for source in wanted.sources])
-    with new_file(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for number, (file, name) in enumerate(files):
-            on_progress(number / len(files), name)
+    # A file may be older than the years that an archive knows.
+    with new_file(path) as temporary, zipfile.ZipFile(temporary, "w", strict_timestamps=False) as archive:
+        for number, file in enumerate(files):
+            on_progress(number / len(files), file.name)
             # What takes space in it, meshes and pictures, is compressed already.
-            archive.write(file, name, zipfile.ZIP_STORED)
+            archive.write(file, file.relative_to(root), zipfile.ZIP_STORED)
     on_progress(1.0, "done")
     return Made((path,), f"{counted(len(files), 'file')} of {counted(len(wanted.sources), 'recording')}")
 
 
-def _files_of(source: Source) -> list[tuple[Path, str]]:
-    """The files of a recording, with their names in an archive. Raises ValueError if there are none."""
+def _files_of(source: Source) -> list[Path]:
+    """The files of a recording; a link is none. Raises ValueError if there are none."""
     if source.kind == "lerobot":
-        found = [file for file in sorted(source.path.rglob("*")) if file.is_file() and not file.is_symlink()]
-        named = [(file, str(file.relative_to(source.path.parent))) for file in found]
+        found = sorted(source.path.rglob("*"))
     else:
         found = [source.path.with_suffix(suffix) for suffix in SUFFIXES]
-        named = [(file, file.name) for file in found if file.is_file() and not file.is_symlink()]
-    if not named:
+    files = [file for file in found if file.is_file() and not file.is_symlink()]
+    if not files:
         raise ValueError(f"{source.stem}: its files are gone")
-    return named
+    return files
 
 
 def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:
