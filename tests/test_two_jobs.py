@@ -97,7 +97,7 @@ class Filming:
         assert self._making.start(self._wanted)
 
     def pids(self) -> list[int]:
-        return running("workbench.jobs.pool")
+        return running("workbench.jobs.pool.processes")
 
     def ended(self) -> bool:
         return not self._making.view().running

@@ -26,7 +26,8 @@ from workbench.cli.record import RecordBar
 from workbench.cli.solve import SolveOutput, as_csv, as_json, as_junit
 from workbench.core.rules import FailOn, Finding
 from workbench.jobs.check import CheckedTask, CheckReport
-from workbench.jobs.record import RecordProgress, Written
+from workbench.jobs.episodes import Written
+from workbench.jobs.record import RecordProgress
 from workbench.jobs.solve import SolveOptions, solve
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions

@@ -15,8 +15,9 @@ from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
 from workbench.jobs.check import CheckOptions, CheckReport, check, merged
-from workbench.jobs.pool import Processes
-from workbench.jobs.record import RecordOptions, record
+from workbench.jobs.episodes import RecordOptions
+from workbench.jobs.pool.processes import Processes
+from workbench.jobs.record import record
 from workbench.jobs.task import TaskOptions
 
 TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
@@ -59,7 +60,7 @@ def test_each_rule_has_its_result_in_the_order_of_the_table_whoever_looked(
     seen: list[str] = []
     alone = check(options(task, *rules), on_result=lambda result: seen.append(result.rule))
     assert seen == ["success-at-reset", "reward-finite"], "as they come"
-    several = check(options(task, *rules, workers=2), executor=Processes())
+    several = check(options(task, *rules, workers=2), executor=Processes(2))
     assert states(alone) == states(several) and list(states(alone)) == [r for r in RULES if r in rules]
     assert states(alone) == {"rows-lost": "broken", "success-at-reset": "broken", "reward-finite": "kept"}
     told = [(finding.key, finding.message, finding.degree, finding.line) for finding in alone.findings]

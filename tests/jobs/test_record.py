@@ -26,9 +26,11 @@ from tests.recording.verify_rrd import verify_rrd
 from workbench.authoring.problem import TaskError
 from workbench.cli.main import main
 from workbench.cli.record import record_in_terminal
+from workbench.jobs.episodes import RecordOptions, Written
 from workbench.jobs.from_recording import options_of
-from workbench.jobs.pool import Deal, Executor, Processes, Work
-from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, Written, record
+from workbench.jobs.pool.deal import Deal, Executor, Work
+from workbench.jobs.pool.processes import Processes
+from workbench.jobs.record import Recorded, RecordProgress, record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode
@@ -109,7 +111,7 @@ def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(recorded: Recor
 
 @pytest.mark.parametrize(
     ("num_envs", "workers", "executor"),
-    [(1, 1, None), pytest.param(1, 1, Processes(), marks=pytest.mark.slow), (3, 3, None)],
+    [(1, 1, None), pytest.param(1, 1, Processes(1), marks=pytest.mark.slow), (1, 3, None), (3, 1, None)],
 )
 def test_the_episodes_are_the_same_on_any_number_of_envs_and_processes(
     recorded: Recorded, num_envs: int, workers: int, executor: Executor | None, tmp_path: Path
@@ -146,12 +148,12 @@ class InAnyOrder:
         self.good, self.slots, self.data = good, slots, data
 
     def run(self, work: Work, deal: Deal) -> None:
-        (what, *_) = work.setups
+        (what,) = work.setup.wanted
         running: list[int] = []
         while True:
             running = [number for number in running if number < deal.limit()]
-            while len(running) < self.slots and (number := deal.next()) is not None:
-                running.append(number)
+            while len(running) < self.slots and (chunk := deal.next("a worker")) is not None:
+                running += chunk.numbers
             if not running:
                 return
             number = running.pop(self.data.draw(st.integers(0, len(running) - 1)))
@@ -159,9 +161,9 @@ class InAnyOrder:
             if self.good[number] or what.successes is None:
                 for suffix in (".rrd", ".h5", ".json"):
                     path.with_suffix(suffix).touch()
-                deal.send_result(number, Written(number, path, number, 1, 0.0, self.good[number]))
+                deal.result("a worker", number, Written(number, path, number, 1, 0.0, self.good[number]))
             else:
-                deal.send_result(number, None)
+                deal.result("a worker", number, None)
 
 
 @given(
@@ -340,7 +342,8 @@ def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.C
     assert record_in_terminal(what) == 1
     said = capsys.readouterr()
     assert "policy failed" in said.err and "tired" in said.err
-    assert "1 episode that had finished before is kept: workbench review" in said.out
+    assert "without a result: episode 1" in said.err
+    assert "Look at them with: workbench review" in said.out
 
 
 def test_a_task_that_goes_to_another_folder_changes_nothing_about_where_files_go(

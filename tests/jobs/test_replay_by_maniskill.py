@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workbench.jobs.record import RecordOptions, record
+from workbench.jobs.episodes import RecordOptions
+from workbench.jobs.record import record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode, read_maniskill

@@ -25,8 +25,9 @@ from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.cli.share import export_in_terminal
 from workbench.core.capture.recorded_state import read_states, state_distance
 from workbench.jobs.actions import read_actions
+from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.from_recording import run_of
-from workbench.jobs.record import RecordOptions, record
+from workbench.jobs.record import record
 from workbench.jobs.replay import replay_to
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording

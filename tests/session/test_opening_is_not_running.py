@@ -25,7 +25,8 @@ from tests.drive.waiting import until
 from workbench.cli.main import main
 from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.cli.terminal import Exit
-from workbench.jobs.record import RecordOptions, record
+from workbench.jobs.episodes import RecordOptions
+from workbench.jobs.record import record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import find_all_sources

@@ -132,7 +132,8 @@ class Known:
 
 def run(row: Row, options: Options, known: Known) -> None:
     """The episodes that a row lacks; each is saved as soon as those before it are there."""
-    from workbench.jobs.record import RecordOptions, RecordProgress, record
+    from workbench.jobs.episodes import RecordOptions
+    from workbench.jobs.record import RecordProgress, record
     from workbench.jobs.solve import SolveOptions
     from workbench.jobs.task import TaskOptions
     from workbench.recording.reader.read_episode import read_episode

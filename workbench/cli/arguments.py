@@ -53,6 +53,29 @@ class PageArguments:
 
 
 @dataclass(frozen=True)
+class JobArguments:
+    """Where a job runs, and what is kept of it.
+
+    Args:
+        workers: processes, each with envs of its own; what comes out is the same with any number.
+        cluster: run the workers on Ray: the address of a cluster, or auto for one that is there, else for one that is
+            started on this machine and ended with the job. Needs maniskill-workbench[cluster].
+        cpus_per_worker: on a cluster, the cores that each worker is given.
+        gpus_per_worker: likewise, the GPUs, or parts of one.
+        job: a file that keeps the results as they come. Where it has some of this very job, the job goes on after them.
+        shard: do only a part of the job, as in 3/64 for the third of 64; workbench merge puts the parts together. Without
+            --job the results are kept in a file that is named after the part.
+    """
+
+    workers: int | None = None
+    cluster: str | None = None
+    cpus_per_worker: float = 1
+    gpus_per_worker: float = 0
+    job: Path | None = None
+    shard: str | None = None
+
+
+@dataclass(frozen=True)
 class BatchArguments:
     """How envs are run.
 

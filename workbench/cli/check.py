@@ -27,7 +27,7 @@ from workbench.jobs.check import (
     count_rules,
     degrees_of_request,
 )
-from workbench.jobs.pool import PoolError
+from workbench.jobs.pool.deal import PoolError
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text

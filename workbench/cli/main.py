@@ -202,7 +202,7 @@ def record(
     use_private_driver()
     with quick_imports():
         from workbench.cli.record import record_in_terminal
-        from workbench.jobs.record import RecordOptions
+        from workbench.jobs.episodes import RecordOptions
         from workbench.machine.processes.debugger import debug_here
 
     try:

@@ -13,11 +13,22 @@ from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, Tim
 from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import TaskError
-from workbench.cli.terminal import err, print_finding, print_problem, print_text, progress_bar, refuse, warn
+from workbench.cli.terminal import (
+    Exit,
+    err,
+    print_failures,
+    print_finding,
+    print_problem,
+    print_text,
+    progress_bar,
+    refuse,
+    warn,
+)
 from workbench.core.backends import unused_gpu_text
 from workbench.jobs.actions import SOLVE
-from workbench.jobs.pool import PoolError
-from workbench.jobs.record import Recorded, RecordOptions, RecordProgress, Written, record, with_given_actions
+from workbench.jobs.episodes import RecordOptions, Written, with_given_actions
+from workbench.jobs.pool.deal import PoolError
+from workbench.jobs.record import Recorded, RecordProgress, record
 from workbench.planning.report import underway_text
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
@@ -147,8 +158,12 @@ def _print_result(requested: RecordOptions, recorded: Recorded) -> int:
     if recorded.written:
         folder = shlex.quote(str(recorded.written[0].path.parent))
         print_text(f"Look at them with: workbench review {folder}")
+    if recorded.failures:
+        print_failures(recorded.failures, lambda number: f"episode {number}")
     if recorded.stopped:
         return refuse("interrupted; finished episodes were kept")
+    if recorded.failures:
+        return Exit.FAILED
     if requested.successes is not None and kept < requested.successes:
         wanted = "1 success was" if requested.successes == 1 else f"{requested.successes} successes were"
         return refuse(f"{wanted} asked for; given up after {_episodes(recorded.tried)}")

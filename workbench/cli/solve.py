@@ -31,8 +31,8 @@ from workbench.cli.terminal import (
     stdout_to_stderr,
 )
 from workbench.core.rules import FailOn, fails
-from workbench.jobs.pool import PoolError
-from workbench.jobs.record import with_given_actions
+from workbench.jobs.episodes import with_given_actions
+from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.solve import SolveOptions, solve
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder

@@ -15,12 +15,13 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.segment import Segment
 from rich.text import Text
 
-from workbench.machine.text import SafeStream, plain_text
+from workbench.machine.text import SafeStream, listed, plain_text
 from workbench.session.clearance import CodeFile, Consent, NotTrusted, Since, TrustQuestion, question_text
 
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
     from workbench.core.rules import Finding
+    from workbench.jobs.pool.deal import Failure
     from workbench.session.process.captured_output import PrintedLine
     from workbench.session.protocol.messages import Event
 
@@ -123,6 +124,24 @@ def print_problem(problem: Problem) -> None:
         err.print(f"    {escape(plain_text(problem.code))}", soft_wrap=True)
     if problem.traceback:
         err.print(f"[dim]{escape(plain_text(problem.traceback.rstrip(), _LINES))}[/]", soft_wrap=True)
+
+
+def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> None:
+    """Print what failed in a job that went on, each kind once with the items that it failed in.
+
+    Args:
+        names: the name of an item.
+    """
+    kinds: dict[object, list[Failure]] = {}
+    for failure in failures:
+        problem = failure.problem
+        kinds.setdefault((problem.stage, problem.file, problem.line), []).append(failure)
+    for alike in kinds.values():
+        print_problem(alike[0].problem)
+        numbers = sorted(number for failure in alike for number in failure.numbers)
+        err.print(
+            escape(f"    without a result: {listed([names(number) for number in numbers])}"), soft_wrap=True
+        )
 
 
 def print_finding(finding: Finding) -> None:

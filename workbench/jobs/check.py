@@ -43,7 +43,8 @@ from workbench.jobs.actions import (
     plain_chooser,
 )
 from workbench.jobs.open_task import Opening, import_task
-from workbench.jobs.pool import Deal, Executor, ItemQueue, Processes, ThisProcess, Work
+from workbench.jobs.pool.deal import Deal, Executor, ItemQueue, ThisProcess, Work
+from workbench.jobs.pool.processes import Processes
 from workbench.jobs.replay import begin_run
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import CurrentFolder
@@ -200,8 +201,8 @@ def check(
     workers = min(cores if what.workers is None else what.workers, len(groups))
     found = _Results(degrees, on_activity, on_result)
     deal: Deal[None, CheckUpdate] = Deal(range(len(groups)), lambda number, none: None, found.take, stop)
-    work = Work(_check_groups, [what] * workers, result=None, update=CheckUpdate, name="that checks")
-    (executor or (ThisProcess() if workers == 1 else Processes())).run(work, deal)
+    work = Work(_check_groups, what, result=None, update=CheckUpdate, name="that checks")
+    (executor or (ThisProcess() if workers == 1 else Processes(workers))).run(work, deal)
     return found.report(began, stop(), _ignored(what))
 
 
@@ -315,8 +316,8 @@ def _check_groups(what: CheckOptions, queue: ItemQueue) -> None:
         _require_assets(loaded, what)
         queue.send_update(CheckUpdate(task=_described(loaded)))
         with suppress(_Stopped):
-            while (taken := queue.next()) is not None:
-                number = taken
+            while (chunk := queue.next()) is not None:
+                (number,) = chunk.numbers
                 queue.send_update(CheckUpdate(activity=groups[number].name))
                 _check_group(groups[number], checkup, degrees, queue)
                 queue.send_update(CheckUpdate(picture_seconds=checkup.picture_seconds))

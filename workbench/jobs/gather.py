@@ -58,11 +58,13 @@ class GatheredEpisode:
         seed: int,
         reset_options: Mapping[str, Any] | None = None,
         acted_by: str = "",
+        id: str = "",
     ) -> GatheredEpisode:
-        """A new episode with a writer into `folder`. Raises RecordingError."""
+        """A new episode with a writer into `folder`; `id` if not a random one. Raises RecordingError."""
+        info = episode_info(task, env, seed, reset_options, acted_by)
         writer = EpisodeWriter(
             folder,
-            episode_info(task, env, seed, reset_options, acted_by),
+            replace(info, id=id) if id else info,
             task.geometry,
             task.segmentation,
             [dimension.name for dimension in task.actions],
@@ -134,6 +136,8 @@ class EpisodeGatherer:
         """Options of the next resets."""
         self.acted_by = ""
         """The source of actions of the next episodes, where the steps do not name it."""
+        self.next_id = ""
+        """Of the next episode, where it is not a random one."""
         self._episodes: dict[int, GatheredEpisode | None] = {int(env): None for env in env_idx}
         self._packer = BatchPacker()
 
@@ -194,7 +198,8 @@ class EpisodeGatherer:
 
     def _begin(self, env: int, stepped: Stepped) -> None:
         seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
-        begun = GatheredEpisode.of(self._folder, self._task, env, seed, self.reset_options, self.acted_by)
+        id, self.next_id = self.next_id, ""
+        begun = GatheredEpisode.of(self._folder, self._task, env, seed, self.reset_options, self.acted_by, id)
         try:
             begun.take(self._packer, stepped.step, env, stepped.columns, stepped.captured)
         except BaseException:

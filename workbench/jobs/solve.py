@@ -10,8 +10,9 @@ from pathlib import Path
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.actions import SOLVE
-from workbench.jobs.pool import Executor
-from workbench.jobs.record import RecordOptions, RecordProgress, Written, record
+from workbench.jobs.episodes import RecordOptions, Written
+from workbench.jobs.pool.deal import Executor
+from workbench.jobs.record import RecordProgress, record
 from workbench.jobs.task import TaskOptions
 from workbench.planning.episodes import PlannedEpisode
 from workbench.planning.options import PlanOptions

@@ -17,7 +17,8 @@ import pytest
 from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
 
 from workbench.cli.main import main
-from workbench.jobs.record import RecordOptions, record
+from workbench.jobs.episodes import RecordOptions
+from workbench.jobs.record import record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode, read_maniskill
 

@@ -86,9 +86,26 @@ def episode_stem(info: EpisodeInfo) -> str:
     Two episodes of one second get the same stem; `publish` makes it unique.
     """
     when = datetime.datetime.fromisoformat(info.written_at).astimezone()
-    task = re.sub(r"[^A-Za-z0-9_-]+", "-", info.task).strip("-_")[:80] or "task"
-    seed = f"seed{info.seed:04d}" if info.seed >= 0 else "noseed"
-    return f"{task}_{seed}_env{info.env_index:02d}_{when:%Y-%m-%dT%H-%M-%S}"
+    return f"{stem_begin(info.task, info.seed)}{info.env_index:02d}_{when:%Y-%m-%dT%H-%M-%S}"
+
+
+def stem_begin(task: str, seed: int) -> str:
+    """What the stems of all episodes of a task from one seed begin with."""
+    name = re.sub(r"[^A-Za-z0-9_-]+", "-", task).strip("-_")[:80] or "task"
+    return f"{name}_{f'seed{seed:04d}' if seed >= 0 else 'noseed'}_env"
+
+
+def remove_episode(folder: Path, task: str, seed: int, id: str) -> None:
+    """Delete what there is of the episode with this id: its files, and the journal of a writer that died.
+
+    Raises OSError.
+    """
+    for path in folder.glob(f"{stem_begin(task, seed)}*.json"):
+        if _id_of(path) == id:
+            for suffix in (".json", ".h5", ".rrd"):  # the .json first: without it there is no episode
+                path.with_suffix(suffix).unlink(missing_ok=True)
+    for path in (folder / FOLDER).glob(f"{id}.*"):
+        path.unlink(missing_ok=True)
 
 
 # --- after the writer died ---------------------------------------------------------------------

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from workbench.authoring.problem import Problem, TaskError
-from workbench.jobs.pool import Deal, ItemQueue, PoolError, Processes, Work
+from workbench.jobs.pool.deal import Deal, ItemQueue, PoolError, Work
+from workbench.jobs.pool.processes import Processes
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.planning.report import SolveReport, underway_text
@@ -138,7 +139,7 @@ class SeedsSolver:
     # --- on the lane ---------------------------------------------------------------------------------
 
     def _solve(self, job: Job, setup: _Setup) -> None:
-        work = Work(_run, (setup,), SolveReport, _Update, "that solves")
+        work = Work(_run, setup, SolveReport, _Update, "that solves")
         deal: Deal[SolveReport, _Update] = Deal(
             range(1),
             lambda number, report: self._take(job, _Update(report=report)),
@@ -146,7 +147,7 @@ class SeedsSolver:
             lambda: job.stopped,
         )
         try:
-            Processes().run(work, deal)
+            Processes(1).run(work, deal)
         except TaskError as error:
             raise JobFailed("the task failed", error.problem) from error
         except OSError as error:

@@ -20,7 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.jobs.pool import Deal, ItemQueue, PoolError, Processes, Work
+from workbench.jobs.pool.deal import Deal, ItemQueue, PoolError, Work
+from workbench.jobs.pool.processes import Processes
 from workbench.machine.files import new_file
 from workbench.machine.software_vulkan import ensure_render_device
 from workbench.recording.episode.episode import Episode
@@ -311,12 +312,12 @@ class Making:
 
     def _run(self, wanted: MakeRequest) -> None:
         came: list[Made | str] = []
-        work = Work(_make, (wanted,), Made | str, tuple[float, str], "that makes it")
+        work = Work(_make, wanted, Made | str, tuple[float, str], "that makes it")
         deal: Deal[Made | str, tuple[float, str]] = Deal(
             range(1), lambda number, one: came.append(one), self._hear, self._stopped.is_set
         )
         try:
-            Processes().run(work, deal)
+            Processes(1).run(work, deal)
         except OSError as error:
             came.append(f"The process that makes it could not be started: {error}.")
         except PoolError as error:

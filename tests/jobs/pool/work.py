@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from workbench.authoring.problem import Problem, TaskError
-from workbench.jobs.pool import ItemQueue
+from workbench.jobs.pool.deal import ItemQueue
 
 PROBLEM = Problem("step", "it broke", "task.py", 3, "1 / 0", "Traceback")
 
@@ -32,27 +32,23 @@ class Squared:
 
 
 def square(setup: Setup, queue: ItemQueue) -> None:
-    """Two items at a time, as an env that has two places."""
+    """The items of a chunk one after another."""
     if setup.how == "cannot be loaded":
         raise TaskError(PROBLEM)
     queue.send_update(f"opened in {os.getpid()} on {','.join(map(str, sorted(os.sched_getaffinity(0))))}")
-    running: list[int] = []
-    while True:
-        running = [number for number in running if number < queue.limit()]
-        while len(running) < 2 and (number := queue.next()) is not None:
-            (setup.folder / f"begun{number}").touch()
-            running.append(number)
-        if not running:
-            return
-        number = running.pop(0)
-        if number == setup.at:
-            go_wrong(setup, queue)
-        queue.send_update(1)
-        queue.send_result(number, Squared(number, number**2, setup.folder / str(number), os.getpid()))
+    while (chunk := queue.next()) is not None:
+        for number in sorted(chunk.wanted):
+            if number >= queue.limit():
+                break
+            if number == setup.at:
+                go_wrong(setup, queue)
+            queue.send_update(1)
+            queue.send_result(number, Squared(number, number**2, setup.folder / str(number), os.getpid()))
 
 
 def go_wrong(setup: Setup, queue: ItemQueue) -> None:
-    if setup.how == "killed":
+    if setup.how == "killed" or (setup.how == "killed once" and not (setup.folder / "killed").exists()):
+        (setup.folder / "killed").touch()
         os.kill(os.getpid(), signal.SIGKILL)
     elif setup.how == "left":
         os._exit(0)

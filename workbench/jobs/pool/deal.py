@@ -1,0 +1,372 @@
+"""Deals a job's numbered items in fixed chunks, and keeps account of what came of them."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import groupby, islice
+from typing import Any, Generic, Protocol, TypeVar
+
+from workbench.authoring.problem import Problem, TaskError
+
+NO_LIMIT = sys.maxsize
+MOST_ALIKE = 3
+"""Chunks that may fail alike one after another: then the others would fail too."""
+
+Setup = TypeVar("Setup")
+Result = TypeVar("Result")
+Update = TypeVar("Update")
+
+
+class PoolError(RuntimeError):
+    """A worker died or failed; the others were stopped and dropped the items under way."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Items that one worker runs together.
+
+    The division does not depend on the number of workers, so that what an item gives cannot depend on it either: the
+    numbers of a policy differ by their last bits with the size of its batch and the row in it.
+    """
+
+    numbers: tuple[int, ...]
+    """Ascending."""
+    wanted: frozenset[int]
+    """Those whose results are not there yet."""
+    again: bool = False
+    """Another worker, or an earlier run of the job, may have begun it: what it wrote may be there."""
+
+
+class ItemQueue(Protocol):
+    """The chunks of one worker. Used on one thread."""
+
+    @property
+    def origin(self) -> Mapping[str, str]:
+        """Where files have travelled to this worker: each folder here, to the one that the submitting side has."""
+        ...
+
+    def next(self) -> Chunk | None:
+        """The next chunk to begin; None if there is none."""
+        ...
+
+    def limit(self) -> int:
+        """Items from this number on are not needed, even if they have begun. It never rises."""
+        ...
+
+    def send_result(self, number: int, result: Any) -> None:
+        """Send the result of an item."""
+        ...
+
+    def send_update(self, update: Any) -> None:
+        """Send progress."""
+        ...
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Items that gave no result."""
+
+    numbers: tuple[int, ...]
+    problem: Problem
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of the equal parts of a job."""
+
+    index: int = 1
+    """From 1 on."""
+    count: int = 1
+
+    def part(self, total: int) -> range:
+        """Its part of so many chunks: the parts follow each other, and no two differ by more than one."""
+        return range(total * (self.index - 1) // self.count, total * self.index // self.count)
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
+
+
+def parse_shard(text: str) -> Shard:
+    """The part that ``--shard`` names, as in ``3/64``. Raises ValueError for another text."""
+    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise ValueError(f"--shard takes a part of a whole, as in 3/64 for the third of 64; got {text!r}")
+    return Shard(int(match[1]), int(match[2]))
+
+
+@dataclass(eq=False)
+class _Held:
+    """A chunk that a worker has."""
+
+    chunk: Chunk
+    missing: set[int]
+    """Wanted items whose results did not come yet."""
+
+
+class Deal(Generic[Result, Update]):
+    """The chunks of a job, and the callbacks for what comes of its items. Used on one thread.
+
+    Chunks are dealt in ascending order. From the limit on no item is needed: a caller that has enough lowers it, and stopping
+    is a limit of 0. A chunk whose worker died is dealt again, after the others.
+    """
+
+    def __init__(
+        self,
+        numbers: Iterable[int],
+        on_result: Callable[[int, Result], None],
+        on_update: Callable[[Update], None] = lambda update: None,
+        stop: Callable[[], bool] = lambda: False,
+        *,
+        chunk: int = 1,
+        tries: int = 1,
+        on_failure: Callable[[Failure], None] | None = None,
+    ) -> None:
+        """
+        Args:
+            numbers: ascending, from 0 on.
+            stop: called often; after True nothing more is needed.
+            chunk: items of a chunk: k belongs to chunk ``k // chunk``.
+            tries: how often a chunk is begun whose workers die.
+            on_failure: called with the items that the author's code failed in, and those whose workers died in each try; the
+                job goes on unless they fail alike. If None the first failure ends the job.
+        """
+        self._numbers, self._size, self._tries = numbers, chunk, tries
+        self._on_result, self._on_update, self._stop = on_result, on_update, stop
+        self._on_failure = on_failure
+        self._known: Mapping[int, Result] = {}
+        self._keep: Callable[[int, Result], None] = lambda number, result: None
+        self._left = self._chunks()
+        self._ahead: deque[Chunk] = deque()
+        """Taken of `_left` already."""
+        self._returned: deque[Chunk] = deque()
+        self._held: dict[Hashable, list[_Held]] = {}
+        self._deaths: dict[int, int] = {}
+        """Of the chunk that begins with this item."""
+        self._failed_alike: list[tuple[object, int]] = []
+        """Of the failures since the last result: in what they are alike, and the first item of the chunk."""
+        self._limit = NO_LIMIT
+        self.results = 0
+        self.failures: list[Failure] = []
+
+    # --- before it begins ------------------------------------------------------------------------------
+
+    def take_part(self, shard: Shard) -> None:
+        """Leave only the chunks of this part."""
+        total = sum(1 for _ in self._chunks())
+        part = shard.part(total)
+        self._left = islice(self._chunks(), part.start, part.stop)
+
+    def go_on(self, known: Mapping[int, Result], keep: Callable[[int, Result], None]) -> None:
+        """Take results of an earlier run of the job, and leave only what it did not do.
+
+        Args:
+            keep: called with each further result before anything else is done with it.
+        """
+        self._known, self._keep = known, keep
+        for number in sorted(known):
+            self.results += 1
+            self._on_result(number, known[number])
+
+    # --- for the workers -------------------------------------------------------------------------------
+
+    def next(self, worker: Hashable) -> Chunk | None:
+        """The next chunk for this worker."""
+        limit = self.limit()
+        chunk = self._ahead.popleft() if self._look(1) else None
+        if chunk is None:
+            while self._returned and min(self._returned[0].wanted) >= limit:
+                self._returned.popleft()
+            chunk = self._returned.popleft() if self._returned else None
+        if chunk is not None:
+            self._held.setdefault(worker, []).append(_Held(chunk, set(chunk.wanted)))
+        return chunk
+
+    def count_left(self, most: int) -> int:
+        """Chunks that can be dealt, counted up to `most`."""
+        limit = self.limit()
+        again = sum(min(chunk.wanted) < limit for chunk in self._returned)
+        return min(self._look(most) + again, most)
+
+    def limit(self) -> int:
+        if self._stop():
+            self.lower(0)
+        return self._limit
+
+    def lower(self, limit: int) -> None:
+        """Lower the limit: items from `limit` on are not needed."""
+        self._limit = min(limit, self._limit)
+
+    def result(self, worker: Hashable, number: int, result: Result) -> None:
+        """Take the result of an item. Raises PoolError if the worker does not have it."""
+        held = next((held for held in self._held.get(worker, ()) if number in held.missing), None)
+        if held is None:
+            raise PoolError("sent the result of an item that it does not have")
+        held.missing.remove(number)
+        if not held.missing:
+            self._held[worker].remove(held)
+        self._failed_alike.clear()
+        self.results += 1
+        self._keep(number, result)
+        self._on_result(number, result)
+
+    def update(self, update: Update) -> None:
+        self._on_update(update)
+
+    def ended(self, worker: Hashable) -> None:
+        """The worker says that it is done. Raises PoolError if it is not."""
+        held = self._held.pop(worker, [])
+        if min((number for one in held for number in one.missing), default=NO_LIMIT) < self.limit():
+            raise PoolError("ended before it was done")
+
+    def failed(self, worker: Hashable, error: TaskError) -> None:
+        """The author's code failed in the last chunk of this worker, which has ended.
+
+        Raises:
+            TaskError: the job is over: no item was begun, or the failure is one too many of its kind.
+        """
+        held = self._held.pop(worker, [])
+        if not held or self._on_failure is None:
+            raise error
+        *others, last = held
+        for one in others:
+            self._give_back(one)
+        self._note(last, error.problem)
+        at = error.problem.stage, error.problem.file, error.problem.line
+        if self._alike(at, last):
+            raise error
+
+    def died(self, worker: Hashable, how: str, code: int | None) -> None:
+        """The worker is gone without a word.
+
+        Args:
+            how: the end of a sentence that begins with its name.
+            code: its exit code, if known: by it deaths are alike.
+
+        Raises:
+            PoolError: the job is over.
+        """
+        held = self._held.pop(worker, [])
+        if self._tries == 1:
+            raise PoolError(how)
+        if self.limit() == 0:
+            return
+        if not held:
+            # Before its first chunk: it is the machine, or the import.
+            self._failed_alike.append((code, -len(self._failed_alike) - 1))
+            if len(self._failed_alike) >= MOST_ALIKE:
+                raise PoolError(how)
+        for one in held:
+            first = one.chunk.numbers[0]
+            self._deaths[first] = self._deaths.get(first, 0) + 1
+            over = self._deaths[first] >= self._tries
+            if not over:
+                self._give_back(one)
+            if self._alike(code, one):
+                raise PoolError(how)
+            if over:
+                if self._on_failure is None or not (self.results or self.count_left(1)):
+                    raise PoolError(how)
+                self._note(one, Problem("worker", f"the worker {how}", None, None, None, ""))
+
+    def require_results(self) -> None:
+        """Raise the TaskError of the first failure, if no item has a result."""
+        if self.failures and not self.results:
+            raise TaskError(self.failures[0].problem)
+
+    # --- inside ----------------------------------------------------------------------------------------
+
+    def _chunks(self) -> Iterator[tuple[int, ...]]:
+        for _, numbers in groupby(self._numbers, lambda number: number // self._size):
+            yield tuple(numbers)
+
+    def _look(self, most: int) -> int:
+        """Have up to `most` chunks in `_ahead`; how many of them are needed."""
+        while len(self._ahead) < most and (numbers := next(self._left, None)) is not None:
+            if wanted := frozenset(numbers) - self._known.keys():
+                self._ahead.append(Chunk(numbers, wanted, again=bool(self._known)))
+        limit = self.limit()
+        return sum(min(chunk.wanted) < limit for chunk in islice(self._ahead, most))
+
+    def _give_back(self, held: _Held) -> None:
+        self._returned.append(Chunk(held.chunk.numbers, frozenset(held.missing), again=True))
+
+    def _note(self, held: _Held, problem: Problem) -> None:
+        limit = self.limit()
+        failure = Failure(tuple(sorted(number for number in held.missing if number < limit)), problem)
+        self.failures.append(failure)
+        if self._on_failure is not None:
+            self._on_failure(failure)
+
+    def _alike(self, key: object, held: _Held) -> bool:
+        """Note a failure of this kind; whether that many chunks failed alike one after another."""
+        self._failed_alike.append((key, held.chunk.numbers[0]))
+        return len({first for kind, first in self._failed_alike if kind == key}) >= MOST_ALIKE
+
+
+@dataclass(frozen=True)
+class Work(Generic[Setup, Result, Update]):
+    """What each worker does."""
+
+    run: Callable[[Setup, ItemQueue], None]
+    """A function that can be imported by its name. It returns when its queue has no next chunk and none is under way.
+
+    A TaskError from it is the failure of its last chunk; an OSError, ValueError or RuntimeError ends the job.
+    """
+    setup: Setup
+    """The first argument of `run`; can be pickled."""
+    result: Any
+    update: Any
+    """Types of results and progress, against which `wire` checks what comes of other processes."""
+    name: str
+    """As in "a process *that records* was killed by SIGKILL"."""
+
+
+class Executor(Protocol):
+    """Does the work of a job."""
+
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+        """Deal until no chunk is left or needed, and all items under way are finished.
+
+        Raises:
+            TaskError, PoolError: as `Deal` decides; or a worker failed in our own code. The other workers were stopped
+                and dropped the items under way.
+        """
+        ...
+
+
+class ThisProcess:
+    """Runs the work in this process; exceptions of `Work.run` other than TaskError pass through."""
+
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+        while True:
+            try:
+                work.run(work.setup, _OwnQueue(deal))
+                return deal.ended(None)
+            except TaskError as error:
+                deal.failed(None, error)
+            if not deal.count_left(1):
+                return
+
+
+@dataclass(frozen=True)
+class _OwnQueue:
+    """The chunks of the process that deals."""
+
+    deal: Deal[Any, Any]
+    origin: Mapping[str, str] = field(default_factory=dict)
+
+    def next(self) -> Chunk | None:
+        return self.deal.next(None)
+
+    def limit(self) -> int:
+        return self.deal.limit()
+
+    def send_result(self, number: int, result: Any) -> None:
+        self.deal.result(None, number, result)
+
+    def send_update(self, update: Any) -> None:
+        self.deal.update(update)

@@ -1,0 +1,291 @@
+"""Keeps the results of a job in a file as they come: a job that was stopped goes on from there, and parts are put together.
+
+An SQLite database: each result is in it as a whole or not at all, also where the process is killed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import sqlite3
+import sys
+import uuid
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from workbench.authoring.loading.reference import named_file
+from workbench.authoring.loading.task_content import read_content
+from workbench.jobs.gather import package_versions
+from workbench.jobs.pool.deal import Deal, Executor, PoolError, Result, Setup, Shard, Update, Work
+from workbench.machine.files import open_regular_file
+from workbench.machine.processes.wire import Unpacker, Unreadable, pack
+
+_MAGIC = 0x57424A31
+"""SQLite's ``application_id`` of these files."""
+_TABLES = """
+CREATE TABLE about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE kept (name TEXT PRIMARY KEY, value BLOB NOT NULL);
+CREATE TABLE result (number INTEGER PRIMARY KEY, value BLOB NOT NULL);
+"""
+_DIFFERENT = 5
+"""Differences that are named."""
+
+Request = TypeVar("Request")
+
+
+class JobFileError(ValueError):
+    """The file is of another job, or is none."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a job file is for."""
+
+    command: str
+    about: Mapping[str, str]
+    """Names and values of all that the results depend on."""
+    request: bytes
+    """What the command asks for, packed: `merge` reads it."""
+    folder: str = ""
+    """Where the episodes go."""
+
+
+def job_of(
+    command: str, task: str, request: Any, leaves_out: Iterable[str], files: Sequence[Path] = ()
+) -> Job:
+    """The job of a command.
+
+    Args:
+        task: as the person named it.
+        request: a dataclass of all that is asked for.
+        leaves_out: its fields that the results do not depend on.
+        files: further files that they depend on, such as a policy's.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    about = {"command": command, "python": ".".join(map(str, sys.version_info[:2])), **package_versions()}
+    file = named_file(task)
+    # By its text: the folder may be another one on each machine.
+    about["task"] = task if file is None else task.replace(str(file.parent) + "/", "").rpartition("/")[2]
+    if file is not None and file.is_file():
+        about["the task's text"] = read_content(file).hash[:12]
+    for path in files:
+        about[f"what {path.name} holds"] = _sum(path)
+    about.update(_flat("", request, {"task", *leaves_out}))
+    folder = getattr(request, "out", None)
+    return Job(command, about, pack(request), "" if folder is None else str(Path(folder).absolute()))
+
+
+def _sum(path: Path) -> str:
+    with open_regular_file(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:12]  # type: ignore[arg-type]
+
+
+def _flat(name: str, value: Any, leaves_out: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
+    if dataclasses.is_dataclass(value):
+        for one in dataclasses.fields(value):
+            if one.name not in leaves_out:
+                yield from _flat(one.name, getattr(value, one.name))
+    elif isinstance(value, Mapping):
+        for key, one in sorted(value.items()):
+            yield from _flat(f"{name} {key}", one)
+    else:
+        yield name.replace("_", " "), json.dumps(value, default=str)
+
+
+class JobFile:
+    """The results of a job, by item. Used on one thread."""
+
+    def __init__(self, path: Path, job: Job) -> None:
+        """Open or create the file.
+
+        Raises:
+            JobFileError: it is of another job (the text says what differs), another process has it open, or it is none.
+            FileNotFoundError: its folder does not exist.
+        """
+        if not path.absolute().parent.is_dir():
+            raise FileNotFoundError(f"there is no folder {path.parent} for {path.name}")
+        self.path = path
+        with _named(path):
+            self._database = sqlite3.connect(path, timeout=0, isolation_level=None)
+        try:
+            with _named(path):
+                # As long as it is open: of two processes that do the same items, each would do all.
+                self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
+                self._database.execute("BEGIN EXCLUSIVE")
+                if not self._database.execute("PRAGMA schema_version").fetchone()[0]:
+                    self._create(job)
+                else:
+                    _require_same(path, job.about, _about(path, self._database))
+                self.run = _kept(self._database, "run").decode()
+                self._database.execute("COMMIT")
+        except BaseException:
+            self._database.close()
+            raise
+
+    def _create(self, job: Job) -> None:
+        self._database.execute(f"PRAGMA application_id = {_MAGIC}")
+        for table in _TABLES.strip().splitlines():
+            self._database.execute(table)
+        self._database.executemany("INSERT INTO about VALUES (?, ?)", job.about.items())
+        kept = {"run": uuid.uuid4().hex.encode(), "request": job.request, "folder": job.folder.encode()}
+        self._database.executemany("INSERT INTO kept VALUES (?, ?)", kept.items())
+
+    def results(self, kind: Any) -> dict[int, Any]:
+        """What is in it, by item. Raises JobFileError if a result cannot be read as this type."""
+        return _results(self.path, self._database, kind)
+
+    def keep(self, number: int, result: object) -> None:
+        """Write a result; it is on disk afterwards. Raises JobFileError."""
+        with _named(self.path):
+            self._database.execute("INSERT INTO result VALUES (?, ?)", (number, pack(result)))
+
+    def close(self) -> None:
+        self._database.close()
+
+
+@dataclass(frozen=True)
+class Kept:
+    """An executor that leaves out what a job file holds, and keeps there what comes."""
+
+    executor: Executor
+    file: JobFile | None = None
+    shard: Shard = Shard()
+
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+        deal.take_part(self.shard)
+        if self.file is not None:
+            deal.go_on(self.file.results(work.result), self.file.keep)
+        if deal.count_left(1):
+            self.executor.run(work, deal)
+
+
+# --- parts put together ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The results of several job files of one job."""
+
+    command: str
+    request: bytes
+    values: dict[int, bytes]
+    """Packed, by item."""
+    folders: dict[int, str]
+    """Where the episode of each item was written."""
+    files: tuple[Path, ...] = field(default=())
+
+    def requested(self, kind: type[Request]) -> Request:
+        """What the command asked for. Raises JobFileError."""
+        try:
+            return Unpacker().unpack(self.request, kind)
+        except Unreadable as error:
+            raise JobFileError(f"{self.files[0]} holds a request that cannot be read ({error})") from error
+
+    def results(self, kind: Any) -> dict[int, Any]:
+        """By item. Raises JobFileError."""
+        unpacker = Unpacker()
+        try:
+            return {number: unpacker.unpack(value, kind) for number, value in sorted(self.values.items())}
+        except Unreadable as error:
+            raise JobFileError(f"a result cannot be read ({error})") from error
+
+
+class Missing(PoolError):
+    """Some items have no result yet; the text says how many."""
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """An executor that runs nothing: its results are known. `left` of them are missing afterwards."""
+
+    known: Mapping[int, Any]
+
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+        deal.go_on(self.known, lambda number, result: None)
+
+
+def read_parts(files: Sequence[Path]) -> Merged:
+    """The results of these job files.
+
+    Raises:
+        JobFileError: they are of different jobs (the text says what differs), or two hold the same item.
+        FileNotFoundError: there is no such file.
+    """
+    about: Mapping[str, str] | None = None
+    values: dict[int, bytes] = {}
+    folders: dict[int, str] = {}
+    request = b""
+    for path in files:
+        if not path.is_file():
+            raise FileNotFoundError(f"there is no file {path}")
+        with (
+            _named(path),
+            closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database,
+        ):
+            told = _about(path, database)
+            if about is None:
+                about, request = told, _kept(database, "request")
+            _require_same(path, about, told)
+            folder = _kept(database, "folder").decode()
+            rows = database.execute("SELECT number, value FROM result").fetchall()
+        doubled = [number for number, _ in rows if number in values]
+        if doubled:
+            raise JobFileError(
+                f"{path} and another of the files both hold item {doubled[0]}: are they the same part twice?"
+            )
+        values.update(rows)
+        folders.update((number, folder) for number, _ in rows)
+    if about is None:
+        raise JobFileError("name the job files to merge")
+    return Merged(about["command"], request, values, folders, tuple(files))
+
+
+def _require_same(path: Path, mine: Mapping[str, str], there: Mapping[str, str]) -> None:
+    names = [name for name in dict.fromkeys((*mine, *there)) if mine.get(name) != there.get(name)]
+    if names:
+        told = "; ".join(
+            f"{name} is {mine.get(name, 'not given')} here and {there.get(name, 'not given')} there"
+            for name in names[:_DIFFERENT]
+        )
+        more = f"; and {len(names) - _DIFFERENT} more differ" if len(names) > _DIFFERENT else ""
+        raise JobFileError(f"{path} is of another job: {told}{more}")
+
+
+def _about(path: Path, database: sqlite3.Connection) -> dict[str, str]:
+    if database.execute("PRAGMA application_id").fetchone()[0] != _MAGIC:
+        raise JobFileError(f"{path} is no job file")
+    return dict(database.execute("SELECT name, value FROM about"))
+
+
+def _kept(database: sqlite3.Connection, name: str) -> bytes:
+    (value,) = database.execute("SELECT value FROM kept WHERE name = ?", (name,)).fetchone()
+    return value
+
+
+def _results(path: Path, database: sqlite3.Connection, kind: Any) -> dict[int, Any]:
+    unpacker = Unpacker()
+    with _named(path):
+        rows = database.execute("SELECT number, value FROM result ORDER BY number").fetchall()
+    try:
+        return {number: unpacker.unpack(value, kind) for number, value in rows}
+    except Unreadable as error:
+        raise JobFileError(f"{path} holds a result that cannot be read ({error})") from error
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Say which file an error of the database is of."""
+    try:
+        yield
+    except sqlite3.OperationalError as error:
+        busy = error.sqlite_errorcode == sqlite3.SQLITE_BUSY
+        why = "another process has it open" if busy else str(error)
+        raise JobFileError(f"{path} cannot be used: {why}") from error
+    except (sqlite3.DatabaseError, TypeError) as error:
+        raise JobFileError(f"{path} is no job file ({error})") from error

@@ -1,0 +1,132 @@
+"""Takes the author's files to workers on other machines: a task with all that lies beside it, a policy, recordings."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any, TypeVar
+
+from workbench.machine.files import read_regular_file
+
+MOST_BYTES = 256 << 20
+"""Of all files together, which each machine of a cluster gets."""
+_LEFT_OUT = {"__pycache__", "node_modules", "site-packages", "venv", "recordings"}
+"""Folders that hold what others made."""
+
+Value = TypeVar("Value")
+
+
+class TooMuch(ValueError):
+    """The files beside the task are more than travel; the text says which are large."""
+
+
+@dataclass(frozen=True)
+class Baggage:
+    """Folders of the submitting side, as one zip."""
+
+    roots: tuple[str, ...]
+    """Absolute. In the zip the files of root k are below ``k/``."""
+    data: bytes
+
+    def unpack(self, folder: Path) -> dict[str, str]:
+        """Write the files below `folder`, which is empty. Returns each root's place there. Raises OSError."""
+        with zipfile.ZipFile(io.BytesIO(self.data)) as archive:
+            archive.extractall(folder)
+        places = {root: str(folder / str(number)) for number, root in enumerate(self.roots)}
+        for place in places.values():
+            Path(place).mkdir(exist_ok=True)
+        return places
+
+
+def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage:
+    """What a job needs.
+
+    Args:
+        folders: each with all that is below it; not what is hidden, a virtual environment, or recordings.
+        files: further ones, each without what is beside it.
+
+    Raises:
+        TooMuch: together they are larger than `MOST_BYTES`.
+        OSError: a file cannot be read.
+    """
+    roots = _outermost(folder.resolve() for folder in folders)
+    found: dict[Path, Path] = {}
+    """Path in the zip, to file."""
+    for number, root in enumerate(roots):
+        for file in files_below(root):
+            found[Path(str(number)) / file.relative_to(root)] = file
+    names = [str(root) for root in roots]
+    for file in files:
+        file = file.resolve()
+        if not any(file.is_relative_to(root) for root in roots):
+            found[Path(str(len(names))) / file.name] = file
+            names.append(str(file.parent))
+    sizes = {file: file.stat().st_size for file in found.values()}
+    if sum(sizes.values()) > MOST_BYTES:
+        largest = sorted(sizes, key=lambda file: -sizes[file])[:3]
+        raise TooMuch(
+            f"the files beside the task are {sum(sizes.values()) >> 20} MB, and up to {MOST_BYTES >> 20} MB travel to the "
+            f"workers. The largest are {', '.join(f'{file} ({sizes[file] >> 20} MB)' for file in largest)}: put the task "
+            "into a folder of its own"
+        )
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, file in sorted(found.items()):
+            archive.writestr(zipfile.ZipInfo(name.as_posix()), read_regular_file(file, MOST_BYTES))
+    return Baggage(tuple(names), data.getvalue())
+
+
+def _outermost(folders: Iterable[Path]) -> list[Path]:
+    """Without those that lie in another one."""
+    kept: list[Path] = []
+    for folder in sorted(set(folders)):
+        if not any(folder.is_relative_to(one) for one in kept):
+            kept.append(folder)
+    return kept
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """The regular files that travel with a task in `folder`, in a fixed order. Links are not followed."""
+    for path, folders, names in os.walk(folder):
+        here = Path(path)
+        folders[:] = sorted(
+            name
+            for name in folders
+            if name not in _LEFT_OUT
+            and not name.startswith(".")
+            and not (here / name / "pyvenv.cfg").exists()
+        )
+        for name in sorted(names):
+            file = here / name
+            if not name.startswith(".") and file.is_file() and not file.is_symlink():
+                yield file
+
+
+def relocated(value: Value, places: Mapping[str, str]) -> Value:
+    """`value` with each of these paths replaced, wherever a text or a path in it names it.
+
+    Of dataclasses, sequences and mappings of them; arrays and bytes stay.
+    """
+    return _relocated(value, sorted(places.items(), key=lambda pair: -len(pair[0]))) if places else value
+
+
+def _relocated(value: Any, places: Sequence[tuple[str, str]]) -> Any:
+    if isinstance(value, str):
+        for before, after in places:
+            value = value.replace(before, after)
+        return value
+    if isinstance(value, PurePath):
+        return type(value)(_relocated(str(value), places))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        named = {one.name: getattr(value, one.name) for one in dataclasses.fields(value) if one.init}
+        return dataclasses.replace(value, **{name: _relocated(one, places) for name, one in named.items()})
+    if isinstance(value, Mapping):
+        return {_relocated(key, places): _relocated(one, places) for key, one in value.items()}
+    if isinstance(value, list | tuple | frozenset | set):
+        return type(value)(_relocated(one, places) for one in value)
+    return value
