@@ -32,7 +32,7 @@ EDITS = (
 )
 """One breach of a rule that stops, one of a rule that warns, one that is silenced, and a comment that silences nothing."""
 RULES_OF_IT = "success-at-reset,success-and-fail,reward-normalized,reward-finite,reward-rows"
-FEW = ("--num-envs", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
+FEW = ("--envs-per-worker", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def test_what_is_ignored_is_in_the_summary_and_in_each_report(
 
 def test_as_many_seeds_as_were_asked_for_are_tried(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of three, with two envs: the fourth is not counted."""
-    few = ("--num-envs", "2", "--seeds", "3", "--workers", "1", "--env", "render_backend=none")
+    few = ("--envs-per-worker", "2", "--seeds", "3", "--workers", "1", "--env", "render_backend=none")
     ended = run(capsys, "bad.py", "--select", "success-at-reset,success-stays-possible", "--json", *few)
     said = json.loads(ended.out)
     (finding,) = said["findings"]
@@ -268,7 +268,7 @@ def test_a_task_that_needs_a_renderer_and_is_given_none_is_told_so(
 def test_a_task_that_needs_a_renderer_gets_one(place: Path, child_process: None) -> None:
     """In a process that has rendered nothing before."""
     reads_what_is_drawn(place)
-    words = ["check", "drawn.py", "--num-envs", "2", "--seeds", "2", "--workers", "1", "--select", "runs"]
+    words = ["check", "drawn.py", "--envs-per-worker", "2", "--seeds", "2", "--workers", "1", "--select", "runs"]
     ended = in_a_process(*words)
     assert ended.returncode == 0, ended.stdout + ended.stderr
 
@@ -394,7 +394,7 @@ def test_other_tasks_of_the_file_are_named(place: Path, capsys: pytest.CaptureFi
 
 def test_the_command_as_a_job_in_ci_runs_it(place: Path, child_process: None) -> None:
     """In processes of its own, with an id that has no file here, and no terminal."""
-    words = ["check", "PushCube-v1", "--num-envs", "2", "--seeds", "2", "--workers", "2"]
+    words = ["check", "PushCube-v1", "--envs-per-worker", "2", "--seeds", "2", "--workers", "2"]
     words += ["--select", "success-at-reset,reward-finite", "--env", "render_backend=none", "--json"]
     ended = in_a_process(*words)
     assert ended.returncode == 0, ended.stderr

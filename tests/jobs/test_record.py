@@ -416,7 +416,7 @@ def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
             "out",
         ),
         *("--env", "render_backend=none"),
-        *("--num-envs", "2", "--workers", "2", "--actions", "hangs.py:act"),
+        *("--envs-per-worker", "1", "--workers", "2", "--actions", "hangs.py:act"),
     ]
     process = subprocess.Popen(
         command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -435,7 +435,7 @@ def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
     command = [
         *(sys.executable, "-m", "workbench.cli.main", "record", "PushCube-v1", "--no-pictures"),
         *("--env", "render_backend=none"),
-        *("--episodes", "100000", "--max-steps", "3", "--num-envs", "2", "--workers", workers),
+        *("--episodes", "100000", "--max-steps", "3", "--envs-per-worker", "2", "--workers", workers),
         *("--out", str(tmp_path)),
     ]
     process = subprocess.Popen(
@@ -484,12 +484,12 @@ def test_arguments_are_refused_with_a_sentence(
     ("arguments", "says"),
     [
         (["record", "PickCub-v1"], "PickCube-v1"),
-        (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
+        (["record", "PickCube-v1", "--envs-per-worker", "0"], "envs-per-worker"),
         (["record", "PickCube-v1", "--actions", "demo.h5"], "demo.h5"),
         (["record", "PickCube-v1", "--actions", "gone.py:act"], "there is no file"),
         (["record", "PickCube-v1", "--actions", "randomly"], "module:function"),
-        (["record", "PickCube-v1", "--num-envs", "1", "--actions", "gone:act"], "no module gone"),
-        (["record", "PickCube-v1", "--num-envs", "1", "--actions", "json:act"], "json has no function act"),
+        (["record", "PickCube-v1", "--envs-per-worker", "1", "--actions", "gone:act"], "no module gone"),
+        (["record", "PickCube-v1", "--envs-per-worker", "1", "--actions", "json:act"], "json has no function act"),
         (["record", "PickCube-v1", "--out", sys.executable], "is not a folder"),
     ],
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
@@ -75,9 +75,12 @@ class JobArguments:
     shard: str | None = None
 
 
+ONE_WORKER = JobArguments(workers=1)
+
+
 @dataclass(frozen=True)
-class BatchArguments:
-    """How envs are run.
+class EnvArguments:
+    """How the envs of a task are made.
 
     Args:
         num_envs: environments to run at once.
@@ -86,39 +89,72 @@ class BatchArguments:
             given, what writes over the state of other envs stops, all else is a warning.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
+        seed: seed of the first env or episode; each further one counts up.
+        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
 
     num_envs: int = 16
     backend: Backend = "auto"
     rules: Rules = None
     imports: Imports = ()
-
-    def options(self) -> TaskOptions:
-        """Raises ValueError with a message that names the argument, as all functions here."""
-        from workbench.jobs.task import TaskOptions
-
-        if not 1 <= self.num_envs <= 4096:
-            raise ValueError(f"--num-envs must be from 1 to 4096, not {self.num_envs}")
-        return TaskOptions(self.num_envs, self.backend, rules=self.rules, imports=imported(self.imports))
-
-
-@dataclass(frozen=True)
-class EnvArguments(BatchArguments):
-    """How the envs of a task are made.
-
-    Args:
-        seed: seed of the first env or episode; each further one counts up.
-        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
-    """
-
     seed: int = 0
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
 
     def options(self) -> TaskOptions:
-        if not 0 <= self.seed < 2**31:
-            raise ValueError(f"--seed must be from 0 to {2**31 - 1}, not {self.seed}")
-        kwargs = dict(_env_argument(pair) for pair in self.env)
-        return replace(super().options(), seed=self.seed, env_kwargs=kwargs)
+        """Raises ValueError with a message that names the argument, as all functions here."""
+        return _options(
+            "num-envs", self.num_envs, self.backend, self.rules, self.imports, self.seed, self.env
+        )
+
+
+@dataclass(frozen=True)
+class EpisodeArguments:
+    """How the envs of each worker are made.
+
+    Args:
+        envs_per_worker: environments that each worker runs at once. The numbers of a policy depend on it by their last
+            bits, and on nothing else of how the job runs.
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
+        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
+            given, what writes over the state of other envs stops, all else is a warning.
+        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
+            repeatable.
+        seed: seed of the first episode; each further one counts up.
+        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+    """
+
+    envs_per_worker: int = 4
+    backend: Backend = "auto"
+    rules: Rules = None
+    imports: Imports = ()
+    seed: int = 0
+    env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+
+    def options(self) -> TaskOptions:
+        count = self.envs_per_worker
+        return _options("envs-per-worker", count, self.backend, self.rules, self.imports, self.seed, self.env)
+
+
+@dataclass(frozen=True)
+class RescoreArguments:
+    """How the envs of each worker are made.
+
+    Args:
+        envs_per_worker: environments that each worker runs at once.
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
+        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
+            given, what writes over the state of other envs stops, all else is a warning.
+        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
+            repeatable.
+    """
+
+    envs_per_worker: int = 16
+    backend: Backend = "auto"
+    rules: Rules = None
+    imports: Imports = ()
+
+    def options(self) -> TaskOptions:
+        return _options("envs-per-worker", self.envs_per_worker, self.backend, self.rules, self.imports)
 
 
 @dataclass(frozen=True)
@@ -126,7 +162,7 @@ class CheckArguments:
     """On what a task is checked.
 
     Args:
-        num_envs: environments to run at once.
+        envs_per_worker: environments that each worker runs at once.
         seeds: how many seeds are tried. What compares whole batches takes one for each env.
         seed: the first of them; each further one counts up.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
@@ -134,14 +170,34 @@ class CheckArguments:
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
 
-    num_envs: int = 8
+    envs_per_worker: int = 8
     seeds: int = 32
     seed: int = 0
     imports: Imports = ()
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
 
     def options(self) -> TaskOptions:
-        return EnvArguments(self.num_envs, "cpu", None, self.imports, self.seed, self.env).options()
+        count = self.envs_per_worker
+        return _options("envs-per-worker", count, "cpu", None, self.imports, self.seed, self.env)
+
+
+def _options(
+    name: str,
+    count: int,
+    backend: Backend,
+    rules: Rules,
+    imports: Sequence[str],
+    seed: int = 0,
+    env: Sequence[str] = (),
+) -> TaskOptions:
+    from workbench.jobs.task import TaskOptions
+
+    if not 1 <= count <= 4096:
+        raise ValueError(f"--{name} must be from 1 to 4096, not {count}")
+    if not 0 <= seed < 2**31:
+        raise ValueError(f"--seed must be from 0 to {2**31 - 1}, not {seed}")
+    kwargs = dict(_env_argument(pair) for pair in env)
+    return TaskOptions(count, backend, seed, kwargs, rules=rules, imports=imported(imports))
 
 
 def plan_options(plan: PlanArguments) -> PlanOptions:

@@ -10,17 +10,20 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from workbench.cli.arguments import (
-    BatchArguments,
     CheckArguments,
     EnvArguments,
+    EpisodeArguments,
     Imports,
+    JobArguments,
     PageArguments,
+    RescoreArguments,
     Rules,
     history_bytes,
     imported,
@@ -39,7 +42,8 @@ from workbench.planning.options import PlanArguments
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""
 
-_FEW = EnvArguments(num_envs=4)
+_FEW = EpisodeArguments()
+_HERE = JobArguments()
 _PLAN = PlanArguments()
 
 app = tyro.extras.SubcommandApp()
@@ -184,10 +188,12 @@ def new(
 def record(
     recording: Annotated[RecordArguments, tyro.conf.PositionalRequiredArgs],
     plan: PlanArguments = _PLAN,
-    envs: EnvArguments = _FEW,
+    envs: EpisodeArguments = _FEW,
+    run: JobArguments = _HERE,
     debug: bool = False,
 ) -> int:
-    """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json.
+    """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json. Episodes that the
+    task's code fails in are told at the end; the exit code is 1 then.
 
     Args:
         debug: wait for a debugger (debugpy, as of VS Code) before the task is loaded, with one worker; breakpoint() stops for
@@ -201,19 +207,22 @@ def record(
         return refuse(why)
     use_private_driver()
     with quick_imports():
+        from workbench.cli.jobs import require_job
         from workbench.cli.record import record_in_terminal
         from workbench.jobs.episodes import RecordOptions
         from workbench.machine.processes.debugger import debug_here
 
     try:
         options, planned = envs.options(), plan_options(plan)
-        if debug and recording.workers > 1:
-            raise ValueError("--debug is for one process: leave out --workers")
+        require_job(run)
+        if debug and (run.cluster is not None or (run.workers or 1) > 1):
+            raise ValueError("--debug is for one process: leave out --workers and --cluster")
         if debug:
             debug_here(print_text)
     except ValueError as error:
         return refuse(str(error))
-    return record_in_terminal(RecordOptions(**vars(recording), options=options, plan=planned))
+    run = replace(run, workers=1) if debug else run
+    return record_in_terminal(RecordOptions(**vars(recording), options=options, plan=planned), run)
 
 
 @app.command
@@ -287,13 +296,14 @@ def solve(
     /,
     *,
     plan: PlanArguments = _PLAN,
+    run: JobArguments = _HERE,
     seeds: int = 32,
     seed: int = 0,
-    workers: int | None = None,
     max_steps: int | None = None,
     seconds_per_seed: float | None = None,
     pictures: bool = False,
     out: Path = Path("recordings"),
+    upload: str = "",
     imports: Imports = (),
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     fail_on: FailOn = "stop",
@@ -311,12 +321,13 @@ def solve(
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         seeds: how many seeds are tried. That no rule is broken says something from 8 on.
         seed: the first of them; each further one counts up.
-        workers: processes, as many as cores if it is not given; the result is the same with any number.
         max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
         seconds_per_seed: wall time after which a seed ends at its next step, solved or not. What that cuts off depends on
             the machine and on what else it does, so that a second run may come to another result.
         pictures: record what every camera sees.
         out: folder for the recordings.
+        upload: an address of fsspec, such as s3://bucket/folder: each episode goes there when it is over, and not into
+            the folder.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
         env: further arguments of the task class, as name=value (value in JSON, or text), such as
@@ -342,11 +353,10 @@ def solve(
         )
     if (why := _without_folder(json_file, csv_file, junit)) is not None:
         return refuse(why)
-    cores = len(os.sched_getaffinity(0))
     try:
-        options = EnvArguments(1, "auto", None, imports, seed, env).options()
+        options = EpisodeArguments(1, "auto", None, imports, seed, env).options()
         planned = plan_options(plan)
-        for name, number in (("seeds", seeds), ("workers", workers), ("max-steps", max_steps)):
+        for name, number in (("seeds", seeds), ("workers", run.workers), ("max-steps", max_steps)):
             if number is not None and number < 1:
                 raise ValueError(f"--{name} must be at least 1, not {number}")
     except ValueError as error:
@@ -357,9 +367,37 @@ def solve(
         from workbench.cli.solve import SolveOutput, solve_in_terminal
         from workbench.jobs.solve import SolveOptions
 
-    processes = min(seeds, cores if workers is None else workers)
-    what = SolveOptions(task, out, seeds, processes, pictures, max_steps, planned, options, seconds_per_seed)
-    return solve_in_terminal(what, SolveOutput(json, json_file, csv, csv_file, junit, fail_on))
+    what = SolveOptions(
+        task, out, seeds, 1, pictures, max_steps, planned, options, seconds_per_seed, upload=upload
+    )
+    return solve_in_terminal(what, SolveOutput(json, json_file, csv, csv_file, junit, fail_on), run)
+
+
+@app.command
+def merge(
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    *,
+    job: Path | None = None,
+    out: Path | None = None,
+    json_file: Path | None = None,
+) -> int:
+    """Put the parts of a job together that were run with --shard, and print what the whole command would have printed. Nothing
+    is run. The exit code is 1 where parts are missing, or as of the command.
+
+    Args:
+        files: job files of all parts.
+        job: also write one job file for the whole. With it the command goes on where parts are missing.
+        out: copy the episodes of all parts into this folder.
+        json_file: also write the result to this file, as JSON, for commands that have one.
+    """
+    for file in files:
+        if not file.is_file():
+            return refuse(f"there is no file {file}")
+    with quick_imports():
+        from workbench.cli.merge import merge_in_terminal
+
+    return merge_in_terminal(files, job, out, json_file)
 
 
 @app.command
@@ -422,7 +460,7 @@ def rescore(
     recorded_source: bool = False,
     use_env_states: bool = False,
     *,
-    batch: BatchArguments,
+    envs: RescoreArguments,
     csv: bool = False,
     csv_file: Path | None = None,
     json: bool = False,
@@ -458,7 +496,7 @@ def rescore(
     if (why := _without_folder(csv_file, json_file)) is not None:
         return refuse(why)
     try:
-        base = batch.options()
+        base = envs.options()
     except ValueError as error:
         return refuse(str(error))
     use_private_driver()
@@ -466,7 +504,7 @@ def rescore(
     from workbench.cli.terminal import not_trusted_lines
     from workbench.session.clearance import NotTrusted
 
-    what = RescoreOptions(places, task, recorded_source, use_env_states, batch.num_envs, base)
+    what = RescoreOptions(places, task, recorded_source, use_env_states, envs.envs_per_worker, base)
     try:
         return run_rescore(what, RescoreOutput(csv, csv_file, json, json_file), trust)
     except NotTrusted as error:

@@ -13,6 +13,8 @@ from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, Tim
 from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import TaskError
+from workbench.cli.arguments import ONE_WORKER, JobArguments
+from workbench.cli.jobs import items_of, print_part, run_by
 from workbench.cli.terminal import (
     Exit,
     err,
@@ -28,10 +30,13 @@ from workbench.core.backends import unused_gpu_text
 from workbench.jobs.actions import SOLVE
 from workbench.jobs.episodes import RecordOptions, Written, with_given_actions
 from workbench.jobs.pool.deal import PoolError
-from workbench.jobs.record import Recorded, RecordProgress, record
+from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.pool.travel import needed_by
+from workbench.jobs.record import Recorded, RecordProgress, chunk_of, record
 from workbench.planning.report import underway_text
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
+from workbench.recording.writing.upload import require_place
 from workbench.session.rescore.recordings import hidden_modules_text
 
 
@@ -95,11 +100,14 @@ def _ended_text(kept: Written | None) -> str:
     return f"{kept.steps} steps, return {kept.total_reward:.3f}{ended}"
 
 
-def record_in_terminal(what: RecordOptions) -> int:
+def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> int:
     """Record and print the result; returns the exit code."""
     before = set(what.out.glob("*.json"))
     try:
-        try_folder(what.out)
+        if what.upload:
+            require_place(what.upload)
+        else:
+            try_folder(what.out)
         requested, _ = with_given_actions(what)
         if recovered := recover_confined(what.out):
             err.print(f"{_episodes(len(recovered))} that an earlier recording left half written: recovered")
@@ -107,10 +115,20 @@ def record_in_terminal(what: RecordOptions) -> int:
             warn(notice)
         if (left_alone := unused_gpu_text(what.options.backend)) is not None:
             warn(left_alone)
+        if run.shard is not None and requested.successes is not None:
+            raise ValueError(
+                "--shard divides episodes, and how many are needed for --successes shows only at the end: give --episodes"
+            )
+        most = requested.tries if requested.successes is not None else requested.episodes
+        assert most is not None
+        chunk = chunk_of(most, what.options.num_envs)
+        wanted = requested.successes or items_of(run, most, chunk)
         left = (TextColumn("left"), TimeRemainingColumn())
-        with progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:
+        with (
+            run_by(run, "record", -(-most // chunk), lambda: job_of_record(requested)) as (executor, name),
+            progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
+        ):
             first_seed = what.options.seed if what.actions == SOLVE else None
-            wanted = requested.successes or requested.episodes
             with RecordBar(bar, wanted, first_seed=first_seed) as record_bar:
                 recorded = record(
                     what,
@@ -118,6 +136,8 @@ def record_in_terminal(what: RecordOptions) -> int:
                     record_bar.show,
                     lambda: record_bar.stop_requested,
                     print_finding,
+                    executor,
+                    name,
                 )
             record_bar.describe("recorded", len(recorded.written))
     except TaskError as error:
@@ -129,7 +149,15 @@ def record_in_terminal(what: RecordOptions) -> int:
         return refuse(str(error))
     except KeyboardInterrupt:
         return refuse("interrupted; finished episodes were kept")
-    return _print_result(requested, recorded)
+    code = print_recorded(requested, recorded)
+    print_part(run, "record", recorded.stopped)
+    return code
+
+
+def job_of_record(requested: RecordOptions) -> Job:
+    """What a job file of this recording is for. Raises OSError."""
+    files = needed_by(requested.task, requested.actions).files
+    return job_of("record", requested.task, requested, ("out", "workers", "upload"), files)
 
 
 def _print_kept(requested: RecordOptions, before: set[Path]) -> None:
@@ -141,11 +169,12 @@ def _print_kept(requested: RecordOptions, before: set[Path]) -> None:
         )
 
 
-def _print_result(requested: RecordOptions, recorded: Recorded) -> int:
+def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
+    """Print the episodes and what came of the request; returns the exit code."""
     for episode in recorded.written:
         ended = {None: "", True: "success", False: "no success"}[episode.success]
         print_text(
-            f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip()
+            f"{episode.shown}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip()
         )
     kept = len(recorded.written)
     if requested.successes is not None:
@@ -155,7 +184,7 @@ def _print_result(requested: RecordOptions, recorded: Recorded) -> int:
         print_text(
             f"{count} did not start as recorded with the recorded seed, and were set to the recorded first state."
         )
-    if recorded.written:
+    if recorded.written and not recorded.written[0].address:
         folder = shlex.quote(str(recorded.written[0].path.parent))
         print_text(f"Look at them with: workbench review {folder}")
     if recorded.failures:

@@ -18,11 +18,14 @@ from rich.table import Table
 
 from workbench.authoring.problem import TaskError
 from workbench.checks.rules import RULES
+from workbench.cli.arguments import ONE_WORKER, JobArguments
 from workbench.cli.check_reports import json_text, xml_text
+from workbench.cli.jobs import items_of, print_part, run_by
 from workbench.cli.record import RecordBar
 from workbench.cli.terminal import (
     Exit,
     out,
+    print_failures,
     print_finding,
     print_problem,
     print_text,
@@ -32,7 +35,9 @@ from workbench.cli.terminal import (
 )
 from workbench.core.rules import FailOn, fails
 from workbench.jobs.episodes import with_given_actions
-from workbench.jobs.pool.deal import PoolError
+from workbench.jobs.pool.deal import Failure, PoolError
+from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.record import chunk_of
 from workbench.jobs.solve import SolveOptions, solve
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
@@ -41,6 +46,7 @@ from workbench.planning.report import SolvedSeed, SolveReport
 from workbench.planning.verdicts import RewardVerdict
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
+from workbench.recording.writing.upload import require_place
 
 _COLUMNS = ("seed", "solved_at", "steps", "return", "seconds", "in_the_way", "rules", "recording")
 
@@ -69,17 +75,35 @@ class SolveOutput:
         return fails(RULES[verdict.rule].degree, self.fail_on)
 
 
-def solve_in_terminal(what: SolveOptions, output: SolveOutput) -> int:
+def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments = ONE_WORKER) -> int:
     """Solve, print, and write the reports; returns the exit code. Ctrl-C keeps and reports what is done."""
     here = CurrentFolder()  # a task may change it
+    failures: list[Failure] = []
     try:
-        try_folder(what.out)
+        if what.upload:
+            require_place(what.upload)
+        else:
+            try_folder(what.out)
         with_given_actions(what.recording())
         recover_confined(what.out)
         left = (TextColumn("left"), TimeRemainingColumn())
-        with stdout_to_stderr(), progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar:
-            with RecordBar(bar, what.seeds, "solving", what.options.seed) as shown:
-                report = solve(what, shown.describe, shown.show, lambda: shown.stop_requested, print_finding)
+        chunk = chunk_of(what.seeds, 1)
+        with (
+            stdout_to_stderr(),
+            run_by(run, "solve", -(-what.seeds // chunk), lambda: _job_of(what)) as (executor, name),
+            progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
+        ):
+            with RecordBar(bar, items_of(run, what.seeds, chunk), "solving", what.options.seed) as shown:
+                report = solve(
+                    what,
+                    shown.describe,
+                    shown.show,
+                    lambda: shown.stop_requested,
+                    print_finding,
+                    executor,
+                    run=name,
+                    on_failures=failures.extend,
+                )
             shown.describe("solved", len(report.seeds))
     except TaskError as error:
         print_problem(error.problem)
@@ -103,9 +127,16 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput) -> int:
         print((as_json if output.json else as_csv)(report, what, output), end="", flush=True)
     else:
         print_report(report)
+    if failures:
+        print_failures(failures, lambda number: f"seed {what.options.seed + number}")
+    print_part(run, "solve", report.stopped)
     if report.stopped:
         return refuse("interrupted; finished episodes were kept")
-    return Exit.FAILED if output.fails(report) else Exit.DONE
+    return Exit.FAILED if failures or output.fails(report) else Exit.DONE
+
+
+def _job_of(what: SolveOptions) -> Job:
+    return job_of("solve", what.task, what, ("out", "workers", "upload"))
 
 
 # --- text ------------------------------------------------------------------------------------------------

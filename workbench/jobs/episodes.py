@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
+import platform
+import tempfile
 import time
 import uuid
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +48,7 @@ from workbench.planning.rollouts import control_mode_to_plan
 from workbench.recording.writing.episode_writer import EpisodeFiles
 from workbench.recording.writing.finish import remove_episode
 from workbench.recording.writing.publish import RecordingError
+from workbench.recording.writing.upload import remove_uploaded_id, upload_episode
 
 _TRIES = 100
 """For each requested success."""
@@ -59,6 +65,8 @@ class RecordOptions(RecordArguments):
     """Of actions that are planned."""
     after_success: int = 0
     """Control steps that an episode goes on after its success."""
+    workers: int = 1
+    """Processes that record, if no executor is given; the episodes are the same with any number."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +75,14 @@ class RecordSetup:
 
     wanted: tuple[RecordOptions, ...]
     """One or several recordings, each as `with_given_actions` completes it."""
+    folders: tuple[bytes, ...]
+    """Absolute path of each recording's folder. As bytes: it does not travel, see `Work.files`."""
     stride: int
     """Item k is episode ``k % stride`` of recording ``k // stride``."""
     run: str
     """Names the job: the ids of its episodes are made of it, so that one that is made again takes the first one's place."""
+    mark: str = ""
+    """A file in the folders, by which a worker on another machine knows that it sees the same ones."""
 
 
 def episode_id(run: str, number: int) -> str:
@@ -112,10 +124,18 @@ class Written:
     steps: int
     total_reward: float
     success: bool | None
+    """At its last state; None for a task without ``success``."""
     start_corrected: bool = False
     """Its seed gave another start than the demonstration's, and the demonstration's first state was restored."""
     planned: PlannedEpisode | None = None
     """What is known of it where its actions were planned."""
+    address: str = ""
+    """Where its .rrd was uploaded to; `path` is not there then."""
+
+    @property
+    def shown(self) -> str:
+        """What to print for it."""
+        return self.address or str(self.path)
 
 
 def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, Sequence[RecordedRun]]:
@@ -170,15 +190,31 @@ def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedR
         what = setup.wanted[at]
         runs = with_given_actions(what)[1] if given is None else given
         with here.again():
-            folder = what.out.absolute()
+            folder = Path(os.fsdecode(setup.folders[at]))
+            if setup.mark and not what.upload and not (folder / setup.mark).exists():
+                raise RecordingError(
+                    f"{platform.node()} does not see the folder {folder} of this machine: name one that all machines of "
+                    "the cluster share, or an address such as s3://bucket/folder"
+                )
             opened = _opened(what, queue)
             try:
-                episodes = _Episodes(opened, what, here, folder, runs, queue, setup.run, at * setup.stride)
-                chunk = episodes.run(chunk or queue.next(), (at + 1) * setup.stride)
+                with _scratch(folder, what) as into:
+                    episodes = _Episodes(opened, what, here, into, runs, queue, setup.run, at * setup.stride)
+                    chunk = episodes.run(chunk or queue.next(), (at + 1) * setup.stride)
             finally:
                 opened.env.close()
                 undo_load(opened.loaded)
         at = _recording_of(chunk, setup)
+
+
+@contextmanager
+def _scratch(folder: Path, what: RecordOptions) -> Iterator[Path]:
+    """Where files are written: the folder, or one of this worker alone if they are uploaded."""
+    if not what.upload:
+        yield folder
+        return
+    with tempfile.TemporaryDirectory(prefix="workbench-upload-") as own:
+        yield Path(own)
 
 
 def _recording_of(chunk: Chunk | None, setup: RecordSetup) -> int | None:
@@ -234,9 +270,12 @@ class _Episodes:
             limit = min(max(run.length for run in given), what.max_steps or 10**9)
         self._limit = limit
         """Control steps after which an episode ends at the latest."""
-        self._finisher = EpisodeFinisher()
+        upload = partial(upload_episode, address=what.upload) if what.upload else None
+        self._finisher = EpisodeFinisher(then=upload)
         self._envs = list(range(opened.env.num_envs))
-        self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
+        self._gatherer = EpisodeGatherer(
+            opened.description, self._envs, folder, self._over, ends="reset", origin=queue.origin
+        )
         self._planned: PlannedActions | None = None
         if what.actions == SOLVE:
             queue.send_update(RecordUpdate("building the envs of the rollouts"))
@@ -335,19 +374,20 @@ class _Episodes:
             files = future.result()
             if isinstance(files, str):
                 raise RecordingError(files)
-            shown = self._what.out / files.rrd.name  # as the person named the folder
+            upload = self._what.upload
             start_corrected = number in self._start_corrected
             self._queue.send_result(
                 number,
                 Written(
                     number - self._first,
-                    shown,
+                    files.rrd,
                     episode.seed,
                     episode.steps,
                     episode.total_reward,
                     episode.success,
                     start_corrected,
                     self._plans.pop(number, None),
+                    f"{upload}/{files.rrd.name}" if upload else "",
                 ),
             )
 
@@ -365,7 +405,11 @@ class _Episodes:
         task, given, seed = self._opened.env, self._given_of(number), self._seed_of(number)
         id = episode_id(self._run, number)
         if self._chunk.again and number in self._chunk.wanted:
-            remove_episode(self._folder, self._opened.description.env_id, seed, id)
+            env_id = self._opened.description.env_id
+            if self._what.upload:
+                remove_uploaded_id(self._what.upload, env_id, seed, id)
+            else:
+                remove_episode(self._folder, env_id, seed, id)
         with blamed("reset", self._opened.loaded, task):
             step = task.reset(seed, [env])
         self._running[env], self._steps[env], self._succeeded[env] = number, 0, 0

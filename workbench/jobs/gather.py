@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from workbench.core.camera_data import Picture
 from workbench.core.capture.recorded_run import STATE, states_of
 from workbench.core.env.step_result import OtherEntry, StepResult
+from workbench.jobs.pool.travel import relocated
 from workbench.jobs.task import Stepped, TaskDescription
 from workbench.machine import DISTRIBUTION
 from workbench.machine.processes.watched_thread import report_failure
@@ -27,6 +29,7 @@ from workbench.recording.episode.side_files import side_files
 from workbench.recording.writing.episode_writer import NO_OTHERS, EpisodeFiles, EpisodeWriter
 from workbench.recording.writing.publish import RecordingError
 
+NOWHERE: Mapping[str, str] = MappingProxyType({})
 _PACKAGES = (DISTRIBUTION, *MANISKILL, "sapien", "torch", "rerun-sdk")
 
 
@@ -59,9 +62,11 @@ class GatheredEpisode:
         reset_options: Mapping[str, Any] | None = None,
         acted_by: str = "",
         id: str = "",
+        origin: Mapping[str, str] = NOWHERE,
     ) -> GatheredEpisode:
-        """A new episode with a writer into `folder`; `id` if not a random one. Raises RecordingError."""
-        info = episode_info(task, env, seed, reset_options, acted_by)
+        """A new episode with a writer into `folder`; `id` if not a random one, `origin` as of `EpisodeGatherer`. Raises
+        RecordingError."""
+        info = relocated(episode_info(task, env, seed, reset_options, acted_by), origin)
         writer = EpisodeWriter(
             folder,
             replace(info, id=id) if id else info,
@@ -122,6 +127,7 @@ class EpisodeGatherer:
         ends: Literal["over", "reset"] = "over",
         one_each: bool = False,
         reset_options: Mapping[str, Any] | None = None,
+        origin: Mapping[str, str] = NOWHERE,
     ) -> None:
         """
         Args:
@@ -129,9 +135,10 @@ class EpisodeGatherer:
             ends: ``over`` ends an episode also where it terminates or is truncated; ``reset`` only where its env is
                 reset, for callers that continue after that.
             one_each: only the next episode of each env.
+            origin: as `pool.deal.ItemQueue.origin`: an episode names the author's files where they came from.
         """
         self._task, self._folder, self._on_episode = task, folder, on_episode
-        self._ends, self._one_each = ends, one_each
+        self._ends, self._one_each, self._origin = ends, one_each, origin
         self.reset_options: Mapping[str, Any] = reset_options or {}
         """Options of the next resets."""
         self.acted_by = ""
@@ -199,7 +206,9 @@ class EpisodeGatherer:
     def _begin(self, env: int, stepped: Stepped) -> None:
         seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
         id, self.next_id = self.next_id, ""
-        begun = GatheredEpisode.of(self._folder, self._task, env, seed, self.reset_options, self.acted_by, id)
+        begun = GatheredEpisode.of(
+            self._folder, self._task, env, seed, self.reset_options, self.acted_by, id, self._origin
+        )
         try:
             begun.take(self._packer, stepped.step, env, stepped.columns, stepped.captured)
         except BaseException:
@@ -330,14 +339,18 @@ class EpisodeFinisher:
     """Writes the files of finished episodes one by one on a thread. Thread-safe."""
 
     def __init__(
-        self, on_change: Callable[[], None] = lambda: None, first: Callable[[], None] | None = None
+        self,
+        on_change: Callable[[], None] = lambda: None,
+        first: Callable[[], None] | None = None,
+        then: Callable[[EpisodeFiles], None] | None = None,
     ) -> None:
         """
         Args:
             on_change: called on the thread when an episode's files are written, or have failed.
             first: called first on the thread.
+            then: called with the files of each episode, which is not finished before.
         """
-        self._on_change = on_change
+        self._on_change, self._then = on_change, then
         self._lock = threading.Lock()
         self._finished = Finished()
         self._waiting = 0
@@ -372,6 +385,8 @@ class EpisodeFinisher:
         try:
             made = episode.writer.finish()
             size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))
+            if self._then is not None:
+                self._then(made)
         except Exception as error:
             # The journal stays; the next start tries again.
             if not isinstance(error, (RecordingError, OSError, ValueError)):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import uuid
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from workbench.core.broken_rule import warn_of
@@ -18,8 +19,10 @@ from workbench.jobs.episodes import (
     record_items,
     with_given_actions,
 )
-from workbench.jobs.pool.deal import Deal, Executor, Failure, ThisProcess, Work
+from workbench.jobs.pool.deal import Deal, Executor, Failure, ItemQueue, ThisProcess, Work
 from workbench.jobs.pool.processes import Processes
+from workbench.jobs.pool.travel import needed_by
+from workbench.recording.writing.upload import remove_uploaded
 
 TRIES = 3
 """How often an episode is begun whose workers die."""
@@ -64,6 +67,8 @@ class Recorded:
     """Episodes with `Written.start_corrected`."""
     failures: tuple[Failure, ...] = ()
     """Episodes, by number, that the author's code failed in, or whose workers died."""
+    missing: int = 0
+    """Episodes that were asked for and did not end."""
 
 
 def chunk_of(episodes: int, num_envs: int) -> int:
@@ -100,14 +105,60 @@ def record(
     """
     what, given = with_given_actions(what)
     recording = _Recording(what, on_activity, on_progress, stop, on_finding)
-    setup = RecordSetup((what,), sys.maxsize, run or uuid.uuid4().hex)
     run_items = record_items
-    if executor is None and what.workers == 1:
-        executor, run_items = ThisProcess(), partial(record_items, given=given)
-    work = Work(run_items, setup, result=Written | None, update=RecordUpdate, name="that records")
-    (executor or Processes(what.workers)).run(work, recording.deal)
+    if executor is None:
+        executor = ThisProcess() if what.workers == 1 else Processes(what.workers)
+    if isinstance(executor, ThisProcess):
+        run_items = partial(record_items, given=given)
+    do_record([what], sys.maxsize, run, executor, recording.deal, run_items)
     recording.deal.require_results()
     return recording.so_far(stop())
+
+
+def collect(what: RecordOptions, known: Mapping[int, Written | None]) -> Recorded:
+    """The recording of which these episodes are known. Runs nothing.
+
+    Args:
+        what: as `with_given_actions` completes it.
+    """
+    recording = _Recording(
+        what, lambda activity: None, lambda progress: None, lambda: False, lambda finding: None
+    )
+    recording.deal.go_on(known, lambda number, written: None)
+    return recording.so_far(stopped=False)
+
+
+def do_record(
+    wanted: Sequence[RecordOptions],
+    stride: int,
+    run: str,
+    executor: Executor,
+    deal: Deal[Written | None, RecordUpdate],
+    run_items: Callable[[RecordSetup, ItemQueue], None] = record_items,
+) -> None:
+    """Record the items of a deal, of one or several recordings. Arguments as of `RecordSetup`; raises as `record`."""
+    run = run or uuid.uuid4().hex
+    needed = [needed_by(what.task, what.actions, what.options.imports) for what in wanted]
+    folders = [what.out.absolute() for what in wanted]
+    mark = f".{run}" if executor.elsewhere else ""
+    work = Work(
+        run_items,
+        RecordSetup(tuple(wanted), tuple(map(os.fsencode, folders)), stride, run, mark),
+        result=Written | None,
+        update=RecordUpdate,
+        name="that records",
+        folders=[folder for one in needed for folder in one.folders],
+        files=[file for one in needed for file in one.files],
+    )
+    marks = [folder / mark for folder, what in zip(folders, wanted, strict=True) if mark and not what.upload]
+    for file in marks:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    try:
+        executor.run(work, deal)
+    finally:
+        for file in marks:
+            file.unlink(missing_ok=True)
 
 
 class _Recording:
@@ -125,7 +176,8 @@ class _Recording:
         stop: Callable[[], bool],
         on_finding: Callable[[Finding], None],
     ) -> None:
-        self._folder, self._wanted = what.out.absolute(), what.successes
+        self._out, self._folder, self._wanted = what.out, what.out.absolute(), what.successes
+        self._upload = what.upload
         self._on_activity, self._on_progress, self._on_finding = on_activity, on_progress, on_finding
         self._kept: dict[int, Written] = {}
         self._ended = self._steps = self._step_limit = 0
@@ -134,6 +186,7 @@ class _Recording:
         """Findings of all processes, to report each once."""
         most = what.episodes if what.successes is None else what.tries
         assert most is not None
+        self._most = most
         self.deal: Deal[Written | None, RecordUpdate] = Deal(
             range(most),
             self._over,
@@ -149,13 +202,15 @@ class _Recording:
         written = tuple(self._kept[number] for number in sorted(self._kept))
         start_corrected = sum(episode.start_corrected for episode in written)
         tried = written[-1].index + 1 if enough else self._ended
-        return Recorded(written, tried, stopped, start_corrected, tuple(self.deal.failures))
+        missing = 0 if enough else self._most - self._ended
+        return Recorded(written, tried, stopped, start_corrected, tuple(self.deal.failures), missing)
 
     def _over(self, number: int, written: Written | None) -> None:
         self._ended += 1
         self._running.pop(number, None)
         if written is not None:
-            self._kept[number] = written
+            # As the person named the folder.
+            self._kept[number] = replace(written, path=self._out / written.path.name)
         if self._wanted is not None and len(self._kept) >= self._wanted:
             last = sorted(self._kept)[self._wanted - 1]
             self.deal.lower(last + 1)
@@ -189,5 +244,8 @@ class _Recording:
         self._on_progress(RecordProgress(kept, self._steps, over, running, self._step_limit, done))
 
     def _remove(self, episode: Written) -> None:
+        if self._upload:
+            remove_uploaded(self._upload, episode.path.stem)
+            return
         for suffix in (".json", ".h5", ".rrd"):  # the .json first: without it there is no episode
             (self._folder / episode.path.name).with_suffix(suffix).unlink(missing_ok=True)

@@ -11,8 +11,8 @@ from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.actions import SOLVE
 from workbench.jobs.episodes import RecordOptions, Written
-from workbench.jobs.pool.deal import Executor
-from workbench.jobs.record import RecordProgress, record
+from workbench.jobs.pool.deal import Executor, Failure
+from workbench.jobs.record import Recorded, RecordProgress, record
 from workbench.jobs.task import TaskOptions
 from workbench.planning.episodes import PlannedEpisode
 from workbench.planning.options import PlanOptions
@@ -33,7 +33,7 @@ class SolveOptions:
     seeds: int = 32
     """How many, from ``options.seed`` on."""
     workers: int = 1
-    """Processes, each with a live env; the result is the same with any number."""
+    """Processes, each with a live env, if no executor is given; the result is the same with any number."""
     pictures: bool = False
     max_steps: int | None = None
     """As `RecordArguments.max_steps`."""
@@ -42,6 +42,8 @@ class SolveOptions:
     """Its number of envs counts for nothing: each process has one."""
     seconds_per_seed: float | None = None
     """As `RecordArguments.seconds_per_seed`."""
+    upload: str = ""
+    """As `RecordArguments.upload`."""
 
     def recording(self) -> RecordOptions:
         """The recording that solves it."""
@@ -53,8 +55,9 @@ class SolveOptions:
             pictures=self.pictures,
             max_steps=self.max_steps,
             seconds_per_seed=self.seconds_per_seed,
+            upload=self.upload,
             workers=self.workers,
-            options=TaskOptions(**{**vars(self.options), "num_envs": self.workers}),
+            options=replace(self.options, num_envs=1),
             plan=self.plan,
             after_success=_AFTER_SUCCESS,
         )
@@ -68,6 +71,8 @@ def solve(
     on_finding: Callable[[Finding], None] = warn_of,
     executor: Executor | None = None,
     on_report: Callable[[SolveReport], None] = lambda report: None,
+    run: str = "",
+    on_failures: Callable[[Sequence[Failure]], None] = lambda failures: None,
 ) -> SolveReport:
     """Solve, recording every episode.
 
@@ -75,6 +80,7 @@ def solve(
 
     Args:
         on_report: called after each seed, with what is known so far.
+        on_failures: called at the end with the seeds, by number, that gave no result, if there are some.
     """
     began = time.monotonic()
     done: dict[int, Written] = {}
@@ -86,8 +92,15 @@ def solve(
             so_far = [done[number] for number in sorted(done)]
             on_report(_report(what, so_far, time.monotonic() - began, stopped=False))
 
-    recorded = record(what.recording(), on_activity, noted, stop, on_finding, executor)
-    return _report(what, recorded.written, time.monotonic() - began, recorded.stopped)
+    recorded = record(what.recording(), on_activity, noted, stop, on_finding, executor, run)
+    if recorded.failures:
+        on_failures(recorded.failures)
+    return report_of(what, recorded, time.monotonic() - began)
+
+
+def report_of(what: SolveOptions, recorded: Recorded, seconds: float) -> SolveReport:
+    """What a recording of planned episodes tells."""
+    return _report(what, recorded.written, seconds, recorded.stopped)
 
 
 def _report(what: SolveOptions, recorded: Sequence[Written], seconds: float, stopped: bool) -> SolveReport:

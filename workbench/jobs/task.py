@@ -213,6 +213,8 @@ class RecordArguments:
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         out: folder for the files.
+        upload: an address of fsspec, such as s3://bucket/folder: each episode goes there when it is over, and not into
+            the folder.
         episodes: how many, over all envs; 4, or as many as a file of actions has.
         successes: continue until so many episodes succeeded, and keep no others.
         tries: give up after so many episodes where successes are wanted; 100 for each.
@@ -226,7 +228,6 @@ class RecordArguments:
         max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
         seconds_per_seed: wall time after which an episode ends at its next step, solved or not. Which ones that cuts off
             depends on the machine and on what else it does, so a second run may record others.
-        workers: processes, each with its share of the envs; the episodes are the same with any number.
     """
 
     task: str
@@ -240,4 +241,4 @@ class RecordArguments:
     fast_pictures: bool = False
     max_steps: int | None = None
     seconds_per_seed: float | None = None
-    workers: int = 1
+    upload: str = ""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 import sys
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby, islice
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from workbench.authoring.problem import Problem, TaskError
@@ -323,10 +324,20 @@ class Work(Generic[Setup, Result, Update]):
     """Types of results and progress, against which `wire` checks what comes of other processes."""
     name: str
     """As in "a process *that records* was killed by SIGKILL"."""
+    folders: Sequence[Path] = ()
+    """What workers on other machines need: folders of the author, each with what is below it."""
+    files: Sequence[Path] = ()
+    """Likewise, further files. Paths in `setup` that are in neither must be places of all machines; what is below a folder
+    that travels and must not be taken for it, such as where results go, stands there as bytes."""
 
 
 class Executor(Protocol):
     """Does the work of a job."""
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether workers may run on other machines."""
+        ...
 
     def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
         """Deal until no chunk is left or needed, and all items under way are finished.
@@ -340,6 +351,10 @@ class Executor(Protocol):
 
 class ThisProcess:
     """Runs the work in this process; exceptions of `Work.run` other than TaskError pass through."""
+
+    @property
+    def elsewhere(self) -> bool:
+        return False
 
     def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
         while True:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import os
 import sqlite3
 import sys
 import uuid
@@ -20,7 +21,7 @@ from typing import Any, TypeVar
 from workbench.authoring.loading.reference import named_file
 from workbench.authoring.loading.task_content import read_content
 from workbench.jobs.gather import package_versions
-from workbench.jobs.pool.deal import Deal, Executor, PoolError, Result, Setup, Shard, Update, Work
+from workbench.jobs.pool.deal import Deal, Executor, Result, Setup, Shard, Update, Work
 from workbench.machine.files import open_regular_file
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack
 
@@ -111,6 +112,8 @@ class JobFile:
         if not path.absolute().parent.is_dir():
             raise FileNotFoundError(f"there is no folder {path.parent} for {path.name}")
         self.path = path
+        self.count = 0
+        """Results that were in it."""
         with _named(path):
             self._database = sqlite3.connect(path, timeout=0, isolation_level=None)
         try:
@@ -123,6 +126,7 @@ class JobFile:
                 else:
                     _require_same(path, job.about, _about(path, self._database))
                 self.run = _kept(self._database, "run").decode()
+                (self.count,) = self._database.execute("SELECT COUNT(*) FROM result").fetchone()
                 self._database.execute("COMMIT")
         except BaseException:
             self._database.close()
@@ -133,7 +137,7 @@ class JobFile:
         for table in _TABLES.strip().splitlines():
             self._database.execute(table)
         self._database.executemany("INSERT INTO about VALUES (?, ?)", job.about.items())
-        kept = {"run": uuid.uuid4().hex.encode(), "request": job.request, "folder": job.folder.encode()}
+        kept = {"run": uuid.uuid4().hex.encode(), "request": job.request, "folder": os.fsencode(job.folder)}
         self._database.executemany("INSERT INTO kept VALUES (?, ?)", kept.items())
 
     def results(self, kind: Any) -> dict[int, Any]:
@@ -144,6 +148,13 @@ class JobFile:
         """Write a result; it is on disk afterwards. Raises JobFileError."""
         with _named(self.path):
             self._database.execute("INSERT INTO result VALUES (?, ?)", (number, pack(result)))
+
+    def put(self, packed: Mapping[int, bytes]) -> None:
+        """Write results that are packed already, those that are there too. Raises JobFileError."""
+        with _named(self.path):
+            self._database.execute("BEGIN")
+            self._database.executemany("INSERT OR REPLACE INTO result VALUES (?, ?)", packed.items())
+            self._database.execute("COMMIT")
 
     def close(self) -> None:
         self._database.close()
@@ -156,6 +167,10 @@ class Kept:
     executor: Executor
     file: JobFile | None = None
     shard: Shard = Shard()
+
+    @property
+    def elsewhere(self) -> bool:
+        return self.executor.elsewhere
 
     def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
         deal.take_part(self.shard)
@@ -173,6 +188,7 @@ class Merged:
     """The results of several job files of one job."""
 
     command: str
+    about: Mapping[str, str]
     request: bytes
     values: dict[int, bytes]
     """Packed, by item."""
@@ -196,18 +212,17 @@ class Merged:
             raise JobFileError(f"a result cannot be read ({error})") from error
 
 
-class Missing(PoolError):
-    """Some items have no result yet; the text says how many."""
+def write_whole(path: Path, merged: Merged) -> None:
+    """Write a job file with all results of the parts.
 
-
-@dataclass(frozen=True)
-class Replayed:
-    """An executor that runs nothing: its results are known. `left` of them are missing afterwards."""
-
-    known: Mapping[int, Any]
-
-    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
-        deal.go_on(self.known, lambda number, result: None)
+    Raises:
+        JobFileError: there is a file of another job, or one that lacks none of them.
+        FileNotFoundError: its folder does not exist.
+    """
+    folder = next(iter(merged.folders.values()), "")
+    file = JobFile(path, Job(merged.command, merged.about, merged.request, folder))
+    with closing(file), _named(path):
+        file.put(merged.values)
 
 
 def read_parts(files: Sequence[Path]) -> Merged:
@@ -232,7 +247,7 @@ def read_parts(files: Sequence[Path]) -> Merged:
             if about is None:
                 about, request = told, _kept(database, "request")
             _require_same(path, about, told)
-            folder = _kept(database, "folder").decode()
+            folder = os.fsdecode(_kept(database, "folder"))
             rows = database.execute("SELECT number, value FROM result").fetchall()
         doubled = [number for number, _ in rows if number in values]
         if doubled:
@@ -243,7 +258,7 @@ def read_parts(files: Sequence[Path]) -> Merged:
         folders.update((number, folder) for number, _ in rows)
     if about is None:
         raise JobFileError("name the job files to merge")
-    return Merged(about["command"], request, values, folders, tuple(files))
+    return Merged(about["command"], about, request, values, folders, tuple(files))
 
 
 def _require_same(path: Path, mine: Mapping[str, str], there: Mapping[str, str]) -> None:

@@ -29,6 +29,10 @@ _EXIT_SECONDS = 10.0
 class Processes:
     """Runs the work in spawned processes, each on its share of the cores."""
 
+    @property
+    def elsewhere(self) -> bool:
+        return False
+
     def __init__(self, workers: int) -> None:
         """
         Args:

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
+from workbench.authoring.loading.reference import find_module, named_file, split_reference
+from workbench.jobs.policy import find_policy
 from workbench.machine.files import read_regular_file
 
 MOST_BYTES = 256 << 20
@@ -27,20 +29,30 @@ class TooMuch(ValueError):
 
 @dataclass(frozen=True)
 class Baggage:
-    """Folders of the submitting side, as one zip."""
+    """Folders and files of the submitting side, as one zip."""
 
     roots: tuple[str, ...]
-    """Absolute. In the zip the files of root k are below ``k/``."""
+    """Absolute paths; what is below them has travelled."""
+    current: str
+    """The current folder there."""
     data: bytes
+    """Names are the absolute paths, without their first slash: so what names another file relatively still finds it."""
 
     def unpack(self, folder: Path) -> dict[str, str]:
-        """Write the files below `folder`, which is empty. Returns each root's place there. Raises OSError."""
+        """Write all below `folder`, which is empty, and make the place of the current folder the current one.
+
+        Returns:
+            each root's place here.
+
+        Raises:
+            OSError: it cannot be written.
+        """
         with zipfile.ZipFile(io.BytesIO(self.data)) as archive:
             archive.extractall(folder)
-        places = {root: str(folder / str(number)) for number, root in enumerate(self.roots)}
-        for place in places.values():
-            Path(place).mkdir(exist_ok=True)
-        return places
+        current = Path(f"{folder}{self.current}")
+        current.mkdir(parents=True, exist_ok=True)
+        os.chdir(current)
+        return {root: f"{folder}{root}" for root in self.roots}
 
 
 def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage:
@@ -55,18 +67,10 @@ def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage
         OSError: a file cannot be read.
     """
     roots = _outermost(folder.resolve() for folder in folders)
-    found: dict[Path, Path] = {}
-    """Path in the zip, to file."""
-    for number, root in enumerate(roots):
-        for file in files_below(root):
-            found[Path(str(number)) / file.relative_to(root)] = file
-    names = [str(root) for root in roots]
-    for file in files:
-        file = file.resolve()
-        if not any(file.is_relative_to(root) for root in roots):
-            found[Path(str(len(names))) / file.name] = file
-            names.append(str(file.parent))
-    sizes = {file: file.stat().st_size for file in found.values()}
+    found = [file for root in roots for file in files_below(root)]
+    alone = {file.resolve() for file in files}
+    alone = {file for file in alone if not any(file.is_relative_to(root) for root in roots)}
+    sizes = {file: file.stat().st_size for file in sorted({*found, *alone})}
     if sum(sizes.values()) > MOST_BYTES:
         largest = sorted(sizes, key=lambda file: -sizes[file])[:3]
         raise TooMuch(
@@ -76,9 +80,54 @@ def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage
         )
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        for name, file in sorted(found.items()):
-            archive.writestr(zipfile.ZipInfo(name.as_posix()), read_regular_file(file, MOST_BYTES))
-    return Baggage(tuple(names), data.getvalue())
+        for file in sizes:
+            archive.writestr(zipfile.ZipInfo(str(file).lstrip("/")), read_regular_file(file, MOST_BYTES))
+    return Baggage(tuple(map(str, (*roots, *sorted(alone)))), str(Path.cwd()), data.getvalue())
+
+
+@dataclass(frozen=True)
+class Needed:
+    """Files of the author that a job needs."""
+
+    folders: tuple[Path, ...]
+    files: tuple[Path, ...]
+
+
+def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Needed:
+    """What a job needs that is not installed.
+
+    Args:
+        task: as `RecordArguments.task`: the folder of its file, or of its package.
+        actions: as `RecordArguments.actions`, if it names a file or a policy.
+        imports: as `TaskOptions.imports`.
+    """
+    folders: list[Path] = []
+    files: list[Path] = []
+    named = split_reference(task)
+    modules = [*imports, *([named[0]] if named else [])]
+    if named is None and (file := named_file(task)) is not None:
+        folders.append(file.parent)
+    policy, colon, _ = actions.rpartition(":")
+    if not colon:
+        if (file := Path(actions)).suffix and file.is_file():
+            files.append(file)
+    elif policy.endswith(".py"):
+        found, _ = find_policy(actions, folders[0] if folders else None)
+        folders.append(Path(found).parent)
+    else:
+        modules.append(policy)
+    for name in modules:
+        place = find_module(name)
+        if place is None or place.file is None or "site-packages" in place.file.parts:
+            continue
+        # With the packages above it, and what else they import.
+        top = name.partition(".")[0]
+        root = next((parent for parent in place.file.parents if parent.name == top), None)
+        if root is None:
+            files.append(place.file)
+        else:
+            folders.append(root)
+    return Needed(tuple(folders), tuple(files))
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:

@@ -1,0 +1,96 @@
+"""Where the work of a command runs: in this process, in others or on a cluster; and the file that keeps its results."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.markup import escape
+
+from workbench.cli.arguments import JobArguments
+from workbench.cli.terminal import err, print_text
+from workbench.jobs.pool.cluster import Cluster
+from workbench.jobs.pool.deal import Executor, Shard, ThisProcess, parse_shard
+from workbench.jobs.pool.job_file import Job, JobFile, Kept
+from workbench.jobs.pool.processes import Processes
+
+
+def require_job(arguments: JobArguments) -> None:
+    """Raise ValueError, with a message that names the argument, for one that makes no sense."""
+    if arguments.workers is not None and arguments.workers < 1:
+        raise ValueError(f"--workers must be at least 1, not {arguments.workers}")
+    for name, number, least in (
+        ("cpus-per-worker", arguments.cpus_per_worker, "above 0"),
+        ("gpus-per-worker", arguments.gpus_per_worker, "0 or more"),
+    ):
+        if number < 0 or (number == 0 and least == "above 0"):
+            raise ValueError(f"--{name} must be {least}, not {number:g}")
+    shard_of(arguments)
+
+
+def shard_of(arguments: JobArguments) -> Shard:
+    """The part of the job that is to be done. Raises ValueError."""
+    return Shard() if arguments.shard is None else parse_shard(arguments.shard)
+
+
+def items_of(arguments: JobArguments, count: int, chunk: int) -> int:
+    """How many of so many items, in chunks of this size, are in the part that is to be done."""
+    part = shard_of(arguments).part(-(-count // chunk))
+    return min(part.stop * chunk, count) - min(part.start * chunk, count)
+
+
+def job_path(arguments: JobArguments, command: str) -> Path | None:
+    """The job file; None if none is kept."""
+    if arguments.job is not None or arguments.shard is None:
+        return arguments.job
+    shard = shard_of(arguments)
+    return Path(f"{command}-{shard.index}-of-{shard.count}.job")
+
+
+@contextmanager
+def run_by(
+    arguments: JobArguments, command: str, chunks: int, job: Callable[[], Job]
+) -> Iterator[tuple[Executor, str]]:
+    """What runs the work of a command, and the name of the run (`episodes.RecordSetup.run`).
+
+    Args:
+        chunks: of the whole job.
+        job: what the job file is for; called only if there is one.
+
+    Raises:
+        ValueError, OSError: as `JobFile`.
+    """
+    shard, path = shard_of(arguments), job_path(arguments, command)
+    here = min(arguments.workers or len(os.sched_getaffinity(0)), len(shard.part(chunks)))
+    executor: Executor = ThisProcess() if here <= 1 else Processes(here)
+    if arguments.cluster is not None:
+        how = arguments.cluster, arguments.workers, arguments.cpus_per_worker, arguments.gpus_per_worker
+        executor = Cluster(*how)
+    if path is None:
+        yield executor, ""
+        return
+    file = JobFile(path, job())
+    try:
+        if file.count:
+            err.print(escape(f"going on after {file.count} results in {path}"), soft_wrap=True)
+        yield Kept(executor, file, shard), file.run
+    finally:
+        file.close()
+
+
+def print_part(arguments: JobArguments, command: str, stopped: bool) -> None:
+    """Say how the job goes on where it was stopped, and what to do with a part."""
+    path = job_path(arguments, command)
+    if stopped:
+        how = (
+            "give --job FILE to be able to go on after what is done"
+            if path is None
+            else "the same command goes on"
+        )
+        err.print(escape(how), soft_wrap=True)
+    elif arguments.shard is not None:
+        print_text(
+            f"Part {arguments.shard} is in {path}. Put all parts together with: workbench merge FILE ..."
+        )

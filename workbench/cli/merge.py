@@ -1,0 +1,93 @@
+"""Runs ``workbench merge``: puts the parts of a job together, and prints what the whole command would have printed."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from workbench.cli.record import print_recorded
+from workbench.cli.solve import SolveOutput, as_json, print_report
+from workbench.cli.terminal import Exit, print_text, refuse
+from workbench.jobs.episodes import RecordOptions, Written
+from workbench.jobs.pool.job_file import JobFileError, Merged, read_parts, write_whole
+from workbench.jobs.record import collect
+from workbench.jobs.solve import SolveOptions, report_of
+from workbench.machine.files import new_file, replace_file
+from workbench.machine.text import listed
+from workbench.recording.writing.publish import RecordingError
+
+
+def merge_in_terminal(
+    files: Sequence[Path], job: Path | None, out: Path | None, json_file: Path | None
+) -> int:
+    """Merge and print; returns the exit code."""
+    try:
+        merged = read_parts(files)
+        merged = _together(merged, out)
+        if job is not None:
+            write_whole(job, merged)
+        code = _print(merged, json_file)
+    except (OSError, ValueError) as error:
+        return refuse(str(error))
+    return code
+
+
+def _together(merged: Merged, out: Path | None) -> Merged:
+    """With all episodes in one folder."""
+    if merged.command not in ("record", "solve", "sweep"):
+        return merged
+    results: dict[int, Written | None] = merged.results(Written | None)
+    local = {number: one for number, one in results.items() if one is not None and not one.address}
+    if out is not None:
+        _copy((Path(merged.folders[number], one.path.name) for number, one in local.items()), out)
+        return replace(merged, folders=dict.fromkeys(merged.folders, str(out.absolute())))
+    folders = {merged.folders[number] for number in local}
+    if len(folders) > 1:
+        raise JobFileError(
+            f"the episodes are in {len(folders)} folders ({listed(sorted(folders), 3)}): name one for all, --out FOLDER"
+        )
+    return merged
+
+
+def _copy(files: Iterable[Path], out: Path) -> None:
+    """Copy episodes that are not there yet, the .json of each last."""
+    for rrd in files:
+        for suffix in (".rrd", ".h5", ".json"):
+            source, target = rrd.with_suffix(suffix), out / f"{rrd.stem}{suffix}"
+            if not source.is_file() and not target.is_file():
+                raise RecordingError(
+                    f"{source} is not there: merge where the folders of all parts can be read"
+                )
+            if not target.exists():
+                with new_file(target) as temporary:
+                    shutil.copyfile(source, temporary)
+
+
+def _print(merged: Merged, json_file: Path | None) -> int:
+    """Print as the command does; returns its exit code."""
+    if json_file is not None and merged.command != "solve":
+        raise JobFileError(f"workbench {merged.command} has no result as JSON: leave out --json-file")
+    folder = next(iter(merged.folders.values()), "")
+    known: dict[int, Written | None] = merged.results(Written | None)
+    if merged.command == "record":
+        what = merged.requested(RecordOptions)
+        what = replace(what, out=Path(folder or what.out))
+        recorded = collect(what, known)
+        code, missing = print_recorded(what, recorded), recorded.missing
+    elif merged.command == "solve":
+        asked = merged.requested(SolveOptions)
+        asked = replace(asked, out=Path(folder or asked.out))
+        recorded = collect(asked.recording(), known)
+        report = report_of(asked, recorded, 0.0)
+        if json_file is not None:
+            replace_file(json_file, as_json(report, asked, SolveOutput()).encode())
+        print_report(report)
+        code, missing = Exit.DONE if report.solved else Exit.FAILED, recorded.missing
+    else:
+        raise JobFileError(f"{merged.files[0]} is of workbench {merged.command}, which merge does not know")
+    if missing:
+        print_text(f"{missing} of the job's episodes are in none of these files.")
+        return Exit.FAILED
+    return code

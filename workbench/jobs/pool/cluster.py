@@ -1,0 +1,441 @@
+"""Runs a job's work on a Ray cluster: one that is there, or one of this machine alone.
+
+A worker is a Ray actor that runs the same function as a local process. What it says goes as bytes of `wire` through one
+more actor, the post, which the process that deals asks: so a worker waits for nobody, and a pickle that the author's code
+made is never read here. When Ray says that an actor is gone, its chunk is dealt again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pickle
+import platform
+import secrets
+import shutil
+import tempfile
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
+from workbench.jobs.gather import package_versions
+from workbench.jobs.pool.deal import NO_LIMIT, Chunk, Deal, PoolError, Result, Setup, Update, Work
+from workbench.jobs.pool.travel import Baggage, pack_baggage, relocated
+from workbench.jobs.pool.worker import MESSAGES, Asks, Gives, Listener, Message, WorkerQueue, work_on
+from workbench.machine.processes.child_python import quick_imports
+from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
+from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
+
+AUTO = "auto"
+_LOOK_SECONDS = 0.1
+_SAY_SECONDS = 0.5
+"""How often a worker says how far it is: the post takes some thousand messages a second from all of them."""
+_END_SECONDS = 120.0
+"""How long a stopped worker may take to write the items that have ended."""
+_INSTALL = "pip install 'maniskill-workbench[cluster]'"
+
+
+class NoCluster(OSError):
+    """There is no such cluster, or it cannot run a worker; the text says what to do."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """An executor whose workers are actors of a Ray cluster."""
+
+    address: str = AUTO
+    """``auto`` takes a cluster that is there, else starts one on this machine that only this user can connect to."""
+    workers: int | None = None
+    """How many; None for as many as the cluster has room for now."""
+    cpus_per_worker: float = 1
+    gpus_per_worker: float = 0
+
+    @property
+    def elsewhere(self) -> bool:
+        return True
+
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+        """As `Executor.run`.
+
+        Raises:
+            NoCluster: as `connected`; or the cluster has no room for a worker.
+            PoolError: a machine has other versions of the packages; or as `Executor.run`.
+            TooMuch: as `pack_baggage`.
+        """
+        baggage = pack_baggage(work.folders, work.files)
+        with connected(self.address) as ray:
+            pool = _ActorPool(ray, self, work, deal, baggage)
+            try:
+                pool.serve()
+            finally:
+                pool.end()
+
+
+@contextmanager
+def connected(address: str = AUTO) -> Iterator[Any]:
+    """The module ``ray``, connected. A cluster that is started here ends with this.
+
+    Raises:
+        NoCluster: Ray is not installed, or nothing answers at the address.
+    """
+    try:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        # It would write over the library path of each actor that has no GPU, and warns of that.
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        import ray
+    except ImportError as error:
+        raise NoCluster(f"--cluster needs Ray, which is not installed: {_INSTALL}") from error
+    if ray.is_initialized():
+        yield ray
+        return
+    how: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "namespace": "workbench"}
+    try:
+        _connect(ray, address, how)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise NoCluster(
+            f"no Ray cluster answers at {address} ({error}). Start one with `ray start --head`, or leave the address "
+            "to auto"
+        ) from error
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def _connect(ray: Any, address: str, how: Mapping[str, Any]) -> None:
+    if address != AUTO:
+        ray.init(address=address, **how)
+        return
+    with suppress(ConnectionError):
+        ray.init(address=AUTO, **how)
+    if not ray.is_initialized():
+        with _only_for_this_user():
+            ray.init(address="local", num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **how)
+        if not ray.get_runtime_context().gcs_address.startswith("127.0.0.1:"):
+            ray.shutdown()
+            raise NoCluster(
+                f"Ray {ray.__version__} would let other machines connect to the cluster that it starts: start one "
+                "yourself with `ray start --head`, and give its address"
+            )
+
+
+@contextmanager
+def _only_for_this_user() -> Iterator[None]:
+    """Let Ray start on the loopback address, with a token that no other user can read.
+
+    Who can connect to a cluster runs code in it, and Ray listens on all addresses of the machine otherwise.
+    """
+    from ray._private import ray_constants
+
+    before = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    # The first for the daemons, which import the constant anew.
+    os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"
+    # Else Ray writes one into the home folder, where others may read it. It asks for tokens by itself.
+    os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+    try:
+        yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
+        os.environ.pop(ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR)
+
+
+def versions_here() -> dict[str, str]:
+    """What must be the same on all machines of a job."""
+    return {"Python": ".".join(platform.python_version_tuple()[:2]), **package_versions()}
+
+
+class OtherVersions(RuntimeError):
+    """A machine has other versions of the packages; the text names them."""
+
+
+# --- where the chunks are dealt ----------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class _Actor:
+    """A worker, seen from here."""
+
+    handle: Any
+    ended: Any
+    """Reference that is ready when it has ended."""
+
+
+class _ActorPool:
+    """Starts the actors of one run, deals to them, and replaces those that fail."""
+
+    def __init__(
+        self,
+        ray: Any,
+        how: Cluster,
+        work: Work[Any, Any, Any],
+        deal: Deal[Any, Any],
+        baggage: Baggage,
+    ) -> None:
+        self._ray, self._how, self._work, self._deal = ray, how, work, deal
+        self._listener = Listener("a worker", work, deal)
+        self._read = Unpacker(MESSAGES).message
+        self._post = ray.remote(num_cpus=0)(Post).remote()
+        self._baggage = ray.put(baggage)
+        self._work_bytes = pickle.dumps((work.run, work.setup))
+        self._actor = ray.remote(
+            num_cpus=how.cpus_per_worker, num_gpus=how.gpus_per_worker, max_restarts=0, max_task_retries=0
+        )(Actor)
+        self._busy: dict[int, _Actor] = {}
+        self._started = 0
+
+    def serve(self) -> None:
+        for _ in range(self._deal.count_left(self._how.workers or self._room())):
+            self._start()
+        sent_limit, stopped = self._deal.limit(), 0.0
+        failure: TaskError | PoolError | None = None
+        while self._busy:
+            if (limit := self._deal.limit()) != sent_limit:
+                sent_limit = limit
+                self._post.set_limit.remote(limit)
+            if limit == 0:
+                stopped = stopped or time.monotonic()
+                if time.monotonic() - stopped > _END_SECONDS:
+                    raise failure or PoolError(f"a worker {self._work.name} did not end in time")
+            for number, raw in self._ray.get(self._post.take.remote(_LOOK_SECONDS)):
+                failure = self._guarded(
+                    number, failure, lambda raw=raw, number=number: self._take(number, raw)
+                )
+            for number in self._gone():
+                failure = self._guarded(number, failure, lambda number=number: self._died(number))
+            if not self._busy and self._deal.count_left(1):
+                self._start()
+        if failure is not None:
+            raise failure
+
+    def end(self) -> None:
+        """End the actors at once, as after a second Ctrl-C: they may not respond."""
+        for actor in self._busy.values():
+            self._ray.kill(actor.handle)
+        self._ray.kill(self._post)
+
+    def _guarded(self, number: int, failure: Any, act: Any) -> Any:
+        """Do this for a worker; after an error that ends the job the others finish what they have."""
+        try:
+            act()
+        except (TaskError, PoolError) as error:
+            self._leave(number)
+            self._deal.lower(0)
+            return failure or error
+        return failure
+
+    def _room(self) -> int:
+        """How many workers the cluster has room for.
+
+        Raises:
+            NoCluster: for none.
+        """
+        asked = {"CPU": self._how.cpus_per_worker, "GPU": self._how.gpus_per_worker}
+        rooms = [
+            min(int(node["Resources"].get(name, 0) // count) for name, count in asked.items() if count > 0)
+            for node in self._ray.nodes()
+            if node["Alive"]
+        ]
+        if not sum(rooms):
+            told = ", ".join(f"{count:g} {name}" for name, count in asked.items() if count > 0)
+            raise NoCluster(f"no machine of the cluster has {told} for a worker")
+        return sum(rooms)
+
+    def _start(self) -> None:
+        number = self._started
+        self._started += 1
+        handle = self._actor.remote(self._post, number, self._how.cpus_per_worker)
+        ended = handle.run.remote(self._work_bytes, self._baggage, versions_here())
+        self._busy[number] = _Actor(handle, ended)
+
+    def _leave(self, number: int) -> None:
+        if (actor := self._busy.pop(number, None)) is not None:
+            self._ray.kill(actor.handle)
+
+    def _take(self, number: int, raw: bytes) -> None:
+        if number not in self._busy:
+            return  # late words of a worker whose chunk was dealt again
+        try:
+            news = self._listener.take(number, self._read(raw))
+        except Unreadable as error:
+            raise PoolError(f"a worker {self._work.name} sent what cannot be read ({error})") from error
+        if news == "asks":
+            self._post.answer.remote(number, self._deal.next(number))
+        elif news in ("failed", "done"):
+            self._leave(number)
+            if news == "failed" and self._deal.count_left(1):
+                self._start()
+
+    def _gone(self) -> list[int]:
+        """Workers whose actor has ended."""
+        by_ref = {actor.ended: number for number, actor in self._busy.items()}
+        ready, _ = self._ray.wait(list(by_ref), num_returns=len(by_ref), timeout=0) if by_ref else ([], [])
+        return [by_ref[ref] for ref in ready]
+
+    def _died(self, number: int) -> None:
+        """Take its last words, and account for its end.
+
+        Raises:
+            TaskError, PoolError: the job is over.
+        """
+        for one, raw in self._ray.get(self._post.take.remote(0.0)):
+            self._take(one, raw)
+        actor = self._busy.get(number)
+        if actor is None:
+            return
+        how = "ended without a word"
+        try:
+            self._ray.get(actor.ended)
+        except self._ray.exceptions.RayTaskError as error:
+            cause = error.cause if isinstance(error.cause, Exception) else error
+            self._leave(number)
+            raise PoolError(str(cause)) from error
+        except self._ray.exceptions.RayError as error:
+            how = f"is gone ({type(error).__name__})"
+        self._leave(number)
+        self._listener.died(number, how, None)
+        if self._deal.count_left(1):
+            self._start()
+
+
+class Post:
+    """An actor through which workers and the process that deals talk. It keeps what nobody has taken yet."""
+
+    def __init__(self) -> None:
+        self._said: deque[tuple[int, bytes]] = deque()
+        self._came = asyncio.Event()
+        self._answers: dict[int, asyncio.Future[Chunk | None]] = {}
+        self._limit = NO_LIMIT
+
+    async def put(self, worker: int, messages: list[bytes]) -> int:
+        """Take messages of a worker; returns the limit."""
+        self._said.extend((worker, message) for message in messages)
+        self._came.set()
+        return self._limit
+
+    async def ask(self, worker: int, messages: list[bytes]) -> tuple[Chunk | None, int]:
+        """Take messages of which the last asks for a chunk; returns it, and the limit."""
+        future: asyncio.Future[Chunk | None] = asyncio.get_running_loop().create_future()
+        self._answers[worker] = future
+        await self.put(worker, messages)
+        return await future, self._limit
+
+    async def answer(self, worker: int, chunk: Chunk | None) -> None:
+        if (future := self._answers.pop(worker, None)) is not None:
+            future.set_result(chunk)
+
+    async def take(self, seconds: float) -> list[tuple[int, bytes]]:
+        """What has come, waiting so long for the first message."""
+        if not self._said and seconds:
+            self._came.clear()
+            try:
+                await asyncio.wait_for(self._came.wait(), seconds)
+            except asyncio.TimeoutError:
+                return []
+        said = list(self._said)
+        self._said.clear()
+        return said
+
+    async def set_limit(self, limit: int) -> None:
+        self._limit = limit
+
+
+# --- a worker ----------------------------------------------------------------------------------------------
+
+
+class Actor:
+    """A worker, in its own process."""
+
+    def __init__(self, post: Any, number: int, cpus: float) -> None:
+        # The software renderer starts a thread for each core of the machine otherwise.
+        os.environ["LP_NUM_THREADS"] = str(max(1, int(cpus)))
+        self._post, self._number = post, number
+
+    def run(self, work: bytes, baggage: Baggage, versions: Mapping[str, str]) -> None:
+        """Do the work.
+
+        Args:
+            work: the pickled function and its setup: what it imports takes seconds, and more before `quick_imports`.
+
+        Raises:
+            OtherVersions: this machine has other ones than the submitting side.
+        """
+        from workbench.machine.software_vulkan import use_private_driver
+
+        _require_versions(versions)
+        refuse_breakpoints(ONE_PROCESS)
+        treat_ctrl_c_as_error()
+        use_private_driver()
+        folder = Path(tempfile.mkdtemp(prefix="workbench-job-"))
+        try:
+            places = baggage.unpack(folder)
+            queue = _PostQueue(self._post, self._number, {str(folder): ""})
+            with quick_imports():
+                run, setup = pickle.loads(work)
+            work_on(run, relocated(setup, places), queue)
+            queue.flush()
+        finally:
+            os.chdir("/")
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _require_versions(versions: Mapping[str, str]) -> None:
+    here = versions_here()
+    if here != versions:
+        told = [
+            f"{name} {here.get(name, 'is not installed')}, and the submitting side {versions.get(name, 'none')}"
+            for name in dict.fromkeys((*versions, *here))
+            if here.get(name) != versions.get(name)
+        ]
+        raise OtherVersions(f"{platform.node()} has {'; '.join(told)}: install the same on all machines")
+
+
+class _PostQueue(WorkerQueue):
+    """The chunks of an actor."""
+
+    def __init__(self, post: Any, worker: int, origin: Mapping[str, str]) -> None:
+        self._post, self._worker, self.origin = post, worker, origin
+        self._waiting: list[bytes] = []
+        self._said = 0.0
+        self._limit: int = NO_LIMIT
+        self._put: Any = None
+        """Of the messages that were put last; its value is the limit then."""
+
+    def next(self) -> Chunk | None:
+        import ray
+
+        messages, self._waiting = [*self._waiting, pack_message(Asks())], []
+        chunk, self._limit = ray.get(self._post.ask.remote(self._worker, messages))
+        return chunk
+
+    def limit(self) -> int:
+        import ray
+
+        if time.monotonic() - self._said > _SAY_SECONDS:
+            self._send()
+        if self._put is not None and ray.wait([self._put], timeout=0)[0]:
+            self._limit, self._put = int(ray.get(self._put)), None
+        return self._limit
+
+    def send(self, message: Message) -> None:
+        self._waiting.append(pack_message(message))
+        if isinstance(message, Gives) or time.monotonic() - self._said > _SAY_SECONDS:
+            self._send()
+
+    def flush(self) -> None:
+        """Wait until all is said."""
+        import ray
+
+        self._send()
+        if self._put is not None:
+            ray.get(self._put)
+
+    def _send(self) -> None:
+        messages, self._waiting = self._waiting, []
+        self._put = self._post.put.remote(self._worker, messages)
+        self._said = time.monotonic()
