@@ -268,7 +268,18 @@ def test_a_task_that_needs_a_renderer_and_is_given_none_is_told_so(
 def test_a_task_that_needs_a_renderer_gets_one(place: Path, child_process: None) -> None:
     """In a process that has rendered nothing before."""
     reads_what_is_drawn(place)
-    words = ["check", "drawn.py", "--envs-per-worker", "2", "--seeds", "2", "--workers", "1", "--select", "runs"]
+    words = [
+        "check",
+        "drawn.py",
+        "--envs-per-worker",
+        "2",
+        "--seeds",
+        "2",
+        "--workers",
+        "1",
+        "--select",
+        "runs",
+    ]
     ended = in_a_process(*words)
     assert ended.returncode == 0, ended.stdout + ended.stderr
 

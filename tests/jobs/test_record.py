@@ -146,6 +146,7 @@ class InAnyOrder:
 
     def __init__(self, good: list[bool], slots: int, data: st.DataObject) -> None:
         self.good, self.slots, self.data = good, slots, data
+        self.elsewhere = False
 
     def run(self, work: Work, deal: Deal) -> None:
         (what,) = work.setup.wanted
@@ -489,7 +490,10 @@ def test_arguments_are_refused_with_a_sentence(
         (["record", "PickCube-v1", "--actions", "gone.py:act"], "there is no file"),
         (["record", "PickCube-v1", "--actions", "randomly"], "module:function"),
         (["record", "PickCube-v1", "--envs-per-worker", "1", "--actions", "gone:act"], "no module gone"),
-        (["record", "PickCube-v1", "--envs-per-worker", "1", "--actions", "json:act"], "json has no function act"),
+        (
+            ["record", "PickCube-v1", "--envs-per-worker", "1", "--actions", "json:act"],
+            "json has no function act",
+        ),
         (["record", "PickCube-v1", "--out", sys.executable], "is not a folder"),
     ],
 )

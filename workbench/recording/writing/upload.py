@@ -32,7 +32,7 @@ def require_place(address: str) -> None:
     """
     system, path = _place(address)
     try:
-        system.makedirs(path, exist_ok=True)
+        _make_place(system, path)
         system.pipe_file(f"{path}/.workbench", b"")
         system.rm_file(f"{path}/.workbench")
     except Exception as error:
@@ -48,6 +48,7 @@ def upload_episode(files: EpisodeFiles, address: str) -> None:
     """
     system, path = _place(address)
     try:
+        _make_place(system, path)
         for file in (files.rrd, files.h5, files.json):
             system.put_file(str(file), f"{path}/{file.name}")
     except Exception as error:
@@ -83,6 +84,12 @@ def remove_uploaded_id(address: str, task: str, seed: int, id: str) -> None:
         raise
     except Exception as error:
         raise RecordingError(f"Cannot look into {address}: {type(error).__name__}: {error}") from error
+
+
+def _make_place(system: Any, path: str) -> None:
+    # A bucket is not made: who may write into one may not always make one.
+    if "/" in path and not system.exists(path):
+        system.makedirs(path, exist_ok=True)
 
 
 def _place(address: str) -> tuple[Any, str]:

@@ -1,0 +1,184 @@
+"""Results of a job in a file: it goes on where it was, for this very job, and parts are put together."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from workbench.jobs.episodes import RecordOptions, Written
+from workbench.jobs.pool.deal import Deal, ItemQueue, Shard, ThisProcess, Work
+from workbench.jobs.pool.job_file import Job, JobFile, JobFileError, Kept, job_of, read_parts, write_whole
+from workbench.jobs.task import TaskOptions
+
+WHOLE = Shard()
+JOB = Job("square", {"command": "square", "seeds": "9"}, b"")
+
+
+def run(
+    path: Path, shard: Shard = WHOLE, job: Job = JOB, stop_after: int = 99
+) -> tuple[dict[int, int], list[int]]:
+    """Results of the squares of nine numbers, and which were made."""
+    made: list[int] = []
+    results: dict[int, int] = {}
+
+    def square(setup: None, queue: ItemQueue) -> None:
+        while (chunk := queue.next()) is not None:
+            for number in sorted(chunk.wanted):
+                if number < queue.limit():
+                    made.append(number)
+                    queue.send_result(number, number**2)
+
+    deal: Deal[int, None] = Deal(range(9), results.__setitem__, stop=lambda: len(made) >= stop_after, chunk=2)
+    file = JobFile(path, job)
+    try:
+        Kept(ThisProcess(), file, shard).run(Work(square, None, int, None, "that squares"), deal)
+    finally:
+        file.close()
+    return results, made
+
+
+def test_a_job_goes_on_after_what_is_done(tmp_path: Path) -> None:
+    _, first = run(tmp_path / "a.job", stop_after=5)
+    assert 5 <= len(first) < 9
+    results, second = run(tmp_path / "a.job")
+    assert sorted(first + second) == list(range(9)) and results == {n: n * n for n in range(9)}
+    assert run(tmp_path / "a.job") == (results, [])
+
+
+def test_parts_are_the_whole(tmp_path: Path) -> None:
+    parts = [tmp_path / f"{index}.job" for index in (1, 2, 3)]
+    for index, path in enumerate(parts, 1):
+        run(path, Shard(index, 3))
+    merged = read_parts(parts)
+    assert merged.results(int) == {n: n * n for n in range(9)}
+    write_whole(tmp_path / "whole.job", merged)
+    assert run(tmp_path / "whole.job") == ({n: n * n for n in range(9)}, [])
+
+
+def test_what_a_part_lacks_is_done_by_the_whole(tmp_path: Path) -> None:
+    run(tmp_path / "1.job", Shard(1, 3))
+    run(tmp_path / "3.job", Shard(3, 3))
+    write_whole(tmp_path / "whole.job", read_parts([tmp_path / "1.job", tmp_path / "3.job"]))
+    results, made = run(tmp_path / "whole.job")
+    assert results == {n: n * n for n in range(9)} and 0 < len(made) < 9
+
+
+def test_another_job_is_refused_with_what_differs(tmp_path: Path) -> None:
+    run(tmp_path / "a.job")
+    other = replace(JOB, about={"command": "square", "seeds": "10", "rules": "off"})
+    with pytest.raises(
+        JobFileError, match="seeds is 10 here and 9 there; rules is off here and not given there"
+    ):
+        JobFile(tmp_path / "a.job", other)
+    run(tmp_path / "b.job", job=other)
+    with pytest.raises(JobFileError, match="b.job is of another job"):
+        read_parts([tmp_path / "a.job", tmp_path / "b.job"])
+
+
+def test_one_part_twice_is_refused(tmp_path: Path) -> None:
+    run(tmp_path / "a.job", Shard(1, 2))
+    with pytest.raises(JobFileError, match="both hold item 0"):
+        read_parts([tmp_path / "a.job", tmp_path / "a.job"])
+
+
+def test_a_file_that_is_open_elsewhere_is_refused(tmp_path: Path) -> None:
+    file = JobFile(tmp_path / "a.job", JOB)
+    with pytest.raises(JobFileError, match="a.job cannot be used: another process has it open"):
+        JobFile(tmp_path / "a.job", JOB)
+    file.close()
+    JobFile(tmp_path / "a.job", JOB).close()
+
+
+def _text(path: Path) -> None:
+    path.write_text("no database")
+
+
+def _other_database(path: Path) -> None:
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE result (number INTEGER)")
+
+
+def _folder(path: Path) -> None:
+    path.mkdir()
+
+
+@pytest.mark.parametrize("make", [_text, _other_database, _folder])
+def test_what_is_no_job_file_is_refused_and_left_alone(make: Callable[[Path], None], tmp_path: Path) -> None:
+    path = tmp_path / "a.job"
+    make(path)
+    before = path.read_bytes() if path.is_file() else b""
+    for use in (lambda: JobFile(path, JOB), lambda: read_parts([path])):
+        with pytest.raises((JobFileError, FileNotFoundError), match=r"a\.job"):
+            use()
+    assert not path.is_file() or path.read_bytes() == before
+
+
+def test_a_result_of_another_type_is_refused(tmp_path: Path) -> None:
+    run(tmp_path / "a.job")
+    with pytest.raises(JobFileError, match="a result cannot be read"):
+        read_parts([tmp_path / "a.job"]).results(Written)
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"there is no folder .*gone for a\.job"):
+        JobFile(tmp_path / "gone" / "a.job", JOB)
+
+
+# --- which job it is -------------------------------------------------------------------------------------
+
+
+@dataclass
+class Place:
+    """A folder with a task and a policy."""
+
+    task: Path
+    policy: Path
+
+    def job(self, **other: Any) -> Job:
+        asked = RecordOptions(
+            str(self.task), **{"episodes": 4, "options": TaskOptions(num_envs=2), "out": Path("a"), **other}
+        )
+        return job_of("record", str(self.task), asked, ("out", "workers"), [self.policy])
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Place:
+    task, policy = tmp_path / "mine.py", tmp_path / "act.npy"
+    task.write_text("import beside\n")
+    (tmp_path / "beside.py").write_text("A = 1\n")
+    policy.write_bytes(b"123")
+    return Place(task, policy)
+
+
+def test_the_same_job_may_run_elsewhere_with_another_number_of_workers(place: Place, tmp_path: Path) -> None:
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    for name in ("mine.py", "beside.py", "act.npy"):
+        (moved / name).write_bytes((tmp_path / name).read_bytes())
+    there = Place(moved / "mine.py", moved / "act.npy")
+    assert place.job().about == there.job(out=Path("b"), workers=7).about
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"episodes": 5},
+        {"max_steps": 3},
+        {"options": TaskOptions(num_envs=3)},
+        {"options": TaskOptions(2, seed=1)},
+    ],
+)
+def test_what_the_results_depend_on_makes_another_job(other: dict[str, Any], place: Place) -> None:
+    assert place.job(**other).about != place.job().about
+
+
+@pytest.mark.parametrize("name", ["mine.py", "beside.py", "act.npy"])
+def test_so_do_the_texts_of_task_and_policy(name: str, place: Place, tmp_path: Path) -> None:
+    before = place.job().about
+    (tmp_path / name).write_text("import beside  # changed\n")
+    assert place.job().about != before

@@ -1,0 +1,139 @@
+"""Episodes that go to another place when they are over: whole ones only, each once, and no file stays here."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pytest
+
+from workbench.jobs.episodes import RecordOptions, episode_id
+from workbench.jobs.pool.deal import Deal, ThisProcess, Work
+from workbench.jobs.record import record
+from workbench.jobs.task import TaskOptions
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.writing.finish import EpisodeFiles
+from workbench.recording.writing.publish import RecordingError
+from workbench.recording.writing.upload import remove_uploaded_id, require_place, upload_episode
+
+
+@pytest.fixture(scope="module")
+def bucket() -> Iterator[str]:
+    """An empty place of an S3 server on the loopback address."""
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(
+        ip_address="127.0.0.1", port=0, verbose=False
+    )
+    server.start()
+    host, port = server.get_host_and_port()
+    patch = pytest.MonkeyPatch()
+    for name, value in {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+    }.items():
+        patch.setenv(name, value)
+    fsspec.filesystem("s3").mkdir("demos")
+    yield "s3://demos/pushed"
+    fsspec.filesystem("s3").clear_instance_cache()
+    patch.undo()
+    server.stop()
+
+
+def asked(out: Path, upload: str, **other: Any) -> RecordOptions:
+    options = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})
+    return RecordOptions(
+        "PushCube-v1", out, pictures=False, max_steps=3, upload=upload, options=options, **other
+    )
+
+
+def names(address: str) -> list[str]:
+    system, path = fsspec.core.url_to_fs(address)
+    system.invalidate_cache()
+    return sorted(name.rpartition("/")[2] for name in system.ls(path, detail=False))
+
+
+def test_episodes_end_up_there_and_not_here(bucket: str, tmp_path: Path) -> None:
+    done = record(asked(tmp_path / "out", bucket, episodes=3))
+    assert [one.address.partition("pushed/")[0] for one in done.written] == ["s3://demos/"] * 3
+    stems = [one.path.stem for one in done.written]
+    assert names(bucket) == sorted(f"{stem}{suffix}" for stem in stems for suffix in (".rrd", ".h5", ".json"))
+    assert not (tmp_path / "out").exists()
+    system, path = fsspec.core.url_to_fs(bucket)
+    system.get(path, str(tmp_path / "back"), recursive=True)
+    episode = read_episode(next((tmp_path / "back").glob("*seed0001*.rrd")))
+    assert (episode.info.seed, episode.length) == (1, 3)
+
+
+def test_surplus_successes_are_removed_there_too(tmp_path: Path) -> None:
+    place = (tmp_path / "there").as_uri()
+    record(asked(tmp_path / "out", place, successes=1, tries=2, actions="hold"))
+    assert names(place) == [] if (tmp_path / "there").exists() else True
+
+
+def test_what_another_worker_has_left_is_replaced(tmp_path: Path) -> None:
+    place = (tmp_path / "there").as_uri()
+    what, run = asked(tmp_path / "out", place, episodes=2), uuid.uuid4().hex
+    first = record(what, run=run)
+
+    class Again:
+        elsewhere = False
+
+        def run(self, work: Work, deal: Deal) -> None:
+            # As where the first worker died before it said that the first episode is there.
+            deal.go_on({1: first.written[1]}, lambda number, written: None)
+            ThisProcess().run(work, deal)
+
+    again = record(what, executor=Again(), run=run)
+    documents = [json.loads(path.read_text()) for path in (tmp_path / "there").glob("*.json")]
+    ids = sorted(document["workbench"]["id"] for document in documents)
+    assert ids == sorted(episode_id(run, number) for number in range(2))
+    assert len(again.written) == 2 and len(names(place)) == 6
+
+
+def _files(folder: Path) -> EpisodeFiles:
+    paths = [folder / f"Task_seed0001_env00_now{suffix}" for suffix in (".rrd", ".h5", ".json")]
+    for path in paths:
+        path.write_text('{"workbench": {"id": "mine"}}')
+    return EpisodeFiles(*paths)
+
+
+def test_the_json_is_the_last_so_half_an_upload_is_no_episode(tmp_path: Path) -> None:
+    files, place = _files(tmp_path), tmp_path / "there"
+    place.mkdir()
+    (place / files.h5.name).mkdir()  # cannot be written over
+    with pytest.raises(RecordingError, match=r"Cannot upload Task_seed0001.*to file://"):
+        upload_episode(files, place.as_uri())
+    assert not (place / files.json.name).exists() and files.json.exists(), "and nothing is lost here"
+
+
+def test_only_the_episode_with_that_id_is_removed(tmp_path: Path) -> None:
+    files, place = _files(tmp_path), (tmp_path / "there").as_uri()
+    upload_episode(files, place)
+    remove_uploaded_id(place, "Task", 1, "another")
+    assert len(names(place)) == 3
+    remove_uploaded_id(place, "Task", 1, "mine")
+    assert names(place) == []
+
+
+@pytest.mark.parametrize(
+    ("address", "says"),
+    [
+        ("nonsense://place", "Protocol not known: nonsense"),
+        ("file:///proc/nowhere", "Cannot record to file:///proc"),
+    ],
+)
+def test_a_place_that_cannot_be_written_is_said_before(address: str, says: str) -> None:
+    with pytest.raises(RecordingError, match=says):
+        require_place(address)
+
+
+def test_a_place_that_can_be_written_is_left_as_it_was() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        require_place(f"file://{folder}")
+        assert list(Path(folder).iterdir()) == []
