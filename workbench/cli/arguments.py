@@ -58,8 +58,8 @@ class JobArguments:
 
     Args:
         workers: processes, each with envs of its own; what comes out is the same with any number.
-        cluster: run the workers on Ray: the address of a cluster, or auto for one that is there, else for one that is
-            started on this machine and ended with the job. Needs maniskill-workbench[cluster].
+        cluster: run the workers on Ray: the address of a cluster; local for one that is started on this machine and ends
+            with the job; or auto, which takes one that is there, else does that. Needs maniskill-workbench[cluster].
         cpus_per_worker: on a cluster, the cores that each worker is given.
         gpus_per_worker: likewise, the GPUs, or parts of one.
         job: a file that keeps the results as they come. Where it has some of this very job, the job goes on after them.

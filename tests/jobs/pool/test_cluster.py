@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import tempfile
@@ -223,7 +224,7 @@ def test_other_versions_are_refused_and_named(
 ) -> None:
     here = seam.versions_here()
     monkeypatch.setattr(seam, "versions_here", lambda: {**here, "torch": "1.0"})
-    with pytest.raises(PoolError, match=f"has torch {here['torch']}, and the submitting side 1.0"):
+    with pytest.raises(PoolError, match=re.escape(f"has torch {here['torch']}, and the submitting side 1.0")):
         Run(Setup(folder=tmp_path), range(8)).by(Cluster(address, 1))
 
 
@@ -241,40 +242,3 @@ def test_a_folder_that_a_machine_does_not_see_is_refused(
         PoolError, match="does not see the folder .*there of this machine: name one that all machines"
     ):
         record(wanted("there"), executor=Cluster(address, 1))
-
-
-@pytest.mark.slow
-def test_a_cluster_that_is_started_here_can_be_reached_from_here_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    script = tmp_path / "starts.py"
-    script.write_text(
-        "import os, psutil\nfrom workbench.jobs.pool.cluster import connected\n\n"
-        "with connected() as ray:\n"
-        "    family = [psutil.Process(), *psutil.Process().children(recursive=True)]\n"
-        "    ports = [one for process in family for one in process.net_connections('inet') if one.status == 'LISTEN']\n"
-        "    print(len(ports), {one.laddr.ip.removeprefix('::ffff:') for one in ports}, os.environ['RAY_AUTH_MODE'])\n"
-    )
-    import subprocess
-    import sys
-
-    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")
-    try:
-        said = subprocess.run(
-            [sys.executable, script],
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=True,
-            env={**os.environ, "RAY_TMPDIR": folder},
-        ).stdout
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-    count, _, rest = said.partition(" ")
-    assert int(count) >= 4 and rest.strip() == "{'127.0.0.1'} token"
-
-
-def test_nothing_at_an_address_is_said() -> None:
-    with pytest.raises(NoCluster, match="no Ray cluster answers at 127.0.0.1:1 "):
-        with connected("127.0.0.1:1"):
-            pass

@@ -13,11 +13,12 @@ import pickle
 import platform
 import secrets
 import shutil
+import socket
 import tempfile
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,13 @@ from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
 
-AUTO = "auto"
+AUTO, LOCAL = "auto", "local"
 _LOOK_SECONDS = 0.1
 _SAY_SECONDS = 0.5
 """How often a worker says how far it is: the post takes some thousand messages a second from all of them."""
 _END_SECONDS = 120.0
 """How long a stopped worker may take to write the items that have ended."""
+_DEAF_SECONDS = 5.0
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
 
 
@@ -49,7 +51,8 @@ class Cluster:
     """An executor whose workers are actors of a Ray cluster."""
 
     address: str = AUTO
-    """``auto`` takes a cluster that is there, else starts one on this machine that only this user can connect to."""
+    """``local`` starts one on this machine that only this user can connect to and that ends with the job; ``auto`` takes one
+    that is there, else does that."""
     workers: int | None = None
     """How many; None for as many as the cluster has room for now."""
     cpus_per_worker: float = 1
@@ -93,35 +96,58 @@ def connected(address: str = AUTO) -> Iterator[Any]:
     if ray.is_initialized():
         yield ray
         return
+    if address == AUTO:
+        address = os.environ.get("RAY_ADDRESS") or _left_here() or LOCAL
+    elif address != LOCAL and (why := _why_deaf(address)) is not None:
+        raise NoCluster(_no_cluster_text(address, why))
     how: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "namespace": "workbench"}
     try:
         _connect(ray, address, how)
     except (ConnectionError, ValueError, RuntimeError) as error:
-        raise NoCluster(
-            f"no Ray cluster answers at {address} ({error}). Start one with `ray start --head`, or leave the address "
-            "to auto"
-        ) from error
+        raise NoCluster(_no_cluster_text(address, str(error))) from error
     try:
         yield ray
     finally:
         ray.shutdown()
 
 
+def _why_deaf(address: str) -> str | None:
+    """Why nothing can be there; None if something listens. Ray itself tries for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        with socket.create_connection((host, int(port)), timeout=_DEAF_SECONDS):
+            return None
+    except ValueError:
+        return "it takes host:port"
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def _no_cluster_text(address: str, why: str) -> str:
+    return f"no Ray cluster answers at {address} ({why}). Start one with `ray start --head`, or give --cluster auto"
+
+
+def _left_here() -> str | None:
+    """The address of a cluster that was started on this machine and still answers."""
+    from ray._private.services import find_bootstrap_address
+
+    # Ray keeps the address of one that has ended, and would try it for minutes.
+    address = find_bootstrap_address(None)
+    return address if address and _why_deaf(address) is None else None
+
+
 def _connect(ray: Any, address: str, how: Mapping[str, Any]) -> None:
-    if address != AUTO:
+    if address != LOCAL:
         ray.init(address=address, **how)
         return
-    with suppress(ConnectionError):
-        ray.init(address=AUTO, **how)
-    if not ray.is_initialized():
-        with _only_for_this_user():
-            ray.init(address="local", num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **how)
-        if not ray.get_runtime_context().gcs_address.startswith("127.0.0.1:"):
-            ray.shutdown()
-            raise NoCluster(
-                f"Ray {ray.__version__} would let other machines connect to the cluster that it starts: start one "
-                "yourself with `ray start --head`, and give its address"
-            )
+    with _only_for_this_user():
+        ray.init(address=LOCAL, num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **how)
+    if not ray.get_runtime_context().gcs_address.startswith("127.0.0.1:"):
+        ray.shutdown()
+        raise NoCluster(
+            f"Ray {ray.__version__} would let other machines connect to the cluster that it starts: start one "
+            "yourself with `ray start --head`, and give its address"
+        )
 
 
 @contextmanager

@@ -1,0 +1,85 @@
+"""A cluster that a job starts for itself, and addresses where there is none."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240)]
+pytest.importorskip("ray")
+STARTS = """
+import os
+import psutil
+from workbench.jobs.pool.cluster import connected
+
+with connected("local") as ray:
+    family = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    ports = [one for process in family for one in process.net_connections("inet") if one.status == "LISTEN"]
+    print(len(ports), {one.laddr.ip.removeprefix("::ffff:") for one in ports}, os.environ["RAY_AUTH_MODE"])
+_, alive = psutil.wait_procs(family[1:], timeout=20)
+print(len(alive))
+"""
+AUTO = """
+from pathlib import Path
+from workbench.jobs.pool.cluster import connected
+
+with connected() as ray:
+    print(ray.get_runtime_context().gcs_address.partition(":")[0])
+"""
+FINDS_NONE = """
+from workbench.jobs.pool.cluster import NoCluster, connected
+
+try:
+    with connected("127.0.0.1:1"):
+        pass
+except NoCluster as error:
+    print(error)
+"""
+
+
+@pytest.fixture
+def ray_folder() -> Iterator[str]:
+    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # a socket's path is short
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def run(script: str, tmp_path: Path, ray_folder: str) -> list[str]:
+    (tmp_path / "script.py").write_text(script)
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py"],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "RAY_TMPDIR": ray_folder},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_it_can_be_reached_from_this_machine_with_a_token_only_and_ends_with_the_job(
+    tmp_path: Path, ray_folder: str
+) -> None:
+    while_it_runs, after = run(STARTS, tmp_path, ray_folder)
+    count, _, rest = while_it_runs.partition(" ")
+    assert int(count) >= 4 and rest == "{'127.0.0.1'} token"
+    assert after == "0"
+
+
+def test_an_address_where_nothing_answers_is_said(tmp_path: Path, ray_folder: str) -> None:
+    (said,) = run(FINDS_NONE, tmp_path, ray_folder)
+    assert said.startswith("no Ray cluster answers at 127.0.0.1:1 ") and "`ray start --head`" in said
+
+
+def test_what_a_cluster_that_has_ended_left_is_passed_over(tmp_path: Path, ray_folder: str) -> None:
+    left = Path(ray_folder) / "ray" / "ray_current_cluster"
+    left.parent.mkdir()
+    left.write_text("127.0.0.1:1")
+    assert run(AUTO, tmp_path, ray_folder) == ["127.0.0.1"]
