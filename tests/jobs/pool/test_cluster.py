@@ -28,7 +28,6 @@ from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
 
 pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240)]
-ray = pytest.importorskip("ray")
 PLAIN = {"render_backend": "none"}
 TASK = """
 from pathlib import Path

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240)]
-pytest.importorskip("ray")
 STARTS = """
 import os
 import psutil

@@ -11,6 +11,7 @@ from typing import Any
 
 import fsspec
 import pytest
+from moto.server import ThreadedMotoServer
 
 from workbench.jobs.episodes import RecordOptions, episode_id
 from workbench.jobs.pool.deal import Deal, ThisProcess, Work
@@ -25,9 +26,7 @@ from workbench.recording.writing.upload import remove_uploaded_id, require_place
 @pytest.fixture(scope="module")
 def bucket() -> Iterator[str]:
     """An empty place of an S3 server on the loopback address."""
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(
-        ip_address="127.0.0.1", port=0, verbose=False
-    )
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
     patch = pytest.MonkeyPatch()
