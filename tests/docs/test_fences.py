@@ -37,7 +37,19 @@ KINDS = {
 RUN = ("", "slow", "wrong")
 COMMANDS = {"open": main.open_page} | {
     name: getattr(main, name)
-    for name in ("new", "record", "check", "solve", "review", "rescore", "share", "export", "view", "doctor")
+    for name in (
+        "new",
+        "record",
+        "check",
+        "solve",
+        "merge",
+        "review",
+        "rescore",
+        "share",
+        "export",
+        "view",
+        "doctor",
+    )
 }
 TYPED = [
     page for page in PAGES if any(f.language in ("python", "sh") and f.mark in RUN for f in fences(page))

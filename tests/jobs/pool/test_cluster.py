@@ -64,6 +64,7 @@ def address() -> Iterator[str]:
     try:
         nodes.add_node(num_cpus=1)
         nodes.wait_for_nodes()
+        assert nodes.address is not None
         with connected(nodes.address):
             yield nodes.address
         nodes.shutdown()

@@ -1,0 +1,237 @@
+"""Episodes a second on a Ray cluster beside local processes, and what each part costs: python tests/benchmarks/cluster.py
+
+Both sides record the same episodes with as many workers as cores, in turns. Told apart are the start (until the first
+episode is over) and the rate from there to the last; a cluster's own start is told by itself. Then with one worker. Then
+the parts that do not grow with the number of machines: a message through the post, a result at the process that deals,
+one in the job file, the files that travel.
+
+    python tests/benchmarks/cluster.py --write    # also into web_assets/docs/reference/cluster.md
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from workbench.jobs.episodes import RecordOptions, Written
+from workbench.jobs.pool.cluster import Cluster, Post, connected
+from workbench.jobs.pool.deal import Deal, Executor, Work
+from workbench.jobs.pool.job_file import Job, JobFile
+from workbench.jobs.pool.processes import Processes
+from workbench.jobs.pool.travel import pack_baggage
+from workbench.jobs.pool.worker import Gives, Listener
+from workbench.jobs.record import Recorded, record
+from workbench.jobs.task import TaskOptions
+from workbench.machine.processes.wire import Unpacker, pack, pack_message
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "web_assets" / "docs" / "reference" / "cluster.md"
+MARKS = "<!-- cluster -->\n", "<!-- /cluster -->"
+CORES = len(os.sched_getaffinity(0))
+MANY = 1000
+"""Cores that the page speaks of."""
+
+
+@dataclass(frozen=True)
+class Options:
+    task: str = "PushCube-v1"
+    episodes: int = 512
+    envs_per_worker: int = 16
+    turns: int = 3
+    write: bool = False
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording."""
+
+    start: float
+    """Seconds until the first episode was over."""
+    rate: float
+    """Episodes a second from there on."""
+    whole: float
+    """Episodes a second, start included."""
+
+
+def recorded(options: Options, executor: Executor, episodes: int) -> tuple[Run, Recorded]:
+    over: list[float] = []
+    with tempfile.TemporaryDirectory() as folder:
+        asked = RecordOptions(
+            options.task,
+            Path(folder),
+            episodes,
+            pictures=False,
+            options=TaskOptions(options.envs_per_worker, env_kwargs={"render_backend": "none"}),
+        )
+        began = time.monotonic()
+        done = record(
+            asked,
+            on_progress=lambda now: over.append(time.monotonic()) if now.over is not None else None,
+            executor=executor,
+        )
+        ended = time.monotonic()
+    assert len(over) == episodes
+    return Run(over[0] - began, (episodes - 1) / (over[-1] - over[0]), episodes / (ended - began)), done
+
+
+def post_costs(ray: Any) -> tuple[float, float]:
+    """Seconds of a request for a chunk and its answer, and messages a second that one post takes."""
+    post = ray.remote(num_cpus=0)(Post).remote()
+    ray.get(post.put.remote(0, []))
+    trips: list[float] = []
+    for _ in range(300):
+        began = time.perf_counter()
+        asked = post.ask.remote(0, [b"asks"])
+        ray.get(post.take.remote(0.1))
+        post.answer.remote(0, None)
+        ray.get(asked)
+        trips.append(time.perf_counter() - began)
+
+    @ray.remote(num_cpus=0)
+    def talk(post: Any, count: int) -> None:
+        ray.get([post.put.remote(0, [b"x" * 300]) for _ in range(count)])
+
+    ray.get([talk.remote(post, 1) for _ in range(2)])
+    began = time.perf_counter()
+    ray.get([talk.remote(post, 3000) for _ in range(2)])
+    rate = 6000 / (time.perf_counter() - began)
+    ray.kill(post)
+    return statistics.median(trips), rate
+
+
+def result_cost(one: Written) -> tuple[int, float, float]:
+    """Bytes of a result, and seconds that it takes at the process that deals, and in the job file."""
+    count = 2000
+    packed = [pack_message(Gives(number, pack(one))) for number in range(count)]
+    deal: Deal[Written | None, None] = Deal(range(count), lambda number, result: None, chunk=count)
+    work = Work(lambda setup, queue: None, None, Written | None, None, "that records")
+    listener, unpacker = Listener("a worker", work, deal), Unpacker((Gives,))
+    deal.next(0)
+    began = time.perf_counter()
+    for raw in packed:
+        listener.take(0, unpacker.message(raw))
+    taken = (time.perf_counter() - began) / count
+    with tempfile.TemporaryDirectory() as folder:
+        file = JobFile(Path(folder) / "a.job", Job("record", {"command": "record"}, b""))
+        began = time.perf_counter()
+        for number in range(300):
+            file.keep(number, one)
+        kept = (time.perf_counter() - began) / 300
+        file.close()
+    return len(packed[0]), taken, kept
+
+
+def text(options: Options) -> Iterator[str]:
+    began = time.monotonic()
+    with connected("local") as ray:
+        started = time.monotonic() - began
+        sides: dict[str, list[Run]] = {"local": [], "ray": [], "one": []}
+        executors = {"local": Processes(CORES), "ray": Cluster(workers=CORES), "one": Processes(1)}
+        one: Written | None = None
+        for _ in range(options.turns):
+            for name, executor in executors.items():
+                count = options.episodes // CORES if name == "one" else options.episodes
+                run, done = recorded(options, executor, count)
+                sides[name].append(run)
+                one = done.written[0]
+                print(name, run, flush=True)
+        trip, messages = post_costs(ray)
+    assert one is not None
+    middle = {
+        name: Run(
+            *(statistics.median(getattr(run, part) for run in runs) for part in ("start", "rate", "whole"))
+        )
+        for name, runs in sides.items()
+    }
+    size, taken, kept = result_cost(one)
+    began = time.perf_counter()
+    baggage = pack_baggage([ROOT / "tasks"])
+    packed = time.perf_counter() - began
+    local, cluster, alone = middle["local"], middle["ray"], middle["one"]
+    yield (
+        f"Measured on {date.today():%B %-d, %Y}, {CORES} cores, {options.task}, {options.episodes} episodes of 50 steps "
+        f"without pictures, {options.envs_per_worker} envs a worker; medians of {options.turns} turns of all sides in one run "
+        "(`tests/benchmarks/cluster.py`)."
+    )
+    yield ""
+    yield "| | episodes a second | first episode after | with the start |"
+    yield "| --- | ---: | ---: | ---: |"
+    for name, run in (
+        (f"{CORES} local processes", local),
+        (f"{CORES} workers of Ray, same cores", cluster),
+        ("1 local process", alone),
+    ):
+        yield f"| {name} | {run.rate:.1f} | {run.start:.1f} s | {run.whole:.1f} |"
+    yield ""
+    yield (
+        f"Ray makes {cluster.rate / local.rate:.0%} of the local rate. Its daemons start once, in {started:.1f} s, and take "
+        f"their part of the same cores. From one core to {CORES} the local rate grows {local.rate / alone.rate:.2f} times."
+    )
+    yield ""
+    yield "| what does not grow with the machines | cost |"
+    yield "| --- | ---: |"
+    yield f"| a request for a chunk through the post, and its answer | {1000 * trip:.1f} ms |"
+    yield f"| messages a second that the post takes, from two senders on these cores | {messages:,.0f} |"
+    yield f"| a result ({size} bytes) at the process that deals | {1e6 * taken:.0f} µs |"
+    yield f"| a result in the job file, on disk | {1000 * kept:.1f} ms |"
+    yield (
+        f"| the files that travel ({len(baggage.data) / 1e6:.1f} MB, the examples in `tasks/`), packed once | {1000 * packed:.0f} ms |"
+    )
+    yield ""
+    yield from on_paper(cluster.rate / CORES, messages, taken, kept, options.envs_per_worker)
+
+
+def on_paper(rate: float, messages: float, taken: float, kept: float, envs: int) -> Iterator[str]:
+    """What many cores would do.
+
+    Args:
+        rate: episodes a second of a core.
+    """
+    results = MANY * rate
+    said = results + 2 * MANY
+    parts = {
+        "the post": messages / (rate + 2) * (rate if rate else 0),
+        "the process that deals": 1 / taken,
+        "the job file": 1 / kept,
+    }
+    name, most = min(parts.items(), key=lambda pair: pair[1])
+    yield (
+        f"So {MANY:,} cores would make {results:,.0f} such episodes a second, if their files have a place to go: "
+        f"{said:,.0f} messages a second (each worker says twice a second how far it is). The post could carry "
+        f"{parts['the post']:,.0f} episodes a second, the process that deals take {parts['the process that deals']:,.0f}, the "
+        f"job file keep {parts['the job file']:,.0f}. "
+        + (
+            f"The first that would be too slow is {name}, from {most / rate:,.0f} cores on: "
+            if most < results
+            else f"The first to be too slow is {name}, at {most / rate:,.0f} cores: "
+        )
+        + "then a job goes in parts, each with a cluster's driver of its own (`--shard`), and `merge` puts them together. "
+        f"Planned episodes take a core seconds each, and are far from that. The last chunk of {envs} envs ends alone: with "
+        f"fewer than some ten chunks a worker, cores wait for it."
+    )
+
+
+def main(options: Options) -> None:
+    lines = list(text(options))
+    print("\n".join(lines))
+    if options.write:
+        pattern = f"{re.escape(MARKS[0])}.*?{re.escape(MARKS[1])}"
+        content = "\n".join([*lines, ""])
+        page = re.sub(pattern, lambda _: f"{MARKS[0]}{content}{MARKS[1]}", PAGE.read_text(), flags=re.DOTALL)
+        PAGE.write_text(page)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
