@@ -200,16 +200,16 @@ def on_paper(rate: float, messages: float, taken: float, kept: float, envs: int)
         rate: episodes a second of a core.
     """
     results = MANY * rate
-    said = results + 2 * MANY
     parts = {
-        "the post": messages / (rate + 2) * (rate if rate else 0),
+        # Each worker says once a second what it has made.
+        "the post": messages * rate,
         "the process that deals": 1 / taken,
         "the job file": 1 / kept,
     }
     name, most = min(parts.items(), key=lambda pair: pair[1])
     yield (
         f"So {MANY:,} cores would make {results:,.0f} such episodes a second, if their files have a place to go: "
-        f"{said:,.0f} messages a second (each worker says twice a second how far it is). The post could carry "
+        f"{MANY:,} messages a second (each worker says once a second what it has made). The post could carry "
         f"{parts['the post']:,.0f} episodes a second, the process that deals take {parts['the process that deals']:,.0f}, the "
         f"job file keep {parts['the job file']:,.0f}. "
         + (

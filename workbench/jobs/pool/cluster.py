@@ -27,15 +27,15 @@ from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
 from workbench.jobs.gather import package_versions
 from workbench.jobs.pool.deal import NO_LIMIT, Chunk, Deal, PoolError, Result, Setup, Update, Work
 from workbench.jobs.pool.travel import Baggage, pack_baggage, relocated
-from workbench.jobs.pool.worker import MESSAGES, Asks, Gives, Listener, Message, WorkerQueue, work_on
+from workbench.jobs.pool.worker import MESSAGES, Asks, Listener, Message, WorkerQueue, work_on
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
 
 AUTO, LOCAL = "auto", "local"
 _LOOK_SECONDS = 0.1
-_SAY_SECONDS = 0.5
-"""How often a worker says how far it is: the post takes some thousand messages a second from all of them."""
+_SAY_SECONDS = 1.0
+"""How often a worker says what it has made: the post takes some thousand messages a second from all of them."""
 _END_SECONDS = 120.0
 """How long a stopped worker may take to write the items that have ended."""
 _DEAF_SECONDS = 5.0
@@ -162,6 +162,8 @@ def _only_for_this_user() -> Iterator[None]:
     ray_constants.ENABLE_RAY_CLUSTER = False
     # The first for the daemons, which import the constant anew.
     os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"
+    # As local processes have it; Ray's own 15 is for machines that others work on.
+    os.environ.setdefault("RAY_worker_niceness", "0")
     # Else Ray writes one into the home folder, where others may read it. It asks for tokens by itself.
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
     try:
@@ -450,7 +452,7 @@ class _PostQueue(WorkerQueue):
 
     def send(self, message: Message) -> None:
         self._waiting.append(pack_message(message))
-        if isinstance(message, Gives) or time.monotonic() - self._said > _SAY_SECONDS:
+        if time.monotonic() - self._said > _SAY_SECONDS:
             self._send()
 
     def flush(self) -> None:
