@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from rich.markup import escape
@@ -12,9 +14,12 @@ from rich.markup import escape
 from workbench.cli.arguments import JobArguments
 from workbench.cli.terminal import err, print_text
 from workbench.jobs.pool.cluster import Cluster
-from workbench.jobs.pool.deal import Executor, Shard, ThisProcess, parse_shard
+from workbench.jobs.pool.deal import Executor, Failure, Shard, ThisProcess, parse_shard
 from workbench.jobs.pool.job_file import Job, JobFile, Kept
 from workbench.jobs.pool.processes import Processes
+from workbench.jobs.record import RecordProgress
+from workbench.machine.text import listed
+from workbench.recording.library.jobs import JobFailure, JobState, JobStatus, StatusFile
 
 
 def require_job(arguments: JobArguments) -> None:
@@ -78,6 +83,72 @@ def run_by(
         yield Kept(executor, file, shard), file.run
     finally:
         file.close()
+
+
+class ToldStatus:
+    """Tells a folder how far the job is that records into it: `told_in_folder`."""
+
+    def __init__(self, file: StatusFile | None, status: JobStatus) -> None:
+        self._file, self._status = file, status
+        self._began: float | None = None
+
+    def beside(self, show: Callable[[RecordProgress], None]) -> Callable[[RecordProgress], None]:
+        """Progress goes to `show` too."""
+
+        def both(now: RecordProgress) -> None:
+            show(now)
+            self._show(now)
+
+        return both
+
+    def end(self, state: JobState) -> None:
+        self._status = replace(self._status, state=state)
+        if self._file is not None:
+            self._file.write(self._status)
+
+    def _show(self, now: RecordProgress) -> None:
+        if self._began is None:
+            self._began, self._first = time.monotonic(), now.kept
+        seconds = time.monotonic() - self._began
+        rate = (now.done - self._first) / seconds if seconds > 1 else 0.0
+        kinds: dict[object, list[Failure]] = {}
+        for failure in now.failures:
+            problem = failure.problem
+            kinds.setdefault((problem.stage, problem.file, problem.line), []).append(failure)
+        failures = []
+        for alike in kinds.values():
+            numbers = sorted(number for failure in alike for number in failure.numbers)
+            problem = alike[0].problem
+            place = f"{problem.file}:{problem.line}: " if problem.file else ""
+            failures.append(
+                JobFailure(listed(numbers), len(numbers), f"{place}{problem.message}", problem.traceback)
+            )
+        self._status = replace(
+            self._status, done=now.kept, rate=rate, failures=tuple(failures), state="running"
+        )
+        if self._file is not None:
+            self._file.write(self._status)
+
+
+@contextmanager
+def told_in_folder(
+    arguments: JobArguments, command: str, task: str, out: Path | str, total: int
+) -> Iterator[ToldStatus]:
+    """Write into a folder of recordings how far the job is, for a page that shows it.
+
+    Args:
+        out: empty for none.
+    """
+    part = "" if arguments.shard is None else str(shard_of(arguments))
+    file = StatusFile(Path(out)) if out else None
+    if file is not None:
+        file.remove_old()
+    told = ToldStatus(file, JobStatus(command, task, 0, total, part=part))
+    try:
+        yield told
+    except BaseException:
+        told.end("failed")
+        raise
 
 
 def print_part(arguments: JobArguments, command: str, stopped: bool) -> None:

@@ -14,7 +14,7 @@ from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import TaskError
 from workbench.cli.arguments import ONE_WORKER, JobArguments
-from workbench.cli.jobs import items_of, print_part, run_by
+from workbench.cli.jobs import items_of, print_part, run_by, told_in_folder
 from workbench.cli.terminal import (
     Exit,
     err,
@@ -84,7 +84,8 @@ class RecordBar:
         if not self.stop_requested:
             rate = f"{now.steps / seconds:.0f} steps a second"
             at = "" if self._first_seed is None else underway_text(now.by_seed(self._first_seed), now.limit)
-            self.describe(f"{self._doing}, {at or rate}")
+            failed = sum(len(failure.numbers) for failure in now.failures)
+            self.describe(f"{self._doing}, {at or rate}" + (f", {failed} failed" if failed else ""))
         if now.over is not None and not err.is_terminal:
             # A bar in a file or a pipe is drawn once, at the end: a job's log would say nothing for hours.
             number, kept = now.over
@@ -127,19 +128,21 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
         with (
             run_by(run, "record", -(-most // chunk), lambda: job_of_record(requested)) as (executor, name),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
+            told_in_folder(run, "record", what.task, "" if what.upload else what.out, wanted) as status,
         ):
             first_seed = what.options.seed if what.actions == SOLVE else None
             with RecordBar(bar, wanted, first_seed=first_seed) as record_bar:
                 recorded = record(
                     what,
                     record_bar.describe,
-                    record_bar.show,
+                    status.beside(record_bar.show),
                     lambda: record_bar.stop_requested,
                     print_finding,
                     executor,
                     name,
                 )
             record_bar.describe("recorded", len(recorded.written))
+            status.end("stopped" if recorded.stopped else "done")
     except TaskError as error:
         print_problem(error.problem)
         _print_kept(what, before)

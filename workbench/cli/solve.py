@@ -20,7 +20,7 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.rules import RULES
 from workbench.cli.arguments import ONE_WORKER, JobArguments
 from workbench.cli.check_reports import json_text, xml_text
-from workbench.cli.jobs import items_of, print_part, run_by
+from workbench.cli.jobs import items_of, print_part, run_by, told_in_folder
 from workbench.cli.record import RecordBar
 from workbench.cli.terminal import (
     Exit,
@@ -88,16 +88,18 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
         recover_confined(what.out)
         left = (TextColumn("left"), TimeRemainingColumn())
         chunk = chunk_of(what.seeds, 1)
+        count = items_of(run, what.seeds, chunk)
         with (
             stdout_to_stderr(),
             run_by(run, "solve", -(-what.seeds // chunk), lambda: _job_of(what)) as (executor, name),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
+            told_in_folder(run, "solve", what.task, "" if what.upload else what.out, count) as status,
         ):
-            with RecordBar(bar, items_of(run, what.seeds, chunk), "solving", what.options.seed) as shown:
+            with RecordBar(bar, count, "solving", what.options.seed) as shown:
                 report = solve(
                     what,
                     shown.describe,
-                    shown.show,
+                    status.beside(shown.show),
                     lambda: shown.stop_requested,
                     print_finding,
                     executor,
@@ -105,6 +107,7 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
                     on_failures=failures.extend,
                 )
             shown.describe("solved", len(report.seeds))
+            status.end("stopped" if report.stopped else "done")
     except TaskError as error:
         print_problem(error.problem)
         return Exit.FAILED

@@ -47,6 +47,8 @@ class RecordProgress:
     """Control steps after which one of them ends at the latest."""
     done: float = 0.0
     """As `kept`; where every episode is kept, those under way count in part."""
+    failures: tuple[Failure, ...] = ()
+    """Episodes so far, by number, that gave no result."""
 
     def by_seed(self, first: int) -> dict[int, int]:
         """`running` by seed, where episode 0 has seed `first`."""
@@ -241,7 +243,8 @@ class _Recording:
         part = sum(min(steps / max(self._step_limit, 1), 1.0) for steps in running.values())
         kept = len(self._kept)
         done = kept + (part if self._wanted is None else 0.0)
-        self._on_progress(RecordProgress(kept, self._steps, over, running, self._step_limit, done))
+        failures = tuple(self.deal.failures)
+        self._on_progress(RecordProgress(kept, self._steps, over, running, self._step_limit, done, failures))
 
     def _remove(self, episode: Written) -> None:
         if self._upload:

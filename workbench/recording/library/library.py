@@ -22,6 +22,7 @@ from workbench.recording.episode.row import (
     clean_text,
 )
 from workbench.recording.library.index import IndexedFiles, LibraryIndex
+from workbench.recording.library.jobs import JobStatus, read_jobs
 from workbench.recording.library.trash import (
     Trash,
     TrashError,
@@ -61,6 +62,8 @@ class LibraryView:
     problem: str | None = None
     """A sentence, if the folder cannot be listed."""
     trash: Trash = Trash()
+    jobs: tuple[JobStatus, ...] = ()
+    """Jobs that record into the folder, or have until a while ago."""
 
 
 class Library:
@@ -138,6 +141,7 @@ class Library:
             began = time.monotonic()
             try:
                 self.refresh(thorough=self._scan_requested.is_set())
+                self._publish(jobs=read_jobs(self.folder, time.time()))
             except Exception:
                 # If the thread ended, the table would never change again.
                 log.exception("The library in %s could not be read; trying again.", self.folder)

@@ -25,6 +25,7 @@ from workbench.ui.library.rows import (
     cells,
     chosen,
     has_outcome,
+    job_text,
     newest_sources,
     none_like_that,
 )
@@ -35,6 +36,8 @@ from workbench.ui.widgets.inputs import Control, tell_all
 from workbench.ui.widgets.parts import Clock, PagePart
 from workbench.ui.widgets.templates import render
 
+MOST_JOBS = 6
+"""Jobs that are shown at once."""
 MOST_OPEN = 4
 """Recordings that a review shows at once."""
 TYPING = 0.2
@@ -104,6 +107,7 @@ class LibraryPanel(PagePart[object]):
                 key="delete",
             ),
         ]
+        self._jobs = server.gui.add_html("", visible=False)
         self._filters = server.gui.add_html("")
         self._find = Control(
             server.gui.add_text(
@@ -126,6 +130,7 @@ class LibraryPanel(PagePart[object]):
         self._number_of: dict[str, int] = {}
         """Number of each recording's row, from 1 on, in the order in which they came."""
         self._drawn: object = None
+        self._jobs_drawn: object = None
         self._filters_drawn: object = None
         """What the filters were counted for: with thousands of rows counting takes long."""
         self._table_drawn: object = None
@@ -201,6 +206,7 @@ class LibraryPanel(PagePart[object]):
         view = self._library.view()
         with self._lock, self._list.lock:
             self._find.show(self._list.words)
+            self._draw_jobs(view)
             wanted = (view.serial, self._list.state(), len(self._actions))
             if wanted == self._drawn:
                 return
@@ -213,6 +219,20 @@ class LibraryPanel(PagePart[object]):
             self._draw_marks(page)
             empty = self._press("empty", self._edits.ask_empty)
             self._trash.content = render("library_trash", trash=view.trash, empty=empty)
+
+    def _draw_jobs(self, view: LibraryView) -> None:
+        """How far the jobs are that record into the folder, each with what failed."""
+        now = time.time()
+        wanted = (view.jobs, [job.is_silent(now) for job in view.jobs])
+        if wanted == self._jobs_drawn:
+            return
+        self._jobs_drawn = wanted
+        shown = [
+            {"of": job, "how": job_text(job, now), "runs": job.state == "running" and not job.is_silent(now)}
+            for job in view.jobs[:MOST_JOBS]
+        ]
+        self._jobs.content = render("library_jobs", jobs=shown)
+        self._jobs.visible = bool(shown)
 
     def _draw_filters(self, view: LibraryView) -> None:
         listed = self._list

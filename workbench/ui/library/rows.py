@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from workbench.machine.text import number_text
 from workbench.recording.episode.row import LibraryRow
+from workbench.recording.library.jobs import JobStatus
 from workbench.ui.widgets.templates import counted, size
 
 Column = Literal["task", "date", "seed", "steps", "return", "success", "version", "tags", "note", "name"]
@@ -190,3 +191,28 @@ def in_words(rows: Sequence[LibraryRow]) -> str:
     by_files = {row.paths: row.size for row in rows}
     what, of = counted(len(rows), "recording"), counted(len(files), "file")
     return f"{what} ({of}, {size(sum(by_files.values()))})"
+
+
+def job_text(job: JobStatus, now: float) -> str:
+    """How a job stands, as the end of a sentence."""
+    if job.is_silent(now):
+        return ", ended without a word: the same command goes on, if it was given --job"
+    if job.state == "stopped":
+        return ", stopped"
+    if job.state == "failed":
+        return ", ended with a failure"
+    if job.state == "done":
+        return ", done"
+    rate = (
+        f", {job.rate:.1f} a second"
+        if job.rate >= 0.1
+        else f", {60 * job.rate:.1f} a minute"
+        if job.rate
+        else ""
+    )
+    left = job.seconds_left
+    if left is None:
+        return rate or ", opening the task"
+    minutes, hours = left / 60, left / 3600
+    when = f"{left:.0f} s" if left < 100 else f"{minutes:.0f} min" if minutes < 100 else f"{hours:.0f} h"
+    return f"{rate}, {when} left"

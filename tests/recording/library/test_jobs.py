@@ -1,0 +1,104 @@
+"""How far a job is that records into a folder, in the library of that folder."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from workbench.recording.library.jobs import (
+    SILENT_SECONDS,
+    JobFailure,
+    JobStatus,
+    StatusFile,
+    read_jobs,
+)
+from workbench.recording.library.library import Library
+from workbench.ui.library.rows import job_text
+from workbench.ui.widgets.templates import render
+
+RUNS = JobStatus("record", "my_task.py", 40, 100, rate=2.0)
+
+
+def test_a_job_is_seen_while_it_runs_and_a_while_after(tmp_path: Path) -> None:
+    now = 1e9
+    file = StatusFile(tmp_path, lambda: now)
+    file.write(RUNS)
+    (status,) = read_jobs(tmp_path, now + 1)
+    assert (status.done, status.total, status.seconds_left) == (40, 100, 30.0)
+    assert job_text(status, now + 1) == ", 2.0 a second, 30 s left"
+    assert status.is_silent(now + SILENT_SECONDS + 1)
+    file.write(JobStatus("record", "my_task.py", 100, 100, state="done"))
+    assert [one.state for one in read_jobs(tmp_path, now + 60)] == ["done"]
+    assert read_jobs(tmp_path, now + 3601) == ()
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_it_is_written_once_a_second_and_its_end_at_once(tmp_path: Path) -> None:
+    now = 1e9
+    file = StatusFile(tmp_path, lambda: now)
+    for done in range(5):
+        file.write(JobStatus("record", "my_task.py", done, 100))
+    assert read_jobs(tmp_path, now)[0].done == 0
+    file.write(JobStatus("record", "my_task.py", 4, 100, state="stopped"))
+    assert read_jobs(tmp_path, now)[0].state == "stopped"
+
+
+def test_a_folder_that_is_not_there_is_not_made(tmp_path: Path) -> None:
+    StatusFile(tmp_path / "gone").write(RUNS)
+    assert not (tmp_path / "gone").exists() and read_jobs(tmp_path / "gone", 0.0) == ()
+
+
+def test_what_an_earlier_job_left_goes(tmp_path: Path) -> None:
+    file = StatusFile(tmp_path, lambda: 1e9)
+    file.write(RUNS)
+    file.remove_old()
+    assert list(tmp_path.iterdir()) == [], "its time is years after that"
+
+
+@given(content=st.binary(max_size=200) | st.builds(lambda value: msgspec.json.encode(value), st.dictionaries(
+    st.sampled_from(["command", "task", "done", "total", "state", "failures", "written_at", "rate"]),
+    st.none() | st.integers() | st.text() | st.floats(allow_nan=False, allow_infinity=False) | st.lists(st.integers()),
+)))  # fmt: skip
+def test_a_file_that_is_anything_else_is_passed_over_or_read_as_data(content: bytes) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / ".job-0.json").write_bytes(content)
+        for status in read_jobs(Path(folder), time.time()):
+            assert isinstance(status, JobStatus)
+
+
+def test_what_is_written_in_it_is_text_on_the_page(tmp_path: Path) -> None:
+    bad = "<script>alert(1)</script>"
+    failure = JobFailure(bad, 2, bad, f"  {bad}\n\x1b[31m")
+    StatusFile(tmp_path).write(JobStatus(bad, bad, 1, 2, failures=(failure,)))
+    jobs = [
+        {"of": job, "how": job_text(job, job.written_at), "runs": True}
+        for job in read_jobs(tmp_path, time.time())
+    ]
+    shown = render("library_jobs", jobs=jobs)
+    assert "<script" not in shown and "&lt;script&gt;" in shown and "\x1b" not in shown
+    assert "2 failed" in shown
+
+
+@pytest.mark.usefixtures("child_process")
+def test_the_library_has_the_jobs_of_its_folder(tmp_path: Path) -> None:
+    from tests.drive.waiting import until
+
+    library = Library(tmp_path)
+    library.watch()
+    try:
+        file = StatusFile(tmp_path)
+        file.write(RUNS)
+        until(lambda: [job.done for job in library.view().jobs] == [40], "the job")
+        before = library.view().serial
+        file.write(JobStatus("record", "my_task.py", 100, 100, state="done"))
+        until(lambda: library.view().jobs[0].state == "done", "its end")
+        assert library.view().serial > before
+    finally:
+        library.close()

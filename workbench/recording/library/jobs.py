@@ -1,0 +1,134 @@
+"""How far a job is that records into a folder: the command writes it there, and a library of the folder shows it."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from workbench.machine.files import read_regular_file, replace_file
+from workbench.recording.episode.row import clean_text
+
+_PREFIX, _SUFFIX = ".job-", ".json"
+_MOST_BYTES = 1 << 18
+_MOST = 64
+"""Files that are looked at: a job in 64 parts has as many."""
+_WRITE_SECONDS = 1.0
+SILENT_SECONDS = 20.0
+"""Without a word for so long, a job is taken for dead."""
+_KEPT_SECONDS = 3600.0
+"""How long the last word of a job is shown."""
+_MOST_FAILURES = 5
+
+JobState = Literal["running", "done", "stopped", "failed"]
+
+
+@dataclass(frozen=True)
+class JobFailure:
+    """Items that failed alike."""
+
+    items: str
+    """Their names."""
+    count: int
+    message: str
+    traceback: str = ""
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """A job at one moment."""
+
+    command: str
+    """As in ``record``."""
+    task: str
+    done: int
+    total: int
+    """Episodes that are over, and that are wanted."""
+    rate: float = 0.0
+    """Episodes a second since it began; 0 if unknown."""
+    failures: tuple[JobFailure, ...] = ()
+    state: JobState = "running"
+    part: str = ""
+    """Of a part, as in ``3/64``."""
+    written_at: float = 0.0
+    """Seconds since 1970."""
+
+    @property
+    def failed(self) -> int:
+        return sum(failure.count for failure in self.failures)
+
+    @property
+    def seconds_left(self) -> float | None:
+        left = self.total - self.done - self.failed
+        return left / self.rate if self.state == "running" and self.rate > 0 else None
+
+    def is_silent(self, now: float) -> bool:
+        """Whether it was ended without a word."""
+        return self.state == "running" and now - self.written_at > SILENT_SECONDS
+
+
+class StatusFile:
+    """Writes how far a job is, at most once a second. What cannot be written is left out: it must not end the job."""
+
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
+        self._folder, self._clock = folder.absolute(), clock
+        self._path = self._folder / f"{_PREFIX}{uuid.uuid4().hex[:12]}{_SUFFIX}"
+        self._written_at = 0.0
+
+    def write(self, status: JobStatus) -> None:
+        now = self._clock()
+        if status.state == "running" and now - self._written_at < _WRITE_SECONDS:
+            return
+        if not self._folder.is_dir():
+            return  # nothing is recorded yet
+        self._written_at = now
+        with contextlib.suppress(OSError):
+            replace_file(self._path, msgspec.json.encode(replace(status, written_at=now)))
+
+    def remove_old(self) -> None:
+        """Remove what jobs of an earlier hour left."""
+        for path in sorted(self._folder.glob(f"{_PREFIX}*{_SUFFIX}"))[: 10 * _MOST]:
+            with contextlib.suppress(OSError):
+                if self._clock() - path.stat().st_mtime > _KEPT_SECONDS:
+                    path.unlink()
+
+
+def read_jobs(folder: Path, now: float) -> tuple[JobStatus, ...]:
+    """The jobs of a folder that are running, or ended within the last hour; the last word first. The files may be anybody's:
+    what is no status is passed over, and texts are cleaned."""
+    found: list[JobStatus] = []
+    with contextlib.suppress(OSError):
+        for path in sorted(folder.glob(f"{_PREFIX}*{_SUFFIX}"))[:_MOST]:
+            with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeError):
+                status = msgspec.json.decode(read_regular_file(path, _MOST_BYTES), type=JobStatus)
+                if 0 <= now - status.written_at < _KEPT_SECONDS:
+                    found.append(_cleaned(status))
+    return tuple(sorted(found, key=lambda status: -status.written_at))
+
+
+def _cleaned(status: JobStatus) -> JobStatus:
+    return replace(
+        status,
+        command=clean_text(status.command, 40),
+        task=clean_text(status.task, 200),
+        part=clean_text(status.part, 20),
+        failures=tuple(
+            JobFailure(
+                clean_text(one.items, 200),
+                max(one.count, 0),
+                clean_text(one.message, 500),
+                # Not the spaces before a line, which say what belongs to what.
+                "\n".join(
+                    line[: len(line) - len(line.lstrip(" "))][:40] + clean_text(line, 300)
+                    for line in one.traceback.splitlines()[:200]
+                ),
+            )
+            for one in status.failures[:_MOST_FAILURES]
+        ),
+    )
