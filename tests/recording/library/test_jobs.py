@@ -54,7 +54,7 @@ def test_a_folder_that_is_not_there_is_not_made(tmp_path: Path) -> None:
 
 
 def test_what_an_earlier_job_left_goes(tmp_path: Path) -> None:
-    file = StatusFile(tmp_path, lambda: 1e9)
+    file = StatusFile(tmp_path, lambda: 1e10)
     file.write(RUNS)
     file.remove_old()
     assert list(tmp_path.iterdir()) == [], "its time is years after that"
