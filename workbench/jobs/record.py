@@ -24,8 +24,8 @@ from workbench.jobs.pool.processes import Processes
 from workbench.jobs.pool.travel import needed_by
 from workbench.recording.writing.upload import remove_uploaded
 
-TRIES = 3
-"""How often an episode is begun whose workers die."""
+TRIES = 2
+"""How often a chunk of episodes is begun whose workers die, before they are tried one by one."""
 _LONG_JOB = 256
 """Batches. From here on a chunk has several: the envs of one wait for each other only at its end."""
 _BATCHES = 4

@@ -213,9 +213,9 @@ def test_what_fails_each_time_is_told_at_the_end_and_all_else_is_done(
 ) -> None:
     run = Run(Setup(how, 4, folder=tmp_path), range(9), chunk=3, tries=2, goes_on=True)
     run.by(Processes(2))
-    assert sorted(run.results) == [0, 1, 2, 3, 6, 7, 8]
+    assert sorted(run.results) == [0, 1, 2, 3, 5, 6, 7, 8]
     (failure,) = run.failures
-    assert (failure.numbers, failure.problem.stage) == ((4, 5), stage)
+    assert (failure.numbers, failure.problem.stage) == ((4,), stage)
 
 
 @child_process
@@ -301,6 +301,20 @@ def test_a_chunk_of_a_dead_worker_comes_again_after_the_others_without_what_it_g
     assert later[2] == Chunk((0, 1), frozenset({0}), again=True)
     with pytest.raises(PoolError, match="that it does not have"):
         told.deal.result("b", 1, 1)
+
+
+def test_the_items_of_a_chunk_that_failed_are_tried_one_by_one_before_all_others() -> None:
+    told = Told(range(9), chunk=3)
+    told.deal.next("a")
+    told.deal.result("a", 1, 1)
+    told.deal.failed("a", problem(7))
+    dealt = [told.deal.next("b") for _ in range(3)]
+    assert dealt == [
+        Chunk((0,), frozenset({0}), again=True),
+        Chunk((2,), frozenset({2}), again=True),
+        Chunk((3, 4, 5), frozenset({3, 4, 5})),
+    ]
+    assert not told.failures
 
 
 def test_the_first_chunks_that_fail_alike_end_the_job() -> None:

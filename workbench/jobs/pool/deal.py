@@ -143,6 +143,8 @@ class Deal(Generic[Result, Update]):
         self._left = self._chunks()
         self._ahead: deque[Chunk] = deque()
         """Taken of `_left` already."""
+        self._alone: deque[Chunk] = deque()
+        """Items of a chunk that failed, each by itself: dealt first, to know which ones fail."""
         self._returned: deque[Chunk] = deque()
         self._held: dict[Hashable, list[_Held]] = {}
         self._deaths: dict[int, int] = {}
@@ -177,19 +179,23 @@ class Deal(Generic[Result, Update]):
     def next(self, worker: Hashable) -> Chunk | None:
         """The next chunk for this worker."""
         limit = self.limit()
-        chunk = self._ahead.popleft() if self._look(1) else None
-        if chunk is None:
-            while self._returned and min(self._returned[0].wanted) >= limit:
-                self._returned.popleft()
-            chunk = self._returned.popleft() if self._returned else None
-        if chunk is not None:
-            self._held.setdefault(worker, []).append(_Held(chunk, set(chunk.wanted)))
-        return chunk
+        for waiting in (self._alone, self._ahead, self._returned):
+            if waiting is self._ahead:
+                self._look(1)
+            while waiting and min(waiting[0].wanted) >= limit:
+                if waiting is self._ahead:
+                    break  # all after it are further
+                waiting.popleft()
+            if waiting and min(waiting[0].wanted) < limit:
+                chunk = waiting.popleft()
+                self._held.setdefault(worker, []).append(_Held(chunk, set(chunk.wanted)))
+                return chunk
+        return None
 
     def count_left(self, most: int) -> int:
         """Chunks that can be dealt, counted up to `most`."""
         limit = self.limit()
-        again = sum(min(chunk.wanted) < limit for chunk in self._returned)
+        again = sum(min(chunk.wanted) < limit for chunk in (*self._alone, *self._returned))
         return min(self._look(most) + again, most)
 
     def limit(self) -> int:
@@ -224,7 +230,7 @@ class Deal(Generic[Result, Update]):
             raise PoolError("ended before it was done")
 
     def failed(self, worker: Hashable, error: TaskError) -> None:
-        """The author's code failed in the last chunk of this worker, which has ended.
+        """The author's code failed in the last chunk of this worker, which has ended. Its items are dealt one by one then.
 
         Raises:
             TaskError: the job is over: no item was begun, or the failure is one too many of its kind.
@@ -235,6 +241,8 @@ class Deal(Generic[Result, Update]):
         *others, last = held
         for one in others:
             self._give_back(one)
+        if self._divide(last):
+            return
         self._note(last, error.problem)
         at = error.problem.stage, error.problem.file, error.problem.line
         if self._alike(at, last):
@@ -268,7 +276,7 @@ class Deal(Generic[Result, Update]):
                 self._give_back(one)
             if self._alike(code, one):
                 raise PoolError(how)
-            if over:
+            if over and not self._divide(one):
                 if self._on_failure is None or not (self.results or self.count_left(1)):
                     raise PoolError(how)
                 self._note(one, Problem("worker", f"the worker {how}", None, None, None, ""))
@@ -294,6 +302,17 @@ class Deal(Generic[Result, Update]):
 
     def _give_back(self, held: _Held) -> None:
         self._returned.append(Chunk(held.chunk.numbers, frozenset(held.missing), again=True))
+
+    def _divide(self, held: _Held) -> bool:
+        """Have the missing items of a chunk dealt one by one; False if there is only one."""
+        limit = self.limit()
+        missing = sorted(number for number in held.missing if number < limit)
+        if len(held.chunk.numbers) == 1 or not missing or self._on_failure is None:
+            return False
+        for number in missing:
+            self._alone.append(Chunk((number,), frozenset((number,)), again=True))
+            self._deaths[number] = self._tries - 1
+        return True
 
     def _note(self, held: _Held, problem: Problem) -> None:
         limit = self.limit()
