@@ -17,6 +17,8 @@ from tests.jobs.pool import work
 from tests.jobs.pool.work import PROBLEM, Setup, Squared, square
 from workbench.authoring.problem import Problem, TaskError
 from workbench.jobs.pool.deal import (
+    FIRST_ALIKE,
+    LATER_ALIKE,
     Chunk,
     Deal,
     Executor,
@@ -317,29 +319,34 @@ def test_the_items_of_a_chunk_that_failed_are_tried_one_by_one_before_all_others
     assert not told.failures
 
 
-def test_the_first_chunks_that_fail_alike_end_the_job() -> None:
-    told = Told(range(10))
-    for number in range(2):
+@pytest.mark.parametrize(("before", "most"), [(0, FIRST_ALIKE), (1, LATER_ALIKE)])
+def test_chunks_that_fail_alike_end_the_job_the_first_ones_soonest(before: int, most: int) -> None:
+    told = Told(range(100))
+    for number in range(before):
+        told.deal.next(number)
+        told.deal.result(number, number, 0)
+    for number in range(before, before + most - 1):
         assert told.deal.next(number) is not None
         told.deal.failed(number, problem(7))
-    assert told.deal.next(2) is not None
+    assert told.deal.next("last") is not None
     with pytest.raises(TaskError, match="it broke at 7"):
-        told.deal.failed(2, problem(7))
-    assert [failure.numbers for failure in told.failures] == [(0,), (1,), (2,)]
+        told.deal.failed("last", problem(7))
+    assert len(told.failures) == most
 
 
 def test_failures_at_different_places_or_between_results_do_not() -> None:
-    told = Told(range(20))
-    for number, line in enumerate([1, 2, 1, 2]):
+    told = Told(range(100))
+    for number in range(2 * FIRST_ALIKE - 2):
         told.deal.next(number)
-        told.deal.failed(number, problem(line))
-    for number in range(4, 10):
-        told.deal.next(number)
+        told.deal.failed(number, problem(number % 2))
+    for number in range(20, 20 + 3 * LATER_ALIKE):
+        chunk = told.deal.next(number)
         if number % 2:
             told.deal.failed(number, problem(1))
         else:
-            told.deal.result(number, number, 0)
-    assert len(told.failures) == 7 and told.deal.count_left(99) == 10
+            assert chunk is not None
+            told.deal.result(number, chunk.numbers[0], 0)
+    assert told.deal.count_left(99) == 100 - (2 * FIRST_ALIKE - 2) - 3 * LATER_ALIKE
 
 
 def test_a_job_without_a_result_is_a_failure() -> None:

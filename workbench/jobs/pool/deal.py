@@ -14,8 +14,10 @@ from typing import Any, Generic, Protocol, TypeVar
 from workbench.authoring.problem import Problem, TaskError
 
 NO_LIMIT = sys.maxsize
-MOST_ALIKE = 3
-"""Chunks that may fail alike one after another: then the others would fail too."""
+FIRST_ALIKE, LATER_ALIKE = 5, 20
+"""Chunks that may fail alike one after another, before the first result and after it: then the others would fail too."""
+_STARTS = 3
+"""Workers that may die before their first chunk."""
 
 Setup = TypeVar("Setup")
 Result = TypeVar("Result")
@@ -266,7 +268,7 @@ class Deal(Generic[Result, Update]):
         if not held:
             # Before its first chunk: it is the machine, or the import.
             self._failed_alike.append((code, -len(self._failed_alike) - 1))
-            if len(self._failed_alike) >= MOST_ALIKE:
+            if len(self._failed_alike) >= _STARTS:
                 raise PoolError(how)
         for one in held:
             first = one.chunk.numbers[0]
@@ -324,7 +326,8 @@ class Deal(Generic[Result, Update]):
     def _alike(self, key: object, held: _Held) -> bool:
         """Note a failure of this kind; whether that many chunks failed alike one after another."""
         self._failed_alike.append((key, held.chunk.numbers[0]))
-        return len({first for kind, first in self._failed_alike if kind == key}) >= MOST_ALIKE
+        alike = {first for kind, first in self._failed_alike if kind == key}
+        return len(alike) >= (LATER_ALIKE if self.results else FIRST_ALIKE)
 
 
 @dataclass(frozen=True)
