@@ -174,7 +174,9 @@ class Episode:
     def flag(self, name: str) -> NDArray[np.bool_] | None:
         """(T + 1,) of an entry of ``evaluate()`` with one value per state, False where it is NaN; None if there is none."""
         values = self.evaluate.get(name)
-        return None if values is None or values.ndim != 1 else np.nan_to_num(values.astype(np.float64)) != 0
+        if values is None or values.ndim != 1:
+            return None
+        return values.copy() if values.dtype == np.bool_ else np.nan_to_num(values.astype(np.float64)) != 0
 
     @property
     def flags(self) -> dict[str, NDArray[np.bool_]]:
