@@ -23,11 +23,12 @@ from workbench.core.scene.simplify import (
     flat_rectangle,
     reduce_mesh,
     rounded,
+    share_smooth,
     share_vertices,
 )
 from workbench.machine.folders import cache_folder, read_private, write_private
 
-_VERSION = 1
+_VERSION = 2
 """Of the files; another one for other levels."""
 _FEWEST_FACES = 24
 _LOST, _USELESS = 0.01, 0.1
@@ -96,7 +97,7 @@ def reduced_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     if kept:
         return kept[0].mesh
     made = reduce_mesh(mesh, max_faces)
-    made = share_vertices(made if made is mesh else rounded(made))
+    made = share_vertices(made if made is mesh else rounded(share_smooth(made)))
     _write(name, (Level(made, 0.0),))
     return made
 

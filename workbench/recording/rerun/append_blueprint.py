@@ -72,6 +72,7 @@ def _encoded(application_id: str, blueprint: rrb.Blueprint) -> bytes:
             application_id=application_id, make_default=False, make_thread_default=False, default_enabled=True
         )
     )
+    layout.set_log_time_enabled(False)  # else the index has three more columns for each component
     layout.set_time("blueprint", sequence=0)
     blueprint._log_to_stream(layout)
     streams: list[bytes] = []

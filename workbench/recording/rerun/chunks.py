@@ -15,8 +15,8 @@ from rerun.chunk import Chunk
 
 STEP = "step"
 SIM_TIME = "sim_time"
-SURFACE = "surface"
-"""Component of a visual: its colour as red, green, blue and alpha, then how metallic and how rough it is."""
+LOOK = "look"
+"""Component of a visual, JSON: its name, its colour as red, green, blue and alpha, how metallic and how rough it is."""
 _MOST_TIMES = 64
 SERIES_COLORS = (
     (86, 180, 233),

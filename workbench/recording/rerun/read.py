@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from collections import OrderedDict
@@ -25,7 +26,7 @@ from workbench.recording.episode.encoded_pictures import (
     decode,
     encode,
 )
-from workbench.recording.rerun.chunks import STEP, SURFACE
+from workbench.recording.rerun.chunks import LOOK, STEP
 from workbench.recording.rerun.private_api import IndexedChunk, decode_chunk, index_of
 
 _PROPERTIES = "/__properties"
@@ -185,9 +186,9 @@ class RerunTable:
         mesh = self._mesh(entity)
         if mesh is None:
             return None
-        name = str(self._one(entity, "visual", default))
-        mesh, material = self._shapes.shared(mesh, self._material(entity))
-        if entity in self._alone and (entity, "visual") in self._static:
+        name, material = self._look(entity, default)
+        mesh, material = self._shapes.shared(mesh, material)
+        if entity in self._alone and {(entity, LOOK), (entity, "visual")} & self._static.keys():
             self._shapes.learn(_content_key(self._alone[entity]), name, mesh, material)
         return name, mesh, material
 
@@ -207,27 +208,39 @@ class RerunTable:
             uvs=None if held["uvs"] is None else _plain(held["uvs"]).reshape(-1, 2),
         )
 
-    def _material(self, entity: str) -> Material:
-        buffer = self._static.get((entity, "Mesh3D:albedo_texture_buffer"))
-        texture = None
-        if buffer is not None:
-            form = self._static[entity, "Mesh3D:albedo_texture_format"][0].as_py()
-            rgb = _plain(buffer.flatten()).reshape(form["height"], form["width"], 3)
-            rgb = self._full_texture(entity, rgb)
-            texture = np.concatenate([rgb, np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=-1)
-        surface = self._static.get((entity, SURFACE))
+    def _look(self, entity: str, default: str) -> tuple[str, Material]:
+        """Name, and material. Raises ValueError or TypeError."""
+        texture = self._texture(entity)
+        look = self._one(entity, LOOK, None)
+        if look is not None:
+            name, *numbers = json.loads(look)
+            r, g, b, a, metallic, roughness = map(float, numbers)
+            return str(name), Material((r, g, b, a), metallic, roughness, texture)
+        # Files of versions before have the name, and a component for all numbers or one for each.
+        name = str(self._one(entity, "visual", default))
+        surface = self._static.get((entity, "surface"))
         if surface is not None:
             r, g, b, a, metallic, roughness = surface.to_pylist()
-            return Material((r, g, b, a), metallic, roughness, texture)
-        # Files of versions before have a component of each.
+            return name, Material((r, g, b, a), metallic, roughness, texture)
         colors = self._static.get((entity, "base_color"))
         r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colors is None else colors.to_pylist()
-        return Material(
+        material = Material(
             base_color=(r, g, b, a),
             metallic=float(self._one(entity, "metallic", 0.0)),
             roughness=float(self._one(entity, "roughness", 1.0)),
             texture=texture,
         )
+        return name, material
+
+    def _texture(self, entity: str) -> NDArray[np.uint8] | None:
+        """(H, W, 4)"""
+        buffer = self._static.get((entity, "Mesh3D:albedo_texture_buffer"))
+        if buffer is None:
+            return None
+        form = self._static[entity, "Mesh3D:albedo_texture_format"][0].as_py()
+        rgb = _plain(buffer.flatten()).reshape(form["height"], form["width"], 3)
+        rgb = self._full_texture(entity, rgb)
+        return np.concatenate([rgb, np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=-1)
 
     def _full_texture(self, entity: str, shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The texture (H, W, 3) of which rerun shows a small one; `shown` itself where there is no other."""

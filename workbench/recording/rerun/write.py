@@ -249,16 +249,11 @@ def _camera(name: str, entity: str, modalities: tuple[str, ...], alone: bool) ->
 
 
 def _curves(arranged: Arrangement) -> rrb.ContainerLike:
-    legend = rrb.PlotLegend(visible=True)
-    views: list[rrb.View] = [rrb.TimeSeriesView(name="Reward", origin="/reward", plot_legend=legend)]
+    views: list[rrb.View] = [rrb.TimeSeriesView(name="Reward", origin="/reward")]
     if arranged.drawn:
-        views.append(
-            rrb.TimeSeriesView(
-                name="Evaluate", origin="/evaluate", contents=list(arranged.drawn), plot_legend=legend
-            )
-        )
+        views.append(rrb.TimeSeriesView(name="Evaluate", origin="/evaluate", contents=list(arranged.drawn)))
     if arranged.acted:
-        views.append(rrb.TimeSeriesView(name="Action", origin="/action", plot_legend=legend))
+        views.append(rrb.TimeSeriesView(name="Action", origin="/action"))
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
     origin = LOGS if arranged.texts else EVENTS
     views.append(rrb.TextLogView(name="Events", origin=origin, columns=columns))
