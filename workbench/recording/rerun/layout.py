@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import rerun as rr
+import xxhash
 from numpy.typing import NDArray
 from PIL import Image
 from rerun.chunk import Chunk
@@ -71,23 +72,33 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
         ValueError: rerun refuses a value.
         OSError: a picture cannot be read.
     """
-    geometry, poses = episode.geometry, episode.poses
-    assert geometry is not None and poses is not None
-    still, present = _never_moves(poses), np.asarray(np.isfinite(poses).any(axis=(0, 2)))
-    bodies = {body: entity for body, entity in enumerate(body_entities(geometry)) if present[body]}
-    cameras = list(zip(episode.cameras, camera_entities([camera.info for camera in episode.cameras])))
-    numbers, pieces = _numbers(episode), _pieces(episode.cameras)
-    ids = _ids(episode.cameras, pieces)
+    yield from shared_chunks(episode)
+    yield from own_chunks(episode)
+
+
+def shared_chunks(episode: Episode) -> Iterator[Chunk]:
+    """Those of `chunks` that the next episode of the scene has too: the same objects, with the same ids."""
+    assert episode.geometry is not None
     yield _world()
+    yield from _meshes(episode.geometry, episode.info.env_index, _bodies(episode))
+    yield from _series(_numbers(episode))
+
+
+def own_chunks(episode: Episode) -> Iterator[Chunk]:
+    """The others of `chunks`."""
+    poses, bodies = episode.poses, _bodies(episode)
+    assert poses is not None
+    still = _never_moves(poses)
+    cameras = list(zip(episode.cameras, camera_entities([camera.info for camera in episode.cameras])))
+    pieces = _pieces(episode.cameras)
+    ids = _ids(episode.cameras, pieces)
     for body, entity in bodies.items():
         if still[body]:
             yield static_pose(entity, poses[0, body, :3], xyzw(poses[0, body, 3:]))
-    yield from _meshes(geometry, episode.info.env_index, bodies)
     if cameras:
         yield _classes(episode.segmentation)
     for (camera, entity), kind in zip(cameras, ids):
         yield from _pinhole(camera, entity, kind)
-    yield from _series(numbers)
     timed = TimedChunks(episode.info.control_dt)
     yield _log(timed, EVENTS, events(episode))
     if episode.texts:
@@ -99,7 +110,7 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
         if not _never_moves(camera.pose):
             pose = np.concatenate(optical_pose(camera.pose), axis=1)
             yield from timed.poses([entity], camera.frame, pose[:, None])
-    for entity, _, values in numbers:
+    for entity, _, values in _numbers(episode):
         if values.size:
             yield timed.scalars(entity, states[len(states) - len(values) :], values)
     for number, some in pieces:
@@ -107,6 +118,13 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
         for modality, pictures in camera.pictures.items():
             columns = _picture_columns(modality, pictures.blobs[some], ids[number])
             yield timed.of(f"{entity}/{modality}", camera.frame[some], columns)
+
+
+def _bodies(episode: Episode) -> dict[int, str]:
+    """Entities of the bodies that are in the episode's env."""
+    assert episode.geometry is not None and episode.poses is not None
+    present = np.asarray(np.isfinite(episode.poses).any(axis=(0, 2)))
+    return {body: entity for body, entity in enumerate(body_entities(episode.geometry)) if present[body]}
 
 
 def _never_moves(poses: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -189,6 +207,8 @@ _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 textures are megabytes to convert."""
 _MOST_MADE = 64
 """Entities per visual. A scene that names bodies by env has one, and a copy, for each env."""
+_encoded: dict[bytes, bytes] = {}
+_MOST_ENCODED = 256
 _making = threading.Lock()
 """Several threads may write episodes of one scene."""
 
@@ -228,10 +248,16 @@ def _is_large(texture: NDArray[np.uint8]) -> bool:
 
 
 def _webp(texture: NDArray[np.uint8]) -> bytes:
-    encoded = io.BytesIO()
-    image = Image.fromarray(np.ascontiguousarray(texture[..., :3]))
-    image.save(encoded, "WEBP", quality=_TEXTURE_QUALITY, method=6)
-    return encoded.getvalue()
+    """Kept by its content: a texture takes 0.2 s, and every recorder reads the scene anew."""
+    pixels = np.ascontiguousarray(texture[..., :3])
+    digest = xxhash.xxh3_128_digest(pixels.data)
+    if digest not in _encoded:
+        content = io.BytesIO()
+        Image.fromarray(pixels).save(content, "WEBP", quality=_TEXTURE_QUALITY, method=6)
+        if len(_encoded) >= _MOST_ENCODED:
+            _encoded.clear()
+        _encoded[digest] = content.getvalue()
+    return _encoded[digest]
 
 
 def _small(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -11,13 +11,14 @@ import errno
 import os
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import BinaryIO
 
 import numpy as np
 import pyarrow as pa
 import xxhash
+from numpy.typing import NDArray
 
 from workbench.recording.rerun.pack_schema import packed_schema
 from workbench.recording.rerun.private_api import Field, read_fields, write_fields
@@ -39,18 +40,18 @@ _SCHEMA_MESSAGE = 1
 _PAYLOAD, _COMPRESSION, _UNPACKED = 2, 3, 4
 """Fields of the table."""
 _LZ4 = 2
-PLACE, SIZE, ENTITY = "chunk_byte_offset", "chunk_byte_size", "chunk_entity_path"
-"""Columns of the table: where a message begins behind its kind and length, how long it is, whose it is."""
+ID, PLACE, SIZE = "chunk_id", "chunk_byte_offset", "chunk_byte_size"
+"""Columns of the table: a chunk's id, where its message begins behind kind and length, and how long it is."""
 
 
 @dataclass(frozen=True)
 class Schema:
     """Of all components of all entities of a store."""
 
-    content: bytes
-    """Protobuf's field."""
+    content: bytes = field(compare=False)
+    """Protobuf's field. Rerun writes the entries in any order."""
     hash: bytes
-    """By rerun, of what it says: two texts of one schema have the same."""
+    """By rerun, of the entries in order: schemas that say the same are equal."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +103,8 @@ class Manifest:
         )
 
 
-def moved(table: pa.RecordBatch, distance: int) -> pa.RecordBatch:
-    """The rows with `distance` added to their places."""
+def moved(table: pa.RecordBatch, distance: int | NDArray[np.int64]) -> pa.RecordBatch:
+    """The rows with `distance`, one for all or one for each, added to their places."""
     column = table.schema.get_field_index(PLACE)
     places = pa.array((table.column(column).to_numpy().astype(np.int64) + distance).astype(np.uint64))
     return table.set_column(column, table.schema.field(column), places)

@@ -8,9 +8,10 @@ import math
 import os
 import re
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,10 @@ from workbench.recording.rerun.layout import (
     camera_entities,
     chunks,
     evaluate_entity,
+    own_chunks,
+    shared_chunks,
 )
+from workbench.recording.rerun.shared_bytes import add_kept, is_known, keep, key_of, schema_hash
 
 MAX_SERIES = 32
 """An ``evaluate()`` entry with more numbers is not drawn: it would hide the others."""
@@ -56,21 +60,42 @@ def write_rrd(episode: Episode, path: Path) -> None:
     application_id = _application_id(episode.info)
     # Without strict mode rerun drops a mesh that it refuses, with a warning.
     with catch_and_log_exceptions(strict=True):
-        write_chunks(_chunks(episode), path, application_id)
-        add_blueprint(path, _blueprint(application_id, arrangement(episode)))
+        blueprint = _blueprint(application_id, arrangement(episode))
+        if episode.cameras:
+            everything = chain(_property_chunks(episode), chunks(episode))
+            write_chunks(everything, path, application_id)
+            add_blueprint(path, blueprint)
+        else:
+            _write_small(episode, path, application_id, blueprint)
 
 
-def _chunks(episode: Episode) -> Iterator[Chunk]:
+def _write_small(episode: Episode, path: Path, application_id: str, blueprint: BlueprintBytes) -> None:
+    """Write an episode without pictures, whose scene is most of its file: the scene's bytes are kept for the next one."""
+    first, shared, own = list(_property_chunks(episode)), list(shared_chunks(episode)), own_chunks(episode)
+    key = key_of(application_id, shared)
+    rest = None
+    if is_known(key):
+        own = list(own)
+        write_chunks(chain(first, own), path, application_id)
+        if add_kept(path, key, len(first), blueprint):
+            return
+        rest = schema_hash(path)
+    write_chunks(chain(first, shared, own), path, application_id)
+    if rest is not None:
+        keep(key, path, rest)
+    add_blueprint(path, blueprint)
+
+
+def _property_chunks(episode: Episode) -> Iterator[Chunk]:
     written = datetime.datetime.fromisoformat(episode.info.written_at).timestamp()
     started = rr.encodings.TimeInt(seconds=written)
     info = rr.archetypes.RecordingInfo(name=_title(episode), start_time=started)
     yield static_chunk("/__properties", info)
     for name, values in properties(episode).items():
         yield property_chunk(name, values)
-    yield from chunks(episode)
 
 
-def write_chunks(chunks: Iterator[Chunk], path: Path, application_id: str) -> None:
+def write_chunks(chunks: Iterable[Chunk], path: Path, application_id: str) -> None:
     """Write `chunks` as one recording. Raises OSError, and errors of `chunks`."""
     failed: list[BaseException] = []
 

@@ -1,0 +1,168 @@
+"""Keeps the bytes of chunks that one file after the other has, such as a scene's meshes: encoding them is most of the work."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import pyarrow as pa
+from rerun.chunk import Chunk
+
+from workbench.recording.rerun.append_blueprint import BlueprintBytes
+from workbench.recording.rerun.private_api import read_fields
+from workbench.recording.rerun.rrd_index import (
+    ID,
+    MESSAGE,
+    PLACE,
+    SIZE,
+    Index,
+    Manifest,
+    Schema,
+    index_bytes,
+    moved,
+    packed,
+    read_index,
+)
+
+_MOST_KEPT = 32
+"""Sets of chunks: an env each, where a scene names its bodies by env. A set has some hundred kilobytes."""
+_RECORDING_ID = 2
+"""Field of a store's ids."""
+
+Key: TypeAlias = tuple[str, ...]
+
+
+@dataclass
+class _Kept:
+    """What the files with a set of chunks have in common."""
+
+    recording_id: bytes = b""
+    messages: bytes = b""
+    """Of the chunks, with that id in each."""
+    wholes: dict[bytes, tuple[Schema, pa.RecordBatch]] = field(default_factory=dict)
+    """Schema of a whole file, and the chunks' rows in its index, by the hash of the schema of all other chunks."""
+
+
+@dataclass(frozen=True)
+class _File:
+    """A complete ``.rrd`` with a recording alone."""
+
+    content: bytes
+    index: Index
+    manifest: Manifest
+
+    @staticmethod
+    def read(path: Path) -> _File:
+        with path.open("rb") as file:
+            index = read_index(file, path.name)
+            file.seek(0)
+            content = file.read()
+        return _File(content, index, Manifest.read(index.manifests[0]))
+
+    @property
+    def recording_id(self) -> bytes:
+        found = dict(read_fields(self.manifest.store))[_RECORDING_ID]
+        assert not isinstance(found, int)
+        return bytes(found)
+
+
+_kept: OrderedDict[Key, _Kept] = OrderedDict()
+_keeping = threading.Lock()
+
+
+def key_of(application_id: str, chunks: Sequence[Chunk]) -> Key:
+    """Of a set of chunks that files of this application share."""
+    return (application_id, *(chunk.id for chunk in chunks))
+
+
+def is_known(key: Key) -> bool:
+    """Whether these chunks were in a file before. The first time it is not worth keeping them: they may not come again."""
+    with _keeping:
+        if key in _kept:
+            _kept.move_to_end(key)
+            return True
+        _kept[key] = _Kept()
+        if len(_kept) > _MOST_KEPT:
+            _kept.popitem(last=False)
+        return False
+
+
+def keep(key: Key, whole: Path, rest: bytes) -> None:
+    """Keep the bytes of these chunks from a file that rerun has written.
+
+    Args:
+        rest: `schema_hash` of the file without them.
+
+    Raises OSError.
+    """
+    file = _File.read(whole)
+    table = file.manifest.table
+    ids = {bytes.fromhex(id_.rpartition("_")[2]) for id_ in key[1:]}
+    rows = np.flatnonzero([id_ in ids for id_ in table.column(ID).to_pylist()])
+    places, sizes = (table.column(name).to_numpy().take(rows).tolist() for name in (PLACE, SIZE))
+    messages = [file.content[place - MESSAGE.size : place + size] for place, size in zip(places, sizes)]
+    ends = np.cumsum([len(message) for message in messages])
+    column = table.schema.get_field_index(PLACE)
+    begins = pa.array((ends - np.array(sizes)).astype(np.uint64))
+    table = table.take(pa.array(rows)).set_column(column, table.schema.field(column), begins)
+    with _keeping:
+        kept = _kept.setdefault(key, _Kept())
+        if not kept.messages:
+            kept.recording_id, kept.messages = file.recording_id, b"".join(messages)
+        kept.wholes[rest] = (packed(file.manifest.schema), table)
+
+
+def schema_hash(path: Path) -> bytes:
+    """That of a file without the shared chunks. Raises OSError."""
+    with path.open("rb") as file:
+        return Manifest.read(read_index(file, path.name).manifests[0]).schema.hash
+
+
+def add_kept(path: Path, key: Key, first: int, blueprint: BlueprintBytes) -> bool:
+    """Add the kept chunks behind the `first` ones of the file at `path`, and a blueprint; whether there were any.
+
+    Raises OSError.
+    """
+    file = _File.read(path)
+    with _keeping:
+        kept = _kept.get(key)
+        whole = None if kept is None else kept.wholes.get(file.manifest.schema.hash)
+    if kept is None or whole is None:
+        return False
+    schema, rows = whole
+    messages = kept.messages.replace(kept.recording_id, file.recording_id)
+    own = file.manifest.table
+    begin = sorted(own.column(PLACE).to_pylist())[first] - MESSAGE.size
+    behind = own.column(PLACE).to_numpy() > begin
+    table = _joined(moved(rows, begin), moved(own, np.where(behind, len(messages), 0)))
+    manifest = replace(file.manifest, schema=schema, table=table)
+    end = file.index.begin + len(messages)
+    manifests = [manifest.written(), blueprint.manifest_at(end)]
+    path.write_bytes(
+        b"".join(
+            (
+                file.content[:begin],
+                messages,
+                file.content[begin : file.index.begin],
+                blueprint.messages,
+                index_bytes(end + len(blueprint.messages), manifests),
+            )
+        )
+    )
+    return True
+
+
+def _joined(kept: pa.RecordBatch, own: pa.RecordBatch) -> pa.RecordBatch:
+    """The rows of both. What `own` lacks are columns that say whether a chunk has a component for all times."""
+    names = {name: number for number, name in enumerate(own.schema.names)}
+    absent = pa.array(np.zeros(own.num_rows, np.bool_))
+    columns = [
+        pa.concat_arrays([column, own.column(names[entry.name]) if entry.name in names else absent])
+        for entry, column in zip(kept.schema, kept.columns)
+    ]
+    return pa.RecordBatch.from_arrays(columns, schema=kept.schema)
