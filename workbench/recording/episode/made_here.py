@@ -48,11 +48,11 @@ def seal(description: Description, source_file: str | None) -> SealJson | None:
         source_file: the absolute path of the task's file.
     """
     values = {name: getattr(description, name) for name in _COVERED}
-    content = seal_text(
-        _content(values, description.source_file, description.files, description.acted_by), "content"
-    )
-    place = seal_text(source_file or "", "place")
-    return None if content is None or place is None else SealJson(content, place)
+    content = _content(values, description.source_file, description.files, description.acted_by)
+    key = _any_key()
+    if key is None:
+        return None
+    return SealJson(_mac(key, "content", content), _mac(key, "place", source_file or ""))
 
 
 def made_here(info: EpisodeInfo) -> MadeHere:
@@ -79,11 +79,8 @@ def seal_text(text: str, what: str = "text") -> str | None:
     Args:
         what: kind of text; the seal is invalid for another kind.
     """
-    try:
-        return _mac(_key() or _new_key(), what, text)
-    except OSError as error:
-        _log_once(f"Recordings of this session cannot be sealed as made here: {error}")
-        return None
+    key = _any_key()
+    return None if key is None else _mac(key, what, text)
 
 
 def is_sealed(text: str, found: object, what: str = "text") -> bool:
@@ -105,6 +102,15 @@ def _content(values: Mapping[str, Any], main: Any, files: Any, acted_by: Sequenc
 
 def _mac(key: bytes, what: str, text: str) -> str:
     return hmac.new(key, f"{what}\0{text}".encode("utf-8", "surrogatepass"), sha256).hexdigest()
+
+
+def _any_key() -> bytes | None:
+    """The key, a new one if there is none; None, logged once, where it cannot be read or written."""
+    try:
+        return _key() or _new_key()
+    except OSError as error:
+        _log_once(f"Recordings of this session cannot be sealed as made here: {error}")
+        return None
 
 
 def _key() -> bytes | None:

@@ -36,9 +36,9 @@ def write_h5(episode: Episode, path: Path) -> None:
         OSError: it cannot be written.
         ValueError: HDF5 refuses a column.
     """
-    # In memory: on a disk error HDF5 leaves files half open.
-    # HDF5's own memory: a BytesIO is asked in Python for every few bytes.
-    with h5py.File("-", "w", driver="core", backing_store=False, block_size=_BLOCK_BYTES) as file:
+    # In memory: on a disk error HDF5 leaves files half open. HDF5's own: a BytesIO is asked in Python for every few bytes.
+    # Nothing is written at the name, but two files may not have the same at a time.
+    with h5py.File(path, "w", driver="core", backing_store=False, block_size=_BLOCK_BYTES) as file:
         put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
         file.flush()
         content = file.id.get_file_image()

@@ -176,4 +176,9 @@ class TimedChunks:
 
 def static_pose(entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> Chunk:
     """The pose, (3,) and (4,), of an entity that never moves."""
+    return _static_pose(entity, tuple(translation.tolist()), tuple(xyzw.tolist()))
+
+
+@lru_cache(maxsize=512)
+def _static_pose(entity: str, translation: tuple[float, ...], xyzw: tuple[float, ...]) -> Chunk:
     return static_chunk(entity, rr.Transform3D(translation=translation, quaternion=rr.Quaternion(xyzw=xyzw)))

@@ -9,7 +9,7 @@ import threading
 import weakref
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -152,7 +152,12 @@ def body_entities(geometry: SceneGeometry) -> tuple[str, ...]:
     Rerun composes the transforms of nested entities, so no body may be below another: an actor with the name of an
     articulation, or of the cameras' folder, gets an underscore.
     """
-    names = [tuple(part for part in name.split("/") if part) or ("unnamed",) for name in geometry.body_names]
+    return _entities_of(geometry.body_names)
+
+
+@lru_cache(maxsize=64)
+def _entities_of(body_names: tuple[str, ...]) -> tuple[str, ...]:
+    names = [tuple(part for part in name.split("/") if part) or ("unnamed",) for name in body_names]
     names = [("cameras_", *name[1:]) if name[0] == "cameras" else name for name in names]
     folders = {name[:depth] for name in names for depth in range(1, len(name))}
     taken: set[tuple[str, ...]] = set()
@@ -365,9 +370,14 @@ def _numbers(episode: Episode) -> list[tuple[str, list[str], NDArray]]:
 
 def series_names(name: str, column: NDArray) -> list[str]:
     """``name``, or ``name[0]``, ``name[1]`` ... for several numbers per step."""
-    if column.ndim == 1:
-        return [name]
-    return [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(column.shape[1:])]
+    return list(_series_names(name, column.shape[1:]))
+
+
+@lru_cache(maxsize=512)
+def _series_names(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
+    if not shape:
+        return (name,)
+    return tuple(f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(shape))
 
 
 def _series(numbers: Iterable[tuple[str, list[str], NDArray]]) -> Iterator[Chunk]:

@@ -159,10 +159,10 @@ def add_kept(path: Path, key: Key, first: int, blueprint: BlueprintBytes) -> boo
 
 def _joined(kept: pa.RecordBatch, own: pa.RecordBatch) -> pa.RecordBatch:
     """The rows of both. What `own` lacks are columns that say whether a chunk has a component for all times."""
-    names = {name: number for number, name in enumerate(own.schema.names)}
+    numbers = {name: number for number, name in enumerate(own.schema.names)}
     absent = pa.array(np.zeros(own.num_rows, np.bool_))
     columns = [
-        pa.concat_arrays([column, own.column(names[entry.name]) if entry.name in names else absent])
-        for entry, column in zip(kept.schema, kept.columns)
+        absent if (number := numbers.get(name)) is None else own.column(number) for name in kept.schema.names
     ]
-    return pa.RecordBatch.from_arrays(columns, schema=kept.schema)
+    both = pa.Table.from_batches([kept, pa.RecordBatch.from_arrays(columns, schema=kept.schema)])
+    return both.combine_chunks().to_batches()[0]

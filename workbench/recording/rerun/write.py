@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import datetime
 import errno
+import json
 import math
 import os
 import re
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
@@ -62,7 +63,7 @@ def write_rrd(episode: Episode, path: Path) -> None:
     with catch_and_log_exceptions(strict=True):
         blueprint = _blueprint(application_id, arrangement(episode))
         if episode.cameras:
-            everything = chain(_property_chunks(episode), chunks(episode))
+            everything = chain(_property_chunks(episode, properties(episode)), chunks(episode))
             write_chunks(everything, path, application_id)
             add_blueprint(path, blueprint)
         else:
@@ -71,11 +72,15 @@ def write_rrd(episode: Episode, path: Path) -> None:
 
 def _write_small(episode: Episode, path: Path, application_id: str, blueprint: BlueprintBytes) -> None:
     """Write an episode without pictures, whose scene is most of its file: the scene's bytes are kept for the next one."""
-    first, shared, own = list(_property_chunks(episode)), list(shared_chunks(episode)), own_chunks(episode)
+    named = properties(episode)
+    texts = [
+        _texts_chunk(name, json_text(named.pop(name))) for name in ("versions", "source") if name in named
+    ]
+    first, own = list(_property_chunks(episode, named)), list(own_chunks(episode))
+    shared = [*texts, *shared_chunks(episode)]
     key = key_of(application_id, shared)
     rest = None
     if is_known(key):
-        own = list(own)
         write_chunks(chain(first, own), path, application_id)
         if add_kept(path, key, len(first), blueprint):
             return
@@ -86,13 +91,19 @@ def _write_small(episode: Episode, path: Path, application_id: str, blueprint: B
     add_blueprint(path, blueprint)
 
 
-def _property_chunks(episode: Episode) -> Iterator[Chunk]:
+def _property_chunks(episode: Episode, named: Mapping[str, dict[str, Any]]) -> Iterator[Chunk]:
     written = datetime.datetime.fromisoformat(episode.info.written_at).timestamp()
     started = rr.encodings.TimeInt(seconds=written)
     info = rr.archetypes.RecordingInfo(name=_title(episode), start_time=started)
     yield static_chunk("/__properties", info)
-    for name, values in properties(episode).items():
+    for name, values in named.items():
         yield property_chunk(name, values)
+
+
+@lru_cache(maxsize=64)
+def _texts_chunk(name: str, texts: str) -> Chunk:
+    """The chunk of a property that most episodes of a process share, from its values as JSON."""
+    return property_chunk(name, json.loads(texts))
 
 
 def write_chunks(chunks: Iterable[Chunk], path: Path, application_id: str) -> None:
