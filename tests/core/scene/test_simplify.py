@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from workbench.core.scene.shapes import Mesh
-from workbench.core.scene.simplify import flat_rectangle, reduce_mesh, with_normals
+from workbench.core.scene.simplify import flat_rectangle, reduce_mesh, share_smooth, with_normals
 
 
 def soup(mesh: trimesh.Trimesh) -> Mesh:
@@ -158,3 +158,20 @@ def test_what_is_no_plain_rectangle_is_not_made_one() -> None:
     swirled.uvs[7] += 0.2
     assert flat_rectangle(swirled) is None
     assert flat_rectangle(soup(trimesh.creation.box())) is None
+
+
+@pytest.mark.parametrize("off, left", [(4.0, 4), (30.0, 6)])
+def test_vertices_at_one_place_are_one_where_they_are_lit_alike(off: float, left: int) -> None:
+    """Two triangles with an edge in common, the second's normals turned by `off` degrees."""
+    square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
+    turned = [0.0, np.sin(np.deg2rad(off)), np.cos(np.deg2rad(off))]
+    normals = np.array([[0, 0, 1]] * 3 + [turned] * 3, np.float32)
+    mesh = Mesh(square[[0, 1, 2, 1, 3, 2]], np.arange(6, dtype=np.uint32).reshape(2, 3), normals)
+    shared = share_smooth(mesh)
+    assert shared.normals is not None and len(shared.vertices) == left
+    np.testing.assert_array_equal(shared.vertices[shared.faces], mesh.vertices[mesh.faces])
+    np.testing.assert_allclose(np.linalg.norm(shared.normals, axis=1), 1, rtol=1e-6)
+    lit = np.einsum("fcd,fcd->fc", shared.normals[shared.faces], normals[mesh.faces])
+    assert (
+        np.rad2deg(np.arccos(np.minimum(lit, 1))).max() < off / 2 + 0.1 if left == 4 else (lit > 0.9999).all()
+    )

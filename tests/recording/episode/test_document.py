@@ -204,6 +204,8 @@ def test_words_are_written_under_their_names_and_what_is_not_said_is_not_written
         ' "a": {',
         '  "body_names": [],',
     ]
+    for value in ({"sum": float("nan"), "é": [[], {}, None]}, {"text": '"{[,:]}" \\ \u2028', "n": [1, -0.5]}):
+        assert json_text(value, indent=2) == json.dumps(value, indent=2)
 
 
 def test_a_camera_comes_back_from_its_words() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,6 @@ from workbench.recording.episode.episode import Episode
 TRAJECTORY = "traj_0"
 _WORTH_PACKING = 8 << 10
 _CHUNK_BYTES = 256 << 10
-_BLOCK_BYTES = 64 << 10
 _LEVEL = 1
 """Of zlib. On numbers of a simulation level 4 saves 1 % more, in a third more time."""
 _MAKES_UTF8 = h5py.h5p.create(h5py.h5p.LINK_CREATE)
@@ -36,14 +37,12 @@ def write_h5(episode: Episode, path: Path) -> None:
         OSError: it cannot be written.
         ValueError: HDF5 refuses a column.
     """
-    # In memory: on a disk error HDF5 leaves files half open. HDF5's own: a BytesIO is asked in Python for every few bytes.
-    # Nothing is written at the name, but two files may not have the same at a time.
-    with h5py.File(path, "w", driver="core", backing_store=False, block_size=_BLOCK_BYTES) as file:
+    # In memory: on a disk error HDF5 leaves files half open.
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
         put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
-        file.flush()
-        content = file.id.get_file_image()
-    with path.open("xb") as written:
-        written.write(content)
+    with path.open("xb") as file:
+        file.write(content.getbuffer())
     h5py.File(path, "r").close()  # fails on a truncated file
 
 
@@ -83,25 +82,38 @@ def put_columns(episode: Episode, trajectory: h5py.Group) -> None:
 
 def _put(parent: h5py.Group, name: str, values: NDArray) -> None:
     """Write a dataset by HDF5's low-level calls: h5py's high-level ones take longer than writing the numbers."""
-    kind, space = h5py.h5t.py_create(values.dtype, logical=True), h5py.h5s.create_simple(values.shape)
-    packing = _packing(values.shape, values.dtype)
+    kind, space = _kind(values.dtype), h5py.h5s.create_simple(values.shape)
+    row = int(np.prod(values.shape[1:])) * values.dtype.itemsize
+    packing = _packed(values.shape, row) if row * values.shape[0] >= _WORTH_PACKING else _PLAIN
     dataset = h5py.h5d.create(parent.id, name.encode(), kind, space, packing, _MAKES_UTF8)
     if values.size:
         dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(values))
 
 
-def _packing(shape: tuple[int, ...], dtype: np.dtype) -> h5py.h5p.PropDCID:
-    """Storage of a dataset: compressed if that saves more than the index of its chunks costs.
+@cache
+def _kind(dtype: np.dtype) -> h5py.h5t.TypeID:
+    return h5py.h5t.py_create(dtype, logical=True)
+
+
+def _plain() -> h5py.h5p.PropDCID:
+    packing = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    packing.set_obj_track_times(False)
+    return packing
+
+
+_PLAIN = _plain()
+
+
+def _packed(shape: tuple[int, ...], row: int) -> h5py.h5p.PropDCID:
+    """Storage of a dataset of which a row has so many bytes: compressed, where that saves more than the index of its
+    chunks costs.
 
     A chunk must fit HDF5's cache of 1 MB: ManiSkill's replay reads row by row.
     """
-    packing = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    packing.set_obj_track_times(False)
-    row = int(np.prod(shape[1:])) * dtype.itemsize
-    if row * shape[0] >= _WORTH_PACKING:
-        packing.set_chunk((min(max(_CHUNK_BYTES // row, 1), shape[0]), *shape[1:]))
-        packing.set_shuffle()
-        packing.set_deflate(_LEVEL)
+    packing = _plain()
+    packing.set_chunk((min(max(_CHUNK_BYTES // row, 1), shape[0]), *shape[1:]))
+    packing.set_shuffle()
+    packing.set_deflate(_LEVEL)
     return packing
 
 

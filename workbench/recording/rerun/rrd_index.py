@@ -18,7 +18,6 @@ from typing import BinaryIO
 import numpy as np
 import pyarrow as pa
 import xxhash
-from numpy.typing import NDArray
 
 from workbench.recording.rerun.pack_schema import packed_schema
 from workbench.recording.rerun.private_api import Field, read_fields, write_fields
@@ -103,8 +102,8 @@ class Manifest:
         )
 
 
-def moved(table: pa.RecordBatch, distance: int | NDArray[np.int64]) -> pa.RecordBatch:
-    """The rows with `distance`, one for all or one for each, added to their places."""
+def moved(table: pa.RecordBatch, distance: int) -> pa.RecordBatch:
+    """The rows with `distance` added to their places."""
     column = table.schema.get_field_index(PLACE)
     places = pa.array((table.column(column).to_numpy().astype(np.int64) + distance).astype(np.uint64))
     return table.set_column(column, table.schema.field(column), places)

@@ -137,9 +137,8 @@ def add_kept(path: Path, key: Key, first: int, blueprint: BlueprintBytes) -> boo
     schema, rows = whole
     messages = kept.messages.replace(kept.recording_id, file.recording_id)
     own = file.manifest.table
-    begin = sorted(own.column(PLACE).to_pylist())[first] - MESSAGE.size
-    behind = own.column(PLACE).to_numpy() > begin
-    table = _joined(moved(rows, begin), moved(own, np.where(behind, len(messages), 0)))
+    begin = own.column(PLACE)[first].as_py() - MESSAGE.size
+    table = _joined(own[:first], moved(rows, begin), moved(own[first:], len(messages)))
     manifest = replace(file.manifest, schema=schema, table=table)
     end = file.index.begin + len(messages)
     manifests = [manifest.written(), blueprint.manifest_at(end)]
@@ -157,12 +156,14 @@ def add_kept(path: Path, key: Key, first: int, blueprint: BlueprintBytes) -> boo
     return True
 
 
-def _joined(kept: pa.RecordBatch, own: pa.RecordBatch) -> pa.RecordBatch:
-    """The rows of both. What `own` lacks are columns that say whether a chunk has a component for all times."""
-    numbers = {name: number for number, name in enumerate(own.schema.names)}
-    absent = pa.array(np.zeros(own.num_rows, np.bool_))
-    columns = [
-        absent if (number := numbers.get(name)) is None else own.column(number) for name in kept.schema.names
-    ]
-    both = pa.Table.from_batches([kept, pa.RecordBatch.from_arrays(columns, schema=kept.schema)])
-    return both.combine_chunks().to_batches()[0]
+def _joined(before: pa.RecordBatch, kept: pa.RecordBatch, behind: pa.RecordBatch) -> pa.RecordBatch:
+    """All rows. What the others lack are columns that say whether a chunk has a component for all times."""
+
+    def widened(own: pa.RecordBatch) -> pa.RecordBatch:
+        absent = pa.array(np.zeros(own.num_rows, np.bool_))
+        columns = [own.column(numbers[name]) if name in numbers else absent for name in kept.schema.names]
+        return pa.RecordBatch.from_arrays(columns, schema=kept.schema)
+
+    numbers = {name: number for number, name in enumerate(before.schema.names)}
+    rows = pa.Table.from_batches([widened(before), kept, widened(behind)])
+    return rows.combine_chunks().to_batches()[0]

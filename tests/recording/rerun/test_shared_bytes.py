@@ -1,0 +1,102 @@
+"""A file that is put together of kept bytes is one that rerun could have written."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import LazyChunkStream, RrdReader
+
+from tests.drive.episodes import Made
+from tests.recording.read_rrd import read_rrd
+from tests.recording.verify_rrd import verify_rrd
+from workbench.core.scene.shapes import SceneGeometry
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.rerun.chunks import static_chunk
+from workbench.recording.rerun.private_api import index_of
+from workbench.recording.rerun.read import RerunTable
+
+Maker = Callable[..., Made]
+EPISODES = 4
+"""The first is written as a whole, the second too, and its bytes are kept."""
+
+
+@pytest.fixture
+def written(make_episode: Maker, tmp_path: Path) -> list[Path]:
+    """Recordings of one scene, without pictures; all but the seed is the same."""
+    episode = make_episode(5)
+    paths = []
+    for seed in range(EPISODES):
+        episode.info = dataclasses.replace(episode.info, seed=seed, id=f"{seed}")
+        paths.append(episode.write(tmp_path).rrd)
+    return paths
+
+
+def test_every_file_holds_the_same(written: list[Path]) -> None:
+    first, *others = (read_rrd(path) for path in written)
+    for other in others:
+        assert other.keys() == first.keys()
+        for entity, columns in first.items():
+            assert other[entity].keys() == columns.keys()
+            if entity.startswith(("/__properties", "/logs")):  # with the seed in them
+                continue
+            for name, column in columns.items():
+                again = other[entity][name]
+                np.testing.assert_equal((again.steps, again.values), (column.steps, column.values))
+    for seed, path in enumerate(written):
+        episode = read_episode(path)
+        assert episode.info.seed == seed and not episode.broken_files
+
+
+def test_rerun_finds_nothing_wrong(written: list[Path]) -> None:
+    for path in (written[0], written[-1]):
+        assert verify_rrd(path) is None
+    readers = [RrdReader(path) for path in written]
+    recordings = [recording for reader in readers for recording in reader.recordings()]
+    assert len({recording.recording_id for recording in recordings}) == EPISODES
+    assert [len(reader.blueprints()) for reader in readers] == [1] * EPISODES
+    # Chunks are where the index says: each is read from there.
+    for reader in readers:
+        streamed = sorted(chunk.id for chunk in reader.stream() if chunk.entity_path.startswith("/world"))
+        found = sorted(
+            chunk.id for chunk in reader.store().stream() if chunk.entity_path.startswith("/world")
+        )
+        assert found == streamed
+
+
+def test_the_index_has_the_rows_that_rerun_writes(written: list[Path]) -> None:
+    rows = []
+    for path in written:
+        index = index_of(RrdReader(path).store(), "step")
+        assert all(later.begin >= earlier.end for earlier, later in zip(index, index[1:]))
+        assert index[0].entity == "/__properties", "what a list of recordings reads comes first"
+        rows.append(
+            [
+                (one.entity, one.rows, one.static, one.components, one.steps)
+                for one in sorted(index, key=lambda one: (one.entity, one.static))
+            ]
+        )
+    assert rows == rows[:1] * EPISODES
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {"surface": [0.1, 0.2, 0.3, 1.0, 0.25, 0.75]},
+        {"base_color": [0.1, 0.2, 0.3, 1.0], "metallic": [0.25], "roughness": [0.75]},
+    ],
+)
+def test_files_of_versions_before_keep_their_colours(tmp_path: Path, numbers: dict[str, Any]) -> None:
+    mesh = rr.Mesh3D(vertex_positions=np.eye(3, dtype=np.float32), triangle_indices=[[0, 1, 2]])
+    chunk = static_chunk("/world/cube/0", mesh, rr.AnyValues(visual="cube/0", **numbers))
+    path = tmp_path / "before.rrd"
+    LazyChunkStream.from_iter([chunk]).write_rrd(path, application_id="before", recording_id="one")
+    bare = SceneGeometry(1, ("cube",), ("dynamic",), (False,), ())
+    (visual,) = RerunTable(path).geometry(bare, ["/world/cube"]).visuals
+    assert visual.name == "cube/0" and visual.material.base_color == (0.1, 0.2, 0.3, 1.0)
+    assert (visual.material.metallic, visual.material.roughness) == (0.25, 0.75)
