@@ -53,6 +53,11 @@ def test_every_file_holds_the_same(written: list[Path]) -> None:
         assert episode.info.seed == seed and not episode.broken_files
 
 
+def test_no_file_is_larger_for_it(written: list[Path]) -> None:
+    whole, *_, joined = (path.stat().st_size for path in written)
+    assert joined < 1.01 * whole
+
+
 def test_rerun_finds_nothing_wrong(written: list[Path]) -> None:
     for path in (written[0], written[-1]):
         assert verify_rrd(path) is None

@@ -204,8 +204,8 @@ def _world() -> Chunk:
     return static_chunk(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
 
-_TEXTURE_QUALITY = 70
-VIEWER_TEXELS = 128
+_TEXTURE_QUALITY = 64
+VIEWER_TEXELS = 96
 """On the longest side of a texture as rerun shows it; the workbench reads the full one, beside it as WebP."""
 _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 """Results of `_mesh_chunk` by the visual's id, while the visual lives: the next episode of the scene reuses them, since

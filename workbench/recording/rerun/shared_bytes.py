@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -31,21 +31,25 @@ from workbench.recording.rerun.rrd_index import (
 
 _MOST_KEPT = 32
 """Sets of chunks: an env each, where a scene names its bodies by env. A set has some hundred kilobytes."""
+_MOST_SHAPES = 16
+"""Sorts of files with one set: which bodies move, and what ``evaluate()`` returns, may differ."""
 _RECORDING_ID = 2
 """Field of a store's ids."""
 
 Key: TypeAlias = tuple[str, ...]
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Kept:
-    """What the files with a set of chunks have in common."""
+    """A set of chunks as it was in a file."""
 
-    recording_id: bytes = b""
-    messages: bytes = b""
-    """Of the chunks, with that id in each."""
-    wholes: dict[bytes, tuple[Schema, pa.RecordBatch]] = field(default_factory=dict)
-    """Schema of a whole file, and the chunks' rows in its index, by the hash of the schema of all other chunks."""
+    recording_id: bytes
+    messages: bytes
+    """With that id in each."""
+    rows: pa.RecordBatch
+    """In the index, with places counted from the first of `messages`."""
+    schema: Schema
+    """Of the whole file."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,8 @@ class _File:
         return bytes(found)
 
 
-_kept: OrderedDict[Key, _Kept] = OrderedDict()
+_kept: OrderedDict[Key, dict[bytes, _Kept]] = OrderedDict()
+"""By the hash of the schema of all other chunks of a file, too."""
 _keeping = threading.Lock()
 
 
@@ -86,7 +91,7 @@ def is_known(key: Key) -> bool:
         if key in _kept:
             _kept.move_to_end(key)
             return True
-        _kept[key] = _Kept()
+        _kept[key] = {}
         if len(_kept) > _MOST_KEPT:
             _kept.popitem(last=False)
         return False
@@ -105,16 +110,21 @@ def keep(key: Key, whole: Path, rest: bytes) -> None:
     ids = {bytes.fromhex(id_.rpartition("_")[2]) for id_ in key[1:]}
     rows = np.flatnonzero([id_ in ids for id_ in table.column(ID).to_pylist()])
     places, sizes = (table.column(name).to_numpy().take(rows).tolist() for name in (PLACE, SIZE))
-    messages = [file.content[place - MESSAGE.size : place + size] for place, size in zip(places, sizes)]
-    ends = np.cumsum([len(message) for message in messages])
+    each = [file.content[place - MESSAGE.size : place + size] for place, size in zip(places, sizes)]
+    ends = np.cumsum([len(message) for message in each])
     column = table.schema.get_field_index(PLACE)
     begins = pa.array((ends - np.array(sizes)).astype(np.uint64))
     table = table.take(pa.array(rows)).set_column(column, table.schema.field(column), begins)
+    id_, messages = file.recording_id, b"".join(each)
     with _keeping:
-        kept = _kept.setdefault(key, _Kept())
-        if not kept.messages:
-            kept.recording_id, kept.messages = file.recording_id, b"".join(messages)
-        kept.wholes[rest] = (packed(file.manifest.schema), table)
+        kept = _kept.setdefault(key, {})
+        for other in kept.values():  # with other chunks beside them, mostly the same bytes
+            if other.messages == messages.replace(id_, other.recording_id):
+                id_, messages = other.recording_id, other.messages
+                break
+        if len(kept) >= _MOST_SHAPES:
+            kept.clear()
+        kept[rest] = _Kept(id_, messages, table, packed(file.manifest.schema))
 
 
 def schema_hash(path: Path) -> bytes:
@@ -130,16 +140,14 @@ def add_kept(path: Path, key: Key, first: int, blueprint: BlueprintBytes) -> boo
     """
     file = _File.read(path)
     with _keeping:
-        kept = _kept.get(key)
-        whole = None if kept is None else kept.wholes.get(file.manifest.schema.hash)
-    if kept is None or whole is None:
+        kept = _kept.get(key, {}).get(file.manifest.schema.hash)
+    if kept is None:
         return False
-    schema, rows = whole
     messages = kept.messages.replace(kept.recording_id, file.recording_id)
     own = file.manifest.table
     begin = own.column(PLACE)[first].as_py() - MESSAGE.size
-    table = _joined(own[:first], moved(rows, begin), moved(own[first:], len(messages)))
-    manifest = replace(file.manifest, schema=schema, table=table)
+    table = _joined(own[:first], moved(kept.rows, begin), moved(own[first:], len(messages)))
+    manifest = replace(file.manifest, schema=kept.schema, table=table)
     end = file.index.begin + len(messages)
     manifests = [manifest.written(), blueprint.manifest_at(end)]
     path.write_bytes(
