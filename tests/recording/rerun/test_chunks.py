@@ -58,6 +58,16 @@ def test_numbers(shape: tuple[int, ...], place: Callable[[NDArray], NDArray]) ->
     assert data_of(ours) == data_of(Chunk.from_columns("/evaluate/offset", times(), columns))
 
 
+def test_texts() -> None:
+    steps = np.array([0, 3, 3], dtype=np.int64)
+    lines = [(0, "INFO", "reset"), (3, "WARN", "fail"), (3, "INFO", "")]
+    ours = TimedChunks(0.05).texts("/logs/events", lines)
+    columns = rr.TextLog.columns(text=["reset", "fail", ""], level=["INFO", "WARN", "INFO"])
+    nanoseconds = (steps * 50_000_000).astype("timedelta64[ns]")
+    index = [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("sim_time", duration=nanoseconds)]
+    assert data_of(ours) == data_of(Chunk.from_columns("/logs/events", index, columns))
+
+
 def test_rows_between_two_equal_ones_are_left_out() -> None:
     values = np.array([0, 0, 0, 1, 1, 1, 0.0])
     assert [

@@ -210,7 +210,8 @@ def movable_bounds(poses: NDArray, kinds: Sequence[BodyKind]) -> tuple[NDArray, 
         poses: (..., B, 7).
         kinds: (B,)
     """
-    points = poses[..., np.isin(np.array(kinds), ("link", "dynamic")), :3].reshape(-1, 3)
+    movable = np.array([kind in ("link", "dynamic") for kind in kinds], np.bool_)
+    points = poses[..., movable, :3].reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         points = np.zeros((1, 3), np.float32)

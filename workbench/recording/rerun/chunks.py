@@ -110,6 +110,12 @@ def _number_column() -> tuple[rr.ComponentDescriptor, pa.DataType]:
     return one.component_descriptor(), one.as_arrow_array().type
 
 
+@cache
+def _text_columns() -> tuple[tuple[rr.ComponentDescriptor, pa.DataType], ...]:
+    one = rr.TextLog.columns(text=[""], level=[""])
+    return tuple((column.component_descriptor(), column.as_arrow_array().type) for column in one)
+
+
 def _lists(numbers: NDArray, kind: pa.DataType, per_row: int) -> pa.Array:
     """`numbers` as rows of type `kind` with `per_row` elements each, which may be fixed-size lists."""
     # Rows of a journal may be unaligned: Arrow would use them without a copy, and rerun aborts the process (seen).
@@ -158,6 +164,15 @@ class TimedChunks:
             steps, flat = steps[rows], flat[rows]
         descriptor, kind = _number_column()
         return self.of(entity, steps, [_Column(descriptor, _lists(flat, kind, flat.shape[1]))])
+
+    def texts(self, entity: str, lines: Sequence[tuple[int, str, str]]) -> Chunk:
+        """A line of a log for each step, level and text."""
+        steps, levels, texts = zip(*lines)
+        columns = [
+            _Column(descriptor, pa.array([[text] for text in column], kind))
+            for (descriptor, kind), column in zip(_text_columns(), (texts, levels))
+        ]
+        return self.of(entity, np.array(steps, dtype=np.int64), columns)
 
     def _times_of(self, steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
         key = steps.tobytes()

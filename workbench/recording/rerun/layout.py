@@ -100,9 +100,9 @@ def own_chunks(episode: Episode) -> Iterator[Chunk]:
     for (camera, entity), kind in zip(cameras, ids):
         yield from _pinhole(camera, entity, kind)
     timed = TimedChunks(episode.info.control_dt)
-    yield _log(timed, EVENTS, events(episode))
+    yield timed.texts(EVENTS, events(episode))
     if episode.texts:
-        yield _log(timed, ENTRY_TEXTS, _texts(episode))
+        yield timed.texts(ENTRY_TEXTS, _texts(episode))
     states = np.arange(len(poses), dtype=np.int64)
     moving = {body: entity for body, entity in bodies.items() if not still[body]}
     yield from timed.poses(list(moving.values()), states, poses[:, list(moving)][..., _XYZW])
@@ -422,12 +422,6 @@ def _texts(episode: Episode) -> list[tuple[int, str, str]]:
         for state, entry in track
     ]
     return sorted(lines, key=lambda line: line[0])
-
-
-def _log(timed: TimedChunks, entity: str, lines: Sequence[tuple[int, str, str]]) -> Chunk:
-    steps, levels, texts = zip(*lines)
-    columns = rr.TextLog.columns(text=list(texts), level=list(levels))
-    return timed.of(entity, np.array(steps, dtype=np.int64), columns)
 
 
 # --- frames ---------------------------------------------------------------------------------------

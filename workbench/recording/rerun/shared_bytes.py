@@ -150,17 +150,15 @@ def add_kept(path: Path, key: Key, first: int, blueprint: BlueprintBytes) -> boo
     manifest = replace(file.manifest, schema=kept.schema, table=table)
     end = file.index.begin + len(messages)
     manifests = [manifest.written(), blueprint.manifest_at(end)]
-    path.write_bytes(
-        b"".join(
-            (
-                file.content[:begin],
-                messages,
-                file.content[begin : file.index.begin],
-                blueprint.messages,
-                index_bytes(end + len(blueprint.messages), manifests),
-            )
-        )
+    parts = (
+        file.content[:begin],
+        messages,
+        file.content[begin : file.index.begin],
+        blueprint.messages,
+        index_bytes(end + len(blueprint.messages), manifests),
     )
+    with path.open("wb") as written:
+        written.writelines(parts)
     return True
 
 
