@@ -171,7 +171,13 @@ def test_what_is_imported_is_a_dependency_of_ours_and_not_only_of_one() -> None:
     """ManiSkill brought scipy along, until it was an extra."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
     ours = {canonicalize_name(Requirement(line).name) for line in project["dependencies"]}
-    ours |= {"mani-skill", "mani-skill-nightly", "debugpy", "maniskill-workbench"}  # by extras, and ourselves
+    ours |= {
+        "mani-skill",
+        "mani-skill-nightly",
+        "debugpy",
+        "ray",
+        "maniskill-workbench",
+    }  # by extras, and ourselves
     brought_by = packages_distributions()
     names = {
         name.split(".")[0]

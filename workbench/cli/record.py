@@ -27,11 +27,10 @@ from workbench.cli.terminal import (
     warn,
 )
 from workbench.core.backends import unused_gpu_text
-from workbench.jobs.actions import SOLVE
+from workbench.jobs.actions import SOLVE, needed_by
 from workbench.jobs.episodes import RecordOptions, Written, with_given_actions
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import Job, job_of
-from workbench.jobs.pool.travel import needed_by
 from workbench.jobs.record import Recorded, RecordProgress, chunk_of, record
 from workbench.planning.report import underway_text
 from workbench.recording.reader.reading import recover_confined

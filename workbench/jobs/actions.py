@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask
-from workbench.authoring.loading.reference import named_file
+from workbench.authoring.loading.reference import find_module, named_file, split_reference
 from workbench.authoring.problem import TaskError, is_ctrl_c
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env import actions
@@ -295,6 +295,51 @@ def plain_chooser(name: str, task: str, seed: int, here: CurrentFolder) -> Actio
 def _folder_of(task: str) -> Path | None:
     file = named_file(task)
     return None if file is None else file.parent
+
+
+@dataclass(frozen=True)
+class Needed:
+    """Files of the author that a job needs."""
+
+    folders: tuple[Path, ...]
+    files: tuple[Path, ...]
+
+
+def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Needed:
+    """What a job needs that is not installed.
+
+    Args:
+        task: as `RecordArguments.task`: the folder of its file, or of its package.
+        actions: as `RecordArguments.actions`, if it names a file or a policy.
+        imports: as `TaskOptions.imports`.
+    """
+    folders: list[Path] = []
+    files: list[Path] = []
+    named = split_reference(task)
+    modules = [*imports, *([named[0]] if named else [])]
+    if named is None and (file := named_file(task)) is not None:
+        folders.append(file.parent)
+    policy, colon, _ = actions.rpartition(":")
+    if not colon:
+        if (file := Path(actions)).suffix and file.is_file():
+            files.append(file)
+    elif policy.endswith(".py"):
+        found, _ = find_policy(actions, folders[0] if folders else None)
+        folders.append(Path(found).parent)
+    else:
+        modules.append(policy)
+    for name in modules:
+        place = find_module(name)
+        if place is None or place.file is None or "site-packages" in place.file.parts:
+            continue
+        # With the packages above it, and what else they import.
+        top = name.partition(".")[0]
+        root = next((parent for parent in place.file.parents if parent.name == top), None)
+        if root is None:
+            files.append(place.file)
+        else:
+            folders.append(root)
+    return Needed(tuple(folders), tuple(files))
 
 
 # --- actions from a file: NumPy arrays, or demonstrations in ManiSkill's ``.h5`` -----------------------

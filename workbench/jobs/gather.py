@@ -7,8 +7,6 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -21,9 +19,8 @@ from workbench.core.capture.recorded_run import STATE, states_of
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.jobs.pool.travel import relocated
 from workbench.jobs.task import Stepped, TaskDescription
-from workbench.machine import DISTRIBUTION
 from workbench.machine.processes.watched_thread import report_failure
-from workbench.machine.versions import MANISKILL
+from workbench.machine.versions import package_versions
 from workbench.recording.episode.columns import BatchPacker
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.side_files import side_files
@@ -31,7 +28,6 @@ from workbench.recording.writing.episode_writer import NO_OTHERS, EpisodeFiles, 
 from workbench.recording.writing.publish import RecordingError
 
 NOWHERE: Mapping[str, str] = MappingProxyType({})
-_PACKAGES = (DISTRIBUTION, *MANISKILL, "sapien", "torch", "rerun-sdk")
 
 
 @dataclass
@@ -311,18 +307,6 @@ def episode_info(
         acted_by=((0, acted_by),) if acted_by else (),
         pictures=task.pictures,
     )
-
-
-@cache
-def package_versions() -> Mapping[str, str]:
-    """Versions of the packages that an episode depends on, as this process has them."""
-    found = {}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:  # a source checkout that was never installed
-            continue
-    return found
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from functools import partial
 
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
+from workbench.jobs.actions import needed_by
 from workbench.jobs.episodes import (
     RecordOptions,
     RecordSetup,
@@ -21,7 +22,6 @@ from workbench.jobs.episodes import (
 )
 from workbench.jobs.pool.deal import Deal, Executor, Failure, ItemQueue, ThisProcess, Work
 from workbench.jobs.pool.processes import Processes
-from workbench.jobs.pool.travel import needed_by
 from workbench.recording.writing.upload import remove_uploaded
 
 TRIES = 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dis
 import importlib
 import importlib.metadata
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import CodeType
@@ -18,6 +18,7 @@ from workbench.machine.maniskill_installed import EXTRAS, installed_maniskills, 
 
 MANISKILL = tuple(EXTRAS)
 """Two distributions with the same files: the release, and the build of a night."""
+_OF_AN_EPISODE = (DISTRIBUTION, *MANISKILL, "sapien", "torch", "rerun-sdk")
 TESTED = {
     "mani_skill": ("3.0.1",),
     "mani_skill-nightly": ("2026.8.2.400",),
@@ -110,6 +111,13 @@ def installed(distribution: str) -> str | None:
         return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
         return None
+
+
+@cache
+def package_versions() -> Mapping[str, str]:
+    """Versions of the packages that an episode depends on, as this process has them."""
+    versions = {name: installed(name) for name in _OF_AN_EPISODE}
+    return {name: version for name, version in versions.items() if version is not None}
 
 
 def maniskill() -> tuple[str, str] | None:

@@ -15,8 +15,7 @@ from typing import Any
 import psutil
 import pytest
 
-from tests.jobs.pool.test_pool import Run
-from tests.jobs.pool.work import Setup
+from tests.jobs.pool.work import Run, Setup
 from workbench.authoring.problem import TaskError
 from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.pool import cluster as seam

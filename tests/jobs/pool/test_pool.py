@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.drive.waiting import until
 from tests.jobs.pool import work
-from tests.jobs.pool.work import PROBLEM, Setup, Squared, square
+from tests.jobs.pool.work import PROBLEM, Run, Setup
 from workbench.authoring.problem import Problem, TaskError
 from workbench.jobs.pool.deal import (
     FIRST_ALIKE,
@@ -23,11 +23,9 @@ from workbench.jobs.pool.deal import (
     Deal,
     Executor,
     Failure,
-    ItemQueue,
     PoolError,
     Shard,
     ThisProcess,
-    Work,
     parse_shard,
 )
 from workbench.jobs.pool.processes import Processes
@@ -36,47 +34,6 @@ from workbench.jobs.pool.processes import Processes
 @pytest.fixture(autouse=True)
 def tests_can_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
-
-
-class Run:
-    """A job, and what was heard of it."""
-
-    def __init__(
-        self,
-        setup: Setup,
-        numbers: Iterable[int],
-        stop: Callable[[], bool] = lambda: False,
-        on_result: Callable[[Run, int], None] = lambda run, number: None,
-        run: Callable[[Setup, ItemQueue], None] = square,
-        **how: Any,
-    ) -> None:
-        self.results: dict[int, Squared] = {}
-        self.updates: list[str] = []
-        self.failures: list[Failure] = []
-        self.steps = 0
-        self._on_result = on_result
-        if how.pop("goes_on", False):
-            how["on_failure"] = self.failures.append
-        self.deal: Deal[Squared, str | int] = Deal(numbers, self.over, self.hear, stop, **how)
-        self.work = Work(run, setup, Squared, str | int, "that squares")
-
-    def over(self, number: int, result: Squared) -> None:
-        assert number not in self.results
-        self.results[number] = result
-        self._on_result(self, number)
-
-    def hear(self, update: str | int) -> None:
-        if isinstance(update, int):
-            self.steps += update
-        else:
-            self.updates.append(update)
-
-    def by(self, executor: Executor) -> Run:
-        executor.run(self.work, self.deal)
-        return self
-
-    def squares(self) -> dict[int, float]:
-        return {number: result.square for number, result in self.results.items()}
 
 
 EXECUTORS = [

@@ -6,11 +6,13 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from workbench.authoring.problem import Problem, TaskError
-from workbench.jobs.pool.deal import ItemQueue
+from workbench.jobs.pool.deal import Deal, Executor, Failure, ItemQueue, Work
 
 PROBLEM = Problem("step", "it broke", "task.py", 3, "1 / 0", "Traceback")
 
@@ -85,3 +87,44 @@ def go_wrong(setup: Setup, queue: ItemQueue) -> None:
 def forget(setup: Setup, queue: ItemQueue) -> None:
     """Ends with an item that it says nothing of."""
     queue.next()
+
+
+class Run:
+    """A job, and what was heard of it."""
+
+    def __init__(
+        self,
+        setup: Setup,
+        numbers: Iterable[int],
+        stop: Callable[[], bool] = lambda: False,
+        on_result: Callable[[Run, int], None] = lambda run, number: None,
+        run: Callable[[Setup, ItemQueue], None] = square,
+        **how: Any,
+    ) -> None:
+        self.results: dict[int, Squared] = {}
+        self.updates: list[str] = []
+        self.failures: list[Failure] = []
+        self.steps = 0
+        self._on_result = on_result
+        if how.pop("goes_on", False):
+            how["on_failure"] = self.failures.append
+        self.deal: Deal[Squared, str | int] = Deal(numbers, self.over, self.hear, stop, **how)
+        self.work = Work(run, setup, Squared, str | int, "that squares")
+
+    def over(self, number: int, result: Squared) -> None:
+        assert number not in self.results
+        self.results[number] = result
+        self._on_result(self, number)
+
+    def hear(self, update: str | int) -> None:
+        if isinstance(update, int):
+            self.steps += update
+        else:
+            self.updates.append(update)
+
+    def by(self, executor: Executor) -> Run:
+        executor.run(self.work, self.deal)
+        return self
+
+    def squares(self) -> dict[int, float]:
+        return {number: result.square for number, result in self.results.items()}

@@ -24,13 +24,13 @@ from pathlib import Path
 from typing import Any
 
 from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
-from workbench.jobs.gather import package_versions
 from workbench.jobs.pool.deal import NO_LIMIT, Chunk, Deal, PoolError, Result, Setup, Update, Work
 from workbench.jobs.pool.travel import Baggage, pack_baggage, relocated
 from workbench.jobs.pool.worker import MESSAGES, Asks, Listener, Message, WorkerQueue, work_on
 from workbench.machine.processes.child_python import quick_imports
 from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
+from workbench.machine.versions import package_versions
 
 AUTO, LOCAL = "auto", "local"
 _LOOK_SECONDS = 0.1

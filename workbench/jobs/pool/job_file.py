@@ -20,10 +20,10 @@ from typing import Any, TypeVar
 
 from workbench.authoring.loading.reference import named_file
 from workbench.authoring.loading.task_content import read_content
-from workbench.jobs.gather import package_versions
 from workbench.jobs.pool.deal import Deal, Executor, Result, Setup, Shard, Update, Work
 from workbench.machine.files import open_regular_file
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack
+from workbench.machine.versions import package_versions
 
 _MAGIC = 0x57424A31
 """SQLite's ``application_id`` of these files."""

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
-from workbench.authoring.loading.reference import find_module, named_file, split_reference
-from workbench.jobs.policy import find_policy
 from workbench.machine.files import read_regular_file
 
 MOST_BYTES = 256 << 20
@@ -83,51 +81,6 @@ def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage
         for file in sizes:
             archive.writestr(zipfile.ZipInfo(str(file).lstrip("/")), read_regular_file(file, MOST_BYTES))
     return Baggage(tuple(map(str, (*roots, *sorted(alone)))), str(Path.cwd()), data.getvalue())
-
-
-@dataclass(frozen=True)
-class Needed:
-    """Files of the author that a job needs."""
-
-    folders: tuple[Path, ...]
-    files: tuple[Path, ...]
-
-
-def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Needed:
-    """What a job needs that is not installed.
-
-    Args:
-        task: as `RecordArguments.task`: the folder of its file, or of its package.
-        actions: as `RecordArguments.actions`, if it names a file or a policy.
-        imports: as `TaskOptions.imports`.
-    """
-    folders: list[Path] = []
-    files: list[Path] = []
-    named = split_reference(task)
-    modules = [*imports, *([named[0]] if named else [])]
-    if named is None and (file := named_file(task)) is not None:
-        folders.append(file.parent)
-    policy, colon, _ = actions.rpartition(":")
-    if not colon:
-        if (file := Path(actions)).suffix and file.is_file():
-            files.append(file)
-    elif policy.endswith(".py"):
-        found, _ = find_policy(actions, folders[0] if folders else None)
-        folders.append(Path(found).parent)
-    else:
-        modules.append(policy)
-    for name in modules:
-        place = find_module(name)
-        if place is None or place.file is None or "site-packages" in place.file.parts:
-            continue
-        # With the packages above it, and what else they import.
-        top = name.partition(".")[0]
-        root = next((parent for parent in place.file.parents if parent.name == top), None)
-        if root is None:
-            files.append(place.file)
-        else:
-            folders.append(root)
-    return Needed(tuple(folders), tuple(files))
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:
