@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.drive.waiting import until
 from tests.jobs.pool import work
-from tests.jobs.pool.work import PROBLEM, Run, Setup
+from tests.jobs.pool.work import PROBLEM, Run, Setup, Squared
 from workbench.authoring.problem import Problem, TaskError
 from workbench.jobs.pool.deal import (
     FIRST_ALIKE,
