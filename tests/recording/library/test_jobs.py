@@ -68,7 +68,7 @@ def test_a_file_that_is_anything_else_is_passed_over_or_read_as_data(content: by
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / ".job-0.json").write_bytes(content)
+        (Path(folder) / ".job-0.status").write_bytes(content)
         for status in read_jobs(Path(folder), time.time()):
             assert isinstance(status, JobStatus)
 

@@ -15,7 +15,7 @@ import msgspec
 from workbench.machine.files import read_regular_file, replace_file
 from workbench.recording.episode.row import clean_text
 
-_PREFIX, _SUFFIX = ".job-", ".json"
+_PREFIX, _SUFFIX = ".job-", ".status"
 _MOST_BYTES = 1 << 18
 _MOST = 64
 """Files that are looked at: a job in 64 parts has as many."""
