@@ -43,10 +43,12 @@ from workbench.ui.tasks.task_list import OPEN, Chooser, OpenDialog
 from workbench.ui.widgets.editor import editor_link
 from workbench.ui.widgets.hotkeys import Command, add_hints, register
 from workbench.ui.widgets.inputs import Control
-from workbench.ui.widgets.parts import Clock, PagePart, Parts
+from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
 
+PANELS_EVERY = 0.06
+"""Seconds between two drawings of the panels while the envs play, every second frame: faster, nobody reads numbers."""
 PANEL_WIDTH = 372
 ENVS_WIDTH = 520
 
@@ -90,6 +92,7 @@ class Page:
         self._link = partial(editor_link, editor, known=session.versions.knows_file)
         self._on_review, self._on_look = on_review, on_look
         self._loop = RedrawLoop(server, "page", session.wait, lambda: self._count_clients() > 0, self.redraw)
+        self._panels_due = DrawDue(PANELS_EVERY, clock)
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
         self._built: tuple[bool, Looks] | None = None
@@ -230,9 +233,10 @@ class Page:
         return self._view_panel.dark
 
     def redraw(self) -> None:
-        """Draw the present state of the session."""
+        """Draw the present state of the session; where only steps go on, the panels less often than the view."""
         view = self._session.view()
-        draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
+        panels = (lambda: self._draw_panels(view)) if self._panels_due.is_due(*_shown_of(view)) else None
+        draw_apart(self._server, panels, lambda: self._draw_scene(view))
 
     def _draw_panels(self, view: SessionView) -> None:
         self._parts.draw(view)
@@ -379,3 +383,19 @@ class Page:
             Command("Switch between the dark and the light theme", self._view_panel.toggle_dark, "D"),
             *self._studio.commands(),
         ]
+
+
+def _shown_of(view: SessionView) -> tuple[object, object]:
+    """What the panels show, and what of it a person waits for, as `DrawDue` takes them."""
+    steps_go_on = view.playing and view.state == "running" and view.timeline.shown is None
+    waited_for = (
+        view.settings,
+        view.busy,
+        view.task_serial,
+        view.problem_serial,
+        view.stale,
+        view.activity,
+        view.pictures_serial,
+    )
+    # Every view is new; where no steps go on, a person waits for each.
+    return object(), (waited_for if steps_go_on else object())

@@ -64,13 +64,14 @@ class RedrawLoop:
             self._thread.join(timeout=5.0)
 
     def _run(self) -> None:
-        seen = -1
+        seen, due = -1, time.monotonic()
         while not self._stopping.is_set():
-            began = time.monotonic()
             seen = self._wait(seen, 0.1)
+            began = time.monotonic()
             if self._has_viewers() and not self._draw_or_say():
                 self._stopping.wait(AGAIN_AFTER)
-            self._stopping.wait(max(0.0, FRAME - (time.monotonic() - began)))
+            due = next_frame(due, began)
+            self._stopping.wait(max(0.0, due - time.monotonic()))
 
     def _draw_or_say(self) -> bool:
         try:
@@ -88,16 +89,29 @@ class RedrawLoop:
         return True
 
 
-def draw_apart(server: viser.ViserServer, panels: Callable[[], None], scene: Callable[[], None]) -> None:
-    """Send the panels first, then the 3-D view in a batch of its own.
+def next_frame(due: float, began: float) -> float:
+    """When to draw next: a frame that came late makes the next wait less, or its delay would be lost for good.
+
+    Args:
+        due: When the last frame was to be drawn, in seconds.
+        began: When it was drawn.
+    """
+    return max(due + FRAME, began + FRAME / 2)
+
+
+def draw_apart(
+    server: viser.ViserServer, panels: Callable[[], None] | None, scene: Callable[[], None]
+) -> None:
+    """Send the panels first, unless they are None, then the 3-D view in a batch of its own.
 
     A browser takes a batch as a whole, and one with anything of the 3-D view waits for the next frame of that view,
     which may take long; numbers and buttons need not.
     """
-    with server.atomic():
-        panels()
-    server.flush()
-    wait_until_taken(server, SENT_WITHIN)
+    if panels is not None:
+        with server.atomic():
+            panels()
+        server.flush()
+        wait_until_taken(server, SENT_WITHIN)
     with server.atomic():
         scene()
     server.flush()
