@@ -75,7 +75,10 @@ class SnapshotPacker:
         before, self._kept = self._kept, {}
         for name, value in self._parts_of(snapshot).items():
             places[id(value)] = len(self._kept)
-            self._kept[name] = self._part(before.get(name), value, new)
+            kept = before.get(name)
+            # Two calls less for each generator of each env.
+            stays = kept is not None and kept.value is value
+            self._kept[name] = kept if stays else self._part(kept, value, new)  # type: ignore[assignment]
         self._buffers = snapshot.memory.task.buffers
         keys = tuple([kept.key for kept in self._kept.values()])
         same, self._last_keys = keys == self._last_keys, keys

@@ -10,8 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-_MEMORY = ctypes.c_char * (624 * 4 + 4)
-"""numpy's ``mt19937_state``: the key, then the position as an int."""
+_KEY = 624
+_WORDS = ctypes.c_char * 16
+"""Words 1 to 4 of the key in numpy's ``mt19937_state``, which is the key and the position, of 4 bytes each. A draw moves the
+position, and the last of a key makes all words anew. Word 0 is the same for every seed."""
+_POSITION = ctypes.c_char * 4
 _HAS_GAUSS = 3
 """Index in ``RandomState.get_state()`` of the flag for a normal number kept aside."""
 
@@ -38,7 +41,7 @@ class _ReadStates:
     generators: list[np.random.RandomState]
     """Kept alive, since their memory is read by address."""
     memory: list[ctypes.Array[ctypes.c_char]]
-    """Views of each state's memory."""
+    """Views of what tells each state from others: some words of its key, its position."""
     copied: bytes
     """Content of `memory` at the last read."""
     states: list[RngState]
@@ -50,7 +53,7 @@ class RngReader:
     """Reads the generators of one env object, and remembers what it read.
 
     ``RandomState.get_state`` takes 55 us a generator, for 64 envs a third of a control step. So a generator is read only when
-    its bytes in memory differ from the last (0.2 us; numpy publishes ``BitGenerator.ctypes.state_address``). One exception:
+    its position or some words of its key differ from the last (0.2 us; whole keys of many envs do not fit into a core's cache; numpy publishes ``BitGenerator.ctypes.state_address``). One exception:
     every second normal number is kept aside, and taking it changes no byte. While one is kept, all are read.
     """
 
@@ -67,7 +70,12 @@ class RngReader:
         bit_generators = [generator._bit_generator for generator in generators]
         # Other bit generators have another memory layout.
         if all(isinstance(b, np.random.MT19937) for b in bit_generators):
-            memory = [_MEMORY.from_address(b.ctypes.state_address) for b in bit_generators]
+            places = [b.ctypes.state_address for b in bit_generators]
+            memory = [
+                view
+                for place in places
+                for view in (_WORDS.from_address(place + 4), _POSITION.from_address(place + 4 * _KEY))
+            ]
             settled = not any(state[_HAS_GAUSS] for state in states)
             self._seen[purpose] = _ReadStates(list(generators), memory, b"".join(memory), states, settled)
         return states
