@@ -1,6 +1,7 @@
-"""How often the page is really updated while the task plays, and how soon a control has its effect.
+"""How often the page is really updated while the task plays, what that takes of the processor, and how soon a control has its
+effect.
 
-    python tests/benchmarks/page_rate.py [--num-envs 16] [--speed "4 ×"] [--cameras] [--software]
+    python tests/benchmarks/page_rate.py [--num-envs 16] [--speed "4 ×"] [--draw page] [--cameras] [--solve]
 
 ``workbench open`` on the example task with a real Chromium before it. *Applied updates* are counted in
 the page: animation frames on which the robot's hand has poses that the frame before did not have. *Click
@@ -8,22 +9,35 @@ to effect* is the time from a key or a click to the change that the person asked
 ``Play`` becoming ``Pause``, and the S key (one control step, through the session and the worker)
 changing the number of elapsed steps.
 
-By default WebGL's draw calls are replaced by nothing, as a stand-in for a browser with a graphics card:
-the server, the worker and all else in the browser are as always. ``--software`` lets Chromium rasterise
-on the processor, which then is the limit on a machine without a card. Without ``--cameras`` the pictures
+The processor's time is told apart by process: the worker (control steps and their snapshots), the server (panels,
+poses, viser's encoding, the socket), the browser's page (viser's client) and its drawing. The workbench, the browser and
+the rest of the machine share the cores: *others* is what the rest took, without what runs in the idle class.
+
+``--draw none``, the default, is a stand-in for a browser with a graphics card: WebGL's draw calls are replaced by
+nothing, and the page is transparent, so that Chromium does not put it together in software, which takes 25 ms a
+frame and a core. All else is done. ``--draw page`` replaces the draw calls alone; with ``--draw all`` Chromium rasterises
+everything on the processor, which then is the limit on a machine without a card. Without ``--cameras`` the pictures
 are unticked: on such a machine the renderer, the physics and the browser share the cores.
+
+``--solve`` measures a second time, in the same page, while actions are planned by rollouts in a process beside. The envs
+then wait for their plans, so there is a new step, and an update, less often. The task is one that never succeeds, or the
+planner would be done after some steps.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
 import statistics
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
+import psutil
 import tyro
 from playwright.sync_api import Page, expect, sync_playwright
 
@@ -36,6 +50,7 @@ NO_DRAWING = """
 for (const name of ['drawElements', 'drawArrays', 'drawElementsInstanced', 'drawArraysInstanced'])
     WebGL2RenderingContext.prototype[name] = function () {};
 """
+TRANSPARENT = "() => { document.documentElement.style.opacity = 0; }"
 COUNT = """async (seconds) => {
     const nodes = () => window.__viserSceneTree.getState();
     const hand = Object.keys(nodes()).find((name) => name.includes('panda_hand'));
@@ -58,20 +73,31 @@ ELAPSED = """() => {
 }"""
 
 
+PACE = r"""() => {
+    const found = document.body.innerText.match(/([0-9.]+) steps\/s/);
+    return found ? found[1] : '';
+}"""
+PROCESSES = ("worker", "server", "planner", "browser's page", "browser's drawing", "browser's rest")
+
+
 @dataclass(frozen=True)
 class Options:
     num_envs: int = 16
     speed: str = "4 ×"
-    seconds: float = 8.0
+    seconds: float = 6.0
+    """Of one window."""
+    windows: int = 3
     clicks: int = 15
+    draw: Literal["none", "page", "all"] = "none"
+    """What Chromium draws, on the processor: nothing, all but the 3-D view's triangles, or all."""
     cameras: bool = False
     """Leave the default pictures on."""
-    software: bool = False
-    """Let Chromium draw, on the processor."""
+    solve: bool = False
+    """Measure again while actions are planned."""
 
 
 def prepare(page: Page, options: Options, url: str) -> None:
-    if not options.software:
+    if options.draw != "all":
         page.add_init_script(NO_DRAWING)
     page.goto(url)
     expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
@@ -85,6 +111,8 @@ def prepare(page: Page, options: Options, url: str) -> None:
     page.locator('input[role="combobox"][value="1 ×"]').click()
     page.get_by_role("option", name=options.speed, exact=True).click()
     page.mouse.click(5, 690)  # keys are ignored inside an input
+    if options.draw == "none":
+        page.evaluate(TRANSPARENT)
 
 
 def play_to_pause(page: Page, clicks: int) -> list[float]:
@@ -128,12 +156,106 @@ def key_to_step(page: Page, presses: int) -> list[float]:
     return times
 
 
+@dataclass(frozen=True)
+class Window:
+    """What one window of seconds saw, each a second."""
+
+    applied: float
+    frames: float
+    processor: dict[str, float]
+    """Cores that each of `PROCESSES` took."""
+    others: float
+    pace: str
+    """Control steps a second, as the page says."""
+
+
+def used(server: int) -> tuple[dict[int, tuple[str, float]], dict[int, float]]:
+    """Seconds of processor so far: of the workbench and the browser, with what they are, and of all else but the idle class."""
+    mine, rest = {}, {}
+    family = {process.pid for process in psutil.Process().children(recursive=True)}
+    for process in psutil.process_iter():
+        try:
+            times, command, niceness = process.cpu_times(), " ".join(process.cmdline()), process.nice()
+            idle = os.sched_getscheduler(process.pid) == os.SCHED_IDLE
+        except (psutil.Error, ProcessLookupError):
+            continue
+        seconds = times.user + times.system
+        if process.pid in family:
+            mine[process.pid] = name_of(process.pid == server, command, niceness), seconds
+        elif process.pid != os.getpid() and not idle:
+            rest[process.pid] = seconds
+    return mine, rest
+
+
+def name_of(is_server: bool, command: str, niceness: int) -> str:
+    if is_server:
+        return "server"
+    if "session.worker.start" in command:
+        # What works beside the worker that plays gives way to it.
+        return "planner" if niceness else "worker"
+    drawing = "browser's drawing" if "--type=gpu-process" in command else "browser's rest"
+    return "browser's page" if "--type=renderer" in command else drawing
+
+
+def watch(page: Page, server: int, seconds: float) -> Window:
+    (before, rest), begun = used(server), time.perf_counter()
+    applied, frames = page.evaluate(COUNT, seconds)
+    (after, rest_after), took = used(server), time.perf_counter() - begun
+    cores: defaultdict[str, float] = defaultdict(float)
+    for pid, (name, spent) in after.items():
+        cores[name] += (spent - before.get(pid, (name, 0.0))[1]) / took
+    others = sum(spent - rest[pid] for pid, spent in rest_after.items() if pid in rest) / took
+    return Window(applied, frames, dict(cores), others, page.evaluate(PACE))
+
+
+def told(windows: list[Window]) -> str:
+    """The window with the most updates, in words, and all of their counts."""
+    best = max(windows, key=lambda window: window.applied)
+    counts = ", ".join(f"{window.applied:.1f}" for window in windows)
+    pace = f", {best.pace} control steps" if best.pace else ""
+    cores = ", ".join(f"{name} {best.processor.get(name, 0.0):.2f}" for name in PROCESSES)
+    an_update = 1000 / max(best.applied, 1e-9)
+    stages = ", ".join(
+        f"{name} {an_update * best.processor.get(name, 0.0):.1f}"
+        for name in PROCESSES
+        if name in best.processor
+    )
+    return (
+        f"applied updates a second: {best.applied:.1f} (of windows: {counts}; animation frames {best.frames:.1f}{pace})\n"
+        f"cores: {cores}; others {best.others:.2f}\n"
+        f"processor, ms an update: {stages}"
+    )
+
+
+def without_success(file: Path) -> None:
+    text = file.read_text()
+    test = "(distance < GOAL_RADIUS)"
+    if test not in text:
+        sys.exit(f"{TASK} has no {test} any more: change `without_success`.")
+    file.write_text(text.replace(test, "(distance < 0)"))
+
+
+def choose_source(page: Page, now: str, wanted: str) -> None:
+    page.locator(f'input[role="combobox"][value="{now}"]').click()
+    page.get_by_role("option", name=wanted, exact=True).click()
+    page.mouse.click(5, 690)
+
+
 def main(options: Options) -> None:
     chromium = find_chromium()
     if chromium is None:
         sys.exit(how_to_get_chromium())
+    drawing = {
+        "none": "nothing is drawn",
+        "page": "draw calls replaced by nothing",
+        "all": "Chromium draws in software",
+    }[options.draw]
+    cameras = "on" if options.cameras else "off"
+    print(f"push_cube.py, {options.num_envs} envs, speed {options.speed}, cameras {cameras}; {drawing}")
     with tempfile.TemporaryDirectory() as name:
         file = Path(shutil.copy(TASK, Path(name) / "push_cube.py"))
+        if options.solve:
+            without_success(file)
         with (
             open_workbench(str(file), "--num-envs", str(options.num_envs), cwd=Path(name)) as opened,
             sync_playwright() as playwright,
@@ -145,14 +267,35 @@ def main(options: Options) -> None:
             page.get_by_role("tab", name="Run").click()
             timed_click(page, "Play", "Pause")
             time.sleep(2.0)
-            applied, frames = page.evaluate(COUNT, options.seconds)
-    drawing = "Chromium draws in software" if options.software else "draw calls replaced by nothing"
-    cameras = "on" if options.cameras else "off"
-    print(f"push_cube.py, {options.num_envs} envs, speed {options.speed}, cameras {cameras}; {drawing}")
-    print(f"applied updates a second: {applied:.1f} (animation frames a second: {frames:.1f})")
+            server = opened.process.pid
+            print(told([watch(page, server, options.seconds) for _ in range(options.windows)]), flush=True)
+            say_clicks(clicks, steps)
+            if options.solve:
+                choose_source(page, "random", "solve")
+                # The envs of the rollouts are made, and the first plan.
+                page.wait_for_function(
+                    f"() => ({PACE})() === '' && /plan/.test(document.body.innerText)", timeout=60_000
+                )
+                time.sleep(10.0)
+                print("while actions are planned (solve):")
+                print(
+                    told([watch(page, server, options.seconds) for _ in range(options.windows)]), flush=True
+                )
+                say_clicks(pauses(page, options.clicks), [])
+
+
+def pauses(page: Page, clicks: int) -> list[float]:
+    """As `play_to_pause`, of a page that plays."""
+    timed_click(page, "Pause", "Play")
+    time.sleep(0.2)
+    return play_to_pause(page, clicks)
+
+
+def say_clicks(clicks: list[float], steps: list[float]) -> None:
     for what, times in (("Play to Pause", clicks), ("S key to the step's numbers", steps)):
-        median, worst = 1000 * statistics.median(times), 1000 * max(times)
-        print(f"{what}: median {median:.0f} ms, worst {worst:.0f} ms of {len(times)}")
+        if times:
+            median, worst = 1000 * statistics.median(times), 1000 * max(times)
+            print(f"{what}: median {median:.0f} ms, worst {worst:.0f} ms of {len(times)}")
 
 
 if __name__ == "__main__":
