@@ -7,7 +7,8 @@ what is sent, behind a relay that counts it.
 
 Both sides play the same steps. *Exact*: a client with so narrow a lens that it sees every motion, and that takes no compression: every pose as it is, which was all that there was before. *As sent*: a view of
 1280 x 720, far away. Prints the kilobytes of an update, the panels' and the poses' part of it before
-compression, and what that is a second at 30 Hz.
+compression, what that is a second at 30 Hz, and the processor's time that the server takes for an update: to draw panels
+and poses, and in viser's thread, which encodes, compresses and sends.
 """
 
 from __future__ import annotations
@@ -141,11 +142,17 @@ class Update:
     arrays: float
     rest: float
     """The same with nothing new to show."""
+    draw: float
+    """Seconds of processor to draw panels and poses."""
+    send: float
+    """The same of viser's thread."""
 
 
 def measure(played: Played, options: Options, exact: bool) -> Update:
     clock, made, client = Clock(), [], Client()
+    others = set(threading.enumerate())
     gated = open_server(ServerOptions(port=0))
+    (sender,) = set(threading.enumerate()) - others
     stage = Stage(gated.server, clock)
     with tempfile.TemporaryDirectory() as folder:
         session = Session(
@@ -167,7 +174,7 @@ def measure(played: Played, options: Options, exact: bool) -> Update:
             thread.start()
             while not gated.server.get_clients():
                 time.sleep(0.01)
-            update = _updates(page, session, made[0], clock, mark, client, line, options)
+            update = _updates(page, session, made[0], clock, mark, client, line, sender, options)
     session.close()
     gated.close()
     thread.join(10.0)
@@ -189,12 +196,13 @@ def _updates(
     mark: Any,
     client: Client,
     line: FarLine,
+    sender: threading.Thread,
     options: Options,
 ) -> Update:
-    shown, updates, begun = 0, 0, session.view().step_serial
+    shown, updates, begun, drew = 0, 0, session.view().step_serial, 0.0
 
     def update(plays: bool) -> None:
-        nonlocal shown, updates
+        nonlocal shown, updates, drew
         updates += 1
         clock.passes(1 / HERTZ)
         while plays and shown < updates * SPEED / HERTZ / played_dt:
@@ -202,7 +210,9 @@ def _updates(
             shown += 1
         if plays:
             wait_until(session, lambda view: view.step_serial >= begun + shown, "the step")
+        drawing = time.thread_time()
         page.redraw()
+        drew += time.thread_time() - drawing
         mark.value = f"mark {updates}"
         while client.has.get(timeout=60.0) != f"mark {updates}":
             pass
@@ -210,25 +220,34 @@ def _updates(
     played_dt = player._played.task.control_dt
     for _ in range(options.settle):
         update(plays=True)
-    before = line.down, client.metadata, client.arrays
+    counts = lambda: (line.down, client.metadata, client.arrays, drew, processor_of(sender))  # noqa: E731
+    before = counts()
     for _ in range(options.updates):
         update(plays=True)
-    wire, metadata, arrays = (
-        (b - a) / options.updates
-        for a, b in zip(before, (line.down, client.metadata, client.arrays), strict=True)
+    wire, metadata, arrays, draw, send = (
+        (b - a) / options.updates for a, b in zip(before, counts(), strict=True)
     )
     for _ in range(HERTZ):
         update(plays=False)
     at_rest = line.down
     for _ in range(HERTZ):
         update(plays=False)
-    return Update(wire, metadata, arrays, (line.down - at_rest) / HERTZ)
+    return Update(wire, metadata, arrays, (line.down - at_rest) / HERTZ, draw, send)
+
+
+def processor_of(thread: threading.Thread) -> float:
+    """Seconds that it took so far."""
+    assert thread.ident is not None
+    return time.clock_gettime(time.pthread_getcpuclockid(thread.ident))
 
 
 def main(options: Options) -> None:
     torch.set_num_threads(1)
-    print("| envs | | kB an update | panels, kB | poses, kB | at 30 Hz, MB a second | paused, kB an update |")
-    print("|---|---|---|---|---|---|---|")
+    print(
+        "| envs | | kB an update | panels, kB | poses, kB | at 30 Hz, MB a second | paused, kB an update "
+        "| processor, ms an update: drawing | viser's thread |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
     count = int((options.updates + options.settle) * SPEED / HERTZ / 0.05) + 2
     for num_envs in options.num_envs:
         played = play(num_envs, count)
@@ -237,7 +256,8 @@ def main(options: Options) -> None:
             parts = found.wire, found.metadata, found.arrays
             print(
                 f"| {num_envs} | {what} | {' | '.join(f'{part / 1e3:.1f}' for part in parts)} "
-                f"| {HERTZ * found.wire / 1e6:.3f} | {found.rest / 1e3:.2f} |",
+                f"| {HERTZ * found.wire / 1e6:.3f} | {found.rest / 1e3:.2f} "
+                f"| {1e3 * found.draw:.1f} | {1e3 * found.send:.1f} |",
                 flush=True,
             )
 

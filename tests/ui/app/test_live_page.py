@@ -97,6 +97,31 @@ def test_a_step_moves_the_robots_and_fills_the_numbers(opened: Opened) -> None:
     assert "of 3" in opened.panels.part("Reward").html()
 
 
+def test_while_steps_go_on_a_press_is_shown_at_once_and_the_robots_move_with_every_frame(
+    opened: Opened,
+) -> None:
+    # No time passes on the page, in which the panels are drawn less often.
+    opened.load()
+    hand, session = opened.panels.bodies("panda_hand")[0], opened.session
+    session.change(action_source="random")
+    session.play()
+    wait_until(session, lambda view: view.state == "running" and view.steps_per_second > 0, "the play")
+    for _ in range(2):
+        opened.page.redraw()
+        assert opened.panels.part("Run").shows("Pause")
+        before, serial = hand.batched_positions.copy(), session.view().step_serial
+        wait_until(session, lambda view, serial=serial: view.step_serial > serial + 5, "further steps")
+        opened.page.redraw()
+        assert (hand.batched_positions != before).any()
+    session.change(selected_env=1)
+    opened.page.redraw()
+    assert opened.panels.control("Selected").value == 1
+    session.pause()
+    opened.page.redraw()
+    assert opened.panels.part("Run").shows("Play")
+    wait_until(session, lambda view: view.state == "paused", "the pause")
+
+
 def test_selecting_an_env_moves_its_mark(opened: Opened) -> None:
     opened.load()
     opened.session.change(selected_env=2)
