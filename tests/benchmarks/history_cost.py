@@ -1,6 +1,6 @@
-"""What keeping every step costs: python tests/benchmarks/history_cost.py
+"""What keeping every step costs: python tests/benchmarks/history_cost.py [--task PushCube-v1] [--processor]
 
-Plays PickCube-v1 in this process as the worker does, packs a snapshot of every step, sends it through a pickle as
+Plays a task in this process as the worker does, packs a snapshot of every step, sends it through a pickle as
 the pipe would, and keeps it in a `History` as the server does. Prints medians: milliseconds of the step, of the
 snapshot, of cutting it in parts, of the message; bytes of the message and bytes that the history holds a step.
 """
@@ -15,6 +15,7 @@ import tracemalloc
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 
 from workbench.core.env import actions
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
@@ -31,16 +33,24 @@ from workbench.jobs.task import Stepped
 from workbench.session.history.env_table import EnvTable
 from workbench.session.history.history import History
 
+TASKS = {"PickCube-v1": PickCubeEnv, "PushCube-v1": PushCubeEnv}
+"""The first asks which bodies touch, the second does not."""
+
 
 @dataclass
 class Options:
     num_envs: tuple[int, ...] = (16, 64)
     steps: int = 150
     """Control steps that are played; every episode is 50."""
+    task: Literal["PickCube-v1", "PushCube-v1"] = "PickCube-v1"
+    processor: bool = False
+    """Take the processor's time of all threads in place of the wall's: on a machine that others use, only that says something."""
 
 
-def measure(num_envs: int, steps: int) -> str:
-    task = TaskEnv(make_env(PickCubeEnv, EnvOptions(num_envs=num_envs, backend="cpu", render=False)), 50)
+def measure(num_envs: int, options: Options) -> str:
+    steps, clock = options.steps, time.process_time if options.processor else time.perf_counter
+    env = make_env(TASKS[options.task], EnvOptions(num_envs=num_envs, backend="cpu", render=False))
+    task = TaskEnv(env, 50)
     rng = np.random.default_rng(0)
     table = EnvTable(read_geometry(task.env), task.reset(seed=0), task.control_dt, task.env.reward_mode, {})
     packer, history = SnapshotPacker(), History(table, 2**40)
@@ -48,21 +58,21 @@ def measure(num_envs: int, steps: int) -> str:
     sizes: list[int] = []
     base, held = 0, 0
     for number in range(steps):
-        times = [time.perf_counter()]
+        times = [clock()]
         step = task.step(actions.random_action(task.parts, num_envs, rng))
-        times.append(time.perf_counter())
+        times.append(clock())
         snapshot = task.snapshot()
-        times.append(time.perf_counter())
+        times.append(clock())
         packed = packer.pack(snapshot)
-        times.append(time.perf_counter())
+        times.append(clock())
         none = np.zeros(num_envs, bool)
         event = Stepped(step, none, (), None, packed.body, packed.keys, packed.new_parts, number)
         message = pickle.dumps(event)
-        times.append(time.perf_counter())
+        times.append(clock())
         if number % 2:
             tracemalloc.start()  # the odd steps tell the bytes, the even ones the time
         history.add(pickle.loads(message))
-        times.append(time.perf_counter())
+        times.append(clock())
         if number % 2:
             held += tracemalloc.get_traced_memory()[0]
             tracemalloc.stop()
@@ -78,7 +88,7 @@ def measure(num_envs: int, steps: int) -> str:
     counted = (history.used - base) / (steps - 21)
     shown = ", ".join(f"{lap} {statistics.median(values):.2f}" for lap, values in laps.items())
     return (
-        f"{num_envs} envs: ms {shown}; message {statistics.median(sizes) / 1000:.1f} KB; "
+        f"{options.task}, {num_envs} envs: ms {shown}; message {statistics.median(sizes) / 1000:.1f} KB; "
         f"history counts {counted / 1000:.1f} KB a step and takes {2 * held / (steps - 21) / 1000:.1f}"
     )
 
@@ -86,7 +96,7 @@ def measure(num_envs: int, steps: int) -> str:
 def main(options: Options) -> None:
     torch.set_num_threads(1)
     for count in options.num_envs:
-        print(measure(count, options.steps), flush=True)
+        print(measure(count, options), flush=True)
 
 
 if __name__ == "__main__":
