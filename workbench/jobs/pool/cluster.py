@@ -23,6 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
 from workbench.jobs.pool.deal import NO_LIMIT, Chunk, Deal, PoolError, Result, Setup, Update, Work
 from workbench.jobs.pool.travel import Baggage, pack_baggage, relocated
@@ -38,7 +40,9 @@ _SAY_SECONDS = 1.0
 """How often a worker says what it has made: the post takes some thousand messages a second from all of them."""
 _END_SECONDS = 120.0
 """How long a stopped worker may take to write the items that have ended."""
+_EXIT_SECONDS = 10.0
 _DEAF_SECONDS = 5.0
+_FOLDER = "workbench-job-"
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
 
 
@@ -215,6 +219,8 @@ class _ActorPool:
             num_cpus=how.cpus_per_worker, num_gpus=how.gpus_per_worker, max_restarts=0, max_task_retries=0
         )(Actor)
         self._busy: dict[int, _Actor] = {}
+        self._ending: list[_Actor] = []
+        """Those that have said their last word, and put their folders away."""
         self._started = 0
 
     def serve(self) -> None:
@@ -242,8 +248,11 @@ class _ActorPool:
             raise failure
 
     def end(self) -> None:
-        """End the actors at once, as after a second Ctrl-C: they may not respond."""
-        for actor in self._busy.values():
+        """Wait for the actors that are done, and end the others at once, as after a second Ctrl-C: they may not respond."""
+        if self._ending:
+            ended = [actor.ended for actor in self._ending]
+            self._ray.wait(ended, num_returns=len(ended), timeout=_EXIT_SECONDS)
+        for actor in (*self._busy.values(), *self._ending):
             self._ray.kill(actor.handle)
         self._ray.kill(self._post)
 
@@ -295,7 +304,7 @@ class _ActorPool:
         if news == "asks":
             self._post.answer.remote(number, self._deal.next(number))
         elif news in ("failed", "done"):
-            self._leave(number)
+            self._ending.append(self._busy.pop(number))
             if news == "failed" and self._deal.count_left(1):
                 self._start()
 
@@ -399,7 +408,8 @@ class Actor:
         refuse_breakpoints(ONE_PROCESS)
         treat_ctrl_c_as_error()
         use_private_driver()
-        folder = Path(tempfile.mkdtemp(prefix="workbench-job-"))
+        _remove_left_folders()
+        folder = Path(tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}-"))
         try:
             places = baggage.unpack(folder)
             queue = _PostQueue(self._post, self._number, {str(folder): ""})
@@ -410,6 +420,14 @@ class Actor:
         finally:
             os.chdir("/")
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove_left_folders() -> None:
+    """Remove what actors that were killed on this machine have left."""
+    for path in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*-*"):
+        pid = path.name.removeprefix(_FOLDER).partition("-")[0]
+        if pid.isdigit() and not psutil.pid_exists(int(pid)):
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def _require_versions(versions: Mapping[str, str]) -> None:
