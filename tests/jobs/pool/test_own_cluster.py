@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
+
+from tests.drive.waiting import until
+from tests.recording.verify_rrd import verify_rrd
 
 pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240)]
 STARTS = """
@@ -82,3 +87,48 @@ def test_what_a_cluster_that_has_ended_left_is_passed_over(tmp_path: Path, ray_f
     left.parent.mkdir()
     left.write_text("127.0.0.1:1")
     assert run(AUTO, tmp_path, ray_folder) == ["127.0.0.1"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_over_and_ends_the_cluster(tmp_path: Path, ray_folder: str) -> None:
+    command = [
+        *(
+            sys.executable,
+            "-m",
+            "workbench.cli.main",
+            "record",
+            "PushCube-v1",
+            "--no-pictures",
+            "--cluster",
+            "local",
+        ),
+        *(
+            "--env",
+            "render_backend=none",
+            "--episodes",
+            "100000",
+            "--max-steps",
+            "3",
+            "--out",
+            str(tmp_path / "out"),
+        ),
+    ]
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, "RAY_TMPDIR": ray_folder},
+    )
+    family: list[psutil.Process] = []
+    until(lambda: list((tmp_path / "out").glob("*.json")) or process.poll() is not None, "an episode", 120)
+    family = psutil.Process(process.pid).children(recursive=True)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does it
+    said, errors = process.communicate(timeout=90)
+    assert process.returncode == 2 and "interrupted" in errors and "Traceback" not in errors
+    written = sorted((tmp_path / "out").glob("*.json"))
+    assert len(said.splitlines()) == len(written) + 1
+    assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])
+    _, alive = psutil.wait_procs(family, timeout=20)
+    assert not alive

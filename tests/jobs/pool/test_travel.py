@@ -1,0 +1,98 @@
+"""The author's files on their way to other machines, and names of them on the way back."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from workbench.jobs.actions import needed_by
+from workbench.jobs.pool import travel
+from workbench.jobs.pool.travel import TooMuch, files_below, pack_baggage, relocated
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with a task in a folder of its own."""
+    mine = tmp_path / "here" / "mine"
+    for name in ("task.py", "beside.py", "assets/cup/cup.urdf", "assets/cup/cup.glb", ".git/config", "venv/pyvenv.cfg",
+                 "other/pyvenv.cfg", "other/lib.py", "__pycache__/task.pyc", "recordings/old.rrd", ".hidden"):  # fmt: skip
+        (mine / name).parent.mkdir(parents=True, exist_ok=True)
+        (mine / name).write_text(name)
+    (mine / "link.py").symlink_to("/etc/passwd")
+    (mine.parent / "policy").mkdir()
+    (mine.parent / "policy" / "act.py").write_text("def act(obs): ...\n")
+    (mine.parent / "demo.npy").write_bytes(b"123")
+    monkeypatch.chdir(mine.parent)
+    return mine
+
+
+def test_what_is_hidden_made_by_others_or_a_link_stays(place: Path) -> None:
+    found = [file.relative_to(place).as_posix() for file in files_below(place)]
+    assert found == ["beside.py", "task.py", "assets/cup/cup.glb", "assets/cup/cup.urdf"]
+
+
+def test_what_is_named_from_the_current_folder_is_found_there_too(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    baggage = pack_baggage([place, place / "assets"], [Path("demo.npy"), place / "task.py"])
+    assert baggage.roots == (str(place), str(place.parent / "demo.npy"))
+    there = tmp_path / "there"
+    there.mkdir()
+    places = baggage.unpack(there)
+    assert Path.cwd() == Path(f"{there}{place.parent}")
+    assert Path("mine/assets/cup/cup.urdf").read_text() == "assets/cup/cup.urdf"
+    assert Path("demo.npy").read_bytes() == b"123"
+    assert Path(places[str(place)], "task.py").samefile("mine/task.py")
+
+
+def test_too_much_is_refused_with_what_is_large(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(travel, "MOST_BYTES", 2 << 20)
+    (place / "huge.bin").write_bytes(bytes(5 << 20))
+    with pytest.raises(TooMuch, match=r"are 5 MB, and up to 2 MB travel.*huge\.bin \(5 MB\)"):
+        pack_baggage([place])
+
+
+@dataclass(frozen=True)
+class Thing:
+    path: Path
+    text: str
+    numbers: np.ndarray
+    raw: bytes
+    more: dict[str, tuple[str, ...]]
+
+
+def test_paths_are_replaced_wherever_they_stand_but_in_bytes_and_arrays() -> None:
+    thing = Thing(Path("/a/b/c.py"), "at /a/b/c.py:3", np.zeros(2), b"/a/b", {"/a/b/c": ("/a/x", "/a/b")})
+    there = relocated(thing, {"/a/b": "/far", "/a": "/near"})
+    assert (there.path, there.text, there.raw) == (Path("/far/c.py"), "at /far/c.py:3", b"/a/b")
+    assert there.more == {"/far/c": ("/near/x", "/far")} and there.numbers is thing.numbers
+    assert relocated(thing, {}) is thing
+
+
+def test_a_job_needs_the_folder_of_its_task_and_what_acts(place: Path) -> None:
+    needed = needed_by("mine/task.py:Task", "policy/act.py:act")
+    assert [folder.resolve() for folder in needed.folders] == [place, place.parent / "policy"]
+    needed = needed_by("mine/task.py", "demo.npy")
+    assert needed.files == (Path("demo.npy"),)
+    assert (
+        needed_by("PushCube-v1", "random") == needed_by("PushCube-v1")
+        and not needed_by("PushCube-v1").folders
+    )
+
+
+def test_a_package_of_the_current_folder_is_needed_from_its_top_and_an_installed_one_is_not(
+    place: Path,
+) -> None:
+    package = place.parent / "lab" / "tasks"
+    package.mkdir(parents=True)
+    for folder in (package, package.parent):
+        (folder / "__init__.py").touch()
+    (package / "cups.py").touch()
+    assert needed_by("lab.tasks.cups:Cups").folders == (package.parent,)
+    assert needed_by("PushCube-v1", imports=["lab.tasks"]).folders == (package.parent,)
+    assert needed_by("mani_skill.envs.tasks.tabletop.push_cube:PushCubeEnv").folders == ()
+    assert os.path.isdir("lab")
