@@ -122,7 +122,11 @@ def test_ctrl_c_keeps_what_is_over_and_ends_the_cluster(tmp_path: Path, ray_fold
         env={**os.environ, "RAY_TMPDIR": ray_folder},
     )
     family: list[psutil.Process] = []
-    until(lambda: list((tmp_path / "out").glob("*.json")) or process.poll() is not None, "an episode", 120)
+    until(
+        lambda: len(list((tmp_path / "out").glob("*.json"))) > 40 or process.poll() is not None,
+        "some episodes",
+        120,
+    )
     family = psutil.Process(process.pid).children(recursive=True)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does it
     said, errors = process.communicate(timeout=90)
