@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
+import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -124,6 +126,41 @@ def test_the_episodes_are_the_same_on_any_number_of_envs_and_processes(
     for one, other in zip(recorded.written, again.written, strict=True):
         assert_same(read_episode(one.path), read_episode(other.path))
         assert one.path.with_suffix(".h5").read_bytes() == other.path.with_suffix(".h5").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [2, 4])
+def test_processes_that_are_killed_cost_no_episode_and_double_none(workers: int, tmp_path: Path) -> None:
+    policy = tmp_path / "act.py"
+    policy.write_text(
+        "import torch\n\ntorch.manual_seed(0)\nlayer = torch.nn.Linear(35, 8)\n\n\n"
+        "def act(obs):\n    return torch.tanh(layer(obs)).detach()\n"
+    )
+    options = TaskOptions(num_envs=3, env_kwargs=PLAIN)
+    what = RecordOptions(
+        *("PushCube-v1", tmp_path / "here", 13),
+        actions=f"{policy}:act",
+        pictures=False,
+        max_steps=5,
+        options=options,
+    )
+    here = record(what)
+    killed: set[int] = set()
+
+    def kill(progress: RecordProgress) -> None:
+        for child in psutil.Process().children(recursive=True) if len(killed) < 2 else ():
+            with suppress(psutil.Error):  # it has ended meanwhile
+                words = child.cmdline()
+                if progress.over and "workbench.jobs.pool.processes" in words and child.children() == []:
+                    child.kill()
+                    killed.add(child.pid)
+                    return
+
+    there = record(replace(what, out=tmp_path / "there", workers=workers), on_progress=kill)
+    assert len(killed) == 2 and not there.failures
+    for one, other in zip(here.written, there.written, strict=True):
+        assert one.path.with_suffix(".h5").read_bytes() == other.path.with_suffix(".h5").read_bytes()
+    assert len(list((tmp_path / "there").iterdir())) == 3 * 13
 
 
 def test_an_episode_does_not_depend_on_those_before_it_in_its_process(tmp_path: Path) -> None:
