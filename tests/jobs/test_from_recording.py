@@ -15,6 +15,7 @@ import pytest
 from tests.drive.session import TASKS, live_session, step, wait_until
 from tests.session.recorded_runs import opened, reaching, record
 from workbench.core.capture.recorded_run import RecordedRun
+from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.from_recording import (
     CannotEnterRecording,
     options_of,
@@ -22,8 +23,13 @@ from workbench.jobs.from_recording import (
     reference_of,
     why_not_enter,
 )
+from workbench.jobs.open_task import open_task
+from workbench.jobs.record import record as record_episodes
+from workbench.jobs.rescore.run import rescore
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.episode.row import Source
+from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 
@@ -233,3 +239,23 @@ def test_another_task_than_the_open_one_is_named(live: Session) -> None:
     assert task is not None
     assert why_not_enter(task, info(None)) == ""
     assert "PickCube-v1" in why_not_enter(task, info(None, "PickCube-v1"))
+
+
+TWO_MODES = "{'panda-0': 'pd_joint_pos', 'panda-1': 'pd_joint_delta_pos'}"
+
+
+def test_two_robots_are_made_again_with_the_mode_that_both_have(tmp_path: Path) -> None:
+    options = TaskOptions(
+        num_envs=1, env_kwargs={"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
+    )
+    what = RecordOptions("TwoRobotPickCube-v1", tmp_path, 1, pictures=False, max_steps=2, options=options)
+    (written,) = record_episodes(what).written
+    info = read_episode(written.path).info
+    assert info.control_mode == info.env_kwargs["control_mode"] == "pd_ee_delta_pose"
+    again = open_task("TwoRobotPickCube-v1", options_of(info, 1, TaskOptions()))
+    (verdict,) = rescore(again, [Source(written.path)])
+    again.env.close()
+    assert not verdict.why_not and not verdict.differs
+    # As recordings of last week have it.
+    older = replace(info, control_mode=TWO_MODES, env_kwargs={})
+    assert "control_mode" not in options_of(older, 1).env_kwargs

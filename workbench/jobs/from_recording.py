@@ -210,7 +210,8 @@ def class_in(file: Path, env_id: str) -> str | None:
 def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None) -> TaskOptions:
     """Options of the recording's task: its own robot, modes and control."""
     kwargs = dict(info.env_kwargs)
-    if info.control_mode is not None:
+    # Earlier recordings of several robots have the text of a dict there.
+    if info.control_mode is not None and info.control_mode.isidentifier():
         kwargs.setdefault("control_mode", info.control_mode)
     for name in (*HOW_IT_IS_RUN, "human_render_camera_configs"):
         kwargs.pop(name, None)

@@ -33,7 +33,7 @@ from workbench.core.capture.recorded_run import env_kwargs
 from workbench.core.env import actions
 from workbench.core.env.assets import MissingAssets
 from workbench.core.env.cpu_scene import BatchedCpuMixin
-from workbench.core.env.keywords import constructor_arguments, describe_keywords
+from workbench.core.env.keywords import constructor_arguments, control_mode_of, describe_keywords
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.maniskill_private import parse_cameras, version_notice
@@ -250,7 +250,6 @@ def describe(
     simulation = "gpu" if env.device.type == "cuda" else "cpu (batched)"
     can_render = bool(env.scene.can_render())
     renderer = find_renderer() if can_render else None
-    control_mode = None if env.agent is None else str(env.control_mode)
     return TaskDescription(
         env_id=loaded.env_id,
         class_name=loaded.class_name,
@@ -265,7 +264,7 @@ def describe(
         max_episode_steps=max_episode_steps,
         obs_mode=env.obs_mode,
         reward_mode=env.reward_mode,
-        control_mode=control_mode,
+        control_mode=control_mode_of(env),
         control_dt=task.control_dt,
         actions=tuple(dimensions),
         geometry=read_geometry(env),

@@ -15,6 +15,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.core.env import actions
+from workbench.core.env.keywords import control_mode_of
 from workbench.core.env.task_env import EnvOptions, build_env
 from workbench.core.maniskill_private import task_class
 from workbench.core.scene.scene_index import once_a_scene, read_poses, scene_index
@@ -97,8 +98,8 @@ def make_rollout_env(
     plain = "state_dict" if "state_dict" in env.SUPPORTED_OBS_MODES else "state"
     kept["obs_mode"] = "none" if env.obs_mode == "none" else plain
     kept["reward_mode"] = env.reward_mode
-    if env.agent is not None and isinstance(env.control_mode, str):
-        kept["control_mode"] = env.control_mode
+    if (mode := control_mode_of(env)) is not None:
+        kept["control_mode"] = mode
     options = EnvOptions(
         rollouts,
         backend="gpu" if env.device.type == "cuda" else "cpu",

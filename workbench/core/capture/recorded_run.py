@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.core.env.keywords import control_mode_of
+
 if TYPE_CHECKING:
     from mani_skill.envs.sapien_env import BaseEnv  # the server reads what is below, and loads no torch
 
@@ -103,8 +105,8 @@ def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
     ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. The replay chooses `HOW_IT_IS_RUN`.
     """
     modes: dict[str, Any] = {"obs_mode": env.obs_mode, "reward_mode": env.reward_mode}
-    if env.agent is not None and isinstance(env.control_mode, str):
-        modes["control_mode"] = env.control_mode
+    if (mode := control_mode_of(env)) is not None:
+        modes["control_mode"] = mode
     every = {**given, **modes}
     return {name: every[name] for name in every if name not in HOW_IT_IS_RUN and _is_json(every[name])}
 

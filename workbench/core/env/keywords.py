@@ -91,6 +91,22 @@ def _agents_of(env: Any) -> Sequence[Any]:
     return tuple(getattr(agent, "agents", None) or (agent,))
 
 
+def control_mode_of(env: Any) -> str | None:
+    """The control mode as ``gym.make`` takes it: of several robots the one that all have. None if they differ, and where there
+    is no robot."""
+    if getattr(env, "agent", None) is None:
+        return None
+    # ManiSkill has a dict of several robots, which it does not take.
+    return one_mode(env.control_mode)
+
+
+def one_mode(mode: object) -> str | None:
+    """The control mode in a text, or of all robots in a dict; None for anything else."""
+    modes = set(mode.values()) if isinstance(mode, dict) else {mode}
+    (first, *others) = modes or {None}
+    return first if isinstance(first, str) and not others else None
+
+
 def _modes(cls: Any, env: Any) -> Iterator[Keyword]:
     supported = getattr(cls, "SUPPORTED_ROBOTS", None) or ()
     robot = getattr(env, "robot_uids", None)

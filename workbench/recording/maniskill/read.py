@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from transforms3d.quaternions import mat2quat
 
 from workbench.core.camera_data import CameraInfo
+from workbench.core.env.keywords import one_mode
 from workbench.recording.episode.document import Document, EpisodeJson, WrongDocument, read_document
 from workbench.recording.episode.encoded_pictures import (
     MILLIMETRES_PER_METRE,
@@ -122,7 +123,7 @@ def _episode(group: H5Group, document: Document, entry: EpisodeJson, path: Path,
         source_hash="",
         source={},
         control_dt=1 / frequency if frequency else _UNKNOWN_DT,
-        control_mode=entry.control_mode if isinstance(entry.control_mode, str) else None,
+        control_mode=one_mode(entry.control_mode),
         backend=str(kwargs.get("sim_backend") or "physx_cpu"),
         env_kwargs=kwargs,
         reset_options=(entry.reset_kwargs and entry.reset_kwargs.options) or {},
