@@ -24,6 +24,33 @@ class Silenced:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """What one rule saw of one thing in some episodes. What several parts of the seeds give is put together by
+    `evidence.over_seeds`."""
+
+    names: tuple[str, ...] = ()
+    """Of the thing, such as a body; empty for the episodes as a whole."""
+    place: tuple[str, int, str] | None = None
+    """File, line and function that a breach is told at."""
+    tried: int = 0
+    """Episodes, or what else the rule counts, that were looked at."""
+    seeds: tuple[int, ...] = ()
+    """Of the episodes in which it is broken."""
+    count: int = 0
+    """Breaches, where they are not counted by episodes."""
+    size: float = 0.0
+    """The worst breach."""
+    numbers: tuple[float, ...] = ()
+    """What else the rule decides by."""
+    texts: tuple[str, ...] = ()
+    """For its sentence."""
+    code: str = ""
+    """The text of the line of `place`."""
+    silence: tuple[str, int] | None = None
+    """Reason and line of the comment that silences the rule there."""
+
+
+@dataclass(frozen=True)
 class RuleResult:
     """What the check of one rule came to."""
 
@@ -36,6 +63,8 @@ class RuleResult:
     """Worth knowing, and no breach."""
     why: str = ""
     seconds: float = 0.0
+    seen: tuple[Seen, ...] = ()
+    """Of a rule that looks at all seeds: by this the results of further seeds are put together with it."""
 
 
 def by_rule(results: Iterable[RuleResult]) -> dict[str, RuleResult]:

@@ -16,7 +16,9 @@ from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import Problem, TaskError
 from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
+from workbench.cli.arguments import JobArguments
 from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
+from workbench.cli.jobs import job_path, print_part, run_by
 from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
 from workbench.core.rules import FailOn, Finding
 from workbench.jobs.check import (
@@ -24,10 +26,13 @@ from workbench.jobs.check import (
     CheckOptions,
     CheckReport,
     check,
+    count_chunks,
     count_rules,
     degrees_of_request,
 )
 from workbench.jobs.pool.deal import PoolError
+from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.pool.travel import needed_by
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text
@@ -49,23 +54,38 @@ class CheckOutput:
     """The lowest degree of a finding that makes the exit code 1."""
 
 
-def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> int:
+def check_in_terminal(
+    what: CheckOptions, output: CheckOutput, began: float, run: JobArguments | None = None
+) -> int:
     """Check, print, and write the reports; returns the exit code.
 
     Args:
         began: when the command began, by ``time.monotonic()``.
+        run: where the work runs; None for as many processes as cores and chunks allow.
     """
+    run = run or JobArguments()
     here, root = CurrentFolder(), Path.cwd()  # a task may change it
     try:
         total = count_rules(degrees_of_request(what))
-        with stdout_to_stderr(), progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar:
+        with (
+            stdout_to_stderr(),
+            run_by(run, "check", count_chunks(what), lambda: _job_of(what)) as (executor, _),
+            progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar,
+        ):
             row = bar.add_task("opening", total=total)
             done: set[str] = set()
             told: set[str] = set()
+            several = False
+
+            def show_groups(count: int, of: int) -> None:
+                nonlocal several
+                several = True
+                bar.update(row, completed=count, total=of)
 
             def show(result: RuleResult) -> None:
                 done.add(result.rule)
-                bar.update(row, completed=len(done))
+                if not several:
+                    bar.update(row, completed=len(done))
                 # What a task raises leaves most rules undecided, for one reason.
                 news = {"broken": f"{result.rule}: broken", "failed": f"not decided: {result.why}"}
                 line = news.get(result.state, "")
@@ -76,12 +96,19 @@ def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> 
 
             try:
                 report = check(
-                    what, lambda activity: bar.update(row, description=activity), show, began=began
+                    what,
+                    lambda activity: bar.update(row, description=activity),
+                    show,
+                    executor=executor,
+                    began=began,
+                    on_progress=show_groups,
                 )
             except BaseException:
                 bar.update(row, visible=False)
                 raise
-            bar.update(row, completed=len(report.results), description="checked")
+            if not several:
+                bar.update(row, completed=len(report.results))
+            bar.update(row, description="checked")
     except TaskError as error:
         print_problem(error.problem)
         said = _without_result(what, output, root, error.problem, began)
@@ -91,7 +118,10 @@ def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> 
     except (OSError, ValueError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
-        return refuse("interrupted")
+        code = refuse("interrupted")
+        if job_path(run, "check") is not None:
+            print_part(run, "check", stopped=True)
+        return code
     else:
         said = Reported(report, what, root, output.fail_on)
     try:
@@ -109,9 +139,19 @@ def check_in_terminal(what: CheckOptions, output: CheckOutput, began: float) -> 
         print(as_json(said), end="", flush=True)
     elif said.error is None:
         print_report(said)
+        print_part(run, "check", stopped=False)
+    return exit_code(said)
+
+
+def exit_code(said: Reported) -> int:
+    """2 where nothing was checked, 1 for a finding of the degree that fails."""
     if said.error is not None:
         return Exit.REFUSED
-    return Exit.FAILED if said.report.fails(output.fail_on) else Exit.DONE
+    return Exit.FAILED if said.report.fails(said.fail_on) else Exit.DONE
+
+
+def _job_of(what: CheckOptions) -> Job:
+    return job_of("check", what.task, what, ("workers",), needed_by(what.task, what.actions).files)
 
 
 def _without_result(
@@ -178,10 +218,13 @@ def _print_summary(report: CheckReport, root: Path) -> None:
     words += [f"{counts[state]} {state}" for state in ("silenced", "skipped") if counts[state]]
     words += [f"{counts['failed']} not decided"] if counts["failed"] else []
     words += [f"{len(report.ignored)} ignored"] if report.ignored else []
-    seconds = f"{report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
-    if report.picture_seconds:
-        seconds += f" and {report.picture_seconds:.1f} s for the first pictures"
-    _print(f"{_safe(report.task.env_id)}: {', '.join(words)}. {seconds}.")
+    said = f"{_safe(report.task.env_id)}: {', '.join(words)}."
+    if report.seconds:
+        said += f" {report.seconds:.1f} s, of which {report.start_seconds:.1f} s to start"
+        if report.picture_seconds:
+            said += f" and {report.picture_seconds:.1f} s for the first pictures"
+        said += "."
+    _print(said)
 
 
 def _print_by_reason(label: str, results: tuple[RuleResult, ...]) -> None:

@@ -231,7 +231,7 @@ def check(
     /,
     *,
     envs: CheckArguments,
-    workers: int | None = None,
+    run: JobArguments = _HERE,
     select: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     ignore: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     actions: str = "random",
@@ -247,7 +247,6 @@ def check(
 
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
-        workers: processes, which share the groups of rules; as many as cores and groups allow.
         select: check only this rule; repeatable, or several with commas. workbench help rules lists them.
         ignore: do not check this rule; repeatable, or several with commas.
         actions: zero, hold, a policy as module:function or file.py:function, or a file, as of workbench record: it acts
@@ -283,11 +282,16 @@ def check(
         use_private_driver()
     with quick_imports():
         from workbench.cli.check import CheckOutput, check_in_terminal
+        from workbench.cli.jobs import require_job
         from workbench.jobs.check import CheckOptions
 
+    try:
+        require_job(run)
+    except ValueError as error:
+        return refuse(str(error))
     rules = separated(select), separated(ignore)
-    what = CheckOptions(task, options, envs.seeds, *rules, actions, workers, solve)
-    return check_in_terminal(what, CheckOutput(json, json_file, junit, sarif, fail_on), began)
+    what = CheckOptions(task, options, envs.seeds, *rules, actions, solve=solve)
+    return check_in_terminal(what, CheckOutput(json, json_file, junit, sarif, fail_on), began, run)
 
 
 @app.command

@@ -7,9 +7,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from workbench.cli.check import CheckOutput, exit_code
+from workbench.cli.check import print_report as print_check
+from workbench.cli.check_reports import Reported
+from workbench.cli.check_reports import as_json as check_as_json
 from workbench.cli.record import print_recorded
 from workbench.cli.solve import SolveOutput, as_json, print_report
 from workbench.cli.terminal import Exit, print_text, refuse
+from workbench.jobs.check import CheckedGroup, CheckOptions
+from workbench.jobs.check import report_of as check_report_of
 from workbench.jobs.episodes import RecordOptions, Written
 from workbench.jobs.pool.job_file import JobFileError, Merged, read_parts, write_whole
 from workbench.jobs.record import collect
@@ -67,6 +73,8 @@ def _copy(files: Iterable[Path], out: Path) -> None:
 
 def _print(merged: Merged, json_file: Path | None) -> int:
     """Print as the command does; returns its exit code."""
+    if merged.command == "check":
+        return _print_check(merged, json_file)
     if json_file is not None and merged.command != "solve":
         raise JobFileError(f"workbench {merged.command} has no result as JSON: leave out --json-file")
     folder = next(iter(merged.folders.values()), "")
@@ -87,7 +95,22 @@ def _print(merged: Merged, json_file: Path | None) -> int:
         code, missing = Exit.DONE if report.solved else Exit.FAILED, recorded.missing
     else:
         raise JobFileError(f"{merged.files[0]} is of workbench {merged.command}, which merge does not know")
+    return _with_missing(code, missing, "episodes")
+
+
+def _with_missing(code: int, missing: int, what: str) -> int:
+    """Say what is missing; returns the exit code."""
     if missing:
-        print_text(f"{missing} of the job's episodes are in none of these files.")
+        print_text(f"{missing} of the job's {what} are in none of these files.")
         return Exit.FAILED
     return code
+
+
+def _print_check(merged: Merged, json_file: Path | None) -> int:
+    what = merged.requested(CheckOptions)
+    report = check_report_of(what, merged.results(CheckedGroup))
+    said = Reported(report, what, Path.cwd(), CheckOutput().fail_on)
+    if json_file is not None:
+        replace_file(json_file, check_as_json(said).encode())
+    print_check(said)
+    return _with_missing(exit_code(said), report.missing, "groups of rules")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.checks.evidence.episodes import Episodes
+from workbench.checks.evidence.over_seeds import OverSeeds, first_kind, together, tried
+from workbench.checks.results import Seen
+from workbench.core.broken_rule import Place
 from workbench.core.env.actions import hold_action
 from workbench.machine.text import listed, of
 
@@ -19,48 +22,76 @@ FLICKER_SHARE = 0.25
 """Of the steps on which success was true for the first time and gone at the next."""
 
 
-def success_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
+def see_success_at_reset(checkup: Checkup) -> Iterator[Seen]:
     """Over all seeds."""
     success = _flag(checkup.starts, "success")[0]
-    if success.any():
-        seeds = [seed for seed, true in zip(checkup.starts.seeds, success, strict=True) if true]
+    seeds = [seed for seed, true in zip(checkup.starts.seeds, success, strict=True) if true]
+    yield Seen(place=checkup.places.entry("success"), tried=len(success), seeds=tuple(seeds))
+
+
+def success_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    if seeds := [seed for row in rows for seed in row.seeds]:
         yield Found(
-            f"success is true right after the reset of {of(len(seeds), len(success), 'seed')} (seed {listed(seeds)}): "
+            f"success is true right after the reset of {of(len(seeds), tried(rows), 'seed')} (seed {listed(seeds)}): "
             "the episode would end at its first step. Place the bodies away from the goal, or ask in evaluate() for "
             "more than they have at the start.",
-            checkup.places.entry("success"),
+            rows[0].place,
             len(seeds),
         )
 
 
-def success_and_fail(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over all rollouts."""
+def see_success_and_fail(checkup: Checkup) -> Iterator[Seen]:
+    """Over all rollouts, up to the kind that has both."""
     for episodes in checkup.rollouts:
         both = _flag(episodes, "success") & _flag(episodes, "fail")
+        place = checkup.places.entry("success")
+        yield _seen_at(both, episodes, (episodes.kind,), place)
         if both.any():
-            step, env = (int(i) for i in np.argwhere(both)[0])
-            count = of(int(both.any(axis=0).sum()), both.shape[1], f"{episodes.kind} episode")
-            yield Found(
-                f"success and fail are both true in {count}, first at step {step} of seed {episodes.seeds[env]}. Write "
-                "`success & ~fail`.",
-                checkup.places.entry("success"),
-                int(both.sum()),
-            )
             return
 
 
-def success_flickers(checkup: Checkup) -> Iterator[Found | Note]:
+def success_and_fail(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    if (row := first_kind(rows)) is not None:
+        yield Found(
+            f"success and fail are both true in {_episodes_of(row)}, {row.texts[0]}. Write `success & ~fail`.",
+            row.place,
+            row.count,
+        )
+
+
+def _seen_at(bad: NDArray[np.bool_], episodes: Episodes, names: tuple[str, ...], place: Place | None) -> Seen:
+    """A row of a breach that is there at states, (T, K), of episodes."""
+    seeds = tuple(episodes.seeds[i] for i in np.flatnonzero(bad.any(axis=0)))
+    texts: tuple[str, ...] = ()
+    if seeds:
+        step, env = (int(i) for i in np.argwhere(bad)[0])
+        texts = (f"first at step {step} of seed {episodes.seeds[env]}",)
+    return Seen(names, place, bad.shape[1], seeds, int(bad.sum()), texts=texts)
+
+
+def _episodes_of(row: Seen) -> str:
+    """``3 of 32 random episodes``, of a row whose first name is their kind."""
+    return of(len(row.seeds), row.tried, f"{row.names[0]} episode")
+
+
+def see_success_flickers(checkup: Checkup) -> Iterator[Seen]:
     """Over all rollouts that succeed."""
-    times = gone = 0
-    at_reset = succeeds = False
-    kinds: list[str] = []
     for episodes in checkup.rollouts:
         success = _flag(episodes, "success")
         begun = success[1:-1] & ~success[:-2]
-        times, gone = times + int(begun.sum()), gone + int((begun & ~success[2:]).sum())
-        at_reset, succeeds = at_reset or bool(success[0].any()), succeeds or bool(success.any())
-        kinds.append(episodes.kind)
-    which = " or ".join(kinds)
+        yield Seen(
+            (episodes.kind,),
+            checkup.places.entry("success"),
+            tried=int(begun.sum()),
+            count=int((begun & ~success[2:]).sum()),
+            numbers=(float(success[0].any()), float(success.any())),
+        )
+
+
+def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    times, gone = sum(row.tried for row in rows), sum(row.count for row in rows)
+    at_reset, succeeds = (any(row.numbers[k] for row in rows) for k in (0, 1))
+    which = " or ".join(dict.fromkeys(row.names[0] for row in rows))
     if not succeeds:
         raise CannotCheck(f"no {which} episode succeeds")
     if not times:
@@ -73,31 +104,39 @@ def success_flickers(checkup: Checkup) -> Iterator[Found | Note]:
         yield Found(
             f"success is true for a single step {gone} of {times} times in {which} episodes. Ask for a state that lasts, "
             "such as `is_robot_static` or a count of steps, or an easier threshold.",
-            checkup.places.entry("success"),
+            rows[0].place,
             gone,
         )
 
 
-def success_stays_possible(checkup: Checkup) -> Iterator[Found | Note]:
+def see_success_stays_possible(checkup: Checkup) -> Iterator[Seen]:
     """Whether there is an entry at all, and in how many rollouts it is reached."""
     entries = checkup.starts.evaluate
     if any(known != "elapsed_steps" for _, known in _misspelt(entries)):
         raise CannotCheck("an entry has nearly the name that ManiSkill reads, see entry-name")
     if "success" not in entries and "fail" not in entries:
         own = checkup.loaded.cls.compute_sparse_reward is not BaseEnv.compute_sparse_reward
-        if checkup.task.env.reward_mode != "sparse" or own:
-            # As ManiSkill's tasks of walking, balancing and drawing.
-            yield Note("evaluate() has neither success nor fail, so no success rate can be counted")
-            return
-        yield Found(
-            "evaluate() returns neither success nor fail, from which the sparse reward is made: it is always 0. Return "
-            "{'success': ...} as a bool tensor with a row for each env.",
-            checkup.places.hook("evaluate"),
-        )
+        # As ManiSkill's tasks of walking, balancing and drawing.
+        as_they_do = checkup.task.env.reward_mode != "sparse" or own
+        yield Seen(place=checkup.places.hook("evaluate"), count=not as_they_do)
     elif "success" in entries:
         for episodes in checkup.rollouts:
             reached = int(_flag(episodes, "success").any(axis=0).sum())
-            yield Note(f"success in {of(reached, len(episodes.seeds), f'{episodes.kind} episode')}")
+            yield Seen((episodes.kind,), tried=len(episodes.seeds), count=reached)
+
+
+def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    for row in rows[:1]:
+        if not row.names and not row.count:
+            yield Note("evaluate() has neither success nor fail, so no success rate can be counted")
+        elif not row.names:
+            yield Found(
+                "evaluate() returns neither success nor fail, from which the sparse reward is made: it is always 0. Return "
+                "{'success': ...} as a bool tensor with a row for each env.",
+                row.place,
+            )
+    for row in together(rows):
+        yield Note(f"success in {of(row.count, row.tried, f'{row.names[0]} episode')}")
 
 
 def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
@@ -132,25 +171,35 @@ def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
-def entries_finite(checkup: Checkup) -> Iterator[Found | Note]:
+def see_entries_finite(checkup: Checkup) -> Iterator[Seen]:
     """Over all rollouts."""
     told: set[str] = set()
     for episodes in checkup.rollouts:
+        yield Seen((episodes.kind,), tried=len(episodes.seeds))
         for name, rows in episodes.evaluate.items():
             if rows.dtype.kind != "f" or name in told:
                 continue
             bad = np.logical_or.reduce(~np.isfinite(rows.reshape(*rows.shape[:2], -1)), axis=2)
-            if not bad.any():
-                continue
-            told.add(name)
-            step, env = (int(i) for i in np.argwhere(bad)[0])
-            count = of(int(bad.any(axis=0).sum()), bad.shape[1], f"{episodes.kind} episode")
-            yield Found(
-                f"{name!r} is not finite in {count}, first at step {step} of seed {episodes.seeds[env]}. Look for a division "
-                "or a square root of what can be 0, and clamp it; for what is not known, return 0 and a bool beside it.",
-                checkup.places.entry(name.rpartition("/")[2]),
-                int(bad.sum()),
-            )
+            if bad.any():
+                told.add(name)
+                place = checkup.places.entry(name.rpartition("/")[2])
+                yield _seen_at(bad, episodes, (episodes.kind, name), place)
+
+
+def entries_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    told: set[str] = set()
+    for row in together(row for row in rows if len(row.names) == 2):
+        kind, name = row.names
+        if name in told:
+            continue
+        told.add(name)
+        count = of(len(row.seeds), tried(rows, kind), f"{kind} episode")
+        yield Found(
+            f"{name!r} is not finite in {count}, {row.texts[0]}. Look for a division "
+            "or a square root of what can be 0, and clamp it; for what is not known, return 0 and a bool beside it.",
+            row.place,
+            row.count,
+        )
 
 
 def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
@@ -167,11 +216,11 @@ def flags(rows: NDArray) -> NDArray[np.bool_]:
 
 
 CHECKS: Mapping[str, Check] = {
-    "success-at-reset": success_at_reset,
-    "success-stays-possible": success_stays_possible,
+    "success-at-reset": OverSeeds(see_success_at_reset, success_at_reset),
+    "success-stays-possible": OverSeeds(see_success_stays_possible, success_stays_possible),
     "entry-name": entry_name,
     "info-rows": info_rows,
-    "success-and-fail": success_and_fail,
-    "success-flickers": success_flickers,
-    "entries-finite": entries_finite,
+    "success-and-fail": OverSeeds(see_success_and_fail, success_and_fail),
+    "success-flickers": OverSeeds(see_success_flickers, success_flickers),
+    "entries-finite": OverSeeds(see_entries_finite, entries_finite),
 }

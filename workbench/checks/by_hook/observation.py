@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from workbench.authoring.loading.blamed import blamed
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note, leaf_rows
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, odd_states, write_all
+from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
+from workbench.checks.results import Seen
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
 from workbench.core.capture.recorded_state import read_states
@@ -34,67 +36,105 @@ MOST_BODIES = 40
 """Bodies that are moved one after the other."""
 
 
-def observation_finite(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts and odd states."""
+def see_observation_finite(checkup: Checkup) -> Iterator[Seen]:
+    """Over random rollouts: a row for each leaf; where all are finite, also over odd states."""
+    finite = True
     for name, rows in _leaves(checkup).items():
         bad = np.logical_or.reduce(~np.isfinite(rows), axis=2)
-        if bad.any():
+        seeds = tuple(checkup.random.seeds[i] for i in np.flatnonzero(bad.any(axis=0)))
+        texts: tuple[str, ...] = ()
+        if seeds:
+            finite = False
             step, env = (int(i) for i in np.argwhere(bad)[0])
-            yield Found(
-                f"{name!r} of the observation is not finite in {of(int(bad.any(axis=0).sum()), bad.shape[1], 'episode')}, "
-                f"first at step {step} of seed {checkup.random.seeds[env]}. Look for a division or a square root of "
-                "what can be 0, and clamp it.",
-                _place(checkup, name),
-                int(bad.sum()),
-            )
-            return
+            texts = (f"first at step {step} of seed {checkup.random.seeds[env]}",)
+        place = _place(checkup, name) if seeds else None
+        yield Seen(("random", name), place, bad.shape[1], seeds, int(bad.sum()), texts=texts)
+    if not finite:
+        return
     seen = checkup.look(odd_states)
     for row, obs in enumerate(seen.obs):
         for name, rows in obs.items():
             bad = ~np.isfinite(rows).all(axis=1)
             if bad.any():
                 env = int(np.flatnonzero(bad)[0])
-                yield Found(
-                    f"{name!r} of the observation is not finite {seen.kinds[row]} (seed {seen.seeds[row][env]}). Look "
-                    "for a division or a square root of what can be 0, and clamp it.",
-                    _place(checkup, name),
-                    int(bad.sum()),
-                )
+                text = f"{seen.kinds[row]} (seed {seen.seeds[row][env]})"
+                place = _place(checkup, name)
+                yield Seen(("odd states", name), place, count=int(bad.sum()), texts=(text,))
                 return
 
 
-def observation_constant(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts and odd states: leaves in which no number ever changes."""
+def observation_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    found = [row for row in together(rows) if row.count]
+    for row in sorted(found, key=lambda row: row.names[0] != "random")[:1]:
+        where = row.texts[0]
+        if row.names[0] == "random":
+            where = f"in {of(len(row.seeds), row.tried, 'episode')}, {where}"
+        yield Found(
+            f"{row.names[1]!r} of the observation is not finite {where}. Look for a division or a square root of what can "
+            "be 0, and clamp it.",
+            row.place,
+            row.count,
+        )
+
+
+def see_observation_constant(checkup: Checkup) -> Iterator[Seen]:
+    """Over random rollouts and odd states: the numbers of each leaf in which none changes."""
     seen = checkup.look(odd_states)
+    yield Seen(tried=len(checkup.seeds))
     for name, rows in _leaves(checkup).items():
         odd = [obs[name] for obs in seen.obs if name in obs]
-        together = np.concatenate([rows.reshape(-1, rows.shape[2]), *odd])
-        if not together.size or not np.isfinite(together).all() or np.ptp(together, axis=0).max() > 0:
+        values = np.concatenate([rows.reshape(-1, rows.shape[2]), *odd])
+        changes = not values.size or not np.isfinite(values).all() or np.ptp(values, axis=0).max() > 0
+        yield Seen(
+            (name,),
+            None if changes else _place(checkup, name),
+            tried=len(values),
+            numbers=() if changes else tuple(values[0].tolist()),
+            texts=("of the robot",) if _is_of_the_robot(checkup, name) else (),
+        )
+
+
+def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    """Leaves that are the same for all seeds."""
+    values: dict[tuple[str, ...], set[tuple[float, ...]]] = {}
+    for row in rows:
+        values.setdefault(row.names, set()).add(row.numbers)
+    for row in together(rows):
+        name, value = row.names[0], np.array(row.numbers)
+        if len(values[row.names]) > 1 or not row.numbers:
             continue
-        value = together[0]
-        if np.isin(value, (0.0, 1.0)).all() or _is_of_the_robot(checkup, name):
+        if np.isin(value, (0.0, 1.0)).all() or row.texts:
             # A flag or a force, which random actions may never raise; or the robot's own, such as a palm that is fixed.
             yield Note(f"{name!r} of the observation is {_text(value)} in all states that were tried")
             continue
         yield Found(
-            f"{name!r} of the observation is {_text(value)} in all of {len(together)} states, over "
-            f"{len(checkup.seeds)} seeds. Leave it out, or draw it anew in _initialize_episode.",
-            _place(checkup, name),
+            f"{name!r} of the observation is {_text(value)} in all of {row.tried} states, over "
+            f"{tried(rows)} seeds. Leave it out, or draw it anew in _initialize_episode.",
+            row.place,
         )
 
 
-def observation_huge(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts."""
+def see_observation_huge(checkup: Checkup) -> Iterator[Seen]:
+    """Over random rollouts: a row for each leaf."""
     for name, rows in _leaves(checkup).items():
         size = np.abs(np.nan_to_num(rows, posinf=0, neginf=0))
         huge = size.max(axis=2) > HUGE
+        texts: tuple[str, ...] = ()
         if huge.any():
             step, env = (int(i) for i in np.argwhere(huge)[0])
+            texts = (f"first at step {step} of seed {checkup.random.seeds[env]}",)
+        place = _place(checkup, name) if texts else None
+        yield Seen((name,), place, count=int(huge.sum()), size=float(size.max()), texts=texts)
+
+
+def observation_huge(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    for row in together(rows):
+        if row.count:
             yield Found(
-                f"{name!r} of the observation is up to {size.max():.4g}, first at step {step} of seed "
-                f"{checkup.random.seeds[env]}. Give metres and radians, clamp it, or leave out what is hidden far away.",
-                _place(checkup, name),
-                int(huge.sum()),
+                f"{row.names[0]!r} of the observation is up to {row.size:.4g}, {row.texts[0]}. Give metres and radians, "
+                "clamp it, or leave out what is hidden far away.",
+                row.place,
+                row.count,
             )
 
 
@@ -235,9 +275,9 @@ def _changed(before: dict[str, NDArray[np.float64]], now: dict[str, NDArray[np.f
 
 
 CHECKS: Mapping[str, Check] = {
-    "observation-finite": observation_finite,
-    "observation-constant": observation_constant,
-    "observation-huge": observation_huge,
+    "observation-finite": OverSeeds(see_observation_finite, observation_finite),
+    "observation-constant": OverSeeds(see_observation_constant, observation_constant),
+    "observation-huge": OverSeeds(see_observation_huge, observation_huge),
 }
 PICTURE_CHECKS: Mapping[str, Check] = {
     "ground-truth": ground_truth,

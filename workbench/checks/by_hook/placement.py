@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from workbench.authoring.problem import TaskError
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.checks.evidence.episodes import SeenOutlier
+from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
+from workbench.checks.results import Seen
 from workbench.core.broken_rule import Place
 from workbench.core.env.actions import random_action
 from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of
@@ -84,8 +86,8 @@ def _is_num_envs(node: ast.AST) -> bool:
     return isinstance(node, ast.Attribute) and node.attr == "num_envs"
 
 
-def overlap_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over all seeds."""
+def see_overlaps_at_reset(checkup: Checkup) -> Iterator[Seen]:
+    """Over all seeds: a row for each pair of bodies."""
     fixed = immovable(checkup)
     seeds_of: dict[tuple[str, str], list[int]] = {}
     depths: dict[tuple[str, str], float] = {}
@@ -94,15 +96,11 @@ def overlap_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
             if overlap.depth > DEEP and not fixed.issuperset(overlap.bodies):
                 seeds_of.setdefault(overlap.bodies, []).append(seed)
                 depths[overlap.bodies] = max(depths.get(overlap.bodies, 0), overlap.depth)
-    # One robot in a table has many links in it: a finding for each pair of owners, of the deepest bodies.
-    deepest: dict[frozenset[str], tuple[str, str]] = {}
-    for pair in sorted(depths, key=lambda pair: -depths[pair]):
-        deepest.setdefault(frozenset(body.split("/", 1)[0] for body in pair), pair)
-    for first, second in deepest.values():
-        seeds = seeds_of[first, second]
-        loose = [body for body in (first, second) if body not in fixed]
+    yield Seen(tried=len(checkup.overlaps))
+    for pair, seeds in seeds_of.items():
+        loose = [body for body in pair if body not in fixed]
         mover = min(loose, key=lambda body: "/" in body)
-        still = [body for body in (first, second) if body in fixed and "/" not in body]
+        still = [body for body in pair if body in fixed and "/" not in body]
         if "/" in mover:
             advice = "Raise its root, or reset it to joint positions with which it touches nothing."
         elif still:
@@ -111,21 +109,34 @@ def overlap_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
             )
         else:
             advice = f"Place {mover} further away, or draw again while they are too near."
+        place = _where_placed(checkup, mover)
+        yield Seen(pair, place, seeds=tuple(seeds), size=depths[pair], texts=(advice,))
+
+
+def overlap_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    # One robot in a table has many links in it: a finding for each pair of owners, of the deepest bodies.
+    deepest: dict[frozenset[str], Seen] = {}
+    for row in sorted(together(rows), key=lambda row: -row.size):
+        deepest.setdefault(frozenset(body.split("/", 1)[0] for body in row.names), row)
+    for row in deepest.values():
+        first, second = row.names
         yield Found(
-            f"{first} and {second} are {1000 * depths[first, second]:.0f} mm inside each other after the reset of "
-            f"{of(len(seeds), len(checkup.overlaps), 'seed')} (seed {listed(seeds)}). {advice}",
-            _where_placed(checkup, mover),
-            len(seeds),
+            f"{first} and {second} are {1000 * row.size:.0f} mm inside each other after the reset of "
+            f"{of(len(row.seeds), tried(rows), 'seed')} (seed {listed(row.seeds)}). {row.texts[0]}",
+            row.place,
+            len(row.seeds),
         )
 
 
-def falls_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
+def see_falls_at_reset(checkup: Checkup) -> Iterator[Seen]:
     """Over all seeds, while the robot holds still for a second."""
     index, still = scene_index(checkup.task.env), checkup.still
     robots = _robots(checkup)
     # What a hand holds may slip, and what is pushed out of the robot has a rule of its own.
     wanted = _start_moving(checkup) | _touched(checkup, robots)
+    yield from (Seen(("wanted", owner)) for owner in sorted(wanted))
     before, after = still.poses[0], still.poses[-1]
+    yield Seen(tried=len(still.seeds))
     for body, name in enumerate(index.names):
         loose = index.kinds[body] == "dynamic" or (
             index.kinds[body] == "link" and index.owners[body] not in robots
@@ -140,20 +151,35 @@ def falls_at_reset(checkup: Checkup) -> Iterator[Found | Note]:
         bad = (moved > MOVED) | (turned > TURNED) | lost
         if not bad.any():
             continue
-        worst = int(np.nan_to_num(np.where(bad, moved, 0), nan=np.inf).argmax())
+        furthest = np.nan_to_num(np.where(bad, moved, 0), nan=np.inf)
+        worst = int(furthest.argmax())
         how = "falls" if away[worst, 2] < -0.7 * moved[worst] else "moves"
         seeds = [still.seeds[i] for i in np.flatnonzero(bad)]
-        yield Found(
-            f"{name} {how} {moved[worst]:.2f} m and turns {np.degrees(turned[worst]):.0f} degrees in the first second of "
-            f"{of(len(seeds), len(bad), 'seed')} (seed {listed(seeds)}) while the robot holds still. Place it where it "
-            "rests.",
+        yield Seen(
+            ("body", name, index.owners[body]),
             _where_placed(checkup, index.owners[body]),
-            len(seeds),
+            seeds=tuple(seeds),
+            size=float(furthest[worst]),
+            texts=(f"{how} {moved[worst]:.2f} m and turns {np.degrees(turned[worst]):.0f} degrees",),
         )
 
 
-def robot_holds(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over all seeds, while the controllers are asked to hold, for a second."""
+def falls_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    wanted = {row.names[1] for row in rows if row.names[:1] == ("wanted",)}
+    for row in together((row for row in rows if row.names[:1] == ("body",)), worst=True):
+        _, name, owner = row.names
+        if owner in wanted:
+            continue
+        yield Found(
+            f"{name} {row.texts[0]} in the first second of {of(len(row.seeds), tried(rows), 'seed')} "
+            f"(seed {listed(row.seeds)}) while the robot holds still. Place it where it rests.",
+            row.place,
+            len(row.seeds),
+        )
+
+
+def see_robot_holds(checkup: Checkup) -> Iterator[Seen]:
+    """Over all seeds, while the controllers are asked to hold, for a second: a row for each joint."""
     env = checkup.task.env
     if not checkup.task.parts:
         raise CannotCheck("it has no robot")
@@ -167,31 +193,44 @@ def robot_holds(checkup: Checkup) -> Iterator[Found | Note]:
     if any(not _is_fixed(robot.robot) for robot in agents(env)):
         raise CannotCheck("its robot stands on the floor: balancing is what a policy learns")
     driven = {joint.name for part in checkup.task.parts for joint in part.controller.joints}
-    qpos, robots = checkup.still.qpos, _robots(checkup)
-    if qpos is None:
+    still, robots = checkup.still, _robots(checkup)
+    if still.qpos is None:
         raise CannotCheck("its robots have different joints in each env")
+    place = checkup.places.hook("_initialize_episode")
     column = 0
     for owner, articulation in joints_of_scene(env):
         for joint in articulation.active_joints:
-            limit = SAGGED["prismatic" if str(joint.type[0]) == "prismatic" else "revolute"]
-            away = np.abs(qpos[-1, :, column] - qpos[0, :, column])
+            kind = "prismatic" if str(joint.type[0]) == "prismatic" else "revolute"
+            away = np.abs(still.qpos[-1, :, column] - still.qpos[0, :, column])
             column += 1
-            if owner not in robots or joint.name not in driven or not (away > limit).any():
+            if owner not in robots or joint.name not in driven:
                 continue
-            count = int((away > limit).sum())
-            unit = "m" if limit == SAGGED["prismatic"] else "rad"
+            bad = away > SAGGED[kind]
+            yield Seen(
+                (owner, joint.name),
+                place,
+                tried=len(away),
+                seeds=tuple(still.seeds[i] for i in np.flatnonzero(bad)),
+                size=float(np.nan_to_num(away).max(initial=0)),
+                texts=("m" if kind == "prismatic" else "rad",),
+            )
+
+
+def robot_holds(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    for row in together(rows):
+        if row.seeds:
             yield Found(
-                f"joint {joint.name} moves {float(away.max()):.2f} {unit} in a second after the reset of "
-                f"{of(count, len(away), 'seed')}, with the targets of the reset. Raise the stiffness or force limit of its "
-                "controller, or reset it to a pose within its limits that touches nothing.",
-                checkup.places.hook("_initialize_episode"),
-                count,
+                f"joint {row.names[1]} moves {row.size:.2f} {row.texts[0]} in a second after the reset of "
+                f"{of(len(row.seeds), row.tried, 'seed')}, with the targets of the reset. Raise the stiffness or force limit "
+                "of its controller, or reset it to a pose within its limits that touches nothing.",
+                row.place,
+                len(row.seeds),
             )
             return
 
 
-def outside_reach(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over all seeds: bodies that are within reach at some, and beyond at others."""
+def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
+    """Over all seeds: how far each body is."""
     task = checkup.task
     robots = agents(task.env)
     if len(robots) != 1 or not _is_fixed(robots[0].robot) or not hasattr(robots[0], "tcp"):
@@ -202,14 +241,26 @@ def outside_reach(checkup: Checkup) -> Iterator[Found | Note]:
         if index.kinds[body] != "dynamic":
             continue
         distance = np.nan_to_num(np.linalg.norm(poses[:, body, :3] - base, axis=1))
-        beyond = distance > reach + REACH_MARGIN
-        if beyond.any() and not beyond.all():
-            seeds = [checkup.starts.seeds[i] for i in np.flatnonzero(beyond)]
+        beyond = np.flatnonzero(distance > reach + REACH_MARGIN)
+        yield Seen(
+            (name,),
+            _where_placed(checkup, name) if len(beyond) else None,
+            tried=len(distance),
+            seeds=tuple(checkup.starts.seeds[i] for i in beyond),
+            size=float(distance.max(initial=0)),
+            numbers=(reach,),
+        )
+
+
+def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    """Of bodies that are within reach at some seeds, and beyond at others."""
+    for row in together(rows, worst=True):
+        if 0 < len(row.seeds) < row.tried:
             yield Found(
-                f"{name} is up to {distance.max():.2f} m from the robot's base, whose tcp reaches {reach:.2f} m, in "
-                f"{of(len(seeds), len(beyond), 'seed')} (seed {listed(seeds)}). Narrow the range in which it is placed.",
-                _where_placed(checkup, name),
-                len(seeds),
+                f"{row.names[0]} is up to {row.size:.2f} m from the robot's base, whose tcp reaches {row.numbers[0]:.2f} m, in "
+                f"{of(len(row.seeds), row.tried, 'seed')} (seed {listed(row.seeds)}). Narrow the range in which it is placed.",
+                row.place,
+                len(row.seeds),
             )
 
 
@@ -296,21 +347,33 @@ def _quaternions(checkup: Checkup) -> Iterator[tuple[str, NDArray[np.float32], P
             yield each.name, each.quaternions, each.place
 
 
-def bodies_stay(checkup: Checkup) -> Iterator[Found | Note]:
+def see_bodies_stay(checkup: Checkup) -> Iterator[Seen]:
     """Over random rollouts, each until its end."""
     rollouts = checkup.random
     of_owner: dict[str, list[SeenOutlier]] = {}
     for seen in sorted(rollouts.outliers, key=lambda seen: (seen.step, seen.seed)):
         if seen.kind.rule == "bodies-stay":
             of_owner.setdefault(seen.body.split("/", 1)[0], []).append(seen)
-    for every in of_owner.values():
+    yield Seen(tried=len(rollouts.seeds))
+    for owner, every in of_owner.items():
         first, seeds = every[0], sorted({seen.seed for seen in every})
-        yield Found(
-            f"{first.reason} at step {first.step} of seed {first.seed}; in this way or another it leaves the scene in "
-            f"{of(len(seeds), len(rollouts.seeds), 'random episode')} (seed {listed(seeds)}). Let nothing overlap and "
-            "nothing be thrown, or end an episode without it: return `fail` from evaluate().",
+        yield Seen(
+            (owner,),
             _where_placed(checkup, first.body),
-            len(seeds),
+            seeds=tuple(seeds),
+            size=-float(first.step),
+            texts=(f"{first.reason} at step {first.step} of seed {first.seed}",),
+        )
+
+
+def bodies_stay(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    for row in sorted(together(rows, worst=True), key=lambda row: -row.size):
+        yield Found(
+            f"{row.texts[0]}; in this way or another it leaves the scene in "
+            f"{of(len(row.seeds), tried(rows), 'random episode')} (seed {listed(row.seeds)}). Let nothing overlap and "
+            "nothing be thrown, or end an episode without it: return `fail` from evaluate().",
+            row.place,
+            len(row.seeds),
         )
 
 
@@ -383,14 +446,14 @@ def immovable(checkup: Checkup) -> set[str]:
     return found
 
 
-RUN_CHECKS: Mapping[str, Check] = {"bodies-stay": bodies_stay}
+RUN_CHECKS: Mapping[str, Check] = {"bodies-stay": OverSeeds(see_bodies_stay, bodies_stay)}
 """They look at random rollouts."""
 CHECKS: Mapping[str, Check] = {
-    "overlap-at-reset": overlap_at_reset,
-    "falls-at-reset": falls_at_reset,
+    "overlap-at-reset": OverSeeds(see_overlaps_at_reset, overlap_at_reset),
+    "falls-at-reset": OverSeeds(see_falls_at_reset, falls_at_reset),
     "batch-of-reset": batch_of_reset,
     "quaternion-order": quaternion_order,
     "unit-quaternion": unit_quaternion,
-    "robot-holds": robot_holds,
-    "outside-reach": outside_reach,
+    "robot-holds": OverSeeds(see_robot_holds, robot_holds),
+    "outside-reach": OverSeeds(see_outside_reach, outside_reach),
 }

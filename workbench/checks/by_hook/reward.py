@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,9 @@ from workbench.checks.by_hook.evaluate import flags
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.checks.evidence.episodes import Episodes
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, odd_states
+from workbench.checks.evidence.over_seeds import OverSeeds, first_kind, tried
+from workbench.checks.results import Seen
+from workbench.core.broken_rule import Place
 from workbench.core.capture.outliers import REWARD_RANGES, ROUNDING
 from workbench.machine.text import of
 
@@ -28,83 +31,109 @@ CLEARLY_LOWER = 0.05
 """As a share of all rewards' range."""
 
 
-def reward_finite(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over all rollouts and odd states."""
-    what = (
-        "Look for a division, a square root or a logarithm of what can be 0; clamp it, or use "
-        "torch.linalg.norm(..., dim=1)."
-    )
+def see_reward_finite(checkup: Checkup) -> Iterator[Seen]:
+    """Over all rollouts, up to the kind with a breach; else over odd states."""
+    place = checkup.places.hook(*_hooks(checkup))
     for episodes in checkup.rollouts:
         reward = _rewards(checkup, episodes)
         bad = ~np.isfinite(reward)
-        if bad.any():
+        seeds = tuple(episodes.seeds[i] for i in np.flatnonzero(bad.any(axis=0)))
+        texts: tuple[str, ...] = ()
+        if seeds:
             step, env = (int(i) for i in np.argwhere(bad)[0])
-            count = of(int(bad.any(axis=0).sum()), bad.shape[1], f"{episodes.kind} episode")
-            yield Found(
-                f"the reward is {reward[step, env]} in {count}, first at step {step + 1} of seed {episodes.seeds[env]}. "
-                f"{what}",
-                checkup.places.hook(*_hooks(checkup)),
-                int(bad.sum()),
-            )
+            texts = f"{reward[step, env]}", f"first at step {step + 1} of seed {episodes.seeds[env]}"
+        yield Seen((episodes.kind,), place, bad.shape[1], seeds, int(bad.sum()), texts=texts)
+        if seeds:
             return
     seen = checkup.look(odd_states)
     rewards = np.stack(seen.reward[checkup.task.env.reward_mode])
     bad = ~np.isfinite(rewards)
+    texts = ()
     if bad.any():
         row, env = (int(i) for i in np.argwhere(bad)[0])
-        yield Found(
-            f"the reward is {rewards[row, env]} in {of(int(bad.sum()), bad.size, 'state')} in which joints and bodies "
-            f"were put, first {seen.kinds[row]} (seed {seen.seeds[row][env]}). {what}",
-            checkup.places.hook(*_hooks(checkup)),
-            int(bad.sum()),
-        )
+        texts = f"{rewards[row, env]}", f"first {seen.kinds[row]} (seed {seen.seeds[row][env]})"
+    yield Seen(("", "odd states"), place, bad.size, count=int(bad.sum()), texts=texts)
 
 
-def reward_changes(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over random rollouts."""
+def reward_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    if (row := first_kind(sorted(rows, key=lambda row: len(row.names)))) is None:
+        return
+    if len(row.names) == 1:
+        where = of(len(row.seeds), row.tried, f"{row.names[0]} episode")
+    else:
+        where = f"{of(row.count, row.tried, 'state')} in which joints and bodies were put"
+    yield Found(
+        f"the reward is {row.texts[0]} in {where}, {row.texts[1]}. Look for a division, a square root or a logarithm of "
+        "what can be 0; clamp it, or use torch.linalg.norm(..., dim=1).",
+        row.place,
+        row.count,
+    )
+
+
+def see_reward_changes(checkup: Checkup) -> Iterator[Seen]:
+    """Over random rollouts: the largest and the smallest."""
     _require_dense(checkup)
     reward = _rewards(checkup, checkup.random)
-    spread = float(np.nan_to_num(reward).max() - np.nan_to_num(reward).min())
-    if spread < 1e-7:
+    known = np.nan_to_num(reward)
+    yield Seen(
+        place=checkup.places.hook(*_hooks(checkup)),
+        tried=reward.size,
+        numbers=(float(known.max()), float(known.min())),
+        texts=(f"{reward.flat[0]:.4g}",),
+    )
+
+
+def reward_changes(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    """One step with another reward than all others is enough."""
+    most, least = max(row.numbers[0] for row in rows), min(row.numbers[1] for row in rows)
+    if most - least < 1e-7:
         yield Found(
-            f"the reward is {reward.flat[0]:.4g} at each of {reward.size} steps of random episodes. Let it depend on a "
+            f"the reward is {rows[0].texts[0]} at each of {tried(rows)} steps of random episodes. Let it depend on a "
             "distance that the robot changes.",
-            checkup.places.hook(*_hooks(checkup)),
+            rows[0].place,
         )
 
 
-def reward_normalized(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over all rollouts, where the reward is the normalized or the sparse one."""
+def see_reward_normalized(checkup: Checkup) -> Iterator[Seen]:
+    """Over all rollouts, where the reward is the normalized or the sparse one, up to the kind with a breach."""
     mode = checkup.task.env.reward_mode
     if mode not in REWARD_RANGES:
         raise CannotCheck("its reward is neither normalized nor sparse")
     least, most = REWARD_RANGES[mode]
+    sparse = mode == "sparse"
+    hooks = [REWARD_HOOKS[mode]] if sparse else ["compute_normalized_dense_reward", "compute_dense_reward"]
     for episodes in checkup.rollouts:
         reward = _rewards(checkup, episodes)
         known = np.nan_to_num(reward)
         outside = (known < least - ROUNDING) | (known > most + ROUNDING)
-        if not outside.any():
-            continue
-        low, high = float(np.nanmin(reward)), float(np.nanmax(reward))
-        sparse = mode == "sparse"
-        yield Found(
-            f"the {'sparse' if sparse else 'normalized'} reward goes from {low:.3g} to {high:.3g} in {episodes.kind} "
-            "episodes. "
-            + (
-                "Return 1 at success, -1 at fail and 0 elsewhere."
-                if sparse
-                else "Divide the dense reward by the largest that an episode can reach in one step."
-            ),
-            checkup.places.hook(
-                *(
-                    [REWARD_HOOKS[mode]]
-                    if sparse
-                    else ["compute_normalized_dense_reward", "compute_dense_reward"]
-                )
-            ),
-            int(outside.sum()),
+        yield Seen(
+            (episodes.kind,),
+            checkup.places.hook(*hooks),
+            count=int(outside.sum()),
+            numbers=(float(np.nanmin(reward)), float(np.nanmax(reward)))
+            if not np.isnan(reward).all()
+            else (),
+            texts=("sparse" if sparse else "normalized",),
         )
+        if outside.any():
+            return
+
+
+def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    if (row := first_kind(rows)) is None:
         return
+    ranges = [one.numbers for one in rows if one.names == row.names and one.numbers]
+    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+    yield Found(
+        f"the {row.texts[0]} reward goes from {low:.3g} to {high:.3g} in {row.names[0]} episodes. "
+        + (
+            "Return 1 at success, -1 at fail and 0 elsewhere."
+            if row.texts[0] == "sparse"
+            else "Divide the dense reward by the largest that an episode can reach in one step."
+        ),
+        row.place,
+        row.count,
+    )
 
 
 def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
@@ -143,12 +172,12 @@ def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] |
     return (slope, offset) if slope > 0 and wrong <= SAME_RATIO * np.abs(normalized).max() else None
 
 
-def reward_order(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over all rollouts and odd states, in episodes that have success."""
+def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
+    """Over all rollouts and odd states: a row for each episode that has success and a higher reward elsewhere."""
     _require_dense(checkup)
-    lower: list[tuple[float, float, float, str]] = []
-    compared = 0
+    place = checkup.places.hook(*_hooks(checkup))
     for scored in _scored(checkup):
+        compared, higher = 0, list[Seen]()
         for column in range(scored.reward.shape[1]):
             reward, success = scored.reward[:, column], scored.success[:, column]
             if not success.any() or success.all():
@@ -156,37 +185,69 @@ def reward_order(checkup: Checkup) -> Iterator[Found | Note]:
             compared += 1
             row = int(np.argmax(np.where(success, -np.inf, reward)))
             at_success, elsewhere = float(reward[success].max()), float(reward[row])
-            if elsewhere > at_success + CLEARLY_LOWER * scored.range:
-                lower.append((elsewhere - at_success, at_success, elsewhere, scored.where(row, column)))
+            if elsewhere > at_success:
+                where = scored.where(row, column)
+                higher.append(
+                    Seen(("episode", scored.of), place, numbers=(at_success, elsewhere), texts=(where,))
+                )
+        ends = float(scored.reward.min()), float(scored.reward.max())
+        yield Seen(("all", scored.of), tried=compared, numbers=ends)
+        yield from higher
+
+
+def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    """By the range of all rewards of the same kind of episodes."""
+    ends: dict[str, list[tuple[float, ...]]] = {}
+    for row in rows:
+        if row.names[0] == "all":
+            ends.setdefault(row.names[1], []).append(row.numbers)
+    ranges = {of: max(most for _, most in all) - min(least for least, _ in all) for of, all in ends.items()}
+    compared = sum(row.tried for row in rows)
     if not compared:
         raise CannotCheck("no episode that was tried succeeds")
+    lower: list[tuple[float, float, float, str]] = []
+    place: Place | None = None
+    for row in rows:
+        if row.names[0] == "episode":
+            at_success, elsewhere = row.numbers
+            if elsewhere > at_success + CLEARLY_LOWER * ranges[row.names[1]]:
+                lower.append((elsewhere - at_success, at_success, elsewhere, row.texts[0]))
+                place = row.place
     if lower:
         _, at_success, elsewhere, where = max(lower)
         yield Found(
             f"the reward is at most {at_success:.4g} at success and {elsewhere:.4g} elsewhere in the same episode "
             f"({where}), in {of(len(lower), compared, 'episode')}. Give success the most: "
             '`reward[info["success"]] = LARGEST_REWARD`.',
-            checkup.places.hook(*_hooks(checkup)),
+            place,
             len(lower),
         )
 
 
-def reward_needs_success(checkup: Checkup) -> Iterator[Found | Note]:
+def see_reward_needs_success(checkup: Checkup) -> Iterator[Seen]:
     """Over all rollouts and odd states, where the reward is the normalized one."""
     if checkup.task.env.reward_mode != "normalized_dense":
         raise CannotCheck("it has no normalized dense reward")
-    given, places = 0, []
     for scored in _scored(checkup):
-        if (scored.reward > LARGEST).any():
-            raise CannotCheck("its normalized reward goes beyond 1")
         most = (scored.reward >= ALL_THERE_IS) & ~scored.success
-        given += int(most.sum())
-        places += [scored.where(int(row), int(column)) for row, column in np.argwhere(most)[:1]]
+        places = [scored.where(int(row), int(column)) for row, column in np.argwhere(most)[:1]]
+        yield Seen(
+            place=checkup.places.hook(*_hooks(checkup)),
+            count=int(most.sum()),
+            size=float(scored.reward.max()),
+            texts=tuple(places),
+        )
+
+
+def reward_needs_success(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    if any(row.size > LARGEST for row in rows):
+        raise CannotCheck("its normalized reward goes beyond 1")
+    given, places = sum(row.count for row in rows), [text for row in rows for text in row.texts]
     if given:
         yield Found(
             f"the normalized reward is 1 without success in {given} states ({places[0]}): waiting there earns as much. "
             'Let success give the most: `reward[info["success"]] = LARGEST_REWARD`.',
-            checkup.places.hook(*_hooks(checkup)),
+            rows[0].place,
             given,
         )
 
@@ -204,10 +265,8 @@ class _Scored:
     """(T, K)"""
     places: list[list[str]]
     """(1, K) or (T, K) which state that is, for a sentence."""
-
-    @property
-    def range(self) -> float:
-        return float(np.ptp(self.reward))
+    of: str
+    """The kind of episodes, or which odd states."""
 
     def where(self, row: int, column: int) -> str:
         if len(self.places) == 1:
@@ -224,7 +283,9 @@ def _scored(checkup: Checkup) -> list[_Scored]:
             raise CannotCheck("evaluate() has no entry success")
         success = flags(episodes.evaluate["success"][1:])
         actions = "" if episodes.kind == "random" else f" with {episodes.kind} actions"
-        found.append(_Scored(rewards, success, [[f"seed {seed}{actions}" for seed in episodes.seeds]]))
+        found.append(
+            _Scored(rewards, success, [[f"seed {seed}{actions}" for seed in episodes.seeds]], episodes.kind)
+        )
     seen = checkup.look(odd_states)
     mode = checkup.task.env.reward_mode
     for seeds in dict.fromkeys(map(tuple, seen.seeds)):
@@ -234,6 +295,7 @@ def _scored(checkup: Checkup) -> list[_Scored]:
                 np.nan_to_num(np.stack([seen.reward[mode][row] for row in rows])),
                 flags(np.stack([seen.evaluate[row]["success"] for row in rows])),
                 [[f"{seen.kinds[row]}, seed {seed}" for seed in seeds] for row in rows],
+                f"odd states from seed {seeds[0]}",
             )
         )
     return found
@@ -260,10 +322,10 @@ def _hooks(checkup: Checkup) -> tuple[str, ...]:
 
 
 CHECKS: Mapping[str, Check] = {
-    "reward-finite": reward_finite,
-    "reward-changes": reward_changes,
-    "reward-normalized": reward_normalized,
+    "reward-finite": OverSeeds(see_reward_finite, reward_finite),
+    "reward-changes": OverSeeds(see_reward_changes, reward_changes),
+    "reward-normalized": OverSeeds(see_reward_normalized, reward_normalized),
     "reward-ratio": reward_ratio,
-    "reward-order": reward_order,
-    "reward-needs-success": reward_needs_success,
+    "reward-order": OverSeeds(see_reward_order, reward_order),
+    "reward-needs-success": OverSeeds(see_reward_needs_success, reward_needs_success),
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sized
+from collections.abc import Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,8 +22,18 @@ from workbench.checks.by_hook import (
     solved,
     source,
 )
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note, finding_of, raised
-from workbench.checks.results import RuleResult, Silenced, State
+from workbench.checks.evidence.checkup import (
+    CannotCheck,
+    Check,
+    Checkup,
+    Found,
+    Note,
+    code_of,
+    finding_of,
+    raised,
+)
+from workbench.checks.evidence.over_seeds import OverSeeds
+from workbench.checks.results import RuleResult, Seen, Silenced, State
 from workbench.checks.rules import CHECK_RULES, RULES
 from workbench.core.env import actions
 from workbench.core.rules import Degree, Finding, silence_of
@@ -51,6 +61,11 @@ GROUPS: tuple[Group, ...] = (
     Group("planned episodes", solved.CHECKS),
 )
 """In the order in which they run: what people meet most first."""
+RULES_OVER_SEEDS: Mapping[str, OverSeeds] = {
+    rule: check for group in GROUPS for rule, check in group.checks.items() if isinstance(check, OverSeeds)
+}
+"""The rules whose results depend on which seeds are looked at, and on how many. All others look at the source, at what is
+built, or at the first batch."""
 CORE_GROUP = "GPU simulation"
 _OF_RETURNS = ("evaluate-rows", "reward-rows")
 CORE_RESETS = 6
@@ -65,11 +80,18 @@ def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> 
             continue
         began = time.perf_counter()
         seen: list[Found | Note] = []
+        rows: list[Seen] = []
         try:
-            for found in check(checkup):
-                seen.append(found)  # one by one: the next may raise
+            if isinstance(check, OverSeeds):
+                for row in check.see(checkup):
+                    rows.append(_with_code(rule, row))
+                seen.extend(check.judge(rows))
+            else:
+                for found in check(checkup):
+                    seen.append(found)  # one by one: the next may raise
         except CannotCheck as reason:
-            yield RuleResult(rule, "skipped", why=str(reason), seconds=time.perf_counter() - began)
+            seconds = time.perf_counter() - began
+            yield RuleResult(rule, "skipped", why=str(reason), seconds=seconds, seen=tuple(rows))
             continue
         except TaskError as error:
             seconds = time.perf_counter() - began
@@ -78,8 +100,14 @@ def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> 
                 yield replace(result_of(rule, degrees[rule], [*seen, raised(error)]), seconds=seconds)
                 continue
             # What it had found before that is true all the same.
+            if isinstance(check, OverSeeds):
+                seen.extend(check.so_far(rows))
             yield replace(
-                result_of(rule, degrees[rule], seen), state="failed", why=str(error), seconds=seconds
+                result_of(rule, degrees[rule], seen),
+                state="failed",
+                why=str(error),
+                seconds=seconds,
+                seen=tuple(rows),
             )
             # What a policy raised is no fault of the task.
             of_task = error.problem.stage != "policy" and not known
@@ -87,7 +115,41 @@ def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> 
                 told.add(cause)
                 yield result_of("runs", degrees["runs"], [cause])
             continue
-        yield replace(result_of(rule, degrees[rule], seen), seconds=time.perf_counter() - began)
+        seconds = time.perf_counter() - began
+        yield replace(result_of(rule, degrees[rule], seen), seconds=seconds, seen=tuple(rows))
+
+
+def over_seeds(results: Sequence[RuleResult], degree: Degree) -> RuleResult:
+    """The result of a rule of `RULES_OVER_SEEDS` over all seeds.
+
+    Args:
+        results: what it came to for each part of them, in their order.
+    """
+    rule, rows = results[0].rule, [row for result in results for row in result.seen]
+    check, failed = RULES_OVER_SEEDS[rule], [result for result in results if result.state == "failed"]
+    seconds = sum(result.seconds for result in results)
+    if not rows and not failed:
+        return replace(results[0], seconds=seconds)
+    try:
+        whole = result_of(rule, degree, [*(check.so_far if failed else check.judge)(rows)], rows)
+    except CannotCheck as reason:
+        return RuleResult(rule, "skipped", why=str(reason), seconds=seconds)
+    if failed and (whole.state == "kept" or len(failed) == len(results)):
+        whole = replace(whole, state="failed", why=failed[0].why)
+    return replace(whole, seconds=seconds)
+
+
+def _with_code(rule: str, row: Seen) -> Seen:
+    """The row with what is known of its line here: it may be judged where the file is another one."""
+    if row.place is None:
+        return row
+    file, line, _ = row.place
+    silence = silence_of(file, line, rule)
+    return replace(
+        row,
+        code=code_of(row.place),
+        silence=None if silence is None else (silence.reason, silence.line),
+    )
 
 
 def _is_known(error: TaskError, checkup: Checkup, degrees: Mapping[str, Degree]) -> bool:
@@ -138,18 +200,30 @@ def _core_rules(degrees: Mapping[str, Degree]) -> list[str]:
     return [rule for rule in RULES if rule not in CHECK_RULES and degrees[rule] != "off"]
 
 
-def result_of(rule: str, degree: Degree, seen: list[Found | Note]) -> RuleResult:
-    """The result of a rule whose check gave this."""
+def result_of(
+    rule: str, degree: Degree, seen: Sequence[Found | Note], rows: Sequence[Seen] = ()
+) -> RuleResult:
+    """The result of a rule whose check gave this.
+
+    Args:
+        rows: with what is known of their lines, where the files may be others here.
+    """
+    known = {row.place: row for row in rows if row.place is not None}
     findings: list[Finding] = []
     silenced: list[Silenced] = []
     for found in seen:
         if isinstance(found, Note):
             continue
         finding = finding_of(rule, degree, found)
-        silence = silence_of(finding.file, finding.line, rule)
+        if found.place in known:
+            row = known[found.place]
+            finding, silence = replace(finding, code=row.code), row.silence
+        else:
+            comment = silence_of(finding.file, finding.line, rule)
+            silence = None if comment is None else (comment.reason, comment.line)
         if silence is None:
             findings.append(finding)
         else:
-            silenced.append(Silenced(finding, silence.reason, silence.line))
+            silenced.append(Silenced(finding, *silence))
     notes = tuple(each.message for each in seen if isinstance(each, Note))
     return RuleResult(rule, _state(findings, silenced), tuple(findings), tuple(silenced), notes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,8 @@ from workbench.checks.by_hook.placement import immovable
 from workbench.checks.evidence.builds import Built
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.checks.evidence.meshes import is_hollow, triangles_in
+from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
+from workbench.checks.results import Seen
 from workbench.core.broken_rule import Place
 from workbench.core.maniskill_private import envs_of, objects_of
 from workbench.core.scene.scene_index import scene_index
@@ -108,7 +110,7 @@ def overlap_at_load(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
-def kinematic_never_moved(checkup: Checkup) -> Iterator[Found | Note]:
+def see_kinematic_never_moved(checkup: Checkup) -> Iterator[Seen]:
     """Over the resets of all seeds and random episodes, where no hook of a step sets a pose: it may do so later."""
     if any(
         _sets_a_pose(function) for _, function in checkup.places.functions() if function.name not in _RESETS
@@ -116,14 +118,24 @@ def kinematic_never_moved(checkup: Checkup) -> Iterator[Found | Note]:
         raise CannotCheck("it sets poses in a step")
     index = scene_index(checkup.task.env)
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])
-    if poses.shape[1] < 2:
-        raise CannotCheck("it needs two seeds")
-    moved = (np.nan_to_num(poses.max(axis=(0, 1)) - poses.min(axis=(0, 1))) > STILL).any(axis=1)
+    yield Seen(tried=poses.shape[1])
     own = {each.name: each for each in _own(checkup) if each.kind == "kinematic"}
-    still: dict[Place | None, list[str]] = {}
     for body, name in enumerate(index.names):
-        if name in own and index.kinds[body] == "kinematic" and not moved[body] and not index.hidden[body]:
-            still.setdefault(own[name].place, []).append(name)
+        if name in own and index.kinds[body] == "kinematic" and not index.hidden[body]:
+            ends = poses[:, :, body].max(axis=(0, 1)), poses[:, :, body].min(axis=(0, 1))
+            yield Seen((name,), own[name].place, numbers=tuple(np.concatenate(ends).tolist()))
+
+
+def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    """Bodies that are at the same pose for all seeds."""
+    if tried(rows) < 2:
+        raise CannotCheck("it needs two seeds")
+    still: dict[Place | None, list[str]] = {}
+    for row in together(rows):
+        ends = np.array([one.numbers for one in rows if one.names == row.names])
+        apart = ends[:, :7].max(axis=0) - ends[:, 7:].min(axis=0)
+        if not (np.nan_to_num(apart) > STILL).any():
+            still.setdefault(row.place, []).append(row.names[0])
     for place, names in still.items():
         yield Found(
             f"{_several(names)} kinematic and at the same pose in every reset and step. Build it with "
@@ -248,24 +260,35 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
         )
 
 
-def env_spacing(checkup: Checkup) -> Iterator[Found | Note]:
-    """Over the resets of all seeds and random episodes."""
+def see_env_spacing(checkup: Checkup) -> Iterator[Seen]:
+    """Over the resets of all seeds and random episodes: a row for each body that comes too far."""
     index, half = scene_index(checkup.task.env), checkup.task.env.sim_config.spacing / 2
     moving = [i for i, kind in enumerate(index.kinds) if kind in ("dynamic", "link") and not index.hidden[i]]
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])[:, :, moving]
     if not moving:
         raise CannotCheck("nothing in it moves")
     away = np.nan_to_num(np.abs(poses[..., :2]).max(axis=-1))
-    far = away.max(axis=(0, 1))
-    if far.max() > half:
-        body = int(far.argmax())
-        count = int((away[:, :, body] > half).any(axis=0).sum())
+    yield Seen(tried=away.shape[1])
+    for row, body in enumerate(moving):
+        far = away[:, :, row]
+        if far.max() > half:
+            seeds = tuple(checkup.starts.seeds[i] for i in np.flatnonzero((far > half).any(axis=0)))
+            place = _settings(checkup)
+            yield Seen(
+                (index.names[body],), place, seeds=seeds, size=float(far.max()), numbers=(float(half),)
+            )
+
+
+def env_spacing(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    found = together(rows)
+    if found:
+        row = max(found, key=lambda row: row.size)
         yield Found(
-            f"{index.names[moving[body]]} comes {far[body]:.1f} m from the middle of its env in {count} of "
-            f"{away.shape[1]} episodes, and the middles are {2 * half:g} m apart. Return "
-            f"`SimConfig(spacing={np.ceil(2.5 * far[body]):g})` from _default_sim_config, or keep it nearer.",
-            _settings(checkup),
-            count,
+            f"{row.names[0]} comes {row.size:.1f} m from the middle of its env in {len(row.seeds)} of "
+            f"{tried(rows)} episodes, and the middles are {2 * row.numbers[0]:g} m apart. Return "
+            f"`SimConfig(spacing={np.ceil(2.5 * row.size):g})` from _default_sim_config, or keep it nearer.",
+            row.place,
+            len(row.seeds),
         )
 
 
@@ -326,7 +349,7 @@ CHECKS: Mapping[str, Check] = {
     "robot-pose": robot_pose,
     "initial-pose": initial_pose,
     "overlap-at-load": overlap_at_load,
-    "kinematic-never-moved": kinematic_never_moved,
+    "kinematic-never-moved": OverSeeds(see_kinematic_never_moved, kinematic_never_moved),
     "body-names": body_names,
     "too-many-links": too_many_links,
     "hull-fills-hollow": hull_fills_hollow,
@@ -334,5 +357,5 @@ CHECKS: Mapping[str, Check] = {
     "heavy-mesh": heavy_mesh,
     "merged-actors": merged_actors,
     "reconfigures": reconfigures,
-    "env-spacing": env_spacing,
+    "env-spacing": OverSeeds(see_env_spacing, env_spacing),
 }

@@ -523,5 +523,10 @@ def overlaps_of(task: TaskEnv, env: int) -> tuple[Overlap, ...]:
 def finding_of(rule: str, degree: Degree, found: Found) -> Finding:
     """The finding, with the text of its line."""
     file, line, function = found.place or (None, None, "")
-    code = "" if file is None or line is None else linecache.getline(file, line).strip()
+    code = "" if found.place is None else code_of(found.place)
     return Finding(rule, degree, found.message, file, line, code, function, found.count, 0)
+
+
+def code_of(place: Place) -> str:
+    """The text of its line, stripped."""
+    return linecache.getline(place[0], place[1]).strip()
