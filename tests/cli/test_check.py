@@ -411,3 +411,28 @@ def test_the_command_as_a_job_in_ci_runs_it(place: Path, child_process: None) ->
     assert ended.returncode == 0, ended.stderr
     said = json.loads(ended.stdout)
     assert said["task"]["id"] == "PushCube-v1" and said["counts"] == {"kept": 2}
+
+
+@pytest.mark.slow
+def test_parts_that_are_merged_print_what_the_whole_would(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ("bad.py", *FEW, "--select", "success-at-reset,entry-name,body-names")
+    whole = run(capsys, *few, "--json-file", "whole.json")
+    for part in ("1/2", "2/2"):
+        assert f"Part {part} is in check-{part[0]}-of-2.job" in run(capsys, *few, "--shard", part).out
+    with pytest.raises(SystemExit) as ended:
+        main(["merge", "check-1-of-2.job", "check-2-of-2.job", "--json-file", "merged.json"])
+    told = capsys.readouterr().out
+    assert ended.value.code == whole.code == 1
+    assert told.splitlines()[:-1] == whole.out.splitlines()[:-1]
+    said, merged = (json.loads((place / name).read_text()) for name in ("whole.json", "merged.json"))
+    for one in (said, merged):
+        for name in ("seconds", "start_seconds", "picture_seconds"):
+            del one[name]
+        for rule in one["rules"]:
+            del rule["seconds"]
+    assert merged == said
+    with pytest.raises(SystemExit) as ended:
+        main(["merge", "check-2-of-2.job"])
+    assert ended.value.code == 1 and "groups of rules are in none of these files" in capsys.readouterr().out

@@ -14,8 +14,10 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
-from workbench.jobs.check import CheckOptions, CheckReport, check, merged
+from workbench.jobs.check import CheckedGroup, CheckOptions, CheckReport, check, merged, report_of
 from workbench.jobs.episodes import RecordOptions
+from workbench.jobs.pool.deal import Shard, ThisProcess
+from workbench.jobs.pool.job_file import JobFile, Kept, job_of, read_parts
 from workbench.jobs.pool.processes import Processes
 from workbench.jobs.record import record
 from workbench.jobs.task import TaskOptions
@@ -188,6 +190,85 @@ def test_what_several_processes_say_of_one_rule_becomes_one_result() -> None:
     assert one == RuleResult("runs", "broken", (again, other), notes=("a", "b"), seconds=1.5)
     undecided = [RuleResult("runs", "kept"), RuleResult("runs", "failed", why="it raised")]
     assert merged(undecided).state == "failed" and merged(undecided).why == "it raised"
+    (of_other_seeds,) = merged(
+        [RuleResult("runs", "broken", (finding,)), RuleResult("runs", "broken", (again,))], other_seeds=True
+    ).findings
+    assert of_other_seeds.count == 5
+
+
+# --- many seeds: several parts, whoever looks at them -----------------------------------------------------
+
+DIES_ONCE = (
+    (
+        "import numpy as np\n",
+        "import os\nimport signal\nfrom pathlib import Path\n\nimport numpy as np\n\n"
+        "MARK, RESETS = Path(__file__).with_name('died'), []\n",
+    ),
+    (
+        "        with torch.device(self.device):\n            b = len(env_idx)\n",
+        "        RESETS.append(1)\n        if len(RESETS) == 6 and not MARK.exists():\n            MARK.touch()\n"
+        "            os.kill(os.getpid(), signal.SIGKILL)\n"
+        "        with torch.device(self.device):\n            b = len(env_idx)\n",
+    ),
+)
+
+
+def parts(task: str) -> CheckOptions:
+    """40 seeds: 32, and 8. The rules are of three groups, of which the last looks at the first part alone."""
+    made = TaskOptions(num_envs=8, env_kwargs=PLAIN, seed=100)
+    return CheckOptions(task, made, seeds=40, select=("outside-reach", "success-at-reset", "body-names"))
+
+
+def told(report: CheckReport) -> object:
+    """All but how long it took."""
+    return (
+        [replace(result, seconds=0.0) for result in report.results],
+        replace(report.task, notices=()),
+        report.comments,
+        report.missing,
+    )
+
+
+@pytest.mark.slow
+def test_many_seeds_come_to_the_same_with_any_number_of_workers_and_deaths(
+    tmp_path: Path, child_process: None
+) -> None:
+    task = task_of(tmp_path, AT_ONCE, *DIES_ONCE)
+    mark = tmp_path / "died"
+    mark.touch()
+    steps: list[int] = []
+    alone = check(parts(task), on_progress=steps.append)
+    assert steps == [1, 2, 3, 4, 5]
+    assert states(alone) == {"body-names": "kept", "outside-reach": "kept", "success-at-reset": "broken"}
+    (finding,) = alone.findings
+    assert finding.count == 40 and "of 40 of 40 seeds (seed 100, 101, 102, 103, 104 ...)" in finding.message
+    mark.unlink()
+    for workers in (1, 2):
+        several = check(parts(task), executor=Processes(workers))
+        assert told(several) == told(alone)
+    assert mark.exists(), "one was killed"
+
+
+@pytest.mark.slow
+def test_parts_of_a_job_are_put_together_and_a_job_goes_on_where_it_was(tmp_path: Path) -> None:
+    task = task_of(tmp_path, AT_ONCE)
+    what = parts(task)
+    whole = check(what)
+    files = [tmp_path / "1.job", tmp_path / "2.job"]
+    for number, path in enumerate(files, 1):
+        file = JobFile(path, job_of("check", task, what, ("workers",)))
+        part = check(what, executor=Kept(ThisProcess(), file, Shard(number, 2)))
+        assert part.missing == (2, 3)[number - 1]
+        file.close()
+    kept = read_parts(files)
+    assert told(report_of(what, kept.results(CheckedGroup))) == told(whole)
+
+    file = JobFile(files[0], job_of("check", task, what, ("workers",)))
+    seen: list[str] = []
+    again = check(what, on_activity=seen.append, executor=Kept(ThisProcess(), file))
+    file.close()
+    assert told(again) == told(whole)
+    assert [text for text in seen if "part 1" in text] == [] and "seeds, part 2 of 2: success" in seen
 
 
 # --- who acts beside random actions ----------------------------------------------------------------------

@@ -20,6 +20,7 @@ from tests.drive.episodes import made, write
 from tests.drive.session import rescored
 from tests.session.recorded_runs import opened
 from workbench.authoring.problem import TaskError
+from workbench.cli.arguments import JobArguments
 from workbench.cli.main import main
 from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.cli.share import export_in_terminal
@@ -27,13 +28,16 @@ from workbench.core.capture.recorded_state import read_states, state_distance
 from workbench.jobs.actions import read_actions
 from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.from_recording import run_of
+from workbench.jobs.pool.deal import Deal, ThisProcess, Work
 from workbench.jobs.record import record
 from workbench.jobs.replay import replay_to
+from workbench.jobs.rescore.job import Code, Recording, rescore_recordings, setup_of
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions
 from workbench.recording.reader.read_episode import read_episode, read_maniskill
 from workbench.recording.reader.reading import find_all_sources
+from workbench.session.clearance import Clearances
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.recordings import Rescorer
 
@@ -204,6 +208,111 @@ def test_a_broken_recording_is_a_row_and_the_others_are_judged(author: Path, tmp
     assert broken.stem in verdicts[0].why_not
 
 
+# --- by several workers ------------------------------------------------------------------------------
+
+DIES_ONCE = (
+    (
+        "import numpy as np\n",
+        "import os\nimport signal\nfrom pathlib import Path\n\nimport numpy as np\n\n"
+        "MARK, CALLS = Path(__file__).with_name('died'), []\n",
+    ),
+    (
+        REWARD,
+        "CALLS.append(1)\n        if len(CALLS) == 20 and not MARK.exists():\n            MARK.touch()\n"
+        f"            os.kill(os.getpid(), signal.SIGKILL)\n        {REWARD} + 0.25",
+    ),
+)
+
+
+def told(verdicts: list[Any]) -> list[Any]:
+    return [
+        (row, verdict.new_reward.tolist(), verdict.old_reward.tolist())
+        for row, verdict in zip(verdict_text.as_rows(verdicts), verdicts, strict=True)
+    ]
+
+
+@pytest.mark.slow
+def test_any_number_of_workers_gives_the_same_also_if_one_is_killed(
+    author: Path, foreign: Path, tmp_path: Path
+) -> None:
+    """One recording a chunk; those of two tasks, and one that cannot be read."""
+    for file in author.glob("recordings/*seed0021*"):
+        (tmp_path / file.name).write_bytes(file.read_bytes()[:100])
+    text = TEXT
+    for old, new in DIES_ONCE:
+        assert old in text
+        text = text.replace(old, new)
+    (author / "push_cube.py").write_text(text)
+    mark = author / "died"
+    mark.touch()
+    what = RescoreOptions((author / "recordings", *tmp_path.glob("*.rrd"), foreign), num_envs=1)
+    trusted = Clearances(all_trusted=True)
+    alone, _ = rescore_all(what, clearances=trusted)
+    assert [bool(verdict.why_not) for verdict in alone] == [False, False, False, True, False, False]
+    assert [verdict.differs for verdict in alone] == [True, True, True, False, False, False]
+    mark.unlink()
+    for workers in (2, 1):
+        verdicts, _ = rescore_all(
+            what, clearances=trusted, run=JobArguments(workers=workers, job=tmp_path / f"{workers}.job")
+        )
+        assert told(verdicts) == told(alone)
+    assert mark.exists(), "one was killed"
+    mark.unlink()
+    activities: list[str] = []
+    again = JobArguments(job=tmp_path / "2.job")
+    verdicts, _ = rescore_all(what, activities.append, clearances=trusted, run=again)
+    assert told(verdicts) == told(alone) and activities == [], "all were done"
+
+
+def test_an_episode_in_which_the_code_raises_is_a_row_and_the_others_are_judged(author: Path) -> None:
+    """A job goes on: the chunk after it begins with envs of its own."""
+    raises = "assert 21 not in self._episode_seed.tolist(), 'not this one'\n        "
+    edit(author, REWARD, raises + REWARD)
+    verdicts, _ = rescore_all(RescoreOptions((author / "recordings",), num_envs=1))
+    assert ["not this one" in verdict.why_not for verdict in verdicts] == [False, True, False]
+    assert not any(verdict.differs for verdict in verdicts)
+
+
+class Elsewhere:
+    """Notes the work, and does it here."""
+
+    elsewhere = True
+    work: Work[Any, Any, Any]
+
+    def run(self, work: Work[Any, Any, Any], deal: Deal[Any, Any]) -> None:
+        self.work = work
+        ThisProcess().run(work, deal)
+
+
+def test_recordings_travel_to_other_machines_unless_they_are_large(
+    author: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the folder of the task. What does not travel is looked for where it is."""
+    shutil.copytree(author / "recordings", tmp_path / "r")
+    task = str(author / "push_cube.py")
+    paths = sorted((tmp_path / "r").glob("*.rrd"))[:1]
+    (source,) = find_all_sources(paths)
+    options = TaskOptions(1, "cpu", 20, {"render_backend": "none"})
+    code = Code(task, options, options)
+    recording = Recording(0, bytes(source.path), None, source.part, source.id, source.name)
+    setup = setup_of([(code, [recording])], 1, use_env_states=False)
+
+    executor = Elsewhere()
+    (result,) = rescore_recordings(setup, executor)
+    assert not result.verdict.why_not and result.verdict.of == source
+    assert {file.suffix for file in executor.work.files} == {".rrd", ".h5", ".json"}
+    assert list(executor.work.folders) == [author]
+    assert executor.work.setup.items[0].travels == source.path
+
+    monkeypatch.setattr("workbench.jobs.rescore.job.MOST_BYTES", 0)
+    (result,) = rescore_recordings(setup, executor)
+    assert not result.verdict.why_not and list(executor.work.files) == []
+    assert executor.work.setup.items[0].travels is None
+    (tmp_path / "r").rename(tmp_path / "gone")
+    with pytest.raises(FileNotFoundError, match="does not see the recordings in .*, which are too large"):
+        executor.run(executor.work, Deal([0], lambda number, result: None))
+
+
 # --- in the terminal ---------------------------------------------------------------------------------
 
 
@@ -255,6 +364,31 @@ def test_a_broken_task_among_others_is_told_at_its_episodes(author: Path, foreig
     broken = [verdict for verdict in verdicts if "nonsense" in verdict.why_not]
     rescored = [verdict for verdict in verdicts if not verdict.why_not]
     assert (len(broken), len(rescored)) == (EPISODES, 2)
+
+
+@pytest.mark.slow
+def test_parts_that_are_merged_print_what_the_whole_would(
+    author: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    edit(author, REWARD, f"{REWARD} + 0.25")
+    few = [str(author / "recordings"), "--envs-per-worker", "1"]
+    code, whole, _ = run([*few, "--workers", "1", "--json-file", "whole.json"], capsys)
+    assert code == 0
+    for part in ("1/2", "2/2"):
+        code, out, _ = run([*few, "--workers", "1", "--shard", part], capsys)
+        assert code == 0 and f"Part {part} is in rescore-{part[0]}-of-2.job" in out
+    with pytest.raises(SystemExit) as ended:
+        main(["merge", "rescore-1-of-2.job", "rescore-2-of-2.job", "--json-file", "merged.json"])
+    assert ended.value.code == 0 and capsys.readouterr().out == whole
+    assert (tmp_path / "merged.json").read_text() == (tmp_path / "whole.json").read_text()
+    with pytest.raises(SystemExit) as ended:
+        main(["merge", "rescore-2-of-2.job"])
+    assert ended.value.code == 1
+    assert "of the job's recordings are in none of these files" in capsys.readouterr().out
+    edit(author, REWARD, f"{REWARD} + 0.5")
+    code, _, err = run([*few, "--shard", "1/2"], capsys)
+    assert code == 2 and "is of another job: code is" in err
 
 
 def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
 from workbench.cli.arguments import JobArguments
 from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
-from workbench.cli.jobs import job_path, print_part, run_by
+from workbench.cli.jobs import job_path, print_part, run_by, shard_of
 from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
 from workbench.core.rules import FailOn, Finding
 from workbench.jobs.check import (
@@ -27,6 +27,7 @@ from workbench.jobs.check import (
     CheckReport,
     check,
     count_chunks,
+    count_groups,
     count_rules,
     degrees_of_request,
 )
@@ -66,10 +67,11 @@ def check_in_terminal(
     run = run or JobArguments()
     here, root = CurrentFolder(), Path.cwd()  # a task may change it
     try:
-        total = count_rules(degrees_of_request(what))
+        total, chunks = count_rules(degrees_of_request(what)), count_chunks(what)
+        groups = count_groups(what, shard_of(run).part(chunks))
         with (
             stdout_to_stderr(),
-            run_by(run, "check", count_chunks(what), lambda: _job_of(what)) as (executor, _),
+            run_by(run, "check", chunks, lambda: _job_of(what)) as (executor, _),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn()) as bar,
         ):
             row = bar.add_task("opening", total=total)
@@ -77,10 +79,10 @@ def check_in_terminal(
             told: set[str] = set()
             several = False
 
-            def show_groups(count: int, of: int) -> None:
+            def show_groups(count: int) -> None:
                 nonlocal several
                 several = True
-                bar.update(row, completed=count, total=of)
+                bar.update(row, completed=count, total=groups)
 
             def show(result: RuleResult) -> None:
                 done.add(result.rule)

@@ -465,6 +465,7 @@ def rescore(
     use_env_states: bool = False,
     *,
     envs: RescoreArguments,
+    run: JobArguments = _HERE,
     csv: bool = False,
     csv_file: Path | None = None,
     json: bool = False,
@@ -489,6 +490,7 @@ def rescore(
     if _lacks_maniskill("rescore"):
         return Exit.REFUSED
     with quick_imports():
+        from workbench.cli.jobs import require_job
         from workbench.cli.rescore import RescoreOptions, RescoreOutput, run_rescore
 
     if task is not None and recorded_source:
@@ -501,16 +503,18 @@ def rescore(
         return refuse(why)
     try:
         base = envs.options()
+        require_job(run)
     except ValueError as error:
         return refuse(str(error))
     use_private_driver()
     from workbench.authoring.problem import TaskError
     from workbench.cli.terminal import not_trusted_lines
+    from workbench.jobs.pool.deal import PoolError
     from workbench.session.clearance import NotTrusted
 
     what = RescoreOptions(places, task, recorded_source, use_env_states, envs.envs_per_worker, base)
     try:
-        return run_rescore(what, RescoreOutput(csv, csv_file, json, json_file), trust)
+        return run_rescore(what, RescoreOutput(csv, csv_file, json, json_file), trust, run)
     except NotTrusted as error:
         for line in not_trusted_lines(error):
             refuse(line)
@@ -518,7 +522,7 @@ def rescore(
     except TaskError as error:
         print_problem(error.problem)
         return Exit.FAILED
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, PoolError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
         return refuse("interrupted")

@@ -12,13 +12,22 @@ from workbench.cli.check import print_report as print_check
 from workbench.cli.check_reports import Reported
 from workbench.cli.check_reports import as_json as check_as_json
 from workbench.cli.record import print_recorded
+from workbench.cli.rescore import (
+    RescoreOutput,
+    RescoreRequest,
+    print_verdicts,
+    warn_of_verdicts,
+    write_tables,
+)
 from workbench.cli.solve import SolveOutput, as_json, print_report
 from workbench.cli.terminal import Exit, print_text, refuse
+from workbench.cli.terminal import out as out_console
 from workbench.jobs.check import CheckedGroup, CheckOptions
 from workbench.jobs.check import report_of as check_report_of
 from workbench.jobs.episodes import RecordOptions, Written
 from workbench.jobs.pool.job_file import JobFileError, Merged, read_parts, write_whole
 from workbench.jobs.record import collect
+from workbench.jobs.rescore.job import RescoredRecording
 from workbench.jobs.solve import SolveOptions, report_of
 from workbench.machine.files import new_file, replace_file
 from workbench.machine.text import listed
@@ -75,6 +84,8 @@ def _print(merged: Merged, json_file: Path | None) -> int:
     """Print as the command does; returns its exit code."""
     if merged.command == "check":
         return _print_check(merged, json_file)
+    if merged.command == "rescore":
+        return _print_rescore(merged, json_file)
     if json_file is not None and merged.command != "solve":
         raise JobFileError(f"workbench {merged.command} has no result as JSON: leave out --json-file")
     folder = next(iter(merged.folders.values()), "")
@@ -114,3 +125,14 @@ def _print_check(merged: Merged, json_file: Path | None) -> int:
         replace_file(json_file, check_as_json(said).encode())
     print_check(said)
     return _with_missing(exit_code(said), report.missing, "groups of rules")
+
+
+def _print_rescore(merged: Merged, json_file: Path | None) -> int:
+    what = merged.requested(RescoreRequest)
+    results: dict[int, RescoredRecording] = merged.results(RescoredRecording)
+    ordered = sorted(results.values(), key=lambda result: result.place)
+    verdicts = [result.verdict for result in ordered]
+    write_tables(verdicts, RescoreOutput(json_file=json_file))
+    print_verdicts(verdicts, out_console)
+    warn_of_verdicts(verdicts, dict.fromkeys(result.note for result in ordered if result.note))
+    return _with_missing(Exit.DONE, what.recordings - len(results), "recordings")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
-import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
@@ -16,8 +18,11 @@ from rich.padding import Padding
 from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 from rich.table import Table
 
-from workbench.authoring.loading.reference import TaskName
+from workbench.authoring.loading.reference import RecordedTask, TaskName, named_file
+from workbench.authoring.loading.task_content import read_content
 from workbench.authoring.problem import TaskError
+from workbench.cli.arguments import ONE_WORKER, JobArguments
+from workbench.cli.jobs import print_part, run_by
 from workbench.cli.terminal import (
     Exit,
     TerminalPrompt,
@@ -31,8 +36,17 @@ from workbench.cli.terminal import (
 from workbench.core.backends import unused_gpu_text
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
-from workbench.jobs.open_task import open_task
-from workbench.jobs.rescore.run import rescore
+from workbench.jobs.from_recording import CannotEnterRecording, recorded_version
+from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.record import chunk_of
+from workbench.jobs.rescore.job import (
+    Code,
+    Recording,
+    RescoredRecording,
+    RescoreSetup,
+    rescore_recordings,
+    setup_of,
+)
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.jobs.task import TaskOptions
 from workbench.machine.files import replace_file
@@ -46,7 +60,6 @@ from workbench.session.rescore.recordings import (
     Group,
     group_episodes,
     hidden_modules_text,
-    rescore_each,
     with_renderer,
 )
 
@@ -76,6 +89,22 @@ class RescoreOutput:
     json_file: Path | None = None
 
 
+@dataclass(frozen=True)
+class RescoreRequest:
+    """What a rescoring asks for, and all that its verdicts depend on."""
+
+    recordings: int
+    """How many."""
+    recorded: str
+    """A sum of their names and sizes."""
+    code: str
+    """A sum of the texts that rescore them."""
+    use_env_states: bool
+    recorded_source: bool
+    envs_per_worker: int
+    options: TaskOptions
+
+
 def rescore_all(
     what: RescoreOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
@@ -83,6 +112,7 @@ def rescore_all(
     on_finding: Callable[[Finding], None] = warn_of,
     clearances: Clearances | None = None,
     on_notice: Callable[[str], None] = lambda notice: None,
+    run: JobArguments = ONE_WORKER,
 ) -> tuple[list[Verdict[Source]], tuple[str, ...]]:
     """The verdicts in the order of the files, and notes about intended differences from the recording.
 
@@ -90,15 +120,16 @@ def rescore_all(
         on_progress: gets the rescored episodes, all episodes, and the control steps so far.
         clearances: decides which code that recordings name may run; None asks no one.
         on_notice: gets a sentence for each file in a task's folder that no import finds, before the task is opened.
+        run: where the work runs; the verdicts are the same everywhere.
 
     Raises:
         NotTrusted: a recording names code that is not trusted and no one can be asked, or the answer to all was no.
         FileNotFoundError, UnreadableRecording: there is nothing to rescore.
         TaskError: no task can be opened, or each raises; if some can, the verdicts of the others carry the error.
         CannotEnterRecording: as TaskError, for a recorded text that cannot be opened.
+        PoolError: as `rescore_recordings`.
+        OSError, ValueError: as `run_by`.
     """
-    torch.set_num_threads(1)  # see workbench.session.worker.loop.work
-    here = CurrentFolder()
     files = [s for s in find_all_sources([place.absolute() for place in what.places]) if s.kind != "lerobot"]
     if not files:
         raise UnreadableRecording(
@@ -108,44 +139,104 @@ def rescore_all(
         files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
     )
     cleared = _cleared(groups, clearances or Clearances())
-    steps = 0
-    printed: set[object] = set()
+    notices = [hidden_modules_text(one) for one in cleared if not isinstance(one, NotCleared)]
+    for notice in dict.fromkeys(notice for some in notices for notice in some):
+        on_notice(notice)
+    setup = _setup_of(what, files, groups, cleared, verdicts)
 
-    def report_once(finding: Finding) -> None:
-        if finding.key not in printed:  # a task that is opened several times breaks the rule each time
-            printed.add(finding.key)
-            on_finding(finding)
+    def job() -> Job:
+        request = _request_of(what, files, groups, cleared)
+        return job_of("rescore", what.task or "as recorded", request, ())
 
-    def rescore_group(group: Group, reference: TaskName) -> None:
-        nonlocal steps
-        for notice in hidden_modules_text(reference):
-            if notice not in printed:
-                printed.add(notice)
-                on_notice(notice)
-        begin = partial(open_task, reference, on_activity=on_activity, on_finding=report_once)
-        with here.again(stay=True):  # the task before may have changed the current folder
-            try:
-                opened = begin(group.options)
-            except TaskError:
-                opened = begin(with_renderer(group.options))
-        before = steps
-
-        def report(now: int) -> None:
-            nonlocal steps
-            steps = before + now
-            on_progress(len(verdicts), len(files), steps)
-
-        try:
-            for verdict in rescore(opened, group.files, use_env_states=what.use_env_states, on_steps=report):
-                verdicts.append(verdict)
-                on_progress(len(verdicts), len(files), steps)
-        finally:
-            opened.env.close()
-
-    rescore_each(groups, cleared, rescore_group, lambda: verdicts, verdicts.extend)
+    with run_by(run, "rescore", len(setup.of_chunk), job) as (executor, _):
+        results = rescore_recordings(setup, executor, on_activity, on_progress, on_finding)
     place = {file.id: number for number, file in enumerate(files)}
-    verdicts.sort(key=lambda verdict: place[verdict.of.id])
-    return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))
+    _require_success(groups, place, results)
+    # Of what a worker says only the numbers are taken.
+    found = [replace(result.verdict, of=files[result.place]) for result in results]
+    return found, tuple(dict.fromkeys(group.note for group in groups if group.note))
+
+
+def _setup_of(
+    what: RescoreOptions,
+    files: Sequence[Source],
+    groups: Sequence[Group],
+    cleared: Sequence[TaskName | NotCleared],
+    unreadable: Sequence[Verdict[Source]],
+) -> RescoreSetup:
+    place = {file.id: number for number, file in enumerate(files)}
+
+    def recording(
+        file: Source, task: str, note: str = "", why_not: str = "", refused: bool = False
+    ) -> Recording:
+        path = os.fsencode(file.path)
+        return Recording(
+            place[file.id], path, None, file.part, file.id, file.name, task, note, why_not, refused
+        )
+
+    found: list[tuple[Code | None, list[Recording]]] = []
+    for group, task in zip(groups, cleared, strict=True):
+        why_not, code = "", None
+        if isinstance(task, NotCleared):
+            why_not = str(task)
+        else:
+            info = group.info if group.recorded_source else None
+            code = Code(task, group.options, with_renderer(group.options), info)
+        of = [recording(file, group.info.task, group.note, why_not, code is None) for file in group.files]
+        found.append((code, of))
+    if unreadable:
+        found.append((None, [recording(one.of, one.task, why_not=one.why_not) for one in unreadable]))
+    return setup_of(found, chunk_of(len(files), what.num_envs), what.use_env_states)
+
+
+def _request_of(
+    what: RescoreOptions,
+    files: Sequence[Source],
+    groups: Sequence[Group],
+    cleared: Sequence[TaskName | NotCleared],
+) -> RescoreRequest:
+    recorded = [(file.name, file.path.stat().st_size) for file in files]
+    code: list[str] = []
+    for group, task in zip(groups, cleared, strict=True):
+        file = None if isinstance(task, NotCleared) else named_file(task)
+        if group.recorded_source:
+            code.append(recorded_version(group.info))
+        elif isinstance(task, RecordedTask) and task.approved is not None:
+            code += sorted(task.approved.values())
+        else:
+            # By its text: the folder may be another one on each machine.
+            code.append(str(task) if file is None or not file.is_file() else read_content(file).hash)
+    return RescoreRequest(
+        len(files),
+        _sum(recorded),
+        _sum(code),
+        what.use_env_states,
+        what.recorded_source,
+        what.num_envs,
+        what.base,
+    )
+
+
+def _sum(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
+
+
+def _require_success(
+    groups: Sequence[Group], place: Mapping[str, int], results: Sequence[RescoredRecording]
+) -> None:
+    """Raise the error of the first group, if all failed: a folder holds recordings of many tasks, and one may be gone."""
+    by_place = {result.place: result for result in results}
+    first: RescoredRecording | None = None
+    for group in groups:
+        of_group = [by_place[place[file.id]] for file in group.files if place[file.id] in by_place]
+        failed = [result for result in of_group if result.failed]
+        if not failed or any(not result.verdict.why_not for result in of_group):
+            return
+        first = first or failed[0]
+    if first is not None and first.problem is not None:
+        raise TaskError(first.problem)
+    if first is not None:
+        raise CannotEnterRecording(first.verdict.why_not)
 
 
 def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | NotCleared]:
@@ -160,9 +251,16 @@ def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | Not
     return cleared
 
 
-def run_rescore(what: RescoreOptions, output: RescoreOutput, trust: bool) -> int:
-    """Rescore, print, and write the requested tables; raises as `rescore_all`, and OSError for a table."""
+def run_rescore(
+    what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments | None = None
+) -> int:
+    """Rescore, print, and write the requested tables; raises as `rescore_all`, and OSError for a table.
+
+    Args:
+        run: where the work runs; None for a process on each core.
+    """
     here = CurrentFolder()  # a task may change it
+    run = run or JobArguments()
     if (left_alone := unused_gpu_text(what.base.backend)) is not None:
         warn(left_alone)
     asks = can_ask()  # before the bar takes the terminal
@@ -188,21 +286,33 @@ def run_rescore(what: RescoreOptions, output: RescoreOutput, trust: bool) -> int
             print_finding,
             Clearances(ask=ask, all_trusted=trust),
             warn,
+            run,
         )
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="rescored")
-    for path, text in ((output.csv_file, verdict_text.as_csv), (output.json_file, verdict_text.as_json)):
-        if path is not None:
-            with here.again():
-                replace_file(path, text(verdicts).encode())
+    with here.again():
+        write_tables(verdicts, output)
     if for_programs:
         print((verdict_text.as_csv if output.csv else verdict_text.as_json)(verdicts), end="", flush=True)
     else:
         print_verdicts(verdicts, out)
+        print_part(run, "rescore", stopped=False)
+    warn_of_verdicts(verdicts, notes)
+    return Exit.DONE
+
+
+def write_tables(verdicts: list[Verdict[Source]], output: RescoreOutput) -> None:
+    """Write the files that are asked for. Raises OSError."""
+    for path, text in ((output.csv_file, verdict_text.as_csv), (output.json_file, verdict_text.as_json)):
+        if path is not None:
+            replace_file(path, text(verdicts).encode())
+
+
+def warn_of_verdicts(verdicts: list[Verdict[Source]], notes: Iterable[str]) -> None:
+    """Warn of what makes the comparison another one than it seems."""
     for note in (*notes, *verdict_text.not_carried(verdicts)):
         warn(note)
     if verdict_text.count_drifted(verdicts):
         warn(verdict_text.drift_summary(verdicts, verdict_text.PUT_IN))
-    return Exit.DONE
 
 
 def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:

@@ -235,6 +235,12 @@ def count_chunks(what: CheckOptions) -> int:
     return _plan(what, degrees_of_request(what)).chunks
 
 
+def count_groups(what: CheckOptions, chunks: range) -> int:
+    """Groups of rules in these chunks, counted for each part of the seeds."""
+    plan = _plan(what, degrees_of_request(what))
+    return sum(number // plan.chunk in chunks for number in plan.numbers)
+
+
 def check(
     what: CheckOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
@@ -242,7 +248,7 @@ def check(
     stop: Callable[[], bool] = lambda: False,
     executor: Executor | None = None,
     began: float | None = None,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: Callable[[int], None] = lambda done: None,
 ) -> CheckReport:
     """Check a task.
 
@@ -253,8 +259,7 @@ def check(
         stop: called between steps; after True the rules that are not done are missing in the report.
         executor: None for this process, or for spawned processes with several workers.
         began: when the work began, by ``time.monotonic()``; None for now.
-        on_progress: where there are several parts of the seeds, gets how many groups of rules are done, and how many there
-            are.
+        on_progress: where there are several parts of the seeds, gets how many groups of rules are done.
 
     Raises:
         TaskError: the task or the policy cannot be imported, or the task lacks assets.
@@ -305,7 +310,7 @@ class _Results:
         what: CheckOptions,
         on_activity: Callable[[str], None] = lambda activity: None,
         on_result: Callable[[RuleResult], None] = lambda result: None,
-        on_progress: Callable[[int, int], None] = lambda done, total: None,
+        on_progress: Callable[[int], None] = lambda done: None,
     ) -> None:
         self._what, self._degrees = what, degrees_of_request(what)
         self._plan = _plan(what, self._degrees)
@@ -331,7 +336,7 @@ class _Results:
         for result in group.results:
             self._show(result)
         if self._plan.parts > 1:
-            self._on_progress(len(self._groups), len(self._plan.numbers))
+            self._on_progress(len(self._groups))
 
     def _see_task(self, task: CheckedTask) -> None:
         if self._task is None:

@@ -1,0 +1,365 @@
+"""Rescores recordings in one process or several: fixed chunks of recordings of one task, and a verdict for each."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import torch
+
+from workbench.authoring.loading.load import undo_load
+from workbench.authoring.loading.reference import RecordedTask, TaskName, named_file
+from workbench.authoring.problem import Problem, TaskError
+from workbench.core.broken_rule import warn_of
+from workbench.core.env.cpu_scene import BatchedCpuMixin
+from workbench.core.rules import Finding
+from workbench.jobs.from_recording import CannotEnterRecording, recorded_source
+from workbench.jobs.open_task import OpenedTask, open_task
+from workbench.jobs.pool.deal import Chunk, Deal, Executor, Failure, ItemQueue, Work
+from workbench.jobs.pool.travel import MOST_BYTES, needed_by
+from workbench.jobs.rescore.run import rescore
+from workbench.jobs.rescore.verdict import Verdict
+from workbench.jobs.task import TaskOptions
+from workbench.machine.folders import CurrentFolder
+from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.episode.row import Source
+
+_TRIES = 3
+"""How often a chunk is begun whose workers die."""
+_PERIOD = 0.2
+"""Seconds between two messages of how far a worker is."""
+_SIDE = (".rrd", ".h5", ".json")
+"""Files of one recording."""
+
+
+@dataclass(frozen=True)
+class Code:
+    """What rescores some recordings."""
+
+    task: TaskName
+    """May run: whoever submits the job has asked."""
+    options: TaskOptions
+    or_else: TaskOptions
+    """In place of `options` where the task cannot be opened with them."""
+    recorded: EpisodeInfo | None = None
+    """Open the text that this recording holds instead."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording that is to be rescored."""
+
+    place: int
+    """In the order of the files."""
+    path: bytes
+    """As bytes: where it does not travel it is a place of all machines, see `Work.files`."""
+    travels: Path | None
+    """The same, if it travels."""
+    part: str | None
+    id: str
+    name: str
+    task: str = ""
+    note: str = ""
+    """Options that differ from the recorded ones on purpose."""
+    why_not: str = ""
+    """Why it cannot be rescored, if that is known before."""
+    refused: bool = False
+    """Because its code may not run."""
+
+    def source(self) -> Source:
+        """Where it is on the submitting side."""
+        return Source(Path(os.fsdecode(self.path)), self.part, self.id, self.name)
+
+    def verdict(self, why_not: str) -> Verdict[Source]:
+        return Verdict(self.source(), task=self.task, why_not=why_not)
+
+
+@dataclass(frozen=True)
+class RescoredRecording:
+    """What an item gives."""
+
+    place: int
+    verdict: Verdict[Source]
+    note: str = ""
+    failed: bool = False
+    """Its code could not be opened, may not run, or raised."""
+    problem: Problem | None = None
+    """What it raised."""
+
+
+@dataclass(frozen=True)
+class RescoreUpdate:
+    """Progress of a worker."""
+
+    activity: str = ""
+    steps: int = 0
+    """Control steps since the last message, over all episodes."""
+    finding: Finding | None = None
+
+
+@dataclass(frozen=True)
+class RescoreSetup:
+    """What the workers rescore."""
+
+    codes: tuple[Code | None, ...]
+    """None for recordings that are not rescored."""
+    of_chunk: tuple[int, ...]
+    """Which of the codes each chunk has."""
+    items: Mapping[int, Recording]
+    """By number; the numbers of chunk k begin with ``k * chunk``."""
+    chunk: int
+    use_env_states: bool = False
+    elsewhere: bool = False
+
+    def code_of(self, chunk: Chunk) -> int:
+        return self.of_chunk[chunk.numbers[0] // self.chunk]
+
+
+def setup_of(
+    groups: Sequence[tuple[Code | None, Sequence[Recording]]], chunk: int, use_env_states: bool
+) -> RescoreSetup:
+    """Number the recordings so that each chunk has those of one group alone."""
+    items: dict[int, Recording] = {}
+    of_chunk: list[int] = []
+    for at, (_, recordings) in enumerate(groups):
+        waiting = iter(recordings)
+        while some := list(islice(waiting, chunk)):
+            items |= dict(enumerate(some, len(of_chunk) * chunk))
+            of_chunk.append(at)
+    return RescoreSetup(tuple(code for code, _ in groups), tuple(of_chunk), items, chunk, use_env_states)
+
+
+def rescore_recordings(
+    setup: RescoreSetup,
+    executor: Executor,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_progress: Callable[[int, int, int], None] = lambda episodes, total, steps: None,
+    on_finding: Callable[[Finding], None] = warn_of,
+) -> list[RescoredRecording]:
+    """What the recordings come to, in the order of the files.
+
+    Args:
+        on_progress: gets the rescored episodes, all episodes, and the control steps so far.
+        on_finding: called once for each place where a task breaks a rule without being stopped.
+
+    Raises:
+        PoolError: a process that rescores failed, or processes die again and again.
+        TooMuch: the files beside the tasks are more than travel to other machines.
+    """
+    results: dict[int, RescoredRecording] = {}
+    found: set[object] = set()
+    steps = 0
+
+    def take(number: int, result: RescoredRecording) -> None:
+        results[number] = result
+        on_progress(len(results), len(setup.items), steps)
+
+    def failed(failure: Failure) -> None:
+        for number in failure.numbers:
+            of = setup.items[number]
+            verdict = of.verdict(failure.problem.message)
+            take(number, RescoredRecording(of.place, verdict, of.note, failed=True, problem=failure.problem))
+
+    def hear(update: RescoreUpdate) -> None:
+        nonlocal steps
+        if update.activity:
+            on_activity(update.activity)
+        if update.finding is not None and update.finding.key not in found:
+            found.add(update.finding.key)
+            on_finding(update.finding)
+        if update.steps:
+            steps += update.steps
+            on_progress(len(results), len(setup.items), steps)
+
+    deal: Deal[RescoredRecording, RescoreUpdate] = Deal(
+        sorted(setup.items), take, hear, chunk=setup.chunk, tries=_TRIES, on_failure=failed
+    )
+    folders, files = _needed(setup)
+    if executor.elsewhere:
+        setup, recordings = _travelling(setup)
+        files = [*files, *recordings]
+    work = Work(
+        rescore_items,
+        setup,
+        result=RescoredRecording,
+        update=RescoreUpdate,
+        name="that rescores",
+        folders=folders,
+        files=files,
+    )
+    executor.run(work, deal)
+    return sorted(results.values(), key=lambda result: result.place)
+
+
+def _needed(setup: RescoreSetup) -> tuple[list[Path], list[Path]]:
+    """Folders and files of the codes."""
+    folders: list[Path] = []
+    files: list[Path] = []
+    for code in filter(None, setup.codes):
+        named = code.task if isinstance(code.task, str) else ""
+        needed = needed_by(named, imports=code.options.imports)
+        folders += needed.folders
+        files += needed.files
+        file = named_file(code.task) if isinstance(code.task, RecordedTask) else None
+        if code.recorded is not None and code.recorded.source_file is not None:
+            file = Path(code.recorded.source_file)
+        if file is not None and file.is_absolute() and file.is_file():
+            folders.append(file.parent)
+    return folders, files
+
+
+def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
+    """The setup for other machines, and the recordings that travel: all, or none if they are too large."""
+    files = {
+        file
+        for of in setup.items.values()
+        if not of.why_not
+        for suffix in _SIDE
+        if (file := of.source().path.with_suffix(suffix)).is_file()
+    }
+    if sum(file.stat().st_size for file in files) > MOST_BYTES // 2:
+        return replace(setup, elsewhere=True), []
+    items = {number: replace(of, travels=of.source().path) for number, of in setup.items.items()}
+    return replace(setup, items=items), sorted(files)
+
+
+# --- one worker --------------------------------------------------------------------------------------------
+
+
+class _Stopped(Exception):
+    """No result is needed any more."""
+
+
+def rescore_items(setup: RescoreSetup, queue: ItemQueue) -> None:
+    """Rescore the chunks that one worker gets. What the author's code raises is the verdict of its recordings."""
+    torch.set_num_threads(1)  # see workbench.session.worker.loop.work
+    here = CurrentFolder()  # a task may change it
+    chunk = queue.next()
+    with suppress(_Stopped):
+        while chunk is not None:
+            at = setup.code_of(chunk)
+            code = setup.codes[at]
+            if code is not None:
+                with here.again():
+                    chunk = _Rescorer(setup, at, queue).run(code, chunk)
+                continue
+            for number in sorted(chunk.wanted):
+                of = setup.items[number]
+                verdict = of.verdict(of.why_not)
+                queue.send_result(number, RescoredRecording(of.place, verdict, of.note, failed=of.refused))
+            chunk = queue.next()
+
+
+@dataclass(frozen=True)
+class _Rescorer:
+    """Rescores the chunks of one code."""
+
+    setup: RescoreSetup
+    at: int
+    """Which code."""
+    queue: ItemQueue
+
+    def run(self, code: Code, chunk: Chunk | None) -> Chunk | None:
+        """Rescore this chunk, and further ones as long as they are of the same code and nothing is raised: then its envs may
+        be in any state. Returns the next chunk."""
+        try:
+            with _opened(code, self.queue) as opened:
+                while chunk is not None and self.setup.code_of(chunk) == self.at:
+                    if not self._rescore(opened, chunk):
+                        return self.queue.next()
+                    chunk = self.queue.next()
+                return chunk
+        except (TaskError, CannotEnterRecording) as error:
+            # It cannot be opened for the others either.
+            while chunk is not None and self.setup.code_of(chunk) == self.at:
+                self._fail(chunk.wanted, error)
+                chunk = self.queue.next()
+            return chunk
+
+    def _rescore(self, opened: OpenedTask, chunk: Chunk) -> bool:
+        """Rescore all of the chunk, also what is known: episodes of one batch may differ by their last bits in another one.
+        Returns False if the task raised."""
+        sources = [self._source(number) for number in chunk.numbers]
+        missing, told, reported = set(chunk.wanted), 0, time.monotonic()
+
+        def on_steps(steps: int) -> None:
+            nonlocal told, reported
+            if time.monotonic() - reported > _PERIOD:
+                self.queue.send_update(RescoreUpdate(steps=steps - told))
+                told, reported = steps, time.monotonic()
+                if self.queue.limit() <= chunk.numbers[0]:
+                    raise _Stopped
+            last[0] = steps
+
+        last = [0]
+        try:
+            for verdict in rescore(
+                opened, sources, use_env_states=self.setup.use_env_states, on_steps=on_steps
+            ):
+                number = int(verdict.of.id)
+                if number in missing:
+                    missing.remove(number)
+                    of = self.setup.items[number]
+                    verdict = replace(verdict, of=of.source())
+                    self.queue.send_result(number, RescoredRecording(of.place, verdict, of.note))
+        except TaskError as error:
+            self._fail(missing, error)
+            return False
+        finally:
+            self.queue.send_update(RescoreUpdate(steps=last[0] - told))
+        return True
+
+    def _source(self, number: int) -> Source:
+        """Where a recording is on this machine; its id is the number."""
+        of = self.setup.items[number]
+        path = of.travels or of.source().path
+        if self.setup.elsewhere and not path.parent.is_dir():
+            raise FileNotFoundError(
+                f"{platform.node()} does not see the recordings in {path.parent}, which are too large to travel: put them "
+                "where all machines of the cluster find them"
+            )
+        return Source(path, of.part, str(number), of.name)
+
+    def _fail(self, numbers: set[int] | frozenset[int], error: TaskError | CannotEnterRecording) -> None:
+        problem = error.problem if isinstance(error, TaskError) else None
+        for number in sorted(numbers):
+            of = self.setup.items[number]
+            result = RescoredRecording(of.place, of.verdict(str(error)), of.note, True, problem)
+            self.queue.send_result(number, result)
+
+
+@contextmanager
+def _opened(code: Code, queue: ItemQueue) -> Iterator[OpenedTask]:
+    """Raises TaskError, CannotEnterRecording."""
+    if code.recorded is not None:
+        with recorded_source(code.recorded) as reference:
+            with _opened(replace(code, task=reference, recorded=None), queue) as opened:
+                yield opened
+        return
+
+    def begin(options: TaskOptions) -> OpenedTask:
+        return open_task(
+            code.task,
+            options,
+            on_activity=lambda activity: queue.send_update(RescoreUpdate(activity)),
+            on_finding=lambda finding: queue.send_update(RescoreUpdate(finding=finding)),
+        )
+
+    try:
+        opened = begin(code.options)
+    except TaskError:
+        opened = begin(code.or_else)
+    if isinstance(opened.env.env, BatchedCpuMixin):
+        # Else an episode depends, by its last bits, on those that the same process rescored before.
+        opened.env.env.begins_anew = True
+    try:
+        yield opened
+    finally:
+        opened.env.close()
+        undo_load(opened.loaded)
