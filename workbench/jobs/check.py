@@ -193,6 +193,8 @@ class _Plan:
     first part alone."""
 
     groups: list[Group]
+    over_seeds: frozenset[str]
+    """Rules that are checked in every part."""
     part: int
     """Seeds of a part. What compares whole batches takes one for each env."""
     parts: int
@@ -201,9 +203,7 @@ class _Plan:
     def numbers(self) -> list[int]:
         """Group g of part k is item ``k * len(groups) + g``."""
         count = len(self.groups)
-        further = [
-            g for g, group in enumerate(self.groups) if not RULES_OVER_SEEDS.keys().isdisjoint(group.checks)
-        ]
+        further = [g for g, group in enumerate(self.groups) if not self.over_seeds.isdisjoint(group.checks)]
         return [*range(count), *(k * count + g for k in range(1, self.parts) for g in further)]
 
     @property
@@ -227,7 +227,8 @@ class _Plan:
 
 def _plan(what: CheckOptions, degrees: Mapping[str, Degree]) -> _Plan:
     part = max(SEEDS_OF_PART, what.options.num_envs)
-    return _Plan(groups_of(degrees), part, -(-what.seeds // part))
+    over_seeds = frozenset(rule for rule in RULES_OVER_SEEDS if degrees[rule] != "off")
+    return _Plan(groups_of(degrees), over_seeds, part, -(-what.seeds // part))
 
 
 def count_chunks(what: CheckOptions) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from workbench.checks.evidence.random_calls import first_draw, global_draw, torc
 from workbench.checks.evidence.step_profile import EVERY_STEP
 from workbench.core.capture.state_columns import env_states, flat_names, split_flat
 from workbench.core.env.actions import random_action
-from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import apply_and_fetch
@@ -54,9 +52,7 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
 def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     """After a reset, and again after resets and steps of other seeds."""
     task, seeds = checkup.task, next(checkup.batches())
-    # Else a touch sensor reads the contacts of the last episode.
-    with without_past(task):
-        first = _seen(task, checkup.reset(task, seeds))
+    first = _seen(task, checkup.reset(task, seeds))
     # Others that have their own generators may be at an equal place after a reset.
     checkup.reset(task, [seed + 5000 for seed in seeds])
     rng = np.random.default_rng(2)
@@ -64,8 +60,7 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
         checkup.step(task, random_action(task.parts, task.num_envs, rng))
     if checkup.num_envs > 1:
         checkup.reset(task, None, [checkup.num_envs - 1])
-    with without_past(task):
-        again = _seen(task, checkup.reset(task, seeds))
+    again = _seen(task, checkup.reset(task, seeds))
     differing = _differing(first, again, SAME)
     if differing:
         drawn = first_draw(checkup.places, global_draw, *_RESET_HOOKS, *_RESULT_HOOKS)
@@ -143,8 +138,7 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
     task = checkup.task
     if not task.parts:
         raise CannotCheck("it takes no actions")
-    with without_past(task):
-        first, second = (_episode(checkup, task, seeds) for _ in range(2))
+    first, second = (_episode(checkup, task, seeds) for _ in range(2))
     for step, (one, other) in enumerate(zip(first, second, strict=True)):
         if not (differing := _differing(one, other, SAME)):
             continue
@@ -167,19 +161,6 @@ def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
             drawn[0],
         )
         return
-
-
-@contextmanager
-def without_past(task: TaskEnv) -> Iterator[None]:
-    """Within this, physics begins at each reset without contacts or an order of solving them from before."""
-    if not isinstance(task.env, BatchedCpuMixin):
-        yield
-        return
-    before, task.env.begins_anew = task.env.begins_anew, True
-    try:
-        yield
-    finally:
-        task.env.begins_anew = before
 
 
 # --- what is compared ------------------------------------------------------------------------------------
