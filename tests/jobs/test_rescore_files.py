@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from workbench.jobs.actions import read_actions
 from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.pool.deal import Deal, ThisProcess, Work
+from workbench.jobs.pool.travel import pack_baggage, relocated
 from workbench.jobs.record import record
 from workbench.jobs.replay import replay_to
 from workbench.jobs.rescore.job import Code, Recording, rescore_recordings, setup_of
@@ -288,9 +290,9 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
     author: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the folder of the task. What does not travel is looked for where it is."""
-    shutil.copytree(author / "recordings", tmp_path / "r")
-    task = str(author / "push_cube.py")
-    paths = sorted((tmp_path / "r").glob("*.rrd"))[:1]
+    shutil.copytree(author, tmp_path / "author")
+    task = str(tmp_path / "author" / "push_cube.py")
+    paths = sorted((tmp_path / "author" / "recordings").glob("*.rrd"))[:1]
     (source,) = find_all_sources(paths)
     options = TaskOptions(1, "cpu", 20, {"render_backend": "none"})
     code = Code(task, options, options)
@@ -301,14 +303,21 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
     (result,) = rescore_recordings(setup, executor)
     assert not result.verdict.why_not and result.verdict.of == source
     assert {file.suffix for file in executor.work.files} == {".rrd", ".h5", ".json"}
-    assert list(executor.work.folders) == [author]
+    assert list(executor.work.folders) == [tmp_path / "author"]
     assert executor.work.setup.items[0].travels == source.path
+    # Recordings beside the task do not travel with it, but on their own.
+    baggage = pack_baggage(executor.work.folders, executor.work.files)
+    (tmp_path / "there").mkdir()
+    here = Path.cwd()
+    places = baggage.unpack(tmp_path / "there")
+    os.chdir(here)
+    assert relocated(source.path, places).is_file() and len(places) == 1
 
     monkeypatch.setattr("workbench.jobs.rescore.job.MOST_BYTES", 0)
     (result,) = rescore_recordings(setup, executor)
     assert not result.verdict.why_not and list(executor.work.files) == []
     assert executor.work.setup.items[0].travels is None
-    (tmp_path / "r").rename(tmp_path / "gone")
+    (tmp_path / "author" / "recordings").rename(tmp_path / "gone")
     with pytest.raises(FileNotFoundError, match="does not see the recordings in .*, which are too large"):
         executor.run(executor.work, Deal([0], lambda number, result: None))
 

@@ -66,8 +66,8 @@ def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage
     """
     roots = _outermost(folder.resolve() for folder in folders)
     found = [file for root in roots for file in files_below(root)]
+    # Also below a root: what is left out there is named here, such as recordings beside the task.
     alone = {file.resolve() for file in files}
-    alone = {file for file in alone if not any(file.is_relative_to(root) for root in roots)}
     sizes = {file: file.stat().st_size for file in sorted({*found, *alone})}
     if sum(sizes.values()) > MOST_BYTES:
         largest = sorted(sizes, key=lambda file: -sizes[file])[:3]
@@ -80,7 +80,8 @@ def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for file in sizes:
             archive.writestr(zipfile.ZipInfo(str(file).lstrip("/")), read_regular_file(file, MOST_BYTES))
-    return Baggage(tuple(map(str, (*roots, *sorted(alone)))), str(Path.cwd()), data.getvalue())
+    outside = sorted(file for file in alone if not any(file.is_relative_to(root) for root in roots))
+    return Baggage(tuple(map(str, (*roots, *outside))), str(Path.cwd()), data.getvalue())
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:

@@ -225,7 +225,7 @@ def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
     }
     if sum(file.stat().st_size for file in files) > MOST_BYTES // 2:
         return replace(setup, elsewhere=True), []
-    items = {number: replace(of, travels=of.source().path) for number, of in setup.items.items()}
+    items = {number: replace(of, travels=of.source().path.resolve()) for number, of in setup.items.items()}
     return replace(setup, items=items), sorted(files)
 
 
