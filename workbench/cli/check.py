@@ -21,6 +21,7 @@ from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, c
 from workbench.cli.jobs import job_path, print_part, run_by, shard_of
 from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
 from workbench.core.rules import FailOn, Finding
+from workbench.jobs.actions import needed_by
 from workbench.jobs.check import (
     CheckedTask,
     CheckOptions,
@@ -33,7 +34,6 @@ from workbench.jobs.check import (
 )
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import Job, job_of
-from workbench.jobs.pool.travel import needed_by
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text

@@ -41,12 +41,12 @@ from workbench.jobs.actions import (
     STEPS_WITHOUT_LIMIT,
     RecordActionChooser,
     find_actions,
+    needed_by,
     plain_chooser,
 )
 from workbench.jobs.open_task import Opening, import_task
 from workbench.jobs.pool.deal import Chunk, Deal, Executor, ItemQueue, ThisProcess, Work
 from workbench.jobs.pool.processes import Processes
-from workbench.jobs.pool.travel import needed_by
 from workbench.jobs.replay import begin_run
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import CurrentFolder

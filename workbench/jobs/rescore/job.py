@@ -19,10 +19,11 @@ from workbench.authoring.problem import Problem, TaskError
 from workbench.core.broken_rule import warn_of
 from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.rules import Finding
+from workbench.jobs.actions import needed_by
 from workbench.jobs.from_recording import CannotEnterRecording, recorded_source
 from workbench.jobs.open_task import OpenedTask, open_task
 from workbench.jobs.pool.deal import Chunk, Deal, Executor, Failure, ItemQueue, Work
-from workbench.jobs.pool.travel import MOST_BYTES, needed_by
+from workbench.jobs.pool.travel import MOST_BYTES
 from workbench.jobs.rescore.run import rescore
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.jobs.task import TaskOptions
