@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.markup import escape
 
 from workbench.cli.arguments import JobArguments
-from workbench.cli.terminal import err, print_text
+from workbench.cli.terminal import err
 from workbench.jobs.pool.cluster import Cluster
 from workbench.jobs.pool.deal import Executor, Failure, Shard, ThisProcess, parse_shard
 from workbench.jobs.pool.job_file import Job, JobFile, Kept
