@@ -102,7 +102,7 @@ def connected(address: str = AUTO) -> Iterator[Any]:
         return
     if address == AUTO:
         address = os.environ.get("RAY_ADDRESS") or _left_here() or LOCAL
-    elif address != LOCAL and (why := _why_deaf(address)) is not None:
+    if address != LOCAL and (why := _why_deaf(address)) is not None:
         raise NoCluster(_no_cluster_text(address, why))
     how: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "namespace": "workbench"}
     try:
