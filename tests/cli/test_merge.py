@@ -63,6 +63,18 @@ def test_parts_and_what_they_lacked_are_the_whole(place: Path, capsys: pytest.Ca
     assert str(place / "demos") in capsys.readouterr().out
 
 
+def test_an_episode_that_was_deleted_is_made_again(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert record("--out", "demos", "--job", "a.job") == 0
+    before = bits(place / "demos")
+    (gone,) = (place / "demos").glob("*seed0003*.json")
+    gone.unlink()
+    assert record("--out", "demos", "--job", "a.job") == 0
+    made = capsys.readouterr().out
+    (again,) = (place / "demos").glob("*seed0003*.json")
+    assert str(again.with_suffix(".rrd").relative_to(place)) in made
+    assert (place / "demos" / f"{again.stem}.h5").read_bytes() == before["seed0003"]
+
+
 def test_a_part_of_another_job_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert record("--shard", "1/3", "--out", "demos") == 0
     assert record("--shard", "2/3", "--out", "demos", "--seed", "5") == 0

@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.markup import escape
 
 from workbench.cli.arguments import JobArguments
 from workbench.cli.terminal import err
+from workbench.jobs.episodes import Written
 from workbench.jobs.pool.cluster import Cluster
 from workbench.jobs.pool.deal import Executor, Failure, Shard, ThisProcess, parse_shard
 from workbench.jobs.pool.job_file import Job, JobFile, Kept
@@ -54,15 +56,25 @@ def job_path(arguments: JobArguments, command: str) -> Path | None:
     return Path(f"{command}-{shard.index}-of-{shard.count}.job")
 
 
+def is_recorded(folder: Path) -> Callable[[Written | None], bool]:
+    """Whether the episode of a result is still in the folder, if it was kept there."""
+    return lambda one: one is None or bool(one.address) or (folder / f"{one.path.stem}.json").exists()
+
+
 @contextmanager
 def run_by(
-    arguments: JobArguments, command: str, chunks: int, job: Callable[[], Job]
+    arguments: JobArguments,
+    command: str,
+    chunks: int,
+    job: Callable[[], Job],
+    is_there: Callable[[Any], bool] = lambda result: True,
 ) -> Iterator[tuple[Executor, str]]:
     """What runs the work of a command, and the name of the run (`episodes.RecordSetup.run`).
 
     Args:
         chunks: of the whole job.
         job: what the job file is for; called only if there is one.
+        is_there: as of `Kept`.
 
     Raises:
         ValueError, OSError: as `JobFile`.
@@ -80,7 +92,7 @@ def run_by(
     try:
         if file.count:
             err.print(escape(f"going on after {file.count} results in {path}"), soft_wrap=True)
-        yield Kept(executor, file, shard), file.run
+        yield Kept(executor, file, shard, is_there), file.run
     finally:
         file.close()
 

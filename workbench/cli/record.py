@@ -14,7 +14,7 @@ from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import TaskError
 from workbench.cli.arguments import ONE_WORKER, JobArguments
-from workbench.cli.jobs import items_of, print_part, run_by, told_in_folder
+from workbench.cli.jobs import is_recorded, items_of, print_part, run_by, told_in_folder
 from workbench.cli.terminal import (
     Exit,
     err,
@@ -125,7 +125,9 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
         wanted = requested.successes or items_of(run, most, chunk)
         left = (TextColumn("left"), TimeRemainingColumn())
         with (
-            run_by(run, "record", -(-most // chunk), lambda: job_of_record(requested)) as (executor, name),
+            run_by(
+                run, "record", -(-most // chunk), lambda: job_of_record(requested), is_recorded(what.out)
+            ) as (executor, name),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
             told_in_folder(run, "record", what.task, "" if what.upload else what.out, wanted) as status,
         ):

@@ -20,7 +20,7 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.rules import RULES
 from workbench.cli.arguments import ONE_WORKER, JobArguments
 from workbench.cli.check_reports import json_text, xml_text
-from workbench.cli.jobs import items_of, print_part, run_by, told_in_folder
+from workbench.cli.jobs import is_recorded, items_of, print_part, run_by, told_in_folder
 from workbench.cli.record import RecordBar
 from workbench.cli.terminal import (
     Exit,
@@ -91,7 +91,10 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
         count = items_of(run, what.seeds, chunk)
         with (
             stdout_to_stderr(),
-            run_by(run, "solve", -(-what.seeds // chunk), lambda: _job_of(what)) as (executor, name),
+            run_by(run, "solve", -(-what.seeds // chunk), lambda: _job_of(what), is_recorded(what.out)) as (
+                executor,
+                name,
+            ),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
             told_in_folder(run, "solve", what.task, "" if what.upload else what.out, count) as status,
         ):

@@ -12,7 +12,7 @@ import os
 import sqlite3
 import sys
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -147,7 +147,7 @@ class JobFile:
     def keep(self, number: int, result: object) -> None:
         """Write a result; it is on disk afterwards. Raises JobFileError."""
         with _named(self.path):
-            self._database.execute("INSERT INTO result VALUES (?, ?)", (number, pack(result)))
+            self._database.execute("INSERT OR REPLACE INTO result VALUES (?, ?)", (number, pack(result)))
 
     def put(self, packed: Mapping[int, bytes]) -> None:
         """Write results that are packed already, those that are there too. Raises JobFileError."""
@@ -167,6 +167,8 @@ class Kept:
     executor: Executor
     file: JobFile | None = None
     shard: Shard = Shard()
+    is_there: Callable[[Any], bool] = lambda result: True
+    """Whether what a result names still exists; else its item is done again."""
 
     @property
     def elsewhere(self) -> bool:
@@ -175,7 +177,8 @@ class Kept:
     def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
         deal.take_part(self.shard)
         if self.file is not None:
-            deal.go_on(self.file.results(work.result), self.file.keep)
+            known = {n: one for n, one in self.file.results(work.result).items() if self.is_there(one)}
+            deal.go_on(known, self.file.keep)
         if deal.count_left(1):
             self.executor.run(work, deal)
 
