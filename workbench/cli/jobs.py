@@ -174,6 +174,5 @@ def print_part(arguments: JobArguments, command: str, stopped: bool) -> None:
         )
         err.print(escape(how), soft_wrap=True)
     elif arguments.shard is not None:
-        print_text(
-            f"Part {arguments.shard} is in {path}. Put all parts together with: workbench merge FILE ..."
-        )
+        text = f"Part {arguments.shard} is in {path}. Put all parts together with: workbench merge FILE ..."
+        err.print(escape(text), soft_wrap=True)
