@@ -420,7 +420,7 @@ def test_parts_that_are_merged_print_what_the_whole_would(
     few = ("bad.py", *FEW, "--select", "success-at-reset,entry-name,body-names")
     whole = run(capsys, *few, "--json-file", "whole.json")
     for part in ("1/2", "2/2"):
-        assert f"Part {part} is in check-{part[0]}-of-2.job" in run(capsys, *few, "--shard", part).out
+        assert f"Part {part} is in check-{part[0]}-of-2.job" in run(capsys, *few, "--shard", part).err
     with pytest.raises(SystemExit) as ended:
         main(["merge", "check-1-of-2.job", "check-2-of-2.job", "--json-file", "merged.json"])
     told = capsys.readouterr().out

@@ -385,8 +385,8 @@ def test_parts_that_are_merged_print_what_the_whole_would(
     code, whole, _ = run([*few, "--workers", "1", "--json-file", "whole.json"], capsys)
     assert code == 0
     for part in ("1/2", "2/2"):
-        code, out, _ = run([*few, "--workers", "1", "--shard", part], capsys)
-        assert code == 0 and f"Part {part} is in rescore-{part[0]}-of-2.job" in out
+        code, _, err = run([*few, "--workers", "1", "--shard", part], capsys)
+        assert code == 0 and f"Part {part} is in rescore-{part[0]}-of-2.job" in err
     with pytest.raises(SystemExit) as ended:
         main(["merge", "rescore-1-of-2.job", "rescore-2-of-2.job", "--json-file", "merged.json"])
     assert ended.value.code == 0 and capsys.readouterr().out == whole
@@ -427,7 +427,7 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
         edit(author, REWARD, "return 1 / 0")
         rescorer.start(find_all_sources((author / "recordings",)))
         view = rescored(rescorer, "failed", "done")
-        assert "could not be opened" in view.why and "ZeroDivisionError" in view.problem.message
+        assert "cannot be opened" in view.why and "ZeroDivisionError" in view.problem.message
         rescorer.start(find_all_sources((author / "recordings", foreign)))
         view = rescored(rescorer, "done", "failed")
         assert view.state == "done"

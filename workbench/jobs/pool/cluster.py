@@ -240,6 +240,7 @@ class _ActorPool:
                 failure = self._guarded(
                     number, failure, lambda raw=raw, number=number: self._take(number, raw)
                 )
+            self._reap()
             for number in self._gone():
                 failure = self._guarded(number, failure, lambda number=number: self._died(number))
             if not self._busy and self._deal.count_left(1):
@@ -255,6 +256,16 @@ class _ActorPool:
         for actor in (*self._busy.values(), *self._ending):
             self._ray.kill(actor.handle)
         self._ray.kill(self._post)
+
+    def _reap(self) -> None:
+        """End the actors that have put their folders away: as long as they live they keep their cores."""
+        if not self._ending:
+            return
+        ended = [actor.ended for actor in self._ending]
+        ready, _ = self._ray.wait(ended, num_returns=len(ended), timeout=0)
+        for actor in [actor for actor in self._ending if actor.ended in ready]:
+            self._ray.kill(actor.handle)
+            self._ending.remove(actor)
 
     def _guarded(self, number: int, failure: Any, act: Any) -> Any:
         """Do this for a worker; after an error that ends the job the others finish what they have."""
