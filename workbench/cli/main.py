@@ -378,6 +378,71 @@ def solve(
 
 
 @app.command
+def sweep(
+    task: Task,
+    /,
+    *,
+    plan: PlanArguments = _PLAN,
+    envs: EpisodeArguments = _FEW,
+    run: JobArguments = _HERE,
+    settings: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set")] = (),
+    seeds: int = 100,
+    actions: str = "random",
+    max_steps: int | None = None,
+    pictures: bool = False,
+    out: Path | None = None,
+    json_file: Path | None = None,
+    csv_file: Path | None = None,
+) -> int:
+    """Record a task with each combination of several values, and compare: how often it succeeds, its return, the terms of
+    its reward. The task's file is not changed. Values that the task fails with are told at the end; the exit code is 1
+    then.
+
+    Args:
+        task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
+        settings: a name and its values, as in --set reach_weight=0.5,1,2 (each in JSON, or text); repeatable, for all
+            combinations. A constant of the file, of its module or of a class, whose value is written there as it is; or an
+            argument of the task class.
+        seeds: how many episodes for each combination: the same seeds for all.
+        actions: random, zero, hold; solve, which plans them by rollouts of the task with its own reward; or a policy as
+            module:function or file.py:function.
+        max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
+        pictures: record what every camera sees.
+        out: folder for the recordings and results.parquet; else one in sweeps, with the name of the task.
+        json_file: also write the results to this file, as JSON.
+        csv_file: also write a row for each episode to this file, as CSV.
+    """
+    if _lacks_maniskill("sweep"):
+        return Exit.REFUSED
+    from workbench.authoring.loading.reference import split_reference, why_missing
+
+    if (why := why_missing(task)) is not None:
+        return refuse(why)
+    if (why := _without_folder(json_file, csv_file)) is not None:
+        return refuse(why)
+    if pictures:
+        use_private_driver()
+    with quick_imports():
+        from workbench.cli.jobs import require_job
+        from workbench.cli.sweep import SweepOutput, parse_settings, sweep_in_terminal
+        from workbench.jobs.sweep import SweepOptions
+
+    try:
+        varied, options, planned = parse_settings(settings), envs.options(), plan_options(plan)
+        require_job(run)
+        for name, number in (("seeds", seeds), ("max-steps", max_steps)):
+            if number is not None and number < 1:
+                raise ValueError(f"--{name} must be at least 1, not {number}")
+    except ValueError as error:
+        return refuse(str(error))
+    if out is None:
+        named = split_reference(task)
+        out = Path("sweeps", named[1] if named is not None else Path(task.partition(".py")[0]).name)
+    what = SweepOptions(task, varied, out, seeds, actions, pictures, max_steps, planned, options)
+    return sweep_in_terminal(what, SweepOutput(json_file, csv_file), run)
+
+
+@app.command
 def merge(
     files: Annotated[tuple[Path, ...], tyro.conf.Positional],
     /,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +20,8 @@ from workbench.cli.rescore import (
     write_tables,
 )
 from workbench.cli.solve import SolveOutput, as_json, print_report
+from workbench.cli.sweep import SweepOutput, write_reports
+from workbench.cli.sweep import print_report as print_report_of_sweep
 from workbench.cli.terminal import Exit, print_text, refuse
 from workbench.cli.terminal import out as out_console
 from workbench.jobs.check import CheckedGroup, CheckOptions
@@ -29,8 +31,10 @@ from workbench.jobs.pool.job_file import JobFileError, Merged, read_parts, write
 from workbench.jobs.record import collect
 from workbench.jobs.rescore.job import RescoredRecording
 from workbench.jobs.solve import SolveOptions, report_of
+from workbench.jobs.sweep import SweepOptions, collect_sweep
 from workbench.machine.files import new_file, replace_file
 from workbench.machine.text import listed
+from workbench.recording.sweeps import RESULTS, write_results
 from workbench.recording.writing.publish import RecordingError
 
 
@@ -56,7 +60,10 @@ def _together(merged: Merged, out: Path | None) -> Merged:
     results: dict[int, Written | None] = merged.results(Written | None)
     local = {number: one for number, one in results.items() if one is not None and not one.address}
     if out is not None:
-        _copy((Path(merged.folders[number], one.path.name) for number, one in local.items()), out)
+        # Those of a sweep are in a folder for each point.
+        below = _folder_of_point(merged) if merged.command == "sweep" else lambda number: ""
+        for number, one in local.items():
+            _copy(Path(merged.folders[number], below(number), one.path.name), out / below(number))
         return replace(merged, folders=dict.fromkeys(merged.folders, str(out.absolute())))
     folders = {merged.folders[number] for number in local}
     if len(folders) > 1:
@@ -66,18 +73,21 @@ def _together(merged: Merged, out: Path | None) -> Merged:
     return merged
 
 
-def _copy(files: Iterable[Path], out: Path) -> None:
-    """Copy episodes that are not there yet, the .json of each last."""
-    for rrd in files:
-        for suffix in (".rrd", ".h5", ".json"):
-            source, target = rrd.with_suffix(suffix), out / f"{rrd.stem}{suffix}"
-            if not source.is_file() and not target.is_file():
-                raise RecordingError(
-                    f"{source} is not there: merge where the folders of all parts can be read"
-                )
-            if not target.exists():
-                with new_file(target) as temporary:
-                    shutil.copyfile(source, temporary)
+def _folder_of_point(merged: Merged) -> Callable[[int], str]:
+    what = merged.requested(SweepOptions)
+    points, stride = what.points, what.stride
+    return lambda number: points[number // stride].folder
+
+
+def _copy(rrd: Path, out: Path) -> None:
+    """Copy an episode that is not there yet, its .json last."""
+    for suffix in (".rrd", ".h5", ".json"):
+        source, target = rrd.with_suffix(suffix), out / f"{rrd.stem}{suffix}"
+        if not source.is_file() and not target.is_file():
+            raise RecordingError(f"{source} is not there: merge where the folders of all parts can be read")
+        if not target.exists():
+            with new_file(target) as temporary:
+                shutil.copyfile(source, temporary)
 
 
 def _print(merged: Merged, json_file: Path | None) -> int:
@@ -86,7 +96,7 @@ def _print(merged: Merged, json_file: Path | None) -> int:
         return _print_check(merged, json_file)
     if merged.command == "rescore":
         return _print_rescore(merged, json_file)
-    if json_file is not None and merged.command != "solve":
+    if json_file is not None and merged.command not in ("solve", "sweep"):
         raise JobFileError(f"workbench {merged.command} has no result as JSON: leave out --json-file")
     folder = next(iter(merged.folders.values()), "")
     known: dict[int, Written | None] = merged.results(Written | None)
@@ -104,6 +114,13 @@ def _print(merged: Merged, json_file: Path | None) -> int:
             replace_file(json_file, as_json(report, asked, SolveOutput()).encode())
         print_report(report)
         code, missing = Exit.DONE if report.solved else Exit.FAILED, recorded.missing
+    elif merged.command == "sweep":
+        varied = merged.requested(SweepOptions)
+        varied = replace(varied, out=Path(folder or varied.out))
+        swept = collect_sweep(varied, known)
+        write_results(varied.out / RESULTS, swept.results)
+        write_reports(swept.results, SweepOutput(json_file))
+        code, missing = print_report_of_sweep(swept, varied, has_table=True), swept.missing
     else:
         raise JobFileError(f"{merged.files[0]} is of workbench {merged.command}, which merge does not know")
     return _with_missing(code, missing, "episodes")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
@@ -43,7 +44,12 @@ class RecordBar:
     """The progress bar, and Ctrl-C: the first ends the recording after the current step; before it, or again, at once."""
 
     def __init__(
-        self, bar: Bar, total: int | None, doing: str = "recording", first_seed: int | None = None
+        self,
+        bar: Bar,
+        total: int | None,
+        doing: str = "recording",
+        first_seed: int | None = None,
+        named: Callable[[int], str] = lambda number: f"episode {number}",
     ) -> None:
         """
         Args:
@@ -51,8 +57,9 @@ class RecordBar:
             doing: what the bar says while episodes run.
             first_seed: where actions are planned, of the first episode: a control step takes long then, so it is said at
                 which one each seed is.
+            named: the name of an episode by its number, where there is no first seed.
         """
-        self._doing, self._first_seed = doing, first_seed
+        self._doing, self._first_seed, self._named = doing, first_seed, named
         self._bar, self._row = bar, bar.add_task("opening", total=total)
         self._total = total
         self.stop_requested = False
@@ -88,7 +95,7 @@ class RecordBar:
         if now.over is not None and not err.is_terminal:
             # A bar in a file or a pipe is drawn once, at the end: a job's log would say nothing for hours.
             number, kept = now.over
-            named = f"episode {number}" if self._first_seed is None else f"seed {self._first_seed + number}"
+            named = self._named(number) if self._first_seed is None else f"seed {self._first_seed + number}"
             line = f"{named}: {_ended_text(kept)}, {now.kept} of {self._total} kept"
             err.print(escape(line), soft_wrap=True)
 

@@ -67,6 +67,8 @@ class RecordOptions(RecordArguments):
     """Control steps that an episode goes on after its success."""
     workers: int = 1
     """Processes that record, if no executor is given; the episodes are the same with any number."""
+    source: dict[str, str] = field(default_factory=dict)
+    """Texts by path that replace the task's files on disk."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,10 @@ class Written:
     """What is known of it where its actions were planned."""
     address: str = ""
     """Where its .rrd was uploaded to; `path` is not there then."""
+    solved_at: int | None = None
+    """Control steps until its first state with success; None without one."""
+    means: dict[str, float] = field(default_factory=dict)
+    """As `recording.episode.episode.Episode.means`."""
 
     @property
     def shown(self) -> str:
@@ -235,6 +241,7 @@ def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> Opened
     opened = open_task(
         what.task,
         options,
+        source=what.source,
         on_activity=lambda activity: queue.send_update(RecordUpdate(activity)),
         on_finding=lambda finding: queue.send_update(RecordUpdate(finding=finding)),
     )
@@ -388,6 +395,8 @@ class _Episodes:
                     start_corrected,
                     self._plans.pop(number, None),
                     f"{upload}/{files.rrd.name}" if upload else "",
+                    files.solved_at,
+                    dict(files.means),
                 ),
             )
 

@@ -142,28 +142,32 @@ def open_task(
     reference: TaskName,
     options: TaskOptions,
     *,
+    source: Mapping[str, str] | None = None,
     on_activity: Callable[[str], None] = lambda activity: None,
     on_finding: Callable[[Finding], None] = warn_of,
 ) -> OpenedTask:
     """Import, build, rehearse and reset a task, without a page.
 
+    Args:
+        source: as `load_task`.
+
     Raises:
         TaskError: with the author's file and line; the import is undone.
     """
     opening = Opening(on_activity, on_finding)
-    loaded = import_task(reference, options, None, opening)
+    loaded = import_task(reference, options, source, opening)
     try:
         return build_task(loaded, options, opening)
     except TaskError as error:
         undo_load(loaded)
-        raise with_advice(error, loaded, options, lambda: load_task(reference)) from error.__cause__
+        raise with_advice(error, loaded, options, lambda: load_task(reference, source)) from error.__cause__
     except BaseException:
         undo_load(loaded)
         raise
 
 
 def import_task(
-    reference: TaskName, options: TaskOptions, source: dict[str, str] | None, opening: Opening
+    reference: TaskName, options: TaskOptions, source: Mapping[str, str] | None, opening: Opening
 ) -> LoadedTask:
     """Import a task's class, with `source` in place of the files on disk if given. Raises TaskError."""
     opening.on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")

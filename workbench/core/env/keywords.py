@@ -73,7 +73,7 @@ def describe_keywords(
         registered: keywords of the registration.
         stop: `BaseEnv`, whose parameters are no keywords of the task itself.
     """
-    parameters = dict(_own_parameters(cls, stop))
+    parameters = dict(parameters_of(cls, stop))
     effective = {**registered, **given}
     own = [
         _describe(name, parameter, effective.get(name, _ABSENT), registered.get(name, _ABSENT))
@@ -131,8 +131,12 @@ def _choice(name: str, value: Any, choices: Sequence[Any]) -> Keyword:
     return Keyword(name, "choice", now, choices=tuple(dict.fromkeys((*texts, now)))[:MOST_CHOICES])
 
 
-def _own_parameters(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parameter]]:
-    """Named parameters of the class's ``__init__``, and of its base classes' as long as each hands keywords on."""
+def parameters_of(cls: type, stop: type) -> Iterator[tuple[str, inspect.Parameter]]:
+    """Named parameters of the class's ``__init__``, and of its base classes' as long as each hands keywords on.
+
+    Args:
+        stop: the base class whose own are left out, with those of its bases.
+    """
     seen: set[str] = set()
     for owner in cls.__mro__:
         if owner is stop or owner is object:
@@ -237,7 +241,7 @@ def constructor_arguments(cls: type, given: Mapping[str, Any], stop: type) -> di
     taken = dict(given)
     if isinstance(robots := taken.get("robot_uids"), list):
         taken["robot_uids"] = tuple(robots)  # a list would be the name of one robot
-    for name, parameter in _own_parameters(cls, stop):
+    for name, parameter in parameters_of(cls, stop):
         kind = parameter.annotation
         if name in taken and isinstance(kind, type) and issubclass(kind, enum.Enum):
             taken[name] = next((one for one in kind if one.value == taken[name]), taken[name])

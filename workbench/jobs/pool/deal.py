@@ -18,6 +18,8 @@ FIRST_ALIKE, LATER_ALIKE = 5, 20
 """Chunks that may fail alike one after another, before the first result and after it: then the others would fail too."""
 _STARTS = 3
 """Workers that may die before their first chunk."""
+_BEFORE_ANY = -1
+"""Stands for the group of a worker that has no chunk yet."""
 
 Setup = TypeVar("Setup")
 Result = TypeVar("Result")
@@ -127,6 +129,7 @@ class Deal(Generic[Result, Update]):
         chunk: int = 1,
         tries: int = 1,
         on_failure: Callable[[Failure], None] | None = None,
+        group: int | None = None,
     ) -> None:
         """
         Args:
@@ -136,10 +139,16 @@ class Deal(Generic[Result, Update]):
             tries: how often a chunk is begun whose workers die.
             on_failure: called with the items that the author's code failed in, and those whose workers died in each try; the
                 job goes on unless they fail alike. If None the first failure ends the job.
+            group: items of a group, of which each begins a chunk: k belongs to group ``k // group``. Where the chunks of one
+                fail alike, or the task cannot be built for it, what is left of it fails too, and the job goes on.
         """
         self._numbers, self._size, self._tries = numbers, chunk, tries
         self._on_result, self._on_update, self._stop = on_result, on_update, stop
-        self._on_failure = on_failure
+        self._on_failure, self._group = on_failure, group or NO_LIMIT
+        self._with_results: set[int] = set()
+        """Groups that have a result."""
+        self._given_up: dict[int, Problem] = {}
+        """Of each group whose chunks fail alike, why."""
         self._known: Mapping[int, Result] = {}
         self._keep: Callable[[int, Result], None] = lambda number, result: None
         self._left = self._chunks()
@@ -151,8 +160,8 @@ class Deal(Generic[Result, Update]):
         self._held: dict[Hashable, list[_Held]] = {}
         self._deaths: dict[int, int] = {}
         """Of the chunk that begins with this item."""
-        self._failed_alike: list[tuple[object, int]] = []
-        """Of the failures since the last result: in what they are alike, and the first item of the chunk."""
+        self._failed_alike: dict[int, list[tuple[object, int]]] = {}
+        """Of the failures of each group since its last result: in what they are alike, and the first item of the chunk."""
         self._limit = NO_LIMIT
         self.results = 0
         self.failures: list[Failure] = []
@@ -174,6 +183,7 @@ class Deal(Generic[Result, Update]):
         self._known, self._keep = known, keep
         for number in sorted(known):
             self.results += 1
+            self._with_results.add(number // self._group)
             self._on_result(number, known[number])
 
     # --- for the workers -------------------------------------------------------------------------------
@@ -217,7 +227,9 @@ class Deal(Generic[Result, Update]):
         held.missing.remove(number)
         if not held.missing:
             self._held[worker].remove(held)
-        self._failed_alike.clear()
+        self._with_results.add(number // self._group)
+        for group in (number // self._group, _BEFORE_ANY):
+            self._failed_alike.pop(group, None)
         self.results += 1
         self._keep(number, result)
         self._on_result(number, result)
@@ -243,12 +255,14 @@ class Deal(Generic[Result, Update]):
         *others, last = held
         for one in others:
             self._give_back(one)
-        if self._divide(last):
+        # What cannot be built is not built for the next chunk of its group either.
+        unbuilt = self._group != NO_LIMIT and error.problem.stage in ("syntax", "import", "build")
+        if not unbuilt and self._divide(last):
             return
-        self._note(last, error.problem)
+        self._fail(last.missing, error.problem)
         at = error.problem.stage, error.problem.file, error.problem.line
-        if self._alike(at, last):
-            raise error
+        if self._alike(at, last) or unbuilt:
+            self._give_up_group(last, error, error.problem)
 
     def died(self, worker: Hashable, how: str, code: int | None) -> None:
         """The worker is gone without a word.
@@ -267,8 +281,9 @@ class Deal(Generic[Result, Update]):
             return
         if not held:
             # Before its first chunk: it is the machine, or the import.
-            self._failed_alike.append((code, -len(self._failed_alike) - 1))
-            if len(self._failed_alike) >= _STARTS:
+            before = self._failed_alike.setdefault(_BEFORE_ANY, [])
+            before.append((code, -len(before) - 1))
+            if len(before) >= _STARTS:
                 raise PoolError(how)
         for one in held:
             first = one.chunk.numbers[0]
@@ -276,12 +291,13 @@ class Deal(Generic[Result, Update]):
             over = self._deaths[first] >= self._tries
             if not over:
                 self._give_back(one)
+            problem = Problem("worker", f"the worker {how}", None, None, None, "")
             if self._alike(code, one):
-                raise PoolError(how)
+                self._give_up_group(one, PoolError(how), problem)
             if over and not self._divide(one):
                 if self._on_failure is None or not (self.results or self.count_left(1)):
                     raise PoolError(how)
-                self._note(one, Problem("worker", f"the worker {how}", None, None, None, ""))
+                self._fail(one.missing, problem)
 
     def require_results(self) -> None:
         """Raise the TaskError of the first failure, if no item has a result."""
@@ -298,36 +314,57 @@ class Deal(Generic[Result, Update]):
         """Have up to `most` chunks in `_ahead`; how many of them are needed."""
         while len(self._ahead) < most and (numbers := next(self._left, None)) is not None:
             if wanted := frozenset(numbers) - self._known.keys():
+                if (problem := self._given_up.get(numbers[0] // self._group)) is not None:
+                    self._fail(wanted, problem)
+                    continue
                 self._ahead.append(Chunk(numbers, wanted, again=bool(self._known)))
         limit = self.limit()
         return sum(min(chunk.wanted) < limit for chunk in islice(self._ahead, most))
 
     def _give_back(self, held: _Held) -> None:
-        self._returned.append(Chunk(held.chunk.numbers, frozenset(held.missing), again=True))
+        if (problem := self._given_up.get(held.chunk.numbers[0] // self._group)) is not None:
+            self._fail(held.missing, problem)
+        else:
+            self._returned.append(Chunk(held.chunk.numbers, frozenset(held.missing), again=True))
 
     def _divide(self, held: _Held) -> bool:
         """Have the missing items of a chunk dealt one by one; False if there is only one."""
         limit = self.limit()
         missing = sorted(number for number in held.missing if number < limit)
-        if len(held.chunk.numbers) == 1 or not missing or self._on_failure is None:
+        given_up = held.chunk.numbers[0] // self._group in self._given_up
+        if len(held.chunk.numbers) == 1 or not missing or self._on_failure is None or given_up:
             return False
         for number in missing:
             self._alone.append(Chunk((number,), frozenset((number,)), again=True))
             self._deaths[number] = self._tries - 1
         return True
 
-    def _note(self, held: _Held, problem: Problem) -> None:
+    def _give_up_group(self, held: _Held, error: TaskError | PoolError, problem: Problem) -> None:
+        """Let what is left of the chunk's group fail; without groups, raise the error."""
+        if self._group == NO_LIMIT or self._on_failure is None:
+            raise error
+        group = held.chunk.numbers[0] // self._group
+        self._given_up[group] = problem
+        for waiting in (self._ahead, self._returned, self._alone):
+            for chunk in [chunk for chunk in waiting if chunk.numbers[0] // self._group == group]:
+                waiting.remove(chunk)
+                self._fail(chunk.wanted, problem)
+
+    def _fail(self, numbers: Iterable[int], problem: Problem) -> None:
         limit = self.limit()
-        failure = Failure(tuple(sorted(number for number in held.missing if number < limit)), problem)
+        failure = Failure(tuple(sorted(number for number in numbers if number < limit)), problem)
         self.failures.append(failure)
         if self._on_failure is not None:
             self._on_failure(failure)
 
     def _alike(self, key: object, held: _Held) -> bool:
-        """Note a failure of this kind; whether that many chunks failed alike one after another."""
-        self._failed_alike.append((key, held.chunk.numbers[0]))
-        alike = {first for kind, first in self._failed_alike if kind == key}
-        return len(alike) >= (LATER_ALIKE if self.results else FIRST_ALIKE)
+        """Note a failure of this kind; whether that many chunks of its group failed alike one after another."""
+        first = held.chunk.numbers[0]
+        group = first // self._group
+        before = self._failed_alike.setdefault(group, [])
+        before.append((key, first))
+        alike = {first for kind, first in before if kind == key}
+        return len(alike) >= (LATER_ALIKE if group in self._with_results else FIRST_ALIKE)
 
 
 @dataclass(frozen=True)

@@ -184,6 +184,24 @@ class Episode:
         found = {name: self.flag(name) for name in ("success", "fail")}
         return {name: flag for name, flag in found.items() if flag is not None}
 
+    @property
+    def solved_at(self) -> int | None:
+        """Control steps until the first state with success; None if there is none. The reset's counts as 0."""
+        success = self.flag("success")
+        return None if success is None or not success.any() else int(np.argmax(success))
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Of each entry of ``evaluate()`` with one number per state, over the states after the reset that have it."""
+        found: dict[str, float] = {}
+        for name, values in self.evaluate.items():
+            if values.ndim == 1 and name not in ("success", "fail"):
+                known = values[1:].astype(np.float64)
+                known = known[~np.isnan(known)]
+                if len(known):
+                    found[name] = float(known.mean())
+        return found
+
     def other_entries_at(self, state: int) -> dict[str, OtherEntry]:
         """Entries of ``evaluate()`` in this state that are not in `evaluate`."""
         found: dict[str, OtherEntry] = {}

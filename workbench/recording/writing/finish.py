@@ -7,7 +7,7 @@ import datetime
 import errno
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,6 +36,10 @@ class EpisodeFiles:
     rrd: Path
     h5: Path
     json: Path
+    solved_at: int | None
+    """As `Episode.solved_at`."""
+    means: Mapping[str, float]
+    """As `Episode.means`."""
 
 
 def make_files(journal: Path, header: Header, folder: Path, states: int | None = None) -> EpisodeFiles:
@@ -61,7 +65,8 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
             write_rrd(episode, rrd)
             write_json(episode, json, folder, (rrd, h5), header.made_here)
         sync_files(temporaries)
-        return EpisodeFiles(*publish(temporaries, folder, episode_stem(header.info)))
+        paths = publish(temporaries, folder, episode_stem(header.info))
+        return EpisodeFiles(*paths, episode.solved_at, episode.means)
     except OSError as error:
         why = error if isinstance(error, RecordingError) else reason(error, folder)
         raise RecordingError(

@@ -1,0 +1,292 @@
+"""Runs ``workbench sweep``: a progress bar, a table of the points, and the results as files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from workbench.authoring.problem import TaskError
+from workbench.cli.arguments import ONE_WORKER, JobArguments
+from workbench.cli.check_reports import json_text
+from workbench.cli.jobs import job_path, print_part, run_by, shard_of
+from workbench.cli.record import RecordBar
+from workbench.cli.terminal import (
+    Exit,
+    out,
+    print_failures,
+    print_finding,
+    print_problem,
+    print_text,
+    progress_bar,
+    refuse,
+)
+from workbench.jobs.pool.deal import PoolError
+from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.pool.travel import needed_by
+from workbench.jobs.sweep import Point, Setting, SweepOptions, SweepReport, recordings_of, sweep
+from workbench.machine.files import replace_file
+from workbench.machine.folders import CurrentFolder
+from workbench.machine.text import number_text
+from workbench.recording.reader.reading import recover_confined
+from workbench.recording.sweeps import RESULTS, PointSummary, SweepResults, value_text, write_results
+from workbench.recording.writing.publish import try_folder
+
+_MOST_POINTS = 50
+"""That are printed."""
+
+
+@dataclass(frozen=True)
+class SweepOutput:
+    """What it gives besides its text and ``results.parquet``."""
+
+    json_file: Path | None = None
+    csv_file: Path | None = None
+
+
+def parse_settings(given: Sequence[str]) -> tuple[Setting, ...]:
+    """The ``--set`` of a command line. Raises ValueError with a message that names the argument."""
+    if not given:
+        raise ValueError("--set takes what varies, as in --set reach_weight=0.5,1,2; repeatable")
+    settings: list[Setting] = []
+    for text in given:
+        name, equals, values = text.partition("=")
+        if not equals or not all(part.isidentifier() for part in name.split(".")):
+            raise ValueError(f"--set takes name=value,value as in --set reach_weight=0.5,1,2; got {text!r}")
+        if any(one.name == name for one in settings):
+            raise ValueError(f"--set names {name} twice: give all its values at once, as in --set {name}=1,2")
+        read = _values(values)
+        told = [json.dumps(value, sort_keys=True) for value in read]
+        if len({float(one) if _is_number(one) else one for one in told}) < len(told):
+            raise ValueError(f"--set {text}: a value is there twice")
+        settings.append(Setting(name, tuple(read)))
+    return tuple(settings)
+
+
+def _values(text: str) -> list[Any]:
+    """The values of a list: each in JSON, else as text."""
+    try:
+        # Lists and texts in quotes have commas of their own.
+        values = json.loads(f"[{text}]", parse_constant=_no_constant)
+    except (ValueError, RecursionError):
+        values = [_value(one.strip()) for one in text.split(",")]
+    if not values or "" in values:
+        raise ValueError(f"--set takes a value before and after each comma; got {text!r}")
+    return values
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(name)
+
+
+def _is_number(text: str) -> bool:
+    return text[:1] in "-0123456789"
+
+
+def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments = ONE_WORKER) -> int:
+    """Sweep, print, and write the results; returns the exit code. Ctrl-C keeps and reports what is done."""
+    here = CurrentFolder()  # a task may change it
+    points = what.points
+    try:
+        job = job_path(run, "sweep")
+        if (what.out / RESULTS).exists() and not (job is not None and job.exists()):
+            raise ValueError(
+                f"{what.out} holds the results of another sweep: name a folder with --out, or remove it"
+            )
+        recordings_of(what)
+        try_folder(what.out)
+        for point in points:
+            recover_confined(what.out / point.folder)
+        shard = shard_of(run)
+        chunks = sorted({number // what.chunk for number in what.items})
+        part = shard.part(len(chunks))
+        mine = set(chunks[part.start : part.stop])
+        total = sum(number // what.chunk in mine for number in what.items)
+        left = (TextColumn("left"), TimeRemainingColumn())
+        with (
+            run_by(run, "sweep", len(chunks), lambda: job_of_sweep(what)) as (executor, name),
+            progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
+        ):
+            with RecordBar(
+                bar, total, "sweeping", named=lambda number: _named(what, points, number)
+            ) as shown:
+                report = sweep(
+                    what,
+                    shown.describe,
+                    shown.show,
+                    lambda: shown.stop_requested,
+                    print_finding,
+                    executor,
+                    name,
+                )
+            shown.describe("swept", len(report.results.episodes))
+    except TaskError as error:
+        print_problem(error.problem)
+        return Exit.FAILED
+    except (OSError, ValueError, PoolError) as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        return refuse("interrupted; finished episodes were kept")
+    try:
+        with here.again():
+            # What a part has is in its job file; the parts would write over each other's table.
+            if run.shard is None:
+                write_results(what.out / RESULTS, report.results)
+            write_reports(report.results, output)
+    except OSError as error:
+        return refuse(str(error))
+    code = print_report(report, what, has_table=run.shard is None)
+    print_part(run, "sweep", report.stopped)
+    return refuse("interrupted; finished episodes were kept") if report.stopped else code
+
+
+def _named(what: SweepOptions, points: Sequence[Point], number: int) -> str:
+    point, episode = divmod(number, what.stride)
+    return f"seed {what.options.seed + episode} of {points[point].folder}"
+
+
+def job_of_sweep(what: SweepOptions) -> Job:
+    """What a job file of this sweep is for. Raises OSError."""
+    return job_of("sweep", what.task, what, ("out", "workers"), needed_by(what.task, what.actions).files)
+
+
+# --- text ------------------------------------------------------------------------------------------------
+
+
+def print_report(report: SweepReport, what: SweepOptions, has_table: bool) -> int:
+    """Print the points, the best first, and what failed; returns the exit code.
+
+    Args:
+        has_table: whether its table of results was written.
+    """
+    print_points(report.results)
+    if report.failures:
+        points = what.points
+        print_failures(report.failures, lambda number: _named(what, points, number))
+    if has_table and any(one.steps is not None for one in report.results.episodes):
+        table, folder = what.out / RESULTS, shlex.quote(str(what.out))
+        print_text(f"Each episode is a row of {table}. Look at them with: workbench review {folder}")
+    return Exit.FAILED if report.failures else Exit.DONE
+
+
+def print_points(results: SweepResults) -> None:
+    """Print a row for each point."""
+    summaries = results.summaries()
+    seen = [one for one in summaries if one.episodes]
+    terms = list(dict.fromkeys(name for one in seen for name in one.means))
+    # What is added up to the reward, where the task tells it; else all that it tells.
+    terms = [name for name in terms if name.startswith("reward_terms/")] or terms
+    table = Table(box=None, pad_edge=False)
+    for name in results.names:
+        table.add_column(escape(name), overflow="fold")
+    for name in ("success", "95 %", "at the end", "return", *terms):
+        table.add_column(escape(name.removeprefix("reward_terms/")), justify="right")
+    table.add_column("episodes", justify="right")
+    for one in summaries[:_MOST_POINTS]:
+        values = [value_text(text) for text in one.values.values()]
+        cells = [*values, *_rates(one), *(_mean(one, name) for name in terms), _count(one)]
+        table.add_row(*map(escape, cells), style="" if one.episodes else "yellow")
+    out.print(table)
+    if len(summaries) > _MOST_POINTS:
+        print_text(f"... and {len(summaries) - _MOST_POINTS} more points")
+    print_text(
+        "success: at any step, with the interval that holds the rate of all seeds with 95 %; return and terms: means"
+    )
+
+
+def _rates(one: PointSummary) -> tuple[str, str, str, str]:
+    total = "-" if one.mean_return is None else number_text(one.mean_return, ".3f")
+    if one.rate is None or one.interval is None or one.solved_at_end is None:
+        return "-", "-", "-", total
+    low, high = one.interval
+    at_end = f"{100 * one.solved_at_end / one.episodes:.0f} %"
+    return f"{100 * one.rate:.0f} %", f"{100 * low:.0f} - {100 * high:.0f} %", at_end, total
+
+
+def _mean(one: PointSummary, name: str) -> str:
+    return number_text(one.means[name], ".3g") if name in one.means else "-"
+
+
+def _count(one: PointSummary) -> str:
+    return f"{one.episodes}, {one.failed} failed" if one.failed else str(one.episodes)
+
+
+# --- for programs ----------------------------------------------------------------------------------------
+
+
+def write_reports(results: SweepResults, output: SweepOutput) -> None:
+    """Write the files that were asked for. Raises OSError."""
+    if output.json_file is not None:
+        replace_file(output.json_file, as_json(results).encode())
+    if output.csv_file is not None:
+        replace_file(output.csv_file, as_csv(results).encode())
+
+
+def as_json(results: SweepResults) -> str:
+    """The points, the best first, each with its episodes."""
+    points = []
+    for one in results.summaries():
+        rows = [_row(results, row) for row in results.episodes if row.point == one.index]
+        points.append(
+            {
+                "point": one.index,
+                "set": {name: json.loads(text) for name, text in one.values.items()},
+                "success_rate": one.rate,
+                "success_interval_95": one.interval,
+                "success_rate_at_end": None
+                if one.solved_at_end is None
+                else one.solved_at_end / one.episodes,
+                "mean_return": one.mean_return,
+                "means": dict(one.means),
+                "failed": one.failed,
+                "failure": one.failure,
+                "episodes": rows,
+            }
+        )
+    return json_text(
+        {"task": results.task, "actions": results.actions, "seeds": results.seeds, "points": points}
+    )
+
+
+def as_csv(results: SweepResults) -> str:
+    """A row for each episode, as in ``results.parquet``."""
+    means = list(dict.fromkeys(name for row in results.episodes for name in row.means))
+    names = [*results.names]
+    text = io.StringIO()
+    header = ["point", *(f"set.{name}" for name in names), *_COLUMNS, *(f"mean.{name}" for name in means)]
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*header, "recording", "failure"])
+    for row in results.episodes:
+        values = [value_text(results.points[row.point][name]) for name in names]
+        told = _row(results, row)
+        writer.writerow(
+            [row.point, *values, *(told[name] for name in _COLUMNS)]
+            + [row.means.get(name) for name in means]
+            + [row.recording, row.failure]
+        )
+    return text.getvalue()
+
+
+_COLUMNS = ("seed", "success", "success_at_end", "solved_at", "steps", "return")
+
+
+def _row(results: SweepResults, row: Any) -> dict[str, Any]:
+    values = row.seed, row.success, row.success_at_end, row.solved_at, row.steps, row.total_reward
+    told = dict(zip(_COLUMNS, values, strict=True))
+    return {**told, "means": dict(row.means), "recording": row.recording, "failure": row.failure}
