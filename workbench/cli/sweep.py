@@ -43,6 +43,7 @@ from workbench.recording.writing.publish import try_folder
 
 _MOST_POINTS = 50
 """That are printed."""
+_TERMS = "reward_terms/"
 
 
 @dataclass(frozen=True)
@@ -188,43 +189,50 @@ def print_report(report: SweepReport, what: SweepOptions, has_table: bool) -> in
 def print_points(results: SweepResults) -> None:
     """Print a row for each point."""
     summaries = results.summaries()
-    seen = [one for one in summaries if one.episodes]
-    terms = list(dict.fromkeys(name for one in seen for name in one.means))
+    terms = list(dict.fromkeys(name for one in summaries for name in one.means))
     # What is added up to the reward, where the task tells it; else all that it tells.
-    terms = [name for name in terms if name.startswith("reward_terms/")] or terms
+    terms = [name for name in terms if name.startswith(_TERMS)] or terms
+    cells = [_cells(one, terms) for one in summaries[:_MOST_POINTS]]
+    heads = [*results.names, "success (95 %)", "at the end", "return"]
+    heads = [*heads, *(name.removeprefix(_TERMS) for name in terms)]
+    widths = [max(map(len, column)) + 2 for column in zip(heads, *(row for _, row in cells), strict=True)]
+    first, fit = len(heads) - len(terms), len(heads)
+    # A table that is broken inside its words cannot be read.
+    while fit > first and sum(widths[:fit]) > out.width:
+        fit -= 1
     table = Table(box=None, pad_edge=False)
-    for name in results.names:
-        table.add_column(escape(name), overflow="fold")
-    for name in ("success", "95 %", "at the end", "return", *terms):
-        table.add_column(escape(name.removeprefix("reward_terms/")), justify="right")
-    table.add_column("episodes", justify="right")
-    for one in summaries[:_MOST_POINTS]:
-        values = [value_text(text) for text in one.values.values()]
-        cells = [*values, *_rates(one), *(_mean(one, name) for name in terms), _count(one)]
-        table.add_row(*map(escape, cells), style="" if one.episodes else "yellow")
+    for k, head in enumerate(heads[:fit]):
+        if k < len(results.names):
+            table.add_column(escape(head), overflow="fold")
+        else:
+            table.add_column(escape(head), justify="right", no_wrap=True)
+    for style, row in cells:
+        table.add_row(*map(escape, row[:fit]), style=style)
     out.print(table)
     if len(summaries) > _MOST_POINTS:
         print_text(f"... and {len(summaries) - _MOST_POINTS} more points")
     print_text(
-        "success: at any step, with the interval that holds the rate of all seeds with 95 %; return and terms: means"
+        "success: at any step, and the interval that holds the rate of all seeds with 95 %; return and terms: means"
     )
+    if fit < len(heads):
+        print_text(f"More means are in {RESULTS}: {', '.join(heads[fit:])}")
 
 
-def _rates(one: PointSummary) -> tuple[str, str, str, str]:
+def _cells(one: PointSummary, terms: Sequence[str]) -> tuple[str, list[str]]:
+    """Style and texts of a row."""
+    values = [value_text(text) for text in one.values.values()]
+    if not one.episodes:
+        return "yellow", [*values, f"{one.failed} failed" if one.failed else "-", *["-"] * (2 + len(terms))]
+    success = at_end = "-"
+    if one.rate is not None and one.interval is not None and one.solved_at_end is not None:
+        low, high = (100 * end for end in one.interval)
+        success = f"{100 * one.rate:.0f} % ({low:.0f} - {high:.0f})"
+        at_end = f"{100 * one.solved_at_end / one.episodes:.0f} %"
+    if one.failed:
+        success += f", {one.failed} failed"
     total = "-" if one.mean_return is None else number_text(one.mean_return, ".3f")
-    if one.rate is None or one.interval is None or one.solved_at_end is None:
-        return "-", "-", "-", total
-    low, high = one.interval
-    at_end = f"{100 * one.solved_at_end / one.episodes:.0f} %"
-    return f"{100 * one.rate:.0f} %", f"{100 * low:.0f} - {100 * high:.0f} %", at_end, total
-
-
-def _mean(one: PointSummary, name: str) -> str:
-    return number_text(one.means[name], ".3g") if name in one.means else "-"
-
-
-def _count(one: PointSummary) -> str:
-    return f"{one.episodes}, {one.failed} failed" if one.failed else str(one.episodes)
+    means = [number_text(one.means[name], ".3g") if name in one.means else "-" for name in terms]
+    return "yellow" if one.failed else "", [*values, success, at_end, total, *means]
 
 
 # --- for programs ----------------------------------------------------------------------------------------

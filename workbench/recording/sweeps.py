@@ -232,9 +232,18 @@ def read_results(path: Path) -> SweepResults:
             wanted = [name for name in names if not name.startswith(SET)]
             columns = parquet.read(columns=wanted).to_pydict()
             return _results(about, columns)
-        except (pa.ArrowException, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-            if isinstance(error, NoSweep):
-                raise
+        except NoSweep:
+            raise
+        # Arrow raises OSError for bytes that are no parquet.
+        except (
+            pa.ArrowException,
+            ValueError,
+            TypeError,
+            KeyError,
+            AttributeError,
+            RecursionError,
+            OSError,
+        ) as error:
             raise NoSweep(f"cannot be read ({type(error).__name__})") from error
 
 

@@ -30,12 +30,14 @@ from workbench.recording.reader.requests import (
     ReadPicture,
     ReadRerunInfo,
     ReadRows,
+    ReadSweep,
     Recover,
     Recovered,
     Request,
     RerunInfo,
     RowsRead,
     SourcesFound,
+    SweepRead,
 )
 from workbench.recording.reader.scan import RecordingFiles
 
@@ -152,6 +154,8 @@ class _Reader:
             return _sources(request)
         if isinstance(request, ReadRerunInfo):
             return _rerun_info(request)
+        if isinstance(request, ReadSweep):
+            return _sweep(request)
         assert isinstance(request, Recover)
         from workbench.recording.writing.finish import recover
 
@@ -195,6 +199,15 @@ def _sources(request: FindSources) -> SourcesFound:
     if request.trajectories:
         return SourcesFound([Source(request.path, name) for name in trajectories(request.path)])
     return SourcesFound(list(sources_in(request.path)))
+
+
+def _sweep(request: ReadSweep) -> SweepRead:
+    from workbench.recording.sweeps import NoSweep, read_results
+
+    try:
+        return SweepRead(read_results(request.path))
+    except NoSweep as error:
+        raise UnreadableRecording(f"{request.path.name} {error}.") from error
 
 
 def _rerun_info(request: ReadRerunInfo) -> RerunInfo:

@@ -33,13 +33,16 @@ from workbench.recording.reader.requests import (
     ReadPicture,
     ReadRerunInfo,
     ReadRows,
+    ReadSweep,
     Recover,
     Recovered,
     RerunInfo,
     RowsRead,
     SourcesFound,
+    SweepRead,
 )
 from workbench.recording.reader.scan import NOTES, RecordingFiles, broken
+from workbench.recording.sweeps import NoSweep, SweepResults, clean_results
 from workbench.recording.writing.publish import RecordingError
 
 ROW_SECONDS = 30.0
@@ -153,6 +156,17 @@ def read_rerun_info(path: Path) -> tuple[str | None, bytes | None]:
     return info.store, info.blueprint
 
 
+def read_sweep(path: Path) -> SweepResults:
+    """The results of a sweep in a ``results.parquet``. A link that leads out of its folder is not followed. Raises as
+    `read_recording`."""
+    path = Path(path).absolute()
+    read, _ = _request(_reader(path.parent, episodes=True), ReadSweep(path), SweepRead, path.name)
+    try:
+        return clean_results(read.results)
+    except NoSweep as error:
+        raise UnreadableRecording(f"{path.name} {error}.") from error
+
+
 def recover_confined(folder: Path) -> tuple[Path, ...]:
     """Make recordings of the journals that dead writers left in `folder`; returns the .rrd of each.
 
@@ -252,7 +266,7 @@ def _thumbnail(jpeg: bytes | None) -> bytes | None:
 
 
 def _request(
-    reader: Reader, request: OpenEpisode | FindSources | ReadRerunInfo, kind: type[T], name: str
+    reader: Reader, request: OpenEpisode | FindSources | ReadRerunInfo | ReadSweep, kind: type[T], name: str
 ) -> tuple[T, int]:
     """The answer, and the number of the process that answered."""
     try:

@@ -13,6 +13,7 @@ from workbench.recording.episode.document import CameraJson
 from workbench.recording.episode.encoded_pictures import Modality
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import LibraryEntry, Source, SourceKind
+from workbench.recording.sweeps import SweepResults
 
 
 class NewReader(msgspec.Struct, tag=True):
@@ -80,13 +81,21 @@ class ReadRerunInfo(msgspec.Struct, frozen=True):
     path: Path
 
 
+class ReadSweep(msgspec.Struct, frozen=True):
+    """The results of a sweep; answered by `SweepRead`."""
+
+    path: Path
+
+
 class Recover(msgspec.Struct, frozen=True):
     """Run `writing.finish.recover` on a folder; answered by `Recovered`."""
 
     folder: Path
 
 
-Request = ReadRows | OpenEpisode | ReadPicture | CloseEpisodes | FindSources | ReadRerunInfo | Recover
+Request = (
+    ReadRows | OpenEpisode | ReadPicture | CloseEpisodes | FindSources | ReadRerunInfo | ReadSweep | Recover
+)
 
 
 class RowsRead(msgspec.Struct, frozen=True):
@@ -141,6 +150,10 @@ class RerunInfo(msgspec.Struct, frozen=True):
     blueprint: bytes | None
 
 
+class SweepRead(msgspec.Struct, frozen=True):
+    results: SweepResults
+
+
 class Recovered(msgspec.Struct, frozen=True):
     made: list[str]
     """Names of their ``.rrd``."""
@@ -154,4 +167,4 @@ class ReadFailed(msgspec.Struct, frozen=True):
     message: str
 
 
-Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | RerunInfo | Recovered | ReadFailed
+Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | RerunInfo | SweepRead | Recovered | ReadFailed

@@ -65,8 +65,8 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
             write_rrd(episode, rrd)
             write_json(episode, json, folder, (rrd, h5), header.made_here)
         sync_files(temporaries)
-        paths = publish(temporaries, folder, episode_stem(header.info))
-        return EpisodeFiles(*paths, episode.solved_at, episode.means)
+        rrd, h5, json = publish(temporaries, folder, episode_stem(header.info))
+        return EpisodeFiles(rrd, h5, json, episode.solved_at, episode.means)
     except OSError as error:
         why = error if isinstance(error, RecordingError) else reason(error, folder)
         raise RecordingError(

@@ -11,6 +11,7 @@ import viser
 
 from workbench.core.camera_data import CameraKey, Picture
 from workbench.recording.library.library import Library
+from workbench.recording.sweeps import RESULTS
 from workbench.session.live.view import ShownCameras
 from workbench.session.protocol.messages import CameraRequest
 from workbench.session.review.review import MOST_OPEN, Review
@@ -33,6 +34,7 @@ from workbench.ui.review.curves import ReviewCurves, ReviewNumbers
 from workbench.ui.review.panel import GO_LIVE, ReviewPanel
 from workbench.ui.review.rescore import RescorePanel
 from workbench.ui.review.scene import ReviewIn3D, shown_together
+from workbench.ui.review.sweep import SweepPanel
 from workbench.ui.scene.viewpoint import ViewPanel
 from workbench.ui.tasks.task_list import OPEN, OpenDialog
 from workbench.ui.widgets.click_targets import Presses
@@ -141,11 +143,16 @@ class ReviewPage:
         with review_tab:
             going = GoLivePart(server, go_live)
             self._view_panel = ViewPanel(server, dark)
-        return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
+        sweep = [] if self._sweep is None else [self._sweep]
+        return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore, *sweep]
 
     def _add_library(self, library: Library) -> None:
         """The table of recordings, in a panel of its own."""
         self._library_window = self._server.gui.add_panel(order=5.0)
+        self._sweep: SweepPanel | None = None
+        if (library.folder / RESULTS).exists():
+            with self._library_window.add_tab("Sweep", viser.Icon.ADJUSTMENTS_HORIZONTAL):
+                self._sweep = SweepPanel(self._server, library, self._review.open)
         with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
             self._library = LibraryPanel(self._server, library, self._review.open, clock=self._clock)
             Presses(self._server).when_unfolded(self._library_unfolded)

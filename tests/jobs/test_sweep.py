@@ -1,0 +1,263 @@
+"""``workbench sweep``: each seed once for each point, the changed text in its recordings, the same on any number of workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+
+from workbench.authoring.problem import TaskError
+from workbench.cli.sweep import parse_settings
+from workbench.jobs.pool.deal import Executor
+from workbench.jobs.pool.processes import Processes
+from workbench.jobs.record import RecordProgress
+from workbench.jobs.sweep import Setting, SweepOptions, SweepReport, collect_sweep, recordings_of, sweep
+from workbench.jobs.task import TaskOptions
+from workbench.recording.reader.read_episode import read_episode
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+REWARD_TERMS = Path(__file__).parents[2] / "tasks" / "reward_terms.py"
+PLAIN = {"render_backend": "none"}
+
+
+def options(
+    out: Path, *given: str, seeds: int = 3, task: Path = REWARD_TERMS, num_envs: int = 2
+) -> SweepOptions:
+    made = TaskOptions(num_envs=num_envs, seed=5, env_kwargs=PLAIN)
+    return SweepOptions(str(task), parse_settings(given), out, seeds, max_steps=3, options=made)
+
+
+def numbers(report: SweepReport) -> list[object]:
+    """All that does not say when it was made."""
+    return [replace(row, recording="") for row in report.results.episodes]
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("sweep")
+
+
+@pytest.fixture(scope="module")
+def swept(out: Path) -> SweepReport:
+    return sweep(options(out, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix"))
+
+
+def test_each_seed_is_recorded_once_for_each_point(swept: SweepReport, out: Path) -> None:
+    rows = swept.results.episodes
+    assert [(row.point, row.seed) for row in rows] == [(p, s) for p in range(4) for s in (5, 6, 7)]
+    assert swept.missing == 0 and not swept.stopped
+    recorded = [row for row in rows if row.recording]
+    assert [row.point for row in recorded] == [0, 0, 0, 2, 2, 2]
+    for row in recorded:
+        episode = read_episode(out / row.recording)
+        assert episode.info.seed == row.seed and episode.length == row.steps == 3
+        assert episode.means == row.means and "reward_terms/reach" in row.means
+
+
+def test_a_recording_holds_the_text_that_ran_and_the_file_stays(swept: SweepReport, out: Path) -> None:
+    before = REWARD_TERMS.read_text()
+    texts = {}
+    for row in swept.results.episodes:
+        if row.recording:
+            (texts[row.point],) = read_episode(out / row.recording).info.source.values()
+    assert texts == {0: before, 2: before.replace("MOST = 5.0", "MOST = 1.0")}
+    # And it is what ran: normalized by another most.
+    first, other = swept.results.episodes[0], swept.results.episodes[6]
+    assert first.total_reward is not None and other.total_reward is not None
+    assert other.total_reward == pytest.approx(5 * first.total_reward, rel=1e-5)
+
+
+def test_a_point_that_cannot_be_built_is_told_in_its_rows_and_the_others_go_on(swept: SweepReport) -> None:
+    failed = [row for row in swept.results.episodes if row.failure]
+    assert [row.point for row in failed] == [1, 1, 1, 3, 3, 3]
+    assert all("nix not in supported modes" in row.failure and row.success is None for row in failed)
+    best, *_, last = swept.results.summaries()
+    assert best.values == {"MOST": "1", "control_mode": '"pd_ee_delta_pos"'} and best.rate == 0
+    assert (last.episodes, last.failed, last.rate) == (0, 3, None)
+
+
+def test_points_that_all_fail_end_the_sweep(tmp_path: Path) -> None:
+    with pytest.raises(TaskError, match="not in supported modes"):
+        sweep(options(tmp_path, "control_mode=nix,nox", seeds=1))
+
+
+@pytest.mark.parametrize("executor", [Processes(2), pytest.param(Processes(4), marks=pytest.mark.slow)])
+def test_the_numbers_are_the_same_on_any_number_of_workers(
+    swept: SweepReport, executor: Executor, tmp_path: Path
+) -> None:
+    what = options(tmp_path, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix")
+    assert numbers(sweep(what, executor=executor)) == numbers(swept)
+
+
+class KillOnce:
+    """Kills a worker, with SIGKILL, when the first episode is over."""
+
+    def __init__(self) -> None:
+        self.done = False
+
+    def __call__(self, progress: RecordProgress) -> None:
+        if progress.over is not None and not self.done:
+            self.done = True
+            workers = [
+                one
+                for one in psutil.Process().children(recursive=True)
+                if "workbench" in " ".join(one.cmdline()) and not one.children()
+            ]
+            os.kill(workers[0].pid, signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_killed_worker_changes_no_number(swept: SweepReport, tmp_path: Path) -> None:
+    killer = KillOnce()
+    what = options(tmp_path, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix")
+    again = sweep(what, on_progress=killer, executor=Processes(2))
+    assert killer.done and numbers(again) == numbers(swept)
+    kept = [row.recording for row in again.results.episodes if row.recording]
+    assert sorted(kept) == sorted(str(file.relative_to(tmp_path)) for file in tmp_path.glob("*/*.rrd"))
+
+
+def test_a_sweep_without_a_part_says_so(tmp_path: Path) -> None:
+    what = options(tmp_path, "MOST=5,1")
+    assert collect_sweep(what, {}).missing == 6
+
+
+# --- what varies ---------------------------------------------------------------------------------------
+
+SEVERAL = """
+import math
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.registration import register_env
+from weights import REACH
+
+SCALE = 2
+LIMITS = (0.1, 0.2)
+ANGLE = math.pi / 2
+NAME = "cube"
+TWICE = 1
+if NAME:
+    TWICE = 2
+weight = 1.0
+
+
+class Base(BaseEnv):
+    SCALE = 3
+
+    def __init__(self, *args, weight=1.0, goals=2, **kwargs):
+        super().__init__(*args, **kwargs)
+
+
+@register_env("Swept-v1")
+class Swept(Base):
+    GAIN: float = 0.5  # of the controller
+
+    def __init__(self, *args, goals=3, tall=False, **kwargs):
+        super().__init__(*args, goals=goals, **kwargs)
+
+
+class Other(BaseEnv):
+    GAIN = 1.0
+
+    def __init__(self, robot_uids="panda"):
+        super().__init__(robot_uids=robot_uids)
+"""
+
+
+@pytest.fixture
+def several(tmp_path: Path) -> Path:
+    (tmp_path / "several.py").write_text(SEVERAL)
+    return tmp_path / "several.py"
+
+
+def changed(file: Path, given: str, task: str = "") -> tuple[dict[str, object], str, str]:
+    """Arguments, and the changed line as it was and is, of the only point. The file is never run: it cannot be."""
+    (recording,) = recordings_of(replace(options(file.parent, given), task=task or str(file)))
+    (text,) = recording.source.values()
+    pairs = zip(SEVERAL.splitlines(), text.splitlines(), strict=True)
+    lines = next(((old, new) for old, new in pairs if old != new), ("", ""))
+    given_kwargs = {name: value for name, value in recording.options.env_kwargs.items() if name not in PLAIN}
+    return given_kwargs, *lines
+
+
+def test_the_smallest_edit_is_made_of_a_constant(several: Path) -> None:
+    assert changed(several, "LIMITS=[1, 0.5]") == ({}, "LIMITS = (0.1, 0.2)", "LIMITS = (1.0, 0.5)")
+    assert changed(several, "NAME=ball") == ({}, 'NAME = "cube"', "NAME = 'ball'")
+    assert changed(several, "several.SCALE=4") == ({}, "SCALE = 2", "SCALE = 4")
+    assert changed(several, "Base.SCALE=4") == ({}, "    SCALE = 3", "    SCALE = 4")
+    gain = "    GAIN: float = 0.5  # of the controller", "    GAIN: float = 2.0  # of the controller"
+    assert changed(several, "Swept.GAIN=2") == ({}, *gain)
+    assert changed(several, "GAIN=2", f"{several}:Swept") == ({}, *gain)
+
+
+def test_an_argument_of_the_constructor_is_given_to_it(several: Path) -> None:
+    assert changed(several, "tall=true") == ({"tall": True}, "", "")
+    assert changed(several, "control_mode=pd_joint_pos") == ({"control_mode": "pd_joint_pos"}, "", "")
+    assert changed(several, "Swept.__init__.weight=2") == ({"weight": 2}, "", "")
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ("SCALE=4", "SCALE of several.py may be Base.SCALE or several.SCALE: name one of them so"),
+        ("weight=4", "weight of several.py may be Swept.__init__.weight or several.weight: name one"),
+        ("GAIN=4", "may be Other.GAIN or Swept.GAIN"),
+        ("talll=true", "did you mean tall?"),
+        ("gian=1", "no constructor argument gian; did you mean GAIN?"),
+        ("num_envs=2", "no constructor argument num_envs"),
+        ("ANGLE=1", "ANGLE (line 9 of several.py) is computed, `math.pi / 2`"),
+        ("TWICE=3", "several.TWICE is set in several lines of several.py: 11, 13"),
+        ("REACH=1", "several.REACH (line 5 of several.py) is imported"),
+        ("LIMITS=3", "several.LIMITS is a list (line 8); got 3"),
+        ("NAME=3", "several.NAME is a text (line 10); got 3"),
+        ("several.SCALE=true", "several.SCALE is a number (line 7); got True"),
+        ("math=1", "is imported"),
+    ],
+)
+def test_a_name_that_cannot_be_set_is_refused_with_what_to_do(several: Path, given: str, why: str) -> None:
+    with pytest.raises(ValueError, match=".") as refused:
+        changed(several, given)
+    assert why in str(refused.value)
+
+
+def test_an_id_takes_its_constructors_arguments_alone(tmp_path: Path) -> None:
+    what = replace(options(tmp_path, "robot_uids=panda,fetch"), task="PickCube-v1")
+    assert [one.options.env_kwargs["robot_uids"] for one in recordings_of(what)] == ["panda", "fetch"]
+    with pytest.raises(ValueError, match="workbench new NAME --from PickCube-v1"):
+        recordings_of(replace(options(tmp_path, "robot_uid=panda"), task="PickCube-v1"))
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("a=0.5,1,2", (0.5, 1, 2)),
+        ("a=[0, 1],[1, 2]", ([0, 1], [1, 2])),
+        ("a=panda,fetch", ("panda", "fetch")),
+        ('a="x,y",z', ('"x', 'y"', "z")),
+        ('a="x,y","z"', ("x,y", "z")),
+        ("C.a=true,null", (True, None)),
+        ("a=x=1", ("x=1",)),
+    ],
+)
+def test_values_are_json_or_text(text: str, values: tuple[object, ...]) -> None:
+    (setting,) = parse_settings([text])
+    assert setting.values == values
+
+
+@pytest.mark.parametrize(
+    "given", [[], ["a"], ["a="], ["a=1,"], ["1a=2"], ["a=1,1.0"], ["a=1", "a=2"], ["a=x,x"], ["=1"]]
+)
+def test_settings_that_make_no_sense_are_refused(given: list[str]) -> None:
+    with pytest.raises(ValueError, match="--set"):
+        parse_settings(given)
+
+
+def test_how_the_episodes_are_cut_does_not_hang_on_the_workers(tmp_path: Path) -> None:
+    what = options(tmp_path, "MOST=1,2,3", seeds=100, num_envs=4)
+    assert replace(what, workers=7).chunk == what.chunk == 8
+    assert what.stride == 104 and len(what.items) == 300 and what.items[100] == 104
+    many = replace(what, settings=(Setting("MOST", tuple(range(200))),))
+    assert many.chunk == 100, "then a point is opened once"
