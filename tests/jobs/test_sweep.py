@@ -178,9 +178,9 @@ def changed(file: Path, given: str, task: str = "") -> tuple[dict[str, object], 
     (recording,) = recordings_of(replace(options(file.parent, given), task=task or str(file)))
     (text,) = recording.source.values()
     pairs = zip(SEVERAL.splitlines(), text.splitlines(), strict=True)
-    lines = next(((old, new) for old, new in pairs if old != new), ("", ""))
+    old, new = next(((old, new) for old, new in pairs if old != new), ("", ""))
     given_kwargs = {name: value for name, value in recording.options.env_kwargs.items() if name not in PLAIN}
-    return given_kwargs, *lines
+    return given_kwargs, old, new
 
 
 def test_the_smallest_edit_is_made_of_a_constant(several: Path) -> None:

@@ -152,7 +152,7 @@ class ReviewPage:
         self._sweep: SweepPanel | None = None
         if (library.folder / RESULTS).exists():
             with self._library_window.add_tab("Sweep", viser.Icon.ADJUSTMENTS_HORIZONTAL):
-                self._sweep = SweepPanel(self._server, library, self._review.open)
+                self._sweep = SweepPanel(self._server, library, self._review.open, self._clock)
         with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
             self._library = LibraryPanel(self._server, library, self._review.open, clock=self._clock)
             Presses(self._server).when_unfolded(self._library_unfolded)

@@ -21,7 +21,7 @@ from workbench.recording.reader.reading import read_sweep
 from workbench.recording.sweeps import RESULTS, PointSummary, SweepEpisode, SweepResults, value_text
 from workbench.session.review.view import ReviewView
 from workbench.ui.widgets.click_targets import Paged, Presses
-from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.parts import Clock, PagePart
 from workbench.ui.widgets.templates import render, short_text
 
 log = logging.getLogger(__name__)
@@ -171,8 +171,9 @@ class SweepPanel(PagePart[ReviewView]):
         server: viser.ViserServer,
         library: Library,
         on_open: Callable[[tuple[str, ...]], None],
+        clock: Clock = time.monotonic,
     ) -> None:
-        self._library, self._on_open = library, on_open
+        self._library, self._on_open, self._clock = library, on_open, clock
         self._file = library.folder / RESULTS
         self._note = server.gui.add_html("")
         self._plot = server.gui.add_html("")
@@ -194,9 +195,10 @@ class SweepPanel(PagePart[ReviewView]):
 
     def _look(self) -> None:
         """Read the file when it has changed, on a thread of its own."""
-        if time.monotonic() - self._looked < LOOK_SECONDS:
+        now = self._clock()
+        if now - self._looked < LOOK_SECONDS:
             return
-        self._looked = time.monotonic()
+        self._looked = now
         try:
             stat = os.stat(self._file)
             seen: object = (stat.st_mtime_ns, stat.st_size)
@@ -245,7 +247,10 @@ class SweepPanel(PagePart[ReviewView]):
         results = self._results
         if results is None:
             return render("note", text=f"Reading {RESULTS}.")
-        return render("sweep_head", results=results, failed=sum(one.failed for one in self._summaries))
+        actions = results.actions.rpartition("/")[2]
+        return render(
+            "sweep_head", results=results, actions=actions, failed=sum(one.failed for one in self._summaries)
+        )
 
     def _is_kept(self, one: PointSummary) -> bool:
         return all(one.values.get(name) in texts for name, texts in self.shown.only.items() if texts)
@@ -268,6 +273,7 @@ class SweepPanel(PagePart[ReviewView]):
                     "kept": kept,
                     "hue": round(25 + 120 * (rate or 0.0)),
                     "chosen": one.index == self.shown.chosen,
+                    "failed": not one.episodes,
                     "press": self._press(("point", one.index), lambda one=one: self._choose(one.index))
                     if kept and len(self._summaries) <= MOST_PRESSED
                     else "",
@@ -331,8 +337,8 @@ class SweepPanel(PagePart[ReviewView]):
                     "chosen": one.index == self.shown.chosen,
                     "values": [value_text(one.values[name]) for name in results.names],
                     "cells": [*_result_cells(one), *(_shown(one.means.get(name)) for name in terms)],
-                    "episodes": f"{one.episodes}, {one.failed} failed" if one.failed else str(one.episodes),
-                    "failed": not one.episodes,
+                    "episodes": one.episodes,
+                    "failed": one.failed,
                 }
             )
         head = [

@@ -1,0 +1,95 @@
+"""The Sweep tab in a real Chromium: points and episodes chosen with the mouse."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+import viser
+from playwright.sync_api import Browser, Page, expect
+
+from tests.drive.page import page_at
+from tests.drive.waiting import until
+from tests.recording.sweep_files import sweep_folder
+from workbench.machine.folders import web_assets_folder
+from workbench.recording.library.library import Library
+from workbench.session.review.view import ReviewView
+from workbench.ui.review.sweep import SweepPanel
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+
+@dataclass
+class Shown:
+    page: Page
+    opened: list[tuple[str, ...]]
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Shown]:
+    folder = tmp_path_factory.mktemp("sweep")
+    sweep_folder(folder)
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    library, opened = Library(folder), []
+    library.refresh()
+    window = server.gui.add_panel()
+    with window.add_tab("Sweep"):
+        panel = SweepPanel(server, library, opened.append)
+    window.dock_left()
+    window.set_width(520)
+    stopping = threading.Event()
+
+    def draw() -> None:
+        while not stopping.wait(0.1):
+            panel.key(ReviewView())
+            panel.draw(ReviewView())
+
+    drawing = threading.Thread(target=draw, daemon=True)
+    drawing.start()
+    with page_at(browser, "about:blank") as (page, errors):
+        page.set_default_timeout(60_000)
+        for script in ("pressed.js", "pressed_by_key.js"):
+            page.add_init_script(path=web_assets_folder() / script)
+        page.goto(f"http://127.0.0.1:{server.get_port()}")
+        page.add_style_tag(path=web_assets_folder() / "panels" / "page.css")
+        page.wait_for_selector(".wb-parallel")
+        yield Shown(page, opened)
+        assert not errors
+    stopping.set()
+    drawing.join()
+    library.close()
+    server.stop()
+
+
+def test_a_line_a_row_and_an_episode_are_pressed_with_the_mouse(shown: Shown) -> None:
+    page = shown.page
+    point = page.locator(".wb-sweep-point")
+    expect(point).to_have_text("reach_weight = 2, robot_uids = panda")
+    # Where it is alone: between the axes of the weight and of the robot, next to the latter.
+    line = page.locator("polyline.wb-to-press").filter(has_text="reach_weight = 0.5, robot_uids = panda")
+    (x1, y1), (x2, y2) = (
+        map(float, pair.split(",")) for pair in str(line.get_attribute("points")).split()[:2]
+    )
+    box = page.locator(".wb-parallel").bounding_box()
+    assert box is not None
+    scale = box["width"] / 500
+    at = box["x"] + scale * (0.7 * x1 + 0.3 * x2), box["y"] + scale * (0.7 * y1 + 0.3 * y2)
+    page.mouse.click(*at)
+    expect(point).to_have_text("reach_weight = 0.5, robot_uids = panda")
+    page.locator(".wb-points tbody tr").filter(has_text="fetch").first.click()
+    expect(point).to_have_text("reach_weight = 2, robot_uids = fetch")
+    page.locator(".wb-sweep-episodes tr", has_text="seed 11").click()
+    until(lambda: shown.opened, "an opened recording")
+    assert shown.opened == [("p7s11",)]
+
+
+def test_a_value_is_pressed_and_the_others_fade(shown: Shown) -> None:
+    page = shown.page
+    rows = page.locator(".wb-sweep-scroll tbody tr")
+    page.locator(".wb-tick-text", has_text="fetch").click()
+    expect(rows).to_have_count(3)
+    expect(page.locator(".wb-left-out")).to_have_count(6)
+    page.get_by_text("Show all points again").click()
+    expect(rows).to_have_count(9)
