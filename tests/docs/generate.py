@@ -41,6 +41,7 @@ COMMANDS = (
     "record",
     "check",
     "solve",
+    "sweep",
     "rescore",
     "share",
     "export",

@@ -42,6 +42,7 @@ COMMANDS = {"open": main.open_page} | {
         "record",
         "check",
         "solve",
+        "sweep",
         "merge",
         "review",
         "rescore",

@@ -1,0 +1,107 @@
+"""``workbench sweep`` as a person types it: its table, its files, its parts put together, and a job that goes on."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from workbench.cli.main import main
+from workbench.recording.sweeps import RESULTS, SweepResults, read_results
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+REWARD_TERMS = Path(__file__).parents[2] / "tasks" / "reward_terms.py"
+SHORT = (
+    "--seeds",
+    "3",
+    "--max-steps",
+    "2",
+    "--envs-per-worker",
+    "2",
+    "--env",
+    "render_backend=none",
+    "--workers",
+    "1",
+)
+
+
+def run(*given: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([*given])
+    return int(ended.value.code or 0)
+
+
+def sweep(*given: str) -> int:
+    return run("sweep", str(REWARD_TERMS), *SHORT, *given)
+
+
+def numbers(folder: Path) -> SweepResults:
+    results = read_results(folder / RESULTS)
+    return replace(results, episodes=tuple(replace(row, recording="") for row in results.episodes))
+
+
+def test_a_sweep_prints_its_points_and_writes_its_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code = sweep(
+        "--set",
+        "MOST=5,1",
+        "--set",
+        "robot_uids=panda,nobody",
+        "--json-file",
+        "a.json",
+        "--csv-file",
+        "a.csv",
+    )
+    said = capsys.readouterr()
+    assert code == 1
+    assert "3 failed" in said.out and "0 % (0 - 56)" in said.out
+    assert "workbench review sweeps/reward_terms" in said.out and "nobody" in said.err
+    results = read_results(tmp_path / "sweeps" / "reward_terms" / RESULTS)
+    assert len(results.episodes) == 12
+    told = json.loads((tmp_path / "a.json").read_text())
+    assert [point["set"]["MOST"] for point in told["points"]] == [1, 5, 5, 1]
+    rows = list(csv.DictReader((tmp_path / "a.csv").read_text().splitlines()))
+    assert [row["set.robot_uids"] for row in rows] == (["panda"] * 3 + ["nobody"] * 3) * 2
+    assert rows[0]["return"] == str(results.episodes[0].total_reward)
+    # Another sweep does not mix with it.
+    assert sweep("--set", "MOST=3") == 2
+    assert "holds the results of another sweep" in capsys.readouterr().err
+
+
+def test_parts_are_merged_to_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert sweep("--set", "MOST=5,1", "--out", "whole") == 0
+    for part in ("1/2", "2/2"):
+        assert sweep("--set", "MOST=5,1", "--out", f"part{part[0]}", "--shard", part) == 0
+        assert not (tmp_path / f"part{part[0]}" / RESULTS).exists()
+    assert (
+        run("merge", "sweep-1-of-2.job", "sweep-2-of-2.job", "--out", "merged", "--json-file", "m.json") == 0
+    )
+    assert numbers(tmp_path / "merged") == numbers(tmp_path / "whole")
+    for row in read_results(tmp_path / "merged" / RESULTS).episodes:
+        assert (tmp_path / "merged" / row.recording).is_file()
+    assert len(json.loads((tmp_path / "m.json").read_text())["points"]) == 2
+
+
+def test_a_job_goes_on_after_what_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = ("--set", "MOST=5,1", "--out", "out", "--job", "s.job")
+    assert sweep(*given) == 0
+    before = numbers(tmp_path / "out")
+    made = {file: file.stat().st_mtime_ns for file in (tmp_path / "out").glob("*/*")}
+    capsys.readouterr()
+    assert sweep(*given) == 0
+    assert "going on after 6 results" in capsys.readouterr().err
+    assert numbers(tmp_path / "out") == before
+    assert {file: file.stat().st_mtime_ns for file in (tmp_path / "out").glob("*/*")} == made
+    # Another one does not take its file.
+    assert sweep("--set", "MOST=5,2", "--out", "other", "--job", "s.job") == 2
+    assert "of another job" in capsys.readouterr().err
