@@ -90,6 +90,9 @@ def test_a_value_of_an_axis_leaves_the_other_points_out(tab: Tab) -> None:
     tab.press('only robot_uids "fetch"')
     assert tab.points() == ["2 fetch", "1 fetch", "0.5 fetch"]
     assert tab.panels.html("wb-parallel").count("wb-left-out") == 6
+    assert "robot_uids = fetch" in tab.panels.html("wb-sweep-point"), (
+        "what is chosen is among those that are shown"
+    )
     tab.press('only robot_uids "panda"')
     assert len(tab.points()) == 6
     tab.press("clear")

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 LOOK_SECONDS = 1.0
 """Between two looks at the file's time."""
-ROWS = 20
+ROWS = 12
 """Of a page of the table."""
 MOST_AXES = 9
 MOST_TICKS = 8
@@ -248,9 +248,8 @@ class SweepPanel(PagePart[ReviewView]):
         if results is None:
             return render("note", text=f"Reading {RESULTS}.")
         actions = results.actions.rpartition("/")[2]
-        return render(
-            "sweep_head", results=results, actions=actions, failed=sum(one.failed for one in self._summaries)
-        )
+        failed, lines = sum(one.failed for one in self._summaries), len(self._summaries) <= MOST_PRESSED
+        return render("sweep_head", results=results, actions=actions, failed=failed, lines=lines)
 
     def _is_kept(self, one: PointSummary) -> bool:
         return all(one.values.get(name) in texts for name, texts in self.shown.only.items() if texts)
@@ -271,7 +270,7 @@ class SweepPanel(PagePart[ReviewView]):
                 {
                     "points": " ".join(known),
                     "kept": kept,
-                    "hue": round(25 + 120 * (rate or 0.0)),
+                    "part": round(100 * (rate or 0.0)),
                     "chosen": one.index == self.shown.chosen,
                     "failed": not one.episodes,
                     "press": self._press(("point", one.index), lambda one=one: self._choose(one.index))
@@ -411,6 +410,10 @@ class SweepPanel(PagePart[ReviewView]):
     def _filter(self, name: str, text: str) -> None:
         self.shown.only.setdefault(name, set()).symmetric_difference_update({text})
         self._pages.go_to(0)
+        kept = [one.index for one in self._summaries if self._is_kept(one)]
+        if kept and self.shown.chosen not in kept:
+            # They are the best first.
+            self.shown.chosen = kept[0]
 
     def _clear(self) -> None:
         self.shown.only.clear()
