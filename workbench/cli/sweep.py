@@ -30,9 +30,9 @@ from workbench.cli.terminal import (
     progress_bar,
     refuse,
 )
+from workbench.jobs.actions import needed_by
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import Job, job_of
-from workbench.jobs.pool.travel import needed_by
 from workbench.jobs.sweep import Point, Setting, SweepOptions, SweepReport, recordings_of, sweep
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder

@@ -15,14 +15,9 @@ from typing import Any
 from workbench.authoring.loading import registry
 from workbench.authoring.loading.modules import read_source
 from workbench.authoring.loading.reference import file_and_class, find_module, named_file, split_reference
-from workbench.authoring.loading.settings import (
-    Argument,
-    Constant,
-    SettingError,
-    TaskText,
-    class_arguments,
-)
 from workbench.authoring.problem import TaskError
+from workbench.authoring.settings.constructor import class_arguments
+from workbench.authoring.settings.task_text import Argument, Constant, SettingError, TaskText
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.actions import SOLVE

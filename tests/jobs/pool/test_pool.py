@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -335,3 +336,22 @@ def test_a_text_that_is_no_shard_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="--shard takes a part of a whole"):
         parse_shard(text)
     assert str(parse_shard("3/64")) == "3/64"
+
+
+@pytest.mark.parametrize(("stage", "begun"), [("reset", FIRST_ALIKE), ("build", 1)])
+def test_a_group_that_fails_alike_is_given_up_and_the_others_go_on(stage: str, begun: int) -> None:
+    results: list[int] = []
+    failures: list[Failure] = []
+    deal: Deal[int, None] = Deal(
+        range(20), lambda number, _: results.append(number), on_failure=failures.append, group=10
+    )
+    failed = 0
+    while (chunk := deal.next("a worker")) is not None:
+        (number,) = chunk.numbers
+        if number < 10:
+            failed += 1
+            deal.failed("a worker", TaskError(replace(PROBLEM, stage=stage)))
+        else:
+            deal.result("a worker", number, number)
+    assert failed == begun and results == list(range(10, 20))
+    assert sorted(number for failure in failures for number in failure.numbers) == list(range(10))

@@ -15,7 +15,7 @@ from workbench.machine.files import read_regular_file
 
 MOST_BYTES = 256 << 20
 """Of all files together, which each machine of a cluster gets."""
-_LEFT_OUT = {"__pycache__", "node_modules", "site-packages", "venv", "recordings"}
+_LEFT_OUT = {"__pycache__", "node_modules", "site-packages", "venv", "recordings", "sweeps"}
 """Folders that hold what others made."""
 
 Value = TypeVar("Value")
