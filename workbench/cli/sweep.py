@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from rich.table import Table
 from workbench.authoring.problem import TaskError
 from workbench.cli.arguments import ONE_WORKER, JobArguments
 from workbench.cli.check_reports import json_text
-from workbench.cli.jobs import job_path, print_part, run_by, shard_of
+from workbench.cli.jobs import job_path, print_part, run_by, shard_of, told_in_folder
 from workbench.cli.record import RecordBar
 from workbench.cli.terminal import (
     Exit,
@@ -31,6 +31,7 @@ from workbench.cli.terminal import (
     refuse,
 )
 from workbench.jobs.actions import needed_by
+from workbench.jobs.episodes import Written
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import Job, job_of
 from workbench.jobs.sweep import Point, Setting, SweepOptions, SweepReport, recordings_of, sweep
@@ -121,8 +122,12 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
         total = sum(number // what.chunk in mine for number in what.items)
         left = (TextColumn("left"), TimeRemainingColumn())
         with (
-            run_by(run, "sweep", len(chunks), lambda: job_of_sweep(what)) as (executor, name),
+            run_by(run, "sweep", len(chunks), lambda: job_of_sweep(what), _is_recorded(what.out)) as (
+                executor,
+                name,
+            ),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
+            told_in_folder(run, "sweep", what.task, what.out, total) as status,
         ):
             with RecordBar(
                 bar, total, "sweeping", named=lambda number: _named(what, points, number)
@@ -130,13 +135,14 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
                 report = sweep(
                     what,
                     shown.describe,
-                    shown.show,
+                    status.beside(shown.show),
                     lambda: shown.stop_requested,
                     print_finding,
                     executor,
                     name,
                 )
             shown.describe("swept", len(report.results.episodes))
+            status.end("stopped" if report.stopped else "done")
     except TaskError as error:
         print_problem(error.problem)
         return Exit.FAILED
@@ -155,6 +161,11 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
     code = print_report(report, what, has_table=run.shard is None)
     print_part(run, "sweep", report.stopped)
     return refuse("interrupted; finished episodes were kept") if report.stopped else code
+
+
+def _is_recorded(out: Path) -> Callable[[Written | None], bool]:
+    """Whether the episode of a result is still in the folder of its point."""
+    return lambda one: one is None or (out / one.path.parent.name / f"{one.path.stem}.json").exists()
 
 
 def _named(what: SweepOptions, points: Sequence[Point], number: int) -> str:

@@ -322,5 +322,6 @@ class _Sweep:
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
         part = sum(min(steps / max(self._limit, 1), 1.0) for steps in self._running.values())
         kept = len(self._rows)
-        told = RecordProgress(kept, self._steps, over, dict(self._running), self._limit, kept + part)
-        self._on_progress(told)
+        running, failures = dict(self._running), tuple(self.deal.failures)
+        done = kept + part
+        self._on_progress(RecordProgress(kept, self._steps, over, running, self._limit, done, failures))
