@@ -24,8 +24,8 @@ from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import draws_its_own_seeds, last_observation, open_env, task_class
-from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.open_task import describe
+from workbench.jobs.record.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.task import Stepped, TaskDescription
 from workbench.recording.episode.episode import NO_SEED
 from workbench.recording.reader.reading import recovered_text

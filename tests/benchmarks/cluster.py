@@ -5,7 +5,7 @@ episode is over) and the rate from there to the last; a cluster's own start is t
 the parts that do not grow with the number of machines: a message through the post, a result at the process that deals,
 one in the job file, the files that travel.
 
-    python tests/benchmarks/cluster.py --write    # also into web_assets/docs/reference/cluster.md
+    python tests/benchmarks/cluster.py --write    # also into web_assets/docs/jobs/cluster.md
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from typing import Any
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from workbench.jobs.episodes import RecordOptions, Written
 from workbench.jobs.pool.cluster import Cluster, Post, connected
 from workbench.jobs.pool.deal import Deal, Executor, Work
 from workbench.jobs.pool.job_file import Job, JobFile
 from workbench.jobs.pool.processes import Processes
 from workbench.jobs.pool.travel import pack_baggage
 from workbench.jobs.pool.worker import Gives, Listener
-from workbench.jobs.record import Recorded, record
+from workbench.jobs.record.episodes import RecordOptions, Written
+from workbench.jobs.record.run import Recorded, record
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import Unpacker, pack, pack_message
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "web_assets" / "docs" / "reference" / "cluster.md"
+PAGE = ROOT / "web_assets" / "docs" / "jobs" / "cluster.md"
 MARKS = "<!-- cluster -->\n", "<!-- /cluster -->"
 CORES = len(os.sched_getaffinity(0))
 MANY = 1000

@@ -11,8 +11,8 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.page import TASK, open_workbench, page_at
 from tests.drive.waiting import until
-from workbench.jobs.episodes import RecordOptions
-from workbench.jobs.record import record
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 
 pytestmark = pytest.mark.browser

@@ -10,8 +10,8 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.drive.page import TASK, open_workbench, page_at
-from workbench.jobs.episodes import RecordOptions
-from workbench.jobs.record import record
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 from workbench.ui.app.trust_dialog import DO_NOT, ONCE
 

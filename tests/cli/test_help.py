@@ -14,7 +14,7 @@ import pytest
 
 from workbench.cli import main
 from workbench.cli.help import for_terminal
-from workbench.cli.terminal import Exit
+from workbench.cli.terminal.output import Exit
 from workbench.machine.processes.child_python import python_command
 from workbench.ui.app.help_pages import RULE_PAGES, Topic, topics
 

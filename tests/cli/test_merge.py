@@ -85,7 +85,7 @@ def test_a_part_of_another_job_is_refused(place: Path, capsys: pytest.CaptureFix
 
 @pytest.mark.slow
 def test_the_script_of_the_docs_does_its_part_as_a_task_of_an_array(place: Path) -> None:
-    page = (web_assets_folder() / "docs" / "reference" / "cluster.md").read_text()
+    page = (web_assets_folder() / "docs" / "jobs" / "cluster.md").read_text()
     (script,) = re.findall(r"```sh fragment\n(#!/bin/bash\n.*?)```", page, re.DOTALL)
     merge = next(line for line in page.splitlines() if line.startswith("workbench merge"))
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from workbench.cli.rescore import print_verdicts
+from workbench.cli.jobs.rescore import print_verdicts
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.recording.episode.row import Source
 

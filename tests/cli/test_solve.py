@@ -21,14 +21,14 @@ from rich.progress import Progress
 
 from tests.drive.waiting import until
 from workbench.checks.results import RuleResult
+from workbench.cli.jobs.record import RecordBar
+from workbench.cli.jobs.solve import SolveOutput, as_csv, as_json, as_junit
 from workbench.cli.main import main
-from workbench.cli.record import RecordBar
-from workbench.cli.solve import SolveOutput, as_csv, as_json, as_junit
 from workbench.core.rules import FailOn, Finding
 from workbench.jobs.check import CheckedTask, CheckReport
-from workbench.jobs.episodes import Written
-from workbench.jobs.record import RecordProgress
-from workbench.jobs.solve import SolveOptions, solve
+from workbench.jobs.record.episodes import Written
+from workbench.jobs.record.run import RecordProgress
+from workbench.jobs.record.solve import SolveOptions, solve
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.planning.report import SolvedSeed, SolveReport
@@ -155,7 +155,7 @@ def test_each_row_names_the_rules_that_it_is_an_example_of() -> None:
 
 def test_the_bar_moves_within_a_seed_and_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     lines: list[str] = []
-    monkeypatch.setattr("workbench.cli.record.err.print", lambda line, **how: lines.append(line))
+    monkeypatch.setattr("workbench.cli.jobs.record.err.print", lambda line, **how: lines.append(line))
     bar = Progress()
     shown = RecordBar(bar, 4, "solving", first_seed=2)
     written = Written(0, Path("2.rrd"), 2, 13, 9.25, True)

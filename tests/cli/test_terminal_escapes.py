@@ -34,8 +34,8 @@ from tests.drive.episodes import made, write
 from tests.drive.waiting import until
 from tests.ui.tabs import handshake
 from workbench.authoring.problem import Problem
-from workbench.cli import terminal
-from workbench.cli.terminal import SafeConsole, print_line, print_problem, print_text, refuse, warn
+from workbench.cli.terminal import output as terminal
+from workbench.cli.terminal.output import SafeConsole, print_line, print_problem, print_text, refuse, warn
 from workbench.machine.text import SafeStream, guard_terminal
 from workbench.recording.library.library import Library
 from workbench.session.process.captured_output import PrintedLine, Run

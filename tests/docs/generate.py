@@ -42,6 +42,7 @@ COMMANDS = (
     "check",
     "solve",
     "sweep",
+    "merge",
     "rescore",
     "share",
     "export",

@@ -21,8 +21,9 @@ import pytest
 from packaging.version import Version
 
 from tests.golden.make import GOLDEN
-from workbench.cli import main, terminal
-from workbench.cli.terminal import Exit
+from workbench.cli import main
+from workbench.cli.terminal import output as terminal
+from workbench.cli.terminal.output import Exit
 
 TEXTS = Path(__file__).parent / "cli"
 COMMANDS = (

@@ -17,7 +17,7 @@ import pytest
 from tests.drive.session import live_session, wait_until
 from tests.golden.make import GOLDEN, expected_of, read_folder
 from workbench.cli.main import main
-from workbench.cli.terminal import Exit
+from workbench.cli.terminal.output import Exit
 from workbench.jobs.from_recording import run_of
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library

@@ -15,11 +15,11 @@ from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
 from workbench.jobs.check import CheckedGroup, CheckOptions, CheckReport, check, merged, report_of
-from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.pool.deal import Shard, ThisProcess
 from workbench.jobs.pool.job_file import JobFile, Kept, job_of, read_parts
 from workbench.jobs.pool.processes import Processes
-from workbench.jobs.record import record
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 
 TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()

@@ -10,7 +10,7 @@ import tyro
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workbench.cli.arguments import EnvArguments
+from workbench.cli.terminal.arguments import EnvArguments
 from workbench.jobs.task import TaskOptions, changed_options, command_line
 
 JSON = st.recursive(

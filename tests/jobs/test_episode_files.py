@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from tests.drive.episodes import appended, made
-from workbench.jobs.gather import EpisodeFinisher, GatheredEpisode
+from workbench.jobs.record.gather import EpisodeFinisher, GatheredEpisode
 from workbench.recording.writing.episode_writer import EpisodeFiles
 
 

@@ -15,7 +15,6 @@ import pytest
 from tests.drive.session import TASKS, live_session, step, wait_until
 from tests.session.recorded_runs import opened, reaching, record
 from workbench.core.capture.recorded_run import RecordedRun
-from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.from_recording import (
     CannotEnterRecording,
     options_of,
@@ -24,7 +23,8 @@ from workbench.jobs.from_recording import (
     why_not_enter,
 )
 from workbench.jobs.open_task import open_task
-from workbench.jobs.record import record as record_episodes
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record as record_episodes
 from workbench.jobs.rescore.run import rescore
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import EpisodeInfo

@@ -17,7 +17,7 @@ from tests.drive.session import live_session, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.odd_entries import TEXT, write_task
 from tests.session.recorded_runs import opened
-from workbench.cli.rescore import RescoreOptions, rescore_all
+from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.replay import replay_to

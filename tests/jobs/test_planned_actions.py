@@ -10,8 +10,8 @@ import pytest
 
 from workbench.authoring.problem import TaskError
 from workbench.cli.main import main
-from workbench.jobs.episodes import RecordOptions
-from workbench.jobs.record import Recorded, record
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import Recorded, record
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import NotAlike

@@ -26,13 +26,13 @@ from tests.drive.page import open_workbench
 from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 from workbench.authoring.problem import TaskError
+from workbench.cli.jobs.record import record_in_terminal
 from workbench.cli.main import main
-from workbench.cli.record import record_in_terminal
-from workbench.jobs.episodes import RecordOptions, Written
 from workbench.jobs.from_recording import options_of
 from workbench.jobs.pool.deal import Deal, Executor, Work
 from workbench.jobs.pool.processes import Processes
-from workbench.jobs.record import Recorded, RecordProgress, record
+from workbench.jobs.record.episodes import RecordOptions, Written
+from workbench.jobs.record.run import Recorded, RecordProgress, record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode

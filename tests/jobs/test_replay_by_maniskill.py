@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workbench.jobs.episodes import RecordOptions
-from workbench.jobs.record import record
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode, read_maniskill

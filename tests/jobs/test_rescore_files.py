@@ -21,17 +21,17 @@ from tests.drive.episodes import made, write
 from tests.drive.session import rescored
 from tests.session.recorded_runs import opened
 from workbench.authoring.problem import TaskError
-from workbench.cli.arguments import JobArguments
+from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.cli.main import main
-from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.cli.share import export_in_terminal
+from workbench.cli.terminal.arguments import JobArguments
 from workbench.core.capture.recorded_state import read_states, state_distance
 from workbench.jobs.actions import read_actions
-from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.pool.deal import Deal, ThisProcess, Work
 from workbench.jobs.pool.travel import pack_baggage, relocated
-from workbench.jobs.record import record
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record
 from workbench.jobs.replay import replay_to
 from workbench.jobs.rescore.job import Code, Recording, rescore_recordings, setup_of
 from workbench.jobs.task import TaskOptions

@@ -17,9 +17,9 @@ from tests.drive.session import wait_until
 from workbench.authoring.problem import Problem, TaskError
 from workbench.core.env.actions import hold_action
 from workbench.core.rules import Finding
-from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.open_task import OpenedTask, Opening, open_task
-from workbench.jobs.record import record
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session

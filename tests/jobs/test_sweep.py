@@ -11,11 +11,18 @@ import psutil
 import pytest
 
 from workbench.authoring.problem import TaskError
-from workbench.cli.sweep import parse_settings
+from workbench.cli.jobs.sweep import parse_settings
 from workbench.jobs.pool.deal import Executor
 from workbench.jobs.pool.processes import Processes
-from workbench.jobs.record import RecordProgress
-from workbench.jobs.sweep import Setting, SweepOptions, SweepReport, collect_sweep, recordings_of, sweep
+from workbench.jobs.record.run import RecordProgress
+from workbench.jobs.record.sweep import (
+    Setting,
+    SweepOptions,
+    SweepReport,
+    collect_sweep,
+    recordings_of,
+    sweep,
+)
 from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
 

@@ -22,11 +22,11 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.drive.session import rescored
 from tests.drive.waiting import until
+from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.cli.main import main
-from workbench.cli.rescore import RescoreOptions, rescore_all
-from workbench.cli.terminal import Exit
-from workbench.jobs.episodes import RecordOptions
-from workbench.jobs.record import record
+from workbench.cli.terminal.output import Exit
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import find_all_sources

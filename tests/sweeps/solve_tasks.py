@@ -132,9 +132,9 @@ class Known:
 
 def run(row: Row, options: Options, known: Known) -> None:
     """The episodes that a row lacks; each is saved as soon as those before it are there."""
-    from workbench.jobs.episodes import RecordOptions
-    from workbench.jobs.record import RecordProgress, record
-    from workbench.jobs.solve import SolveOptions
+    from workbench.jobs.record.episodes import RecordOptions
+    from workbench.jobs.record.run import RecordProgress, record
+    from workbench.jobs.record.solve import SolveOptions
     from workbench.jobs.task import TaskOptions
     from workbench.recording.reader.read_episode import read_episode
 

@@ -11,7 +11,7 @@ from rich.markdown import Markdown
 from rich.markup import escape
 from rich.table import Table
 
-from workbench.cli.terminal import Exit, out, refuse
+from workbench.cli.terminal.output import Exit, out, refuse
 from workbench.machine.text import plain_text
 from workbench.ui.app.help_pages import GROUPS, RULE_PAGES, Topic, by_path, find_topic, topics, topics_about
 

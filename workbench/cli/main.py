@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from workbench.cli.arguments import (
+from workbench.cli.terminal.arguments import (
     CheckArguments,
     EnvArguments,
     EpisodeArguments,
@@ -30,7 +30,7 @@ from workbench.cli.arguments import (
     plan_options,
     separated,
 )
-from workbench.cli.terminal import Exit, print_problem, print_text, refuse, warn
+from workbench.cli.terminal.output import Exit, print_problem, print_text, refuse, warn
 from workbench.core.rules import FailOn
 from workbench.jobs.task import RecordArguments, ShownPictures
 from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
@@ -207,9 +207,9 @@ def record(
         return refuse(why)
     use_private_driver()
     with quick_imports():
-        from workbench.cli.jobs import require_job
-        from workbench.cli.record import record_in_terminal
-        from workbench.jobs.episodes import RecordOptions
+        from workbench.cli.jobs.record import record_in_terminal
+        from workbench.cli.jobs.run_by import require_job
+        from workbench.jobs.record.episodes import RecordOptions
         from workbench.machine.processes.debugger import debug_here
 
     try:
@@ -281,8 +281,8 @@ def check(
     if options.env_kwargs.get("render_backend") != "none":
         use_private_driver()
     with quick_imports():
-        from workbench.cli.check import CheckOutput, check_in_terminal
-        from workbench.cli.jobs import require_job
+        from workbench.cli.jobs.check import CheckOutput, check_in_terminal
+        from workbench.cli.jobs.run_by import require_job
         from workbench.jobs.check import CheckOptions
 
     try:
@@ -368,8 +368,8 @@ def solve(
     if pictures and options.env_kwargs.get("render_backend") != "none":
         use_private_driver()
     with quick_imports():
-        from workbench.cli.solve import SolveOutput, solve_in_terminal
-        from workbench.jobs.solve import SolveOptions
+        from workbench.cli.jobs.solve import SolveOutput, solve_in_terminal
+        from workbench.jobs.record.solve import SolveOptions
 
     what = SolveOptions(
         task, out, seeds, 1, pictures, max_steps, planned, options, seconds_per_seed, upload=upload
@@ -423,9 +423,9 @@ def sweep(
     if pictures:
         use_private_driver()
     with quick_imports():
-        from workbench.cli.jobs import require_job
-        from workbench.cli.sweep import SweepOutput, parse_settings, sweep_in_terminal
-        from workbench.jobs.sweep import SweepOptions
+        from workbench.cli.jobs.run_by import require_job
+        from workbench.cli.jobs.sweep import SweepOutput, parse_settings, sweep_in_terminal
+        from workbench.jobs.record.sweep import SweepOptions
 
     try:
         varied, options, planned = parse_settings(settings), envs.options(), plan_options(plan)
@@ -464,7 +464,7 @@ def merge(
         if not file.is_file():
             return refuse(f"there is no file {file}")
     with quick_imports():
-        from workbench.cli.merge import merge_in_terminal
+        from workbench.cli.jobs.merge import merge_in_terminal
 
     return merge_in_terminal(files, job, out, json_file)
 
@@ -555,8 +555,8 @@ def rescore(
     if _lacks_maniskill("rescore"):
         return Exit.REFUSED
     with quick_imports():
-        from workbench.cli.jobs import require_job
-        from workbench.cli.rescore import RescoreOptions, RescoreOutput, run_rescore
+        from workbench.cli.jobs.rescore import RescoreOptions, RescoreOutput, run_rescore
+        from workbench.cli.jobs.run_by import require_job
 
     if task is not None and recorded_source:
         return refuse("--task and --recorded-source name two versions to rescore with: give one of them")
@@ -573,7 +573,7 @@ def rescore(
         return refuse(str(error))
     use_private_driver()
     from workbench.authoring.problem import TaskError
-    from workbench.cli.terminal import not_trusted_lines
+    from workbench.cli.terminal.output import not_trusted_lines
     from workbench.jobs.pool.deal import PoolError
     from workbench.session.clearance import NotTrusted
 

@@ -15,7 +15,15 @@ from rich.markup import escape
 
 import workbench
 from workbench.authoring.loading.reference import TaskName, named_file
-from workbench.cli.terminal import out, print_addresses, print_event, print_line, print_text, refuse, warn
+from workbench.cli.terminal.output import (
+    out,
+    print_addresses,
+    print_event,
+    print_line,
+    print_text,
+    refuse,
+    warn,
+)
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN
 from workbench.jobs.task import ShownPictures, TaskOptions
 from workbench.machine.kept_choices import kept_choices

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from rich.progress import TimeRemainingColumn
 
-from workbench.cli.terminal import print_addresses, print_text, progress_bar, refuse, warn
+from workbench.cli.terminal.output import print_addresses, print_text, progress_bar, refuse, warn
 
 if TYPE_CHECKING:
     from workbench.recording.episode.row import Source

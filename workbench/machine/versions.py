@@ -141,7 +141,7 @@ def unmet_requirements() -> list[tuple[Requirement, str | None]]:
     """What this distribution asks for and is lacking or of another version, which comes with it.
 
     Raises:
-        PackageNotFoundError: The distribution itself is not installed.
+        importlib.metadata.PackageNotFoundError: The distribution itself is not installed.
     """
     found = []
     for requirement in map(Requirement, importlib.metadata.requires(DISTRIBUTION) or []):

@@ -17,12 +17,12 @@ import pytest
 
 from tests.jobs.pool.work import Run, Setup
 from workbench.authoring.problem import TaskError
-from workbench.jobs.episodes import RecordOptions
 from workbench.jobs.pool import cluster as seam
 from workbench.jobs.pool.cluster import Cluster, NoCluster, connected
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import JobFile, Kept, job_of
-from workbench.jobs.record import Recorded, record
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import Recorded, record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from workbench.jobs.episodes import RecordOptions, Written
 from workbench.jobs.pool.deal import Deal, ItemQueue, Shard, ThisProcess, Work
 from workbench.jobs.pool.job_file import Job, JobFile, JobFileError, Kept, job_of, read_parts, write_whole
+from workbench.jobs.record.episodes import RecordOptions, Written
 from workbench.jobs.task import TaskOptions
 
 WHOLE = Shard()

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from tests.drive.rows import EpisodeRow, packed
 from workbench.core.env.step_result import OtherEntry, StepResult
-from workbench.jobs.gather import batch_columns
+from workbench.jobs.record.gather import batch_columns
 from workbench.recording.episode.columns import BatchPacker, assemble, layout_type
 
 

@@ -17,8 +17,8 @@ import pytest
 from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
 
 from workbench.cli.main import main
-from workbench.jobs.episodes import RecordOptions
-from workbench.jobs.record import record
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode, read_maniskill
 

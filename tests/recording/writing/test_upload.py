@@ -13,9 +13,9 @@ import fsspec
 import pytest
 from moto.server import ThreadedMotoServer
 
-from workbench.jobs.episodes import RecordOptions, episode_id
 from workbench.jobs.pool.deal import Deal, ThisProcess, Work
-from workbench.jobs.record import record
+from workbench.jobs.record.episodes import RecordOptions, episode_id
+from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.writing.finish import EpisodeFiles
@@ -99,7 +99,8 @@ def _files(folder: Path) -> EpisodeFiles:
     paths = [folder / f"Task_seed0001_env00_now{suffix}" for suffix in (".rrd", ".h5", ".json")]
     for path in paths:
         path.write_text('{"workbench": {"id": "mine"}}')
-    return EpisodeFiles(*paths)
+    rrd, h5, json_file = paths
+    return EpisodeFiles(rrd, h5, json_file, None, {})
 
 
 def test_the_json_is_the_last_so_half_an_upload_is_no_episode(tmp_path: Path) -> None:

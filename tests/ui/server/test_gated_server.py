@@ -19,7 +19,7 @@ import viser._messages
 import viser.infra._infra
 
 from tests.drive.page import page_at
-from workbench.cli.terminal import print_addresses
+from workbench.cli.terminal.output import print_addresses
 from workbench.machine.folders import web_assets_folder
 from workbench.ui.server import gated_server as door_module
 from workbench.ui.server import listening, responses, viser_private

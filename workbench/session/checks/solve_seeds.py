@@ -170,7 +170,7 @@ class SeedsSolver:
 
 def _run(setup: _Setup, queue: ItemQueue) -> None:
     """Runs in the other process, which starts the workers."""
-    from workbench.jobs.solve import SolveOptions, solve
+    from workbench.jobs.record.solve import SolveOptions, solve
 
     if queue.next() is None:
         return

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer
+from workbench.jobs.record.gather import EpisodeFinisher, EpisodeGatherer
 from workbench.jobs.task import Stepped, TaskDescription
 from workbench.machine.processes.watched_thread import report_failure, watched_thread
 from workbench.recording.reader.reading import recover_confined, recovered_text

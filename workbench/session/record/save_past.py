@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from workbench.jobs.gather import EpisodeFinisher, GatheredEpisode
+from workbench.jobs.record.gather import EpisodeFinisher, GatheredEpisode
 from workbench.jobs.task import TaskDescription
 from workbench.recording.episode.columns import BatchPacker
 from workbench.recording.writing.publish import RecordingError

@@ -34,6 +34,7 @@ OVERVIEW = "overview"
 """The topic that is README."""
 GROUPS = (
     ("", "Use it"),
+    ("jobs", "Let it run for long"),
     ("reference", "Look something up"),
     ("developers", "Change the workbench"),
 )
@@ -42,7 +43,7 @@ RULE_PAGES = "rules"
 """Folder with a page for each rule of `checks`. They are no list to read: the topic ``rules`` has them in a table."""
 FIRST = (
     OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "solve",
-    "batched_env", "safety", "limits", "gallery", "rules", "keys", "cli",
+    "sweep", "cluster", "batched_env", "safety", "limits", "gallery", "rules", "keys", "cli",
 )  # fmt: skip
 """Order of the topics; those that are not listed follow by name."""
 _DOCS = "web_assets/docs/"

@@ -14,9 +14,9 @@ from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, Tim
 from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import TaskError
-from workbench.cli.arguments import ONE_WORKER, JobArguments
-from workbench.cli.jobs import is_recorded, items_of, print_part, run_by, told_in_folder
-from workbench.cli.terminal import (
+from workbench.cli.jobs.run_by import is_recorded, items_of, print_part, run_by, told_in_folder
+from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
+from workbench.cli.terminal.output import (
     Exit,
     err,
     print_failures,
@@ -29,10 +29,10 @@ from workbench.cli.terminal import (
 )
 from workbench.core.backends import unused_gpu_text
 from workbench.jobs.actions import SOLVE, needed_by
-from workbench.jobs.episodes import RecordOptions, Written, with_given_actions
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import Job, job_of
-from workbench.jobs.record import Recorded, RecordProgress, chunk_of, record
+from workbench.jobs.record.episodes import RecordOptions, Written, with_given_actions
+from workbench.jobs.record.run import Recorded, RecordProgress, chunk_of, record
 from workbench.planning.report import underway_text
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder

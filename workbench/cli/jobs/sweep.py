@@ -16,11 +16,11 @@ from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, Tim
 from rich.table import Table
 
 from workbench.authoring.problem import TaskError
-from workbench.cli.arguments import ONE_WORKER, JobArguments
-from workbench.cli.check_reports import json_text
-from workbench.cli.jobs import job_path, print_part, run_by, shard_of, told_in_folder
-from workbench.cli.record import RecordBar
-from workbench.cli.terminal import (
+from workbench.cli.jobs.check_reports import json_text
+from workbench.cli.jobs.record import RecordBar
+from workbench.cli.jobs.run_by import job_path, print_part, run_by, shard_of, told_in_folder
+from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
+from workbench.cli.terminal.output import (
     Exit,
     out,
     print_failures,
@@ -31,10 +31,10 @@ from workbench.cli.terminal import (
     refuse,
 )
 from workbench.jobs.actions import needed_by
-from workbench.jobs.episodes import Written
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import Job, job_of
-from workbench.jobs.sweep import Point, Setting, SweepOptions, SweepReport, recordings_of, sweep
+from workbench.jobs.record.episodes import Written
+from workbench.jobs.record.sweep import Point, Setting, SweepOptions, SweepReport, recordings_of, sweep
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import number_text

@@ -18,11 +18,11 @@ from rich.table import Table
 
 from workbench.authoring.problem import TaskError
 from workbench.checks.rules import RULES
-from workbench.cli.arguments import ONE_WORKER, JobArguments
-from workbench.cli.check_reports import json_text, xml_text
-from workbench.cli.jobs import is_recorded, items_of, print_part, run_by, told_in_folder
-from workbench.cli.record import RecordBar
-from workbench.cli.terminal import (
+from workbench.cli.jobs.check_reports import json_text, xml_text
+from workbench.cli.jobs.record import RecordBar
+from workbench.cli.jobs.run_by import is_recorded, items_of, print_part, run_by, told_in_folder
+from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
+from workbench.cli.terminal.output import (
     Exit,
     out,
     print_failures,
@@ -34,11 +34,11 @@ from workbench.cli.terminal import (
     stdout_to_stderr,
 )
 from workbench.core.rules import FailOn, fails
-from workbench.jobs.episodes import with_given_actions
 from workbench.jobs.pool.deal import Failure, PoolError
 from workbench.jobs.pool.job_file import Job, job_of
-from workbench.jobs.record import chunk_of
-from workbench.jobs.solve import SolveOptions, solve
+from workbench.jobs.record.episodes import with_given_actions
+from workbench.jobs.record.run import chunk_of
+from workbench.jobs.record.solve import SolveOptions, solve
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text

@@ -7,31 +7,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from workbench.cli.check import CheckOutput, exit_code
-from workbench.cli.check import print_report as print_check
-from workbench.cli.check_reports import Reported
-from workbench.cli.check_reports import as_json as check_as_json
-from workbench.cli.record import print_recorded
-from workbench.cli.rescore import (
+from workbench.cli.jobs.check import CheckOutput, exit_code
+from workbench.cli.jobs.check import print_report as print_check
+from workbench.cli.jobs.check_reports import Reported
+from workbench.cli.jobs.check_reports import as_json as check_as_json
+from workbench.cli.jobs.record import print_recorded
+from workbench.cli.jobs.rescore import (
     RescoreOutput,
     RescoreRequest,
     print_verdicts,
     warn_of_verdicts,
     write_tables,
 )
-from workbench.cli.solve import SolveOutput, as_json, print_report
-from workbench.cli.sweep import SweepOutput, write_reports
-from workbench.cli.sweep import print_report as print_report_of_sweep
-from workbench.cli.terminal import Exit, print_text, refuse
-from workbench.cli.terminal import out as out_console
+from workbench.cli.jobs.solve import SolveOutput, as_json, print_report
+from workbench.cli.jobs.sweep import SweepOutput, write_reports
+from workbench.cli.jobs.sweep import print_report as print_report_of_sweep
+from workbench.cli.terminal.output import Exit, print_text, refuse
+from workbench.cli.terminal.output import out as out_console
 from workbench.jobs.check import CheckedGroup, CheckOptions
 from workbench.jobs.check import report_of as check_report_of
-from workbench.jobs.episodes import RecordOptions, Written
 from workbench.jobs.pool.job_file import JobFileError, Merged, read_parts, write_whole
-from workbench.jobs.record import collect
+from workbench.jobs.record.episodes import RecordOptions, Written
+from workbench.jobs.record.run import collect
+from workbench.jobs.record.solve import SolveOptions, report_of
+from workbench.jobs.record.sweep import SweepOptions, collect_sweep
 from workbench.jobs.rescore.job import RescoredRecording
-from workbench.jobs.solve import SolveOptions, report_of
-from workbench.jobs.sweep import SweepOptions, collect_sweep
 from workbench.machine.files import new_file, replace_file
 from workbench.machine.text import listed
 from workbench.recording.sweeps import RESULTS, write_results

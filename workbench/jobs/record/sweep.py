@@ -21,10 +21,10 @@ from workbench.authoring.settings.task_text import Argument, Constant, SettingEr
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.actions import SOLVE
-from workbench.jobs.episodes import RecordOptions, RecordUpdate, Written, with_given_actions
 from workbench.jobs.pool.deal import Deal, Executor, Failure, ThisProcess
 from workbench.jobs.pool.processes import Processes
-from workbench.jobs.record import TRIES, RecordProgress, chunk_of, do_record
+from workbench.jobs.record.episodes import RecordOptions, RecordUpdate, Written, with_given_actions
+from workbench.jobs.record.run import TRIES, RecordProgress, chunk_of, do_record
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.recording.sweeps import MOST_POINTS, SweepEpisode, SweepResults, value_text

@@ -12,14 +12,14 @@ from typing import Any
 
 from rich.markup import escape
 
-from workbench.cli.arguments import JobArguments
-from workbench.cli.terminal import err
-from workbench.jobs.episodes import Written
+from workbench.cli.terminal.arguments import JobArguments
+from workbench.cli.terminal.output import err
 from workbench.jobs.pool.cluster import Cluster
 from workbench.jobs.pool.deal import Executor, Failure, Shard, ThisProcess, parse_shard
 from workbench.jobs.pool.job_file import Job, JobFile, Kept
 from workbench.jobs.pool.processes import Processes
-from workbench.jobs.record import RecordProgress
+from workbench.jobs.record.episodes import Written
+from workbench.jobs.record.run import RecordProgress
 from workbench.machine.text import listed
 from workbench.recording.library.jobs import JobFailure, JobState, JobStatus, StatusFile
 

@@ -16,10 +16,19 @@ from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import Problem, TaskError
 from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
-from workbench.cli.arguments import JobArguments
-from workbench.cli.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
-from workbench.cli.jobs import job_path, print_part, run_by, shard_of
-from workbench.cli.terminal import Exit, err, out, print_problem, progress_bar, refuse, stdout_to_stderr, warn
+from workbench.cli.jobs.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
+from workbench.cli.jobs.run_by import job_path, print_part, run_by, shard_of
+from workbench.cli.terminal.arguments import JobArguments
+from workbench.cli.terminal.output import (
+    Exit,
+    err,
+    out,
+    print_problem,
+    progress_bar,
+    refuse,
+    stdout_to_stderr,
+    warn,
+)
 from workbench.core.rules import FailOn, Finding
 from workbench.jobs.actions import needed_by
 from workbench.jobs.check import (

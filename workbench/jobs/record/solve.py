@@ -10,9 +10,9 @@ from pathlib import Path
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.actions import SOLVE
-from workbench.jobs.episodes import RecordOptions, Written
 from workbench.jobs.pool.deal import Executor, Failure
-from workbench.jobs.record import Recorded, RecordProgress, record
+from workbench.jobs.record.episodes import RecordOptions, Written
+from workbench.jobs.record.run import Recorded, RecordProgress, record
 from workbench.jobs.task import TaskOptions
 from workbench.planning.episodes import PlannedEpisode
 from workbench.planning.options import PlanOptions

@@ -12,7 +12,9 @@ from functools import partial
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.actions import needed_by
-from workbench.jobs.episodes import (
+from workbench.jobs.pool.deal import Deal, Executor, Failure, ItemQueue, ThisProcess, Work
+from workbench.jobs.pool.processes import Processes
+from workbench.jobs.record.episodes import (
     RecordOptions,
     RecordSetup,
     RecordUpdate,
@@ -20,8 +22,6 @@ from workbench.jobs.episodes import (
     record_items,
     with_given_actions,
 )
-from workbench.jobs.pool.deal import Deal, Executor, Failure, ItemQueue, ThisProcess, Work
-from workbench.jobs.pool.processes import Processes
 from workbench.recording.writing.upload import remove_uploaded
 
 TRIES = 2

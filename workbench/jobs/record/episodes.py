@@ -36,9 +36,9 @@ from workbench.jobs.actions import (
     find_actions,
     plain_chooser,
 )
-from workbench.jobs.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.open_task import OpenedTask, open_task
 from workbench.jobs.pool.deal import Chunk, ItemQueue
+from workbench.jobs.record.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.replay import restore_recorded
 from workbench.jobs.task import RecordArguments, Stepped, TaskOptions
 from workbench.machine.folders import CurrentFolder

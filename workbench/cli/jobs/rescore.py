@@ -21,9 +21,9 @@ from rich.table import Table
 from workbench.authoring.loading.reference import RecordedTask, TaskName, named_file
 from workbench.authoring.loading.task_content import read_content
 from workbench.authoring.problem import TaskError
-from workbench.cli.arguments import ONE_WORKER, JobArguments
-from workbench.cli.jobs import print_part, run_by
-from workbench.cli.terminal import (
+from workbench.cli.jobs.run_by import print_part, run_by
+from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
+from workbench.cli.terminal.output import (
     Exit,
     TerminalPrompt,
     can_ask,
@@ -38,7 +38,7 @@ from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.from_recording import CannotEnterRecording, recorded_version
 from workbench.jobs.pool.job_file import Job, job_of
-from workbench.jobs.record import chunk_of
+from workbench.jobs.record.run import chunk_of
 from workbench.jobs.rescore.job import (
     Code,
     Recording,

@@ -1,0 +1,1 @@
+"""What all commands take, and how they print and ask."""
