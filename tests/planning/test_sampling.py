@@ -184,5 +184,6 @@ def test_options_out_of_range_are_refused_by_name(wrong: dict, says: str) -> Non
 
 def test_the_usual_horizon_is_half_a_second_within_bounds() -> None:
     assert [USUAL.steps(dt) for dt in (0.05, 0.02, 0.01, 0.5)] == [10, 20, 20, 8]
+    assert [USUAL.steps(dt, has_success=False) for dt in (0.1, 0.05, 0.02)] == [10, 20, 20], "a whole second"
     assert replace(USUAL, horizon=1.0).steps(0.05) == 20
     assert replace(USUAL, horizon=0.1, every=4).steps(0.05) == 4

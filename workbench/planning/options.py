@@ -22,7 +22,8 @@ class PlanArguments:
             candidate (predictive sampling; Howell et al., 2022); cem, mean and spread of the best ones (the
             cross-entropy method, kept warm as in iCEM; Pinneri et al., 2020).
         rollouts: candidates that are tried at once, each in an env of its own.
-        horizon: seconds that a plan looks ahead; 0 for half a second, but from 8 to 20 control steps.
+        horizon: seconds that a plan looks ahead; 0 for half a second, or a whole one where the task has no success to come to,
+            but from 8 to 20 control steps.
         knots: actions that a candidate is made of, in equal distances; between them it is interpolated.
         noise: standard deviation of a candidate's knots around the plan, of half the range of each action dimension.
         temperature: of mppi, in standard deviations of what the best quarter of the candidates earned; the lower, the more
@@ -62,13 +63,16 @@ class PlanOptions(PlanArguments):
         if not 0 <= self.horizon < math.inf:
             raise ValueError(f"horizon is a time in seconds, 0 for the usual one, not {self.horizon}")
 
-    def steps(self, control_dt: float) -> int:
+    def steps(self, control_dt: float, has_success: bool = True) -> int:
         """H, the control steps of a plan, at least two and as many as are taken before the next one.
 
         Args:
             control_dt: simulated seconds of a control step.
+            has_success: whether the task's ``evaluate`` tells a success. Without one there is something to keep up, such as a
+                pole's balance, and half a second ahead nothing has fallen yet.
         """
         fewest, most = _STEPS
-        usual = min(most, max(fewest, round(0.5 / control_dt)))
+        seconds = 0.5 if has_success else 1.0
+        usual = min(most, max(fewest, round(seconds / control_dt)))
         steps = max(2, round(self.horizon / control_dt)) if self.horizon else usual
         return max(steps, self.every)

@@ -145,7 +145,7 @@ class RolloutPlanner:
         self._parts = actions.action_parts(env)
         if not self._parts:
             raise ValueError("there is nothing to plan: the task has no robot with a controller")
-        self.horizon = options.steps(env.control_timestep)
+        self.horizon = options.steps(env.control_timestep, "success" in env.get_info())
         """H, control steps that a plan looks ahead."""
         low, high = actions.bounds(self._parts)
         bounded = np.isfinite(low) & np.isfinite(high)

@@ -187,7 +187,8 @@ class SolvePanel(PagePart[SessionView]):
         self._envs.show(view.settings.solve_all)
         self._method.show(plan.method)
         self._rollouts.show(plan.rollouts)
-        self._horizon.show(min(horizon_seconds(plan, task.control_dt), LONGEST_HORIZON))
+        has_success = view.step is None or "success" in view.step.evaluate
+        self._horizon.show(min(horizon_seconds(plan, task.control_dt, has_success), LONGEST_HORIZON))
         self._noise.show(plan.noise)
         self._temperature.show(plan.temperature)
         self._temperature.handle.visible = plan.method == "mppi"
@@ -251,9 +252,9 @@ class SolvePanel(PagePart[SessionView]):
             tell_all(self._server, "Solved", f"{what} at step {step}.", color=None, seconds=8.0)
 
 
-def horizon_seconds(plan: PlanOptions, control_dt: float) -> float:
+def horizon_seconds(plan: PlanOptions, control_dt: float, has_success: bool = True) -> float:
     """The horizon that a plan has, the usual one too."""
-    return plan.steps(control_dt) * control_dt
+    return plan.steps(control_dt, has_success) * control_dt
 
 
 def offers_better_mode(view: SessionView) -> bool:
