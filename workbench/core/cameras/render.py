@@ -168,7 +168,7 @@ def begin_pictures(
         needed = [_textures(cameras[kind, name], modalities) for name, kind, modalities in requests]
         if batched is not None and (degree or batched.pictures) == "fast":
             for (name, kind, _), textures in zip(requests, needed, strict=True):
-                batched.prepare_fast(env_index, (kind, name), textures)
+                batched.prepare_fast(env_index, (kind, name), textures, places)
         sub_scene.update_render()
         move_bodies()
         for (name, kind, modalities), component, textures in zip(requests, components, needed, strict=True):

@@ -51,7 +51,7 @@ from workbench.core.scene.fast_shapes import FastShapes, shown
 from workbench.core.simulation.accessors import install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
-from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, drawn_at
+from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, drawn_at
 from workbench.core.snapshots.snapshot import begin_anew
 from workbench.core.snapshots.task_state import note_constructed, note_scene
 
@@ -148,16 +148,22 @@ class BatchedCpuScene(ManiSkillScene):
             return camera
         shapes, cameras = self._fast_parts()
         drawing = camera if textures is None else cameras.beside(camera, textures)
-        with shown(shapes.bodies(key, camera_components(self._sensor(key)))[env]):
+        with shown(shapes.bodies(key, env)):
             drawing.take_picture()
         return drawing
 
-    def prepare_fast(self, env: int, key: CameraKey, textures: Collection[str]) -> None:
-        """Make what a fast picture of this camera draws, once, and move it to where the camera is now."""
+    def prepare_fast(
+        self, env: int, key: CameraKey, textures: Collection[str], places: Places = NOWHERE_ELSE
+    ) -> None:
+        """Make what a fast picture of this camera draws, once, and move it to where the camera is now.
+
+        Args:
+            places: where bodies of the env are drawn instead.
+        """
         sensor = self._sensor(key)
         components = camera_components(sensor)
         shapes, cameras = self._fast_parts()
-        shapes.bodies(key, components)
+        shapes.prepare(env, key, components, places)
         cameras.follow(env, sensor.config, components[env], textures)
 
     def forget_fast_shapes(self) -> None:
@@ -209,11 +215,12 @@ class BatchedCpuScene(ManiSkillScene):
         elsewhere = px.elsewhere(range(len(self.sub_scenes)))
         for env, sub_scene in enumerate(self.sub_scenes):
             components = (sensor.camera._render_cameras[env] for sensor in every)
-            with drawn_at(elsewhere.get(env, NOWHERE_ELSE), components) as move_bodies:
+            places = elsewhere.get(env, NOWHERE_ELSE)
+            with drawn_at(places, components) as move_bodies:
                 for kind, cameras in chosen if self.pictures == "fast" else ():
                     for name, sensor in cameras.items():
                         if isinstance(group := sensor.camera.camera_group, CpuCameraGroup):
-                            self.prepare_fast(env, (kind, name), group.textures)
+                            self.prepare_fast(env, (kind, name), group.textures, places)
                 sub_scene.update_render()
                 move_bodies()
 

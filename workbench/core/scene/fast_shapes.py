@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import sapien
 import sapien.render
+from sapien import physx
 from numpy.typing import NDArray
 
+from workbench.core.scene.in_view import Planes, are_outside, cut_to_view, planes_of
 from workbench.core.scene.mesh_levels import are_known, within
 from workbench.core.scene.read_scene import exact_part
 from workbench.core.scene.shapes import Mesh
 from workbench.core.scene.simplify import drop_uvs
+from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places
 
 HEAVY = 500
 """Bodies with meshes of more triangles are simplified; the others stay exact, and so do cylinders, spheres and the like: what
@@ -27,8 +31,11 @@ _NEAREST = 0.02
 _FINEST = 1e-4
 """Metres. Tolerances are this times a power of two, so that poses that differ a little give the same meshes."""
 
-Bodies = tuple[tuple[sapien.render.RenderBodyComponent, sapien.render.RenderBodyComponent], ...]
-"""The exact component of each simplified body of an env, and the simplified one beside it."""
+_SAME_PLACE = 1e-5, 1e-4
+"""Metres and radians, about: a body that is so near to where it was, as seen from a camera, has not moved."""
+
+Bodies = tuple[tuple[sapien.render.RenderBodyComponent, sapien.render.RenderBodyComponent | None], ...]
+"""The exact component of each body of an env that is drawn otherwise, and what is drawn instead; None for nothing."""
 
 
 @contextmanager
@@ -37,49 +44,85 @@ def shown(bodies: Bodies) -> Iterator[None]:
     was = [exact.visibility for exact, _ in bodies]
     try:
         for (exact, fast), visibility in zip(bodies, was, strict=True):
-            fast.visibility = visibility
+            if fast is not None:
+                fast.visibility = visibility
             exact.visibility = 0.0
         yield
     finally:
         for (exact, fast), visibility in zip(bodies, was, strict=True):
             exact.visibility = visibility
-            fast.visibility = 0.0
+            if fast is not None:
+                fast.visibility = 0.0
 
 
 class FastShapes:
     """The simplified shapes of a scene, beside the exact ones and hidden, made for each camera at its first fast picture.
 
     How much a body is simplified is decided by its distance from the camera where both are then, by the lens and by the
-    size in pixels. The shapes share the materials of the exact ones, so that a colour which is changed later changes in
-    both; a body's id in segmentation pictures is that of its entity.
+    size in pixels. What is outside the camera's view is not drawn; a body that the camera is fixed to, whose triangles are
+    mostly beside or behind it, is cut to what is in view. The shapes share the materials of the exact ones, so that a
+    colour which is changed later changes in both; a body's id in segmentation pictures is that of its entity.
     """
 
     def __init__(self, sub_scenes: Sequence[sapien.Scene]) -> None:
         self._heavy = [[(body.entity, body) for body in heavy_bodies(scene)] for scene in sub_scenes]
         self._chosen = _Chosen()
-        self._components: dict[tuple[int, float], tuple[Any, Any]] = {}
-        """By the id of the exact one, which is kept beside it, and the tolerance."""
-        self._of_camera: dict[Hashable, list[Bodies]] = {}
+        self._boxes = [np.array([self._box(body) for _, body in of_env]) for of_env in self._heavy]
+        """(B, 2, 3) of each env, in the frames of its bodies."""
+        self._components: dict[Hashable, tuple[Any, Any]] = {}
+        """By the id of the exact one, which is kept beside it, and by how it is simplified."""
+        self._tolerances: dict[Hashable, dict[str, float]] = {}
+        """By camera and name of the body."""
+        self._cut: dict[tuple[Hashable, str], _Cut] = {}
+        """By camera and name of a body that it is fixed to."""
+        self._of_camera: dict[tuple[Hashable, int], Bodies] = {}
+        """By camera and env."""
 
-    def bodies(self, key: Hashable, camera: Sequence[sapien.render.RenderCameraComponent]) -> list[Bodies]:
-        """Those of each env for the camera of this name.
-
-        What the first call for a camera makes is where its bodies are after the next ``update_render``.
+    def prepare(
+        self,
+        env: int,
+        key: Hashable,
+        camera: Sequence[sapien.render.RenderCameraComponent],
+        places: Places = NOWHERE_ELSE,
+    ) -> None:
+        """Choose what the camera of this name sees where it and the bodies are now; call it before ``update_render``.
 
         Args:
             camera: its component in each env.
+            places: where bodies of this env are drawn instead; its cameras have been moved with them.
         """
-        if key not in self._of_camera:
-            tolerances = self._tolerances(camera)
-            self._of_camera[key] = [
-                tuple(
-                    (body, fast)
-                    for entity, body in of_env
-                    if (fast := self._simplified(body, tolerances[_shared_name(entity, env)])) is not None
-                )
-                for env, of_env in enumerate(self._heavy)
-            ]
-        return self._of_camera[key]
+        if key not in self._tolerances:
+            self._tolerances[key] = self._tolerances_of(camera)
+        component, of_env = camera[env], self._heavy[env]
+        if not of_env:
+            return
+        to_camera = component.get_global_pose().inv()
+        poses = [to_camera * _pose(entity, places) for entity, _ in of_env]
+        planes = planes_of(component)
+        in_bodies = planes @ np.array([pose.to_transformation_matrix() for pose in poses])
+        outside = are_outside(self._boxes[env], in_bodies)
+        fixed = _fixed_to(component.entity)
+        drawn: list[tuple[Any, Any]] = []
+        for (entity, body), is_outside, pose, here in zip(of_env, outside, poses, in_bodies, strict=True):
+            if is_outside:
+                drawn.append((body, None))
+                continue
+            name = _shared_name(entity, env)
+            if id(entity) in fixed:
+                cut = self._cut.get((key, name))
+                if cut is None:
+                    cut = self._cut[key, name] = _Cut(pose, self._nearest(body, pose, here), planes)
+                if cut.is_for(pose, planes):
+                    drawn.append((body, self._cut_body(body, key, cut, component, here)))
+                    continue
+            simplified = self._simplified(body, self._tolerances[key][name])
+            if simplified is not None:
+                drawn.append((body, simplified))
+        self._of_camera[key, env] = tuple(drawn)
+
+    def bodies(self, key: Hashable, env: int) -> Bodies:
+        """What `prepare` chose last for this camera."""
+        return self._of_camera.get((key, env), ())
 
     def remove(self) -> None:
         """Take them out of the scene."""
@@ -88,29 +131,114 @@ class FastShapes:
                 fast.entity.remove_component(fast)
         self._components.clear()
         self._of_camera.clear()
+        self._tolerances.clear()
+        self._cut.clear()
 
-    def _tolerances(self, camera: Sequence[sapien.render.RenderCameraComponent]) -> dict[str, float]:
+    def _tolerances_of(self, camera: Sequence[sapien.render.RenderCameraComponent]) -> dict[str, float]:
         """In metres, by the name of the body: the same in all envs, where equal states are to look alike."""
         finest: dict[str, float] = {}
         for env, (component, of_env) in enumerate(zip(camera, self._heavy, strict=True)):
-            pixels_off = TOLERANCE * max(1.0, component.height / _SMALL) ** 0.5
-            position, pixel = np.asarray(component.get_global_pose().p, np.float32), _pixel(component)
+            position = np.asarray(component.get_global_pose().p, np.float32)
             for entity, body in of_env:
                 name = _shared_name(entity, env)
-                distance = _distance(position, np.asarray(body.get_global_aabb_fast()))
-                off = pixels_off * pixel * max(distance, _NEAREST)
+                off = _tolerance(component, _distance(position, np.asarray(body.get_global_aabb_fast())))
                 finest[name] = min(finest.get(name, np.inf), off)
         return {name: _rounded(off) for name, off in finest.items()}
 
+    def _box(self, body: Any) -> NDArray[np.float32]:
+        """(2, 3) low and high corner of what is drawn, in the body's frame."""
+        corners = []
+        for shape in body.render_shapes:
+            frame = shape.local_pose.to_transformation_matrix()
+            for index, part in enumerate(shape.parts):
+                exact, scale = exact_part(shape, part, index)
+                low, high = self._chosen.box(exact)
+                eight = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+                corners.append((eight * scale) @ frame[:3, :3].T + frame[:3, 3])
+        every = np.concatenate(corners)
+        return np.array([every.min(axis=0), every.max(axis=0)], np.float32)
+
+    def _nearest(self, body: Any, pose: sapien.Pose, planes: Planes) -> float:
+        """Metres to the nearest vertex of a triangle that is in view, infinite where none is.
+
+        Args:
+            pose: of the body, in the camera's frame.
+            planes: of the camera, in the body's frame.
+        """
+        eye, nearest = np.asarray(pose.inv().p), np.inf
+        for shape in body.render_shapes:
+            frame = shape.local_pose.to_transformation_matrix()
+            for index, part in enumerate(shape.parts):
+                exact, scale = exact_part(shape, part, index)
+                placed = frame @ np.diag([*scale, 1.0])
+                seen = cut_to_view(exact, planes @ placed).vertices
+                if len(seen):
+                    at = seen @ placed[:3, :3].T + placed[:3, 3]
+                    nearest = min(nearest, float(np.linalg.norm(at - eye, axis=1).min()))
+        return nearest
+
+    def _cut_body(self, body: Any, key: Hashable, cut: _Cut, camera: Any, planes: Planes) -> Any:
+        if not np.isfinite(cut.nearest):
+            return None
+        by = (id(body), key)
+        if by not in self._components:
+            tolerance = _rounded(_tolerance(camera, cut.nearest))
+            made = _simplified(body, tolerance, self._chosen, planes)
+            self._add(by, body, made)
+        return self._components[by][1]
+
     def _simplified(self, body: Any, tolerance: float) -> sapien.render.RenderBodyComponent | None:
-        key = (id(body), tolerance)
-        if key not in self._components:
-            made = _simplified(body, tolerance, self._chosen)
-            self._components[key] = body, made
-            if made is not None:
-                made.visibility = 0.0
-                body.entity.add_component(made)
-        return self._components[key][1]
+        by = (id(body), tolerance)
+        if by not in self._components:
+            self._add(by, body, _simplified(body, tolerance, self._chosen))
+        return self._components[by][1]
+
+    def _add(self, by: Hashable, body: Any, made: sapien.render.RenderBodyComponent | None) -> None:
+        self._components[by] = body, made
+        if made is not None:
+            made.visibility = 0.0
+            body.entity.add_component(made)
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Where a body was, as seen from the camera, when it was cut to the view."""
+
+    pose: sapien.Pose
+    nearest: float
+    """Metres to what is in view, infinite where nothing is."""
+    planes: Planes
+
+    def is_for(self, pose: sapien.Pose, planes: Planes) -> bool:
+        """Whether a body that is there now, and this lens, give the same picture of it."""
+        off, turned = np.abs(pose.p - self.pose.p).max(), pose.q - self.pose.q
+        if off > _SAME_PLACE[0] or np.abs(turned).max() > _SAME_PLACE[1]:
+            return False
+        return np.array_equal(planes, self.planes)
+
+
+def _pose(entity: sapien.Entity, places: Places) -> sapien.Pose:
+    """Where it is drawn."""
+    if id(entity) not in places:
+        return entity.pose
+    pose = places[id(entity)][1]
+    return sapien.Pose(pose[:3], pose[3:])  # type: ignore[arg-type]
+
+
+def _fixed_to(entity: sapien.Entity) -> set[int]:
+    """Ids of the entities of an articulation that never move as seen from this one."""
+    link: Any = entity.find_component_by_type(physx.PhysxArticulationLinkComponent)
+    found, left = {id(entity)}, [] if link is None else [link]
+    while left:
+        link = left.pop()
+        beside = [child for child in link.children if child.joint.type == "fixed"]
+        if link.parent is not None and link.joint.type == "fixed":
+            beside.append(link.parent)
+        for other in beside:
+            if id(other.entity) not in found:
+                found.add(id(other.entity))
+                left.append(other)
+    return found
 
 
 def heavy_bodies(sub_scene: sapien.Scene) -> Iterator[sapien.render.RenderBodyComponent]:
@@ -145,6 +273,14 @@ class _Chosen:
 
     def __init__(self) -> None:
         self._made: dict[tuple[int, bool, float], tuple[Mesh, Mesh]] = {}
+        self._boxes: dict[int, tuple[Mesh, NDArray[np.float32]]] = {}
+
+    def box(self, exact: Mesh) -> NDArray[np.float32]:
+        """(2, 3) low and high corner."""
+        if id(exact) not in self._boxes:
+            corners = np.array([exact.vertices.min(axis=0), exact.vertices.max(axis=0)])
+            self._boxes[id(exact)] = exact, corners
+        return self._boxes[id(exact)][1]
 
     def mesh(self, exact: Mesh, textured: bool, tolerance: float) -> Mesh:
         key = (id(exact), textured, tolerance)
@@ -159,8 +295,14 @@ def _is_textured(material: Any) -> bool:
     return any(getattr(material, f"{kind}_texture") is not None for kind in kinds)
 
 
-def _simplified(body: Any, tolerance: float, chosen: _Chosen) -> sapien.render.RenderBodyComponent | None:
-    """None where nothing of it can be simplified."""
+def _simplified(
+    body: Any, tolerance: float, chosen: _Chosen, planes: Planes | None = None
+) -> sapien.render.RenderBodyComponent | None:
+    """None where nothing of it can be simplified, or nothing is in view.
+
+    Args:
+        planes: in the body's frame, to cut its triangles to; None for all of them.
+    """
     shapes, fewer = [], False
     for shape in body.render_shapes:
         for index, part in enumerate(shape.parts):
@@ -169,9 +311,13 @@ def _simplified(body: Any, tolerance: float, chosen: _Chosen) -> sapien.render.R
             mesh = exact
             if largest > 0 and _is_mesh(shape):
                 mesh = chosen.mesh(exact, _is_textured(part.material), tolerance / largest)
+            if planes is not None:
+                placed = shape.local_pose.to_transformation_matrix() @ np.diag([*scale, 1.0])
+                mesh = cut_to_view(mesh, planes @ placed)
             fewer |= len(mesh.faces) < len(exact.faces)
-            shapes.append(_shape(mesh, scale, shape, part.material))
-    if not fewer:
+            if len(mesh.faces):
+                shapes.append(_shape(mesh, scale, shape, part.material))
+    if not shapes or (planes is None and not fewer):
         return None
     made = sapien.render.RenderBodyComponent()
     made.shading_mode = body.shading_mode
@@ -204,6 +350,12 @@ def _is_mesh(shape: Any) -> bool:
 def _shared_name(entity: Any, env: int) -> str:
     """The name without ManiSkill's prefix of the env, so that a body is equally fine in all envs."""
     return entity.name.removeprefix(f"scene-{env}-").removeprefix(f"scene-{env}_")
+
+
+def _tolerance(camera: sapien.render.RenderCameraComponent, distance: float) -> float:
+    """Metres that a surface at this distance may be off."""
+    pixels_off = TOLERANCE * max(1.0, camera.height / _SMALL) ** 0.5
+    return pixels_off * _pixel(camera) * max(distance, _NEAREST)
 
 
 def _pixel(camera: sapien.render.RenderCameraComponent) -> float:

@@ -1,0 +1,54 @@
+"""What a camera cannot see: boxes and triangles wholly outside its field of view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import sapien
+import sapien.render
+from numpy.typing import NDArray
+
+from workbench.core.scene.shapes import Mesh
+
+_MARGIN = 1.0
+"""Pixels around the picture that count as seen, for what is not quite where it was measured."""
+
+Planes = NDArray[np.float64]
+"""(5, 4) left, right, top, bottom and near: a point is in view where all of ``planes @ (x, y, z, 1)`` are positive."""
+
+
+def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
+    """Of a camera, in its own frame: x forward, y left, z up."""
+    k = np.asarray(camera.get_intrinsic_matrix(), np.float64)
+    # Times x, the column and the row of a point's pixel.
+    column, row, x = np.array([k[0, 2], -k[0, 0], -k[0, 1], 0]), np.array([k[1, 2], 0, -k[1, 1], 0]), np.eye(4)[0]
+    planes = [
+        column + _MARGIN * x,
+        (camera.width + _MARGIN) * x - column,
+        row + _MARGIN * x,
+        (camera.height + _MARGIN) * x - row,
+        x - [0, 0, 0, 0.99 * camera.near],
+    ]
+    return np.array(planes)
+
+
+def are_outside(boxes: NDArray[np.float32], planes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(B,) whether boxes (B, 2, 3) are wholly outside one of the planes (B, 5, 4), each in the frame of its box."""
+    farthest = (planes[:, :, None, :3] * boxes[:, None]).max(axis=2).sum(axis=-1) + planes[..., 3]
+    return (farthest < 0).any(axis=1)
+
+
+def cut_to_view(mesh: Mesh, planes: Planes) -> Mesh:
+    """`mesh` without the triangles that are wholly outside one of the planes, in whose frame it is."""
+    outside = (mesh.vertices @ planes[:, :3].T + planes[:, 3] < 0) @ (1 << np.arange(len(planes)))
+    of_faces = outside[mesh.faces]
+    kept = mesh.faces[(of_faces[:, 0] & of_faces[:, 1] & of_faces[:, 2]) == 0]
+    index, faces = np.unique(kept, return_inverse=True)
+    return replace(
+        mesh,
+        vertices=mesh.vertices[index],
+        faces=faces.reshape(-1, 3).astype(np.uint32),
+        normals=None if mesh.normals is None else mesh.normals[index],
+        uvs=None if mesh.uvs is None else mesh.uvs[index],
+    )
