@@ -29,7 +29,7 @@ _SMALL = 128
 _NEAREST = 0.02
 """Metres. Nothing is looked at from nearer for long, and a camera within its own mount would forbid any simplification."""
 _FINEST = 1e-4
-"""Metres. Tolerances are this times a power of two, so that poses that differ a little give the same meshes."""
+"""Metres. Tolerances are this times powers of the fourth root of two, so that poses that differ a little give the same meshes."""
 
 _SAME_PLACE = 1e-5, 1e-4
 """Metres and radians, about: a body that is so near to where it was, as seen from a camera, has not moved."""
@@ -371,4 +371,4 @@ def _distance(point: NDArray[np.float32], box: NDArray[np.float32]) -> float:
 def _rounded(tolerance: float) -> float:
     if tolerance < _FINEST:
         return tolerance
-    return _FINEST * 2.0 ** np.floor(np.log2(tolerance / _FINEST))
+    return _FINEST * 2.0 ** (np.floor(4 * np.log2(tolerance / _FINEST)) / 4)
