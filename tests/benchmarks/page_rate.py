@@ -16,7 +16,8 @@ the rest of the machine share the cores: *others* is what the rest took, without
 ``--draw none``, the default, is a stand-in for a browser with a graphics card: WebGL's draw calls are replaced by
 nothing, and the page is transparent, so that Chromium does not put it together in software, which takes 25 ms a
 frame and a core. All else is done. ``--draw page`` replaces the draw calls alone; with ``--draw all`` Chromium rasterises
-everything on the processor, which then is the limit on a machine without a card. Without ``--cameras`` the pictures
+everything on the processor, which then is the limit on a machine without a card; ``--draw as-with-a-card`` does so too, and tells
+the page that it has one, which leaves out what the page does to be drawn in less time. Without ``--cameras`` the pictures
 are unticked: on such a machine the renderer, the physics and the browser share the cores.
 
 ``--solve`` measures a second time, in the same page, while actions are planned by rollouts in a process beside. The envs
@@ -49,6 +50,12 @@ TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 NO_DRAWING = """
 for (const name of ['drawElements', 'drawArrays', 'drawElementsInstanced', 'drawArraysInstanced'])
     WebGL2RenderingContext.prototype[name] = function () {};
+"""
+A_CARD = """
+const ask = WebGL2RenderingContext.prototype.getParameter, UNMASKED_RENDERER = 0x9246;
+WebGL2RenderingContext.prototype.getParameter = function (what) {
+    return what === UNMASKED_RENDERER ? 'NVIDIA GeForce RTX 3060' : ask.call(this, what);
+};
 """
 TRANSPARENT = "() => { document.documentElement.style.opacity = 0; }"
 COUNT = """async (seconds) => {
@@ -88,7 +95,7 @@ class Options:
     """Of one window."""
     windows: int = 3
     clicks: int = 15
-    draw: Literal["none", "page", "all"] = "none"
+    draw: Literal["none", "page", "all", "as-with-a-card"] = "none"
     """What Chromium draws, on the processor: nothing, all but the 3-D view's triangles, or all."""
     cameras: bool = False
     """Leave the default pictures on."""
@@ -97,8 +104,10 @@ class Options:
 
 
 def prepare(page: Page, options: Options, url: str) -> None:
-    if options.draw != "all":
+    if options.draw in ("none", "page"):
         page.add_init_script(NO_DRAWING)
+    if options.draw == "as-with-a-card":
+        page.add_init_script(A_CARD)
     page.goto(url)
     expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
     page.get_by_role("tab", name="Cameras").click()
@@ -249,6 +258,7 @@ def main(options: Options) -> None:
         "none": "nothing is drawn",
         "page": "draw calls replaced by nothing",
         "all": "Chromium draws in software",
+        "as-with-a-card": "Chromium draws in software, and the page is as with a card",
     }[options.draw]
     cameras = "on" if options.cameras else "off"
     print(f"push_cube.py, {options.num_envs} envs, speed {options.speed}, cameras {cameras}; {drawing}")

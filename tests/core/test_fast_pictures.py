@@ -199,3 +199,67 @@ def test_after_a_restored_snapshot_both_are_what_they_were(env: Any) -> None:
     restore_snapshot(env, snapshot)
     np.testing.assert_array_equal(taken("exact"), exact)
     np.testing.assert_array_equal(taken("fast"), fast)
+
+
+@pytest.fixture(scope="module")
+def wrist() -> Iterator[Any]:
+    made = batched("PickCube-v1", obs_mode="rgb", robot_uids="panda_wristcam")
+    yield made
+    made.close()
+
+
+def drawn_by(env: Any, camera: str) -> dict[str, int]:
+    """Triangles that stand for those of each body in fast pictures of env 0, by the body's name; without those that are exact."""
+    count = {}
+    for exact, fast in env.scene._fast[0].bodies(("sensor", camera), 0):
+        shapes = [] if fast is None else fast.render_shapes
+        count[exact.entity.name] = sum(len(part.triangles) for shape in shapes for part in shape.parts)
+    return count
+
+
+def test_a_wrist_camera_draws_nothing_of_what_is_beside_and_behind_it(wrist: Any) -> None:
+    exact, fast = (
+        take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb", "segmentation"])], degree=degree)[0]
+        for degree in ("exact", "fast")
+    )
+    np.testing.assert_array_equal(fast.segmentation, exact.segmentation)
+    assert fast.rgb is not None and exact.rgb is not None
+    assert np.abs(fast.rgb.astype(int) - exact.rgb).mean() < 1
+    drawn = drawn_by(wrist, "hand_camera")
+    # The first is the camera's own body, of 425,000 triangles.
+    assert drawn["camera_link"] == drawn["panda_link7"] == drawn["panda_link0"] == 0
+
+
+def test_a_camera_that_is_moved_on_its_mount_sees_what_it_is_fixed_to(wrist: Any) -> None:
+    component = camera_components(wrist._sensors["hand_camera"])[0]
+    take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb"])], degree="fast")
+    was = component.local_pose
+    # Back by the length of a hand, and looking the same way.
+    component.local_pose = was * sapien.Pose([-0.25, 0, 0])
+    try:
+        exact, fast = (
+            take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb", "segmentation"])], degree=degree)[0]
+            for degree in ("exact", "fast")
+        )
+    finally:
+        component.local_pose = was
+    mount = component.entity.per_scene_id
+    assert (exact.segmentation == mount).sum() > 50 and (fast.segmentation == mount).sum() > 50
+    assert (fast.segmentation != exact.segmentation).mean() < 0.02
+    (again,) = take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb"])], degree="fast")
+    assert drawn_by(wrist, "hand_camera")["camera_link"] == 0 and again.rgb is not None
+
+
+def test_a_body_that_comes_into_view_is_drawn(env: Any) -> None:
+    component = camera_components(env._sensors["base_camera"])[0]
+    request = [("base_camera", "sensor", ["rgb", "segmentation"])]
+    was = component.local_pose
+    try:
+        component.local_pose = was * sapien.Pose(q=[0, 0, 0, 1])
+        (away,) = take_pictures(env, 0, request, degree="fast")
+        assert set(drawn_by(env, "base_camera").values()) <= {0, 2}, "the robot is behind it; the floor is not"
+    finally:
+        component.local_pose = was
+    exact, fast = (take_pictures(env, 0, request, degree=degree)[0] for degree in ("exact", "fast"))
+    assert (fast.segmentation != exact.segmentation).mean() < 0.01
+    assert (away.segmentation != exact.segmentation).mean() > 0.1

@@ -45,7 +45,7 @@ SCRIPTS = (
     "unfolded.js",
     "typed_numbers.js",
     "key_help.js",
-    "steady_resolution.js",
+    "drawn_in_software.js",
     "tab_title.js",
     "task_list.js",
     "tab_stays.js",

@@ -1,0 +1,76 @@
+// A page that is drawn in software draws its view in less time, and keeps one resolution, so that it never stands still to
+// change it. Whoever has a graphics card keeps what viser does.
+//
+// Less time: without smoothed edges, which are half of a frame, without a copy of each frame for scripts that read it back,
+// and without the highlights of materials. The texts that are exchanged are three.js's in viser 1.1; where one is another,
+// it is drawn as it is.
+//
+// One resolution: viser lowers the resolution of its view when frames come slowly, and raises it again. On a graphics card that costs
+// nothing that is seen. Where the browser draws on the processor, new buffers wait for all that is still to be drawn:
+// the page answers nothing for 0.2 to 0.8 s, at moments that nobody chose (it goes down, up, and down again), one of
+// them the first seconds in which the author's code hangs and the page is needed most. Such a page therefore stays at
+// the resolution it begins with. Not at a lower one: what lies over the view (the timeline, a banner) is fitted to the
+// view's width, which viser tells in these pixels.
+//
+// viser reads a fixed resolution from its address, once, before it makes its canvas: so it is put there for that long,
+// and not left behind in what people bookmark or copy. One that stands there already is somebody's wish.
+"use strict";
+{
+  const KEY = "fixedDpr"; // viser 1.1, DevSettingsStore.ts
+  const SOFTWARE = /swiftshader|llvmpipe|softpipe|software/i; // as in its BrowserWarning.tsx
+
+  const CHEAPER = [
+    [
+      "vec3 specularBRDF = BRDF_GGX( directLight.direction, geometryViewDir, geometryNormal, material );",
+      "vec3 specularBRDF = vec3( 0.0 );",
+    ],
+    ["vec3 F = F_Schlick( material.specularColor, material.specularF90, dotVH );", "vec3 F = material.specularColor;"],
+    ["RE_IndirectSpecular( radiance, iblIrradiance, clearcoatRadiance,", "if ( false ) RE_IndirectSpecular( radiance, iblIrradiance, clearcoatRadiance,"],
+    ["material.dfg = texture2D( dfgLUT, vec2( material.roughness, dotNVms ) ).rg;", "material.dfg = vec2( 1.0, 0.0 );"],
+    ["vec3 dxy = max( abs( dFdx( nonPerturbedNormal ) ), abs( dFdy( nonPerturbedNormal ) ) );", "vec3 dxy = vec3( 0.0 );"],
+    // Of a vertex of what is drawn many times: whole numbers are divided one by one, others four at once.
+    ["int x = j % size;\n    int y = j / size;", "int y = int( ( float( j ) + 0.5 ) / float( size ) );\n    int x = j - y * size;"],
+  ];
+
+  function isDrawnInSoftware() {
+    const gl = document.createElement("canvas").getContext("webgl2");
+    if (!gl) return false;
+    const named = gl.getExtension("WEBGL_debug_renderer_info");
+    const renderer = named ? gl.getParameter(named.UNMASKED_RENDERER_WEBGL) : "";
+    // A browser has only so many contexts, and else keeps this one until its memory is searched for garbage.
+    gl.getExtension("WEBGL_lose_context")?.loseContext();
+    return SOFTWARE.test(renderer);
+  }
+
+  function drawInLessTime() {
+    const { getContext } = HTMLCanvasElement.prototype;
+    HTMLCanvasElement.prototype.getContext = function (kind, asked) {
+      const cheaper = kind === "webgl2" ? { ...asked, antialias: false, preserveDrawingBuffer: false } : asked;
+      return getContext.call(this, kind, cheaper);
+    };
+    const { shaderSource } = WebGL2RenderingContext.prototype;
+    WebGL2RenderingContext.prototype.shaderSource = function (shader, text) {
+      const exchanged = CHEAPER.reduce((source, [was, becomes]) => source.replaceAll(was, becomes), text);
+      return shaderSource.call(this, shader, exchanged);
+    };
+  }
+
+  function changeAddress(change) {
+    const address = new URL(location.href);
+    change(address.searchParams);
+    history.replaceState(history.state, "", address);
+  }
+
+  const software = isDrawnInSoftware();
+  if (software) drawInLessTime();
+  if (software && !new URLSearchParams(location.search).has(KEY)) {
+    const beginsWith = Math.min(Math.max(devicePixelRatio, 1), 2); // as react-three-fiber's canvas by itself
+    changeAddress((asked) => asked.set(KEY, beginsWith));
+    const looked = new MutationObserver(() => {
+      if (!document.querySelector("canvas[data-engine]")) return;
+      looked.disconnect();
+      changeAddress((asked) => asked.delete(KEY));
+    });
+    looked.observe(document, { childList: true, subtree: true });
+  }
+}
