@@ -86,7 +86,10 @@ def draw_until(gated_server: GatedServer, page: Page, reached: str) -> None:
 def shaders_of_a_box(gated_server: GatedServer, page: Page) -> list[str]:
     """The texts of the shaders that draw boxes as the envs' bodies are drawn."""
     box = as_glb([(box_mesh((0.5, 0.5, 0.5)), Material((0.5, 0.5, 0.5, 1.0)))])
-    one = {"batched_wxyzs": np.eye(4, dtype=np.float32)[:1], "batched_positions": np.zeros((1, 3), np.float32)}
+    one = {
+        "batched_wxyzs": np.eye(4, dtype=np.float32)[:1],
+        "batched_positions": np.zeros((1, 3), np.float32),
+    }
     node = gated_server.server.scene.add_batched_glb("/boxes", box, **one)
     found = "window.shaders.filter((text) => text.includes('USE_INSTANCING_INDIRECT') && text.includes('#define STANDARD'))"
     until(lambda: page.evaluate(f"{found}.length") >= 2, "the shaders of a box")
@@ -128,7 +131,11 @@ def test_a_page_drawn_in_software_is_drawn_in_less_time(gated_server: GatedServe
     asked = page.evaluate(f"{CANVAS}.getContext('webgl2').getContextAttributes()")
     assert not asked["antialias"] and not asked["preserveDrawingBuffer"]
     text = "\n".join(shaders_of_a_box(gated_server, page))
-    for cheaper in ("specularBRDF = vec3( 0.0 )", "F = material.specularColor", "if ( false ) RE_IndirectSpecular("):
+    for cheaper in (
+        "specularBRDF = vec3( 0.0 )",
+        "F = material.specularColor",
+        "if ( false ) RE_IndirectSpecular(",
+    ):
         assert cheaper in text
     for cheaper in ("material.dfg = vec2( 1.0, 0.0 )", "vec3 dxy = vec3( 0.0 )", "int x = j - y * size"):
         assert cheaper in text

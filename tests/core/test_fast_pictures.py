@@ -257,7 +257,9 @@ def test_a_body_that_comes_into_view_is_drawn(env: Any) -> None:
     try:
         component.local_pose = was * sapien.Pose(q=[0, 0, 0, 1])
         (away,) = take_pictures(env, 0, request, degree="fast")
-        assert set(drawn_by(env, "base_camera").values()) <= {0, 2}, "the robot is behind it; the floor is not"
+        assert set(drawn_by(env, "base_camera").values()) <= {0, 2}, (
+            "the robot is behind it; the floor is not"
+        )
     finally:
         component.local_pose = was
     exact, fast = (take_pictures(env, 0, request, degree=degree)[0] for degree in ("exact", "fast"))

@@ -26,14 +26,18 @@ def test_a_point_is_in_view_where_its_pixel_is_in_the_picture(camera: Any) -> No
     k = camera.get_intrinsic_matrix()
     column, row = k[0, 2] - k[0, 0] * y / x, k[1, 2] - k[1, 1] * z / x
     seen = (x > 0.1) & (column > 0) & (column < 40) & (row > 0) & (row < 30)
-    outside = are_outside(np.stack([points, points], axis=1).astype(np.float32), np.tile(planes_of(camera), (2000, 1, 1)))
+    outside = are_outside(
+        np.stack([points, points], axis=1).astype(np.float32), np.tile(planes_of(camera), (2000, 1, 1))
+    )
     assert seen.any() and not (outside & seen).any()
     nearly = (x > 0.09) & (column > -2) & (column < 42) & (row > -2) & (row < 32)
     assert outside[~nearly].all()
 
 
 def test_a_box_around_the_camera_is_in_view_and_one_behind_it_is_not(camera: Any) -> None:
-    boxes = np.array([[[-1, -1, -1], [1, 1, 1]], [[-3, -1, -1], [-2, 1, 1]], [[1, 5, -1], [2, 6, 1]]], np.float32)
+    boxes = np.array(
+        [[[-1, -1, -1], [1, 1, 1]], [[-3, -1, -1], [-2, 1, 1]], [[1, 5, -1], [2, 6, 1]]], np.float32
+    )
     outside = are_outside(boxes, np.tile(planes_of(camera), (3, 1, 1)))
     np.testing.assert_array_equal(outside, [False, True, True])
 

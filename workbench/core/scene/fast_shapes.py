@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import sapien
 import sapien.render
-from sapien import physx
 from numpy.typing import NDArray
+from sapien import physx
 
 from workbench.core.scene.in_view import Planes, are_outside, cut_to_view, planes_of
 from workbench.core.scene.mesh_levels import are_known, within
@@ -153,7 +153,14 @@ class FastShapes:
             for index, part in enumerate(shape.parts):
                 exact, scale = exact_part(shape, part, index)
                 low, high = self._chosen.box(exact)
-                eight = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+                eight = np.array(
+                    [
+                        [x, y, z]
+                        for x in (low[0], high[0])
+                        for y in (low[1], high[1])
+                        for z in (low[2], high[2])
+                    ]
+                )
                 corners.append((eight * scale) @ frame[:3, :3].T + frame[:3, 3])
         every = np.concatenate(corners)
         return np.array([every.min(axis=0), every.max(axis=0)], np.float32)

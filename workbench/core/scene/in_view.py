@@ -22,7 +22,11 @@ def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
     """Of a camera, in its own frame: x forward, y left, z up."""
     k = np.asarray(camera.get_intrinsic_matrix(), np.float64)
     # Times x, the column and the row of a point's pixel.
-    column, row, x = np.array([k[0, 2], -k[0, 0], -k[0, 1], 0]), np.array([k[1, 2], 0, -k[1, 1], 0]), np.eye(4)[0]
+    column, row, x = (
+        np.array([k[0, 2], -k[0, 0], -k[0, 1], 0]),
+        np.array([k[1, 2], 0, -k[1, 1], 0]),
+        np.eye(4)[0],
+    )
     planes = [
         column + _MARGIN * x,
         (camera.width + _MARGIN) * x - column,
