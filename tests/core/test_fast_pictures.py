@@ -252,7 +252,7 @@ def test_a_camera_that_is_moved_on_its_mount_sees_what_it_is_fixed_to(wrist: Any
 
 def test_a_body_that_comes_into_view_is_drawn(env: Any) -> None:
     component = camera_components(env._sensors["base_camera"])[0]
-    request = [("base_camera", "sensor", ["rgb", "segmentation"])]
+    request: list[Any] = [("base_camera", "sensor", ["rgb", "segmentation"])]
     was = component.local_pose
     try:
         component.local_pose = was * sapien.Pose(q=[0, 0, 0, 1])

@@ -218,10 +218,11 @@ class _Cut:
 
     def is_for(self, pose: sapien.Pose, planes: Planes) -> bool:
         """Whether a body that is there now, and this lens, give the same picture of it."""
-        off, turned = np.abs(pose.p - self.pose.p).max(), pose.q - self.pose.q
-        if off > _SAME_PLACE[0] or np.abs(turned).max() > _SAME_PLACE[1]:
-            return False
-        return np.array_equal(planes, self.planes)
+        off = np.abs(np.asarray(pose.p) - np.asarray(self.pose.p)).max()
+        now, then = np.asarray(pose.q), np.asarray(self.pose.q)
+        # A quaternion and its negative are one rotation.
+        turned = min(np.abs(now - then).max(), np.abs(now + then).max())
+        return off <= _SAME_PLACE[0] and turned <= _SAME_PLACE[1] and np.array_equal(planes, self.planes)
 
 
 def _pose(entity: sapien.Entity, places: Places) -> sapien.Pose:
