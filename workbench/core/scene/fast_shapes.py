@@ -11,9 +11,8 @@ import numpy as np
 import sapien
 import sapien.render
 from numpy.typing import NDArray
-from sapien import physx
 
-from workbench.core.scene.in_view import Planes, are_outside, cut_to_view, planes_of
+from workbench.core.scene.in_view import Planes, are_outside, cut_to_view, fixed_to, planes_of
 from workbench.core.scene.mesh_levels import are_known, within
 from workbench.core.scene.read_scene import exact_part
 from workbench.core.scene.shapes import Mesh
@@ -101,7 +100,7 @@ class FastShapes:
         planes = planes_of(component)
         in_bodies = planes @ np.array([pose.to_transformation_matrix() for pose in poses])
         outside = are_outside(self._boxes[env], in_bodies)
-        fixed = _fixed_to(component.entity)
+        fixed = fixed_to(component.entity)
         drawn: list[tuple[Any, Any]] = []
         for (entity, body), is_outside, pose, here in zip(of_env, outside, poses, in_bodies, strict=True):
             if is_outside:
@@ -231,22 +230,6 @@ def _pose(entity: sapien.Entity, places: Places) -> sapien.Pose:
         return entity.pose
     pose = places[id(entity)][1]
     return sapien.Pose(pose[:3], pose[3:])  # type: ignore[arg-type]
-
-
-def _fixed_to(entity: sapien.Entity) -> set[int]:
-    """Ids of the entities of an articulation that never move as seen from this one."""
-    link: Any = entity.find_component_by_type(physx.PhysxArticulationLinkComponent)
-    found, left = {id(entity)}, [] if link is None else [link]
-    while left:
-        link = left.pop()
-        beside = [child for child in link.children if child.joint.type == "fixed"]
-        if link.parent is not None and link.joint.type == "fixed":
-            beside.append(link.parent)
-        for other in beside:
-            if id(other.entity) not in found:
-                found.add(id(other.entity))
-                left.append(other)
-    return found
 
 
 def heavy_bodies(sub_scene: sapien.Scene) -> Iterator[sapien.render.RenderBodyComponent]:

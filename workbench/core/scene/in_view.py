@@ -1,13 +1,15 @@
-"""What a camera cannot see: boxes and triangles wholly outside its field of view."""
+"""What a camera cannot see: boxes and triangles wholly outside its field of view. And what never moves before it."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import sapien
 import sapien.render
 from numpy.typing import NDArray
+from sapien import physx
 
 from workbench.core.scene.shapes import Mesh
 
@@ -56,3 +58,19 @@ def cut_to_view(mesh: Mesh, planes: Planes) -> Mesh:
         normals=None if mesh.normals is None else mesh.normals[index],
         uvs=None if mesh.uvs is None else mesh.uvs[index],
     )
+
+
+def fixed_to(entity: sapien.Entity) -> set[int]:
+    """Ids of the entities of an articulation that never move as seen from this one."""
+    link: Any = entity.find_component_by_type(physx.PhysxArticulationLinkComponent)
+    found, left = {id(entity)}, [] if link is None else [link]
+    while left:
+        link = left.pop()
+        beside = [child for child in link.children if child.joint.type == "fixed"]
+        if link.parent is not None and link.joint.type == "fixed":
+            beside.append(link.parent)
+        for other in beside:
+            if id(other.entity) not in found:
+                found.add(id(other.entity))
+                left.append(other)
+    return found
