@@ -232,6 +232,7 @@ def test_a_worker_that_fits_on_no_machine_is_refused(address: str, tmp_path: Pat
         Run(Setup(folder=tmp_path), range(8)).by(Cluster(address, cpus_per_worker=64))
 
 
+@pytest.mark.slow
 def test_a_folder_that_a_machine_does_not_see_is_refused(
     address: str, task: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -82,6 +82,7 @@ def test_an_address_where_nothing_answers_is_said(tmp_path: Path, ray_folder: st
     assert said.startswith("no Ray cluster answers at 127.0.0.1:1 ") and "`ray start --head`" in said
 
 
+@pytest.mark.slow
 def test_what_a_cluster_that_has_ended_left_is_passed_over(tmp_path: Path, ray_folder: str) -> None:
     left = Path(ray_folder) / "ray" / "ray_current_cluster"
     left.parent.mkdir()
