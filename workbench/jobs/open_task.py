@@ -102,7 +102,9 @@ def with_advice(
         and not isinstance(error.__cause__, _NOT_OF_THE_BATCH)
         and _runs_alone(again, options)
     ):
-        advice.append(f"it fails with {options.num_envs} envs and runs with one: --num-envs 1")
+        advice.append(
+            f"it fails with {options.num_envs} envs and runs with one: --num-envs 1, or --envs-per-worker 1"
+        )
     if loaded.others and loaded.file is not None and not knows_others:
         file = loaded.file.name
         advice.append(
