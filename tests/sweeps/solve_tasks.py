@@ -239,7 +239,8 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def _seconds(row: Row) -> str:
-    return f"{row.seconds / len(row.episodes):.0f}" if row.episodes else ""
+    # None where a sweep was ended in the middle of a task.
+    return f"{row.seconds / len(row.episodes):.0f}" if row.episodes and row.seconds else ""
 
 
 def _why(row: Row, episodes: Sequence[PlannedEpisode]) -> Iterator[str]:
