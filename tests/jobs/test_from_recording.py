@@ -244,7 +244,9 @@ def test_another_task_than_the_open_one_is_named(live: Session) -> None:
 TWO_MODES = "{'panda-0': 'pd_joint_pos', 'panda-1': 'pd_joint_delta_pos'}"
 
 
-def test_two_robots_are_made_again_with_the_mode_that_both_have(tmp_path: Path) -> None:
+def test_two_robots_are_made_again_with_the_mode_that_both_have(
+    renderer: None, child_process: None, tmp_path: Path
+) -> None:
     options = TaskOptions(
         num_envs=1, env_kwargs={"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
     )

@@ -58,7 +58,7 @@ def test_no_file_is_larger_for_it(written: list[Path]) -> None:
     assert joined < 1.01 * whole
 
 
-def test_rerun_finds_nothing_wrong(written: list[Path]) -> None:
+def test_rerun_finds_nothing_wrong(child_process: None, written: list[Path]) -> None:
     for path in (written[0], written[-1]):
         assert verify_rrd(path) is None
     readers = [RrdReader(path) for path in written]
