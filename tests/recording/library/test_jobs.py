@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -56,8 +57,26 @@ def test_a_folder_that_is_not_there_is_not_made(tmp_path: Path) -> None:
 def test_what_an_earlier_job_left_goes(tmp_path: Path) -> None:
     file = StatusFile(tmp_path, lambda: 1e10)
     file.write(RUNS)
-    file.remove_old()
+    file.remove_old(RUNS)
     assert list(tmp_path.iterdir()) == [], "its time is years after that"
+
+
+def test_a_job_that_goes_on_replaces_its_last_word_and_no_other(tmp_path: Path) -> None:
+    now = time.time()
+    for status in (
+        replace(RUNS, state="stopped"),
+        replace(RUNS, part="1/2", state="done"),
+        replace(RUNS, task="other.py", state="done"),
+        RUNS,
+    ):
+        StatusFile(tmp_path, lambda: now).write(status)
+    StatusFile(tmp_path, lambda: now).remove_old(RUNS)
+    left = {(one.task, one.part, one.state) for one in read_jobs(tmp_path, now)}
+    assert left == {
+        ("my_task.py", "1/2", "done"),
+        ("other.py", "", "done"),
+        ("my_task.py", "", "running"),
+    }, "another may be under way"
 
 
 @given(content=st.binary(max_size=200) | st.builds(lambda value: msgspec.json.encode(value), st.dictionaries(

@@ -114,6 +114,8 @@ class ToldStatus:
         return both
 
     def end(self, state: JobState) -> None:
+        if self._began is None and state == "failed":
+            return  # it was refused: there is nothing of it
         self._status = replace(self._status, state=state)
         if self._file is not None:
             self._file.write(self._status)
@@ -153,9 +155,10 @@ def told_in_folder(
     """
     part = "" if arguments.shard is None else str(shard_of(arguments))
     file = StatusFile(Path(out)) if out else None
+    status = JobStatus(command, task, 0, total, part=part)
     if file is not None:
-        file.remove_old()
-    told = ToldStatus(file, JobStatus(command, task, 0, total, part=part))
+        file.remove_old(status)
+    told = ToldStatus(file, status)
     try:
         yield told
     except BaseException:

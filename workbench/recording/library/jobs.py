@@ -91,11 +91,18 @@ class StatusFile:
         with contextlib.suppress(OSError):
             replace_file(self._path, msgspec.json.encode(replace(status, written_at=now)))
 
-    def remove_old(self) -> None:
-        """Remove what jobs of an earlier hour left."""
+    def remove_old(self, status: JobStatus) -> None:
+        """Remove what jobs of an earlier hour left, and the last word of earlier runs of this one."""
+        now = self._clock()
+        mine = (status.command, status.task, status.part)
         for path in sorted(self._folder.glob(f"{_PREFIX}*{_SUFFIX}"))[: 10 * _MOST]:
-            with contextlib.suppress(OSError):
-                if self._clock() - path.stat().st_mtime > _KEPT_SECONDS:
+            with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeError):
+                if now - path.stat().st_mtime > _KEPT_SECONDS:
+                    path.unlink()
+                    continue
+                there = msgspec.json.decode(read_regular_file(path, _MOST_BYTES), type=JobStatus)
+                over = there.state != "running" or there.is_silent(now)
+                if over and (there.command, there.task, there.part) == mine:
                     path.unlink()
 
 
