@@ -14,6 +14,7 @@ import viser
 from tests.drive.episodes import made, write
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
+from tests.recording.sweep_files import sweep_folder
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.columns import TextEntry
 from workbench.recording.library.library import Library
@@ -90,6 +91,27 @@ def test_says_what_to_do_while_nothing_is_open(shown: Shown) -> None:
     assert "Choose one in the library" in shown.panels.part("Review").html()
     assert not shown.panels.part("Timeline").seen and not shown.panels.shows("Play")
     assert not shown.panels.is_folded("Library") and "nothing open" in shown.panels.html("wb-status")
+
+
+def test_the_results_of_a_sweep_have_a_tab_also_if_they_come_later(
+    child_process: None, gated_server: GatedServer, panels: Panels, clock: Clock, tmp_path: Path
+) -> None:
+    write(tmp_path, made(4, seed=1))
+    place = Workplace(gated_server, tmp_path, no_session, TaskOptions())
+    place.shelf.library.refresh()
+    page = ReviewPage(place, clock=clock)
+    clock.passes()
+    page.redraw()
+    assert "reach_weight" not in panels.html()
+    sweep_folder(tmp_path)
+
+    def has_points() -> bool:
+        clock.passes()
+        page.redraw()
+        return "reach_weight" in panels.part("Sweep").html()
+
+    until(has_points, "the points")
+    place.close()
 
 
 def test_an_opened_recording_fills_every_part(shown: Shown) -> None:

@@ -48,10 +48,14 @@ if TYPE_CHECKING:
 
 TOLD_EVERY = 0.1
 """Seconds between two drawings of the panels while it plays. Faster, numbers cannot be read."""
+SWEEP_EVERY = 1.0
+"""Seconds between two looks for the results of a sweep."""
 PANEL_WIDTH = 340
 LIBRARY_WIDTH = 520
 LEAST_VIEW = 240
 """Least pixels of the view between the library and another panel."""
+LEAST_BESIDE_SWEEP = 400
+"""Least pixels of the view in which an episode of a sweep is watched beside its table; the timeline needs most of it."""
 NARROW = 700
 """Pixels of the view next to the library; below this there is no room for both."""
 TOLD_WIDTH = 20.0
@@ -85,6 +89,7 @@ class ReviewPage:
         self._unfolded = "", 0.0
         """Which of the two panels was unfolded last, and when, until the width was checked."""
         self._told = DrawDue(TOLD_EVERY, clock)
+        self._looked = DrawDue(SWEEP_EVERY, clock)
         self._framing = place.stage.framing
 
         server.gui.main_panel.dock_right()
@@ -101,6 +106,8 @@ class ReviewPage:
         self._timeline = ReviewTimeline(server, review, clock)
         self._in_3d = ReviewIn3D(server, review, place.stage)
         self._parts = Parts((self._panel, self._timeline, *in_tabs, self._opening), clock)
+        if self._sweep is not None:
+            self._parts.add(self._sweep)
         commands = [*self._commands(), *place.commands, *self._library.commands()]
         register(server, commands)
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
@@ -143,16 +150,12 @@ class ReviewPage:
         with review_tab:
             going = GoLivePart(server, go_live)
             self._view_panel = ViewPanel(server, dark)
-        sweep = [] if self._sweep is None else [self._sweep]
-        return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore, *sweep]
+        return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
 
     def _add_library(self, library: Library) -> None:
         """The table of recordings, in a panel of its own."""
         self._library_window = self._server.gui.add_panel(order=5.0)
-        self._sweep: SweepPanel | None = None
-        if (library.folder / RESULTS).exists():
-            with self._library_window.add_tab("Sweep", viser.Icon.ADJUSTMENTS_HORIZONTAL):
-                self._sweep = SweepPanel(self._server, library, self._review.open, self._clock)
+        self._sweep = self._sweep_of(library)
         with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
             self._library = LibraryPanel(self._server, library, self._review.open, clock=self._clock)
             Presses(self._server).when_unfolded(self._library_unfolded)
@@ -180,6 +183,27 @@ class ReviewPage:
         self._place.dialog.tell(self._library.leave_keys)
         if self._had_opened:
             self._show_library(False)
+
+    def _sweep_of(self, library: Library) -> SweepPanel | None:
+        """The tab with the results of a sweep, if the folder has some."""
+        if not (library.folder / RESULTS).exists():
+            return None
+        with self._library_window.add_tab("Sweep", viser.Icon.ADJUSTMENTS_HORIZONTAL):
+            return SweepPanel(self._server, library, self._open_of_sweep, self._clock)
+
+    def _look_for_sweep(self) -> None:
+        """Add the tab of a sweep whose results came after the page."""
+        if self._sweep is not None or not self._looked.is_due(object()):
+            return
+        if (sweep := self._sweep_of(self._place.shelf.library)) is not None:
+            self._sweep = sweep
+            self._parts.add(sweep)
+
+    def _open_of_sweep(self, ids: tuple[str, ...]) -> None:
+        self._review.open(ids)
+        if self._smallest_view() >= LEAST_BESIDE_SWEEP:
+            # The panel stays: a person goes from the best episode to the worst.
+            self._had_opened = self._awaited = ids
 
     # --- start and stop --------------------------------------------------------------------------
 
@@ -213,6 +237,7 @@ class ReviewPage:
         """Draw the panels, all from one view; while it plays, less often than the 3-D view."""
         if not self._told.is_due(object(), urgent=None if view.playing else object()):
             return
+        self._look_for_sweep()
         self._open_the_newest(view)
         self._make_way_for_the_first(view)
         self._fold_what_crowds()
@@ -257,8 +282,8 @@ class ReviewPage:
     def _make_way_for_the_first(self, view: ReviewView) -> None:
         """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""
         ids = tuple(one.id for one in view.opened)
-        if self._awaited and not ids:
-            # Still being read: "nothing is open" is not news, and what opens then is not another one.
+        if self._awaited and (not ids or view.loading):
+            # Still being read: "nothing is open", or what was, is not news, and what opens then is not another one.
             return
         self._awaited = ()
         if ids != self._had_opened:

@@ -62,7 +62,14 @@ class Parts(Generic[View]):
     """The parts of a page, in the order in which they are drawn."""
 
     def __init__(self, parts: Iterable[PagePart[View]], clock: Clock = time.monotonic) -> None:
-        self._parts = [(part, DrawDue(part.every, clock)) for part in parts]
+        self._clock = clock
+        self._parts: list[tuple[PagePart[View], DrawDue]] = []
+        for part in parts:
+            self.add(part)
+
+    def add(self, part: PagePart[View]) -> None:
+        """Draw this one too, after the others."""
+        self._parts.append((part, DrawDue(part.every, self._clock)))
 
     def draw(self, view: View) -> None:
         for part, due in self._parts:
