@@ -27,7 +27,7 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from workbench.jobs.pool.cluster import Cluster, Post, connected
 from workbench.jobs.pool.deal import Deal, Executor, Work
-from workbench.jobs.pool.job_file import Job, JobFile
+from workbench.jobs.pool.job_file import JobFile, JobKey
 from workbench.jobs.pool.processes import Processes
 from workbench.jobs.pool.travel import pack_baggage
 from workbench.jobs.pool.worker import Gives, Listener
@@ -124,7 +124,7 @@ def result_cost(one: Written) -> tuple[int, float, float]:
         listener.take(0, unpacker.message(raw))
     taken = (time.perf_counter() - began) / count
     with tempfile.TemporaryDirectory() as folder:
-        file = JobFile(Path(folder) / "a.job", Job("record", {"command": "record"}, b""))
+        file = JobFile(Path(folder) / "a.job", JobKey("record", {"command": "record"}, b""))
         began = time.perf_counter()
         for number in range(300):
             file.keep(number, one)

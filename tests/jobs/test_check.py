@@ -14,7 +14,7 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
-from workbench.jobs.check import CheckedGroup, CheckOptions, CheckReport, check, merged, report_of
+from workbench.jobs.check import CheckOptions, CheckReport, GroupOutcome, check, merged, report_of
 from workbench.jobs.pool.deal import Shard, ThisProcess
 from workbench.jobs.pool.job_file import JobFile, Kept, job_of, read_parts
 from workbench.jobs.pool.processes import Processes
@@ -261,7 +261,7 @@ def test_parts_of_a_job_are_put_together_and_a_job_goes_on_where_it_was(tmp_path
         assert part.missing == (2, 3)[number - 1]
         file.close()
     kept = read_parts(files)
-    assert told(report_of(what, kept.results(CheckedGroup))) == told(whole)
+    assert told(report_of(what, kept.results(GroupOutcome))) == told(whole)
 
     file = JobFile(files[0], job_of("check", task, what, ("workers",)))
     seen: list[str] = []

@@ -33,7 +33,7 @@ from workbench.jobs.pool.travel import pack_baggage, relocated
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
 from workbench.jobs.replay import replay_to
-from workbench.jobs.rescore.job import Code, Recording, rescore_recordings, setup_of
+from workbench.jobs.rescore.job import Recording, RescoredBy, rescore_recordings, setup_of
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions
@@ -295,7 +295,7 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
     paths = sorted((tmp_path / "author" / "recordings").glob("*.rrd"))[:1]
     (source,) = find_all_sources(paths)
     options = TaskOptions(1, "cpu", 20, {"render_backend": "none"})
-    code = Code(task, options, options)
+    code = RescoredBy(task, options, options)
     recording = Recording(0, bytes(source.path), None, source.part, source.id, source.name)
     setup = setup_of([(code, [recording])], 1, use_env_states=False)
 

@@ -105,7 +105,7 @@ class CheckUpdate:
 
 
 @dataclass(frozen=True)
-class CheckedGroup:
+class GroupOutcome:
     """What a group of rules came to for one part of the seeds."""
 
     results: tuple[RuleResult, ...]
@@ -278,14 +278,14 @@ def check(
         workers = min(cores if what.workers is None else what.workers, plan.chunks)
         executor = ThisProcess() if workers == 1 else Processes(workers)
     found = _Results(what, on_activity, on_result, on_progress)
-    deal: Deal[CheckedGroup, CheckUpdate] = Deal(
+    deal: Deal[GroupOutcome, CheckUpdate] = Deal(
         plan.numbers, found.take, found.hear, stop, chunk=plan.chunk, tries=_TRIES
     )
     needed = needed_by(what.task, what.actions, what.options.imports)
     work = Work(
         _check_groups,
         what,
-        result=CheckedGroup,
+        result=GroupOutcome,
         update=CheckUpdate,
         name="that checks",
         folders=needed.folders,
@@ -295,7 +295,7 @@ def check(
     return found.report(began, stop())
 
 
-def report_of(what: CheckOptions, known: Mapping[int, CheckedGroup]) -> CheckReport:
+def report_of(what: CheckOptions, known: Mapping[int, GroupOutcome]) -> CheckReport:
     """The report of a check of which these items are known. Runs nothing. Raises ValueError as `degrees_of_request`."""
     found = _Results(what)
     for number in sorted(known):
@@ -320,7 +320,7 @@ class _Results:
         self._started = 0.0
         self._shown: set[tuple[str, float]] = set()
         """Results that were told already, by rule and seconds."""
-        self._groups: dict[int, CheckedGroup] = {}
+        self._groups: dict[int, GroupOutcome] = {}
 
     def hear(self, update: CheckUpdate) -> None:
         if update.task is not None:
@@ -330,7 +330,7 @@ class _Results:
         if update.result is not None:
             self._show(update.result)
 
-    def take(self, number: int, group: CheckedGroup) -> None:
+    def take(self, number: int, group: GroupOutcome) -> None:
         if group.task is not None:
             self._see_task(group.task)
         self._groups[number] = group
@@ -353,7 +353,7 @@ class _Results:
     def report(self, began: float | None, stopped: bool) -> CheckReport:
         # Stopped before the task was imported: nothing is known of it.
         task = self._task or CheckedTask("", "", None)
-        by_part: dict[int, list[CheckedGroup]] = {}
+        by_part: dict[int, list[GroupOutcome]] = {}
         for number in sorted(self._groups):
             by_part.setdefault(self._plan.of(number)[0], []).append(self._groups[number])
         by_rule: dict[str, list[RuleResult]] = {}
@@ -385,7 +385,7 @@ class _Results:
             rule for rule in RULES if rule in what.ignore and (not what.select or rule in what.select)
         )
 
-    def _of_part(self, groups: Sequence[CheckedGroup]) -> dict[str, RuleResult]:
+    def _of_part(self, groups: Sequence[GroupOutcome]) -> dict[str, RuleResult]:
         """The result of each rule for one part of the seeds."""
         earliest: dict[object, Finding] = {}
         for finding in (finding for group in groups for finding in group.findings):
@@ -540,7 +540,7 @@ class _Worker:
         )
         return self._checkup
 
-    def _checked(self, group: Group, checkup: Checkup, task: CheckedTask | None) -> CheckedGroup:
+    def _checked(self, group: Group, checkup: Checkup, task: CheckedTask | None) -> GroupOutcome:
         known, silenced = len(checkup.findings), len(checkup.silenced)
         if self._part > 0:
             checks = {rule: check for rule, check in group.checks.items() if rule in RULES_OVER_SEEDS}
@@ -550,7 +550,7 @@ class _Worker:
         for result in run(group, checkup, self._degrees):
             results.append(result)
             self._queue.send_update(CheckUpdate(result=replace(result, seen=())))
-        return CheckedGroup(
+        return GroupOutcome(
             tuple(results),
             tuple(checkup.findings[known:]),
             tuple(checkup.silenced[silenced:]),

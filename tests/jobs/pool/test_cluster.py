@@ -110,7 +110,7 @@ def workers_of_ray() -> list[psutil.Process]:
     return [
         one
         for one in psutil.process_iter(["cmdline"])
-        if (one.info["cmdline"] or [""])[0] == "ray::Actor.run"
+        if (one.info["cmdline"] or [""])[0] == "ray::RayWorker.run"
     ]
 
 

@@ -11,16 +11,16 @@ from typing import Any
 import pytest
 
 from workbench.jobs.pool.deal import Deal, ItemQueue, Shard, ThisProcess, Work
-from workbench.jobs.pool.job_file import Job, JobFile, JobFileError, Kept, job_of, read_parts, write_whole
+from workbench.jobs.pool.job_file import JobFile, JobFileError, JobKey, Kept, job_of, read_parts, write_whole
 from workbench.jobs.record.episodes import RecordOptions, Written
 from workbench.jobs.task import TaskOptions
 
 WHOLE = Shard()
-JOB = Job("square", {"command": "square", "seeds": "9"}, b"")
+JOB = JobKey("square", {"command": "square", "seeds": "9"}, b"")
 
 
 def run(
-    path: Path, shard: Shard = WHOLE, job: Job = JOB, stop_after: int = 99
+    path: Path, shard: Shard = WHOLE, job: JobKey = JOB, stop_after: int = 99
 ) -> tuple[dict[int, int], list[int]]:
     """Results of the squares of nine numbers, and which were made."""
     made: list[int] = []
@@ -82,7 +82,10 @@ def test_another_job_is_refused_with_what_differs(tmp_path: Path) -> None:
 
 def test_one_part_twice_is_refused(tmp_path: Path) -> None:
     run(tmp_path / "a.job", Shard(1, 2))
-    with pytest.raises(JobFileError, match="both hold item 0"):
+    with pytest.raises(
+        JobFileError,
+        match="a.job and .*a.job hold the same results .number 0, for one.: they are the same part",
+    ):
         read_parts([tmp_path / "a.job", tmp_path / "a.job"])
 
 
@@ -139,7 +142,7 @@ class Place:
     task: Path
     policy: Path
 
-    def job(self, **other: Any) -> Job:
+    def job(self, **other: Any) -> JobKey:
         asked = RecordOptions(
             str(self.task), **{"episodes": 4, "options": TaskOptions(num_envs=2), "out": Path("a"), **other}
         )

@@ -42,7 +42,7 @@ from workbench.jobs.check import (
     degrees_of_request,
 )
 from workbench.jobs.pool.deal import PoolError
-from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text
@@ -161,7 +161,7 @@ def exit_code(said: Reported) -> int:
     return Exit.FAILED if said.report.fails(said.fail_on) else Exit.DONE
 
 
-def _job_of(what: CheckOptions) -> Job:
+def _job_of(what: CheckOptions) -> JobKey:
     return job_of("check", what.task, what, ("workers",), needed_by(what.task, what.actions).files)
 
 

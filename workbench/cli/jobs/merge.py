@@ -24,9 +24,9 @@ from workbench.cli.jobs.sweep import SweepOutput, write_reports
 from workbench.cli.jobs.sweep import print_report as print_report_of_sweep
 from workbench.cli.terminal.output import Exit, print_text, refuse
 from workbench.cli.terminal.output import out as out_console
-from workbench.jobs.check import CheckedGroup, CheckOptions
+from workbench.jobs.check import CheckOptions, GroupOutcome
 from workbench.jobs.check import report_of as check_report_of
-from workbench.jobs.pool.job_file import JobFileError, Merged, read_parts, write_whole
+from workbench.jobs.pool.job_file import JobFileError, JobParts, read_parts, write_whole
 from workbench.jobs.record.episodes import RecordOptions, Written
 from workbench.jobs.record.run import collect
 from workbench.jobs.record.solve import SolveOptions, report_of
@@ -53,7 +53,7 @@ def merge_in_terminal(
     return code
 
 
-def _together(merged: Merged, out: Path | None) -> Merged:
+def _together(merged: JobParts, out: Path | None) -> JobParts:
     """With all episodes in one folder."""
     if merged.command not in ("record", "solve", "sweep"):
         return merged
@@ -73,7 +73,7 @@ def _together(merged: Merged, out: Path | None) -> Merged:
     return merged
 
 
-def _folder_of_point(merged: Merged) -> Callable[[int], str]:
+def _folder_of_point(merged: JobParts) -> Callable[[int], str]:
     what = merged.requested(SweepOptions)
     points, stride = what.points, what.stride
     return lambda number: points[number // stride].folder
@@ -90,7 +90,7 @@ def _copy(rrd: Path, out: Path) -> None:
                 shutil.copyfile(source, temporary)
 
 
-def _print(merged: Merged, json_file: Path | None) -> int:
+def _print(merged: JobParts, json_file: Path | None) -> int:
     """Print as the command does; returns its exit code."""
     if merged.command == "check":
         return _print_check(merged, json_file)
@@ -134,9 +134,9 @@ def _with_missing(code: int, missing: int, what: str) -> int:
     return code
 
 
-def _print_check(merged: Merged, json_file: Path | None) -> int:
+def _print_check(merged: JobParts, json_file: Path | None) -> int:
     what = merged.requested(CheckOptions)
-    report = check_report_of(what, merged.results(CheckedGroup))
+    report = check_report_of(what, merged.results(GroupOutcome))
     said = Reported(report, what, Path.cwd(), CheckOutput().fail_on)
     if json_file is not None:
         replace_file(json_file, check_as_json(said).encode())
@@ -144,7 +144,7 @@ def _print_check(merged: Merged, json_file: Path | None) -> int:
     return _with_missing(exit_code(said), report.missing, "groups of rules")
 
 
-def _print_rescore(merged: Merged, json_file: Path | None) -> int:
+def _print_rescore(merged: JobParts, json_file: Path | None) -> int:
     what = merged.requested(RescoreRequest)
     results: dict[int, RescoredRecording] = merged.results(RescoredRecording)
     ordered = sorted(results.values(), key=lambda result: result.place)

@@ -30,7 +30,7 @@ from workbench.cli.terminal.output import (
 from workbench.core.backends import unused_gpu_text
 from workbench.jobs.actions import SOLVE, needed_by
 from workbench.jobs.pool.deal import PoolError
-from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.episodes import RecordOptions, Written, with_given_actions
 from workbench.jobs.record.run import Recorded, RecordProgress, chunk_of, record
 from workbench.planning.report import underway_text
@@ -136,7 +136,9 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
                 run, "record", -(-most // chunk), lambda: job_of_record(requested), is_recorded(what.out)
             ) as (executor, name),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
-            told_in_folder(run, "record", what.task, "" if what.upload else what.out, wanted) as status,
+            told_in_folder(
+                run, "record", what.task, None if what.upload else what.out, wanted, _named
+            ) as status,
         ):
             first_seed = what.options.seed if what.actions == SOLVE else None
             with RecordBar(bar, wanted, first_seed=first_seed) as record_bar:
@@ -165,7 +167,7 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
     return code
 
 
-def job_of_record(requested: RecordOptions) -> Job:
+def job_of_record(requested: RecordOptions) -> JobKey:
     """What a job file of this recording is for. Raises OSError."""
     files = needed_by(requested.task, requested.actions).files
     return job_of("record", requested.task, requested, ("out", "workers", "upload"), files)
@@ -199,7 +201,7 @@ def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
         folder = shlex.quote(str(recorded.written[0].path.parent))
         print_text(f"Look at them with: workbench review {folder}")
     if recorded.failures:
-        print_failures(recorded.failures, lambda number: f"episode {number}")
+        print_failures(recorded.failures, _named)
     if recorded.stopped:
         return refuse("interrupted; finished episodes were kept")
     if recorded.failures:
@@ -208,6 +210,10 @@ def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
         wanted = "1 success was" if requested.successes == 1 else f"{requested.successes} successes were"
         return refuse(f"{wanted} asked for; given up after {_episodes(recorded.tried)}")
     return 0
+
+
+def _named(number: int) -> str:
+    return f"episode {number}"
 
 
 def _episodes(count: int) -> str:

@@ -37,11 +37,11 @@ from workbench.core.backends import unused_gpu_text
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.from_recording import CannotEnterRecording, recorded_version
-from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.run import chunk_of
 from workbench.jobs.rescore.job import (
-    Code,
     Recording,
+    RescoredBy,
     RescoredRecording,
     RescoreSetup,
     rescore_recordings,
@@ -144,7 +144,7 @@ def rescore_all(
         on_notice(notice)
     setup = _setup_of(what, files, groups, cleared, verdicts)
 
-    def job() -> Job:
+    def job() -> JobKey:
         request = _request_of(what, files, groups, cleared)
         return job_of("rescore", what.task or "as recorded", request, ())
 
@@ -174,14 +174,14 @@ def _setup_of(
             place[file.id], path, None, file.part, file.id, file.name, task, note, why_not, refused
         )
 
-    found: list[tuple[Code | None, list[Recording]]] = []
+    found: list[tuple[RescoredBy | None, list[Recording]]] = []
     for group, task in zip(groups, cleared, strict=True):
         why_not, code = "", None
         if isinstance(task, NotCleared):
             why_not = str(task)
         else:
             info = group.info if group.recorded_source else None
-            code = Code(task, group.options, with_renderer(group.options), info)
+            code = RescoredBy(task, group.options, with_renderer(group.options), info)
         of = [recording(file, group.info.task, group.note, why_not, code is None) for file in group.files]
         found.append((code, of))
     if unreadable:

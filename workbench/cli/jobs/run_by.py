@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,11 +12,12 @@ from typing import Any
 
 from rich.markup import escape
 
+from workbench.authoring.problem import Problem, TaskError
 from workbench.cli.terminal.arguments import JobArguments
 from workbench.cli.terminal.output import err
 from workbench.jobs.pool.cluster import Cluster
-from workbench.jobs.pool.deal import Executor, Failure, Shard, ThisProcess, parse_shard
-from workbench.jobs.pool.job_file import Job, JobFile, Kept
+from workbench.jobs.pool.deal import Executor, Shard, ThisProcess, by_kind, parse_shard
+from workbench.jobs.pool.job_file import JobFile, JobKey, Kept
 from workbench.jobs.pool.processes import Processes
 from workbench.jobs.record.episodes import Written
 from workbench.jobs.record.run import RecordProgress
@@ -66,7 +67,7 @@ def run_by(
     arguments: JobArguments,
     command: str,
     chunks: int,
-    job: Callable[[], Job],
+    job: Callable[[], JobKey],
     is_there: Callable[[Any], bool] = lambda result: True,
 ) -> Iterator[tuple[Executor, str]]:
     """What runs the work of a command, and the name of the run (`episodes.RecordSetup.run`).
@@ -100,65 +101,68 @@ def run_by(
 class ToldStatus:
     """Tells a folder how far the job is that records into it: `told_in_folder`."""
 
-    def __init__(self, file: StatusFile | None, status: JobStatus) -> None:
-        self._file, self._status = file, status
+    def __init__(self, file: StatusFile | None, status: JobStatus, names: Callable[[int], str]) -> None:
+        self._file, self._status, self._names = file, status, names
         self._began: float | None = None
+        self._first = 0
+        """Episodes that were there when it began."""
+        self._last: RecordProgress | None = None
 
     def beside(self, show: Callable[[RecordProgress], None]) -> Callable[[RecordProgress], None]:
         """Progress goes to `show` too."""
 
         def both(now: RecordProgress) -> None:
             show(now)
-            self._show(now)
+            if self._began is None:
+                self._began, self._first = time.monotonic(), now.kept
+            self._last = now
+            # It comes with every control step of every worker.
+            if self._file is not None and self._file.is_due():
+                self._write("running")
 
         return both
 
     def end(self, state: JobState) -> None:
-        if self._began is None and state == "failed":
-            return  # it was refused: there is nothing of it
-        self._status = replace(self._status, state=state)
-        if self._file is not None:
-            self._file.write(self._status)
+        """Tell the last word; of a job that was refused before its first episode there is none."""
+        if self._file is not None and (self._last is not None or state != "failed"):
+            self._write(state)
 
-    def _show(self, now: RecordProgress) -> None:
-        if self._began is None:
-            self._began, self._first = time.monotonic(), now.kept
-        seconds = time.monotonic() - self._began
-        rate = (now.done - self._first) / seconds if seconds > 1 else 0.0
-        kinds: dict[object, list[Failure]] = {}
-        for failure in now.failures:
-            problem = failure.problem
-            kinds.setdefault((problem.stage, problem.file, problem.line), []).append(failure)
-        failures = []
-        for alike in kinds.values():
-            numbers = sorted(number for failure in alike for number in failure.numbers)
-            problem = alike[0].problem
-            place = f"{problem.file}:{problem.line}: " if problem.file else ""
-            failures.append(
-                JobFailure(listed(numbers), len(numbers), f"{place}{problem.message}", problem.traceback)
-            )
-        self._status = replace(
-            self._status, done=now.kept, rate=rate, failures=tuple(failures), state="running"
-        )
-        if self._file is not None:
-            self._file.write(self._status)
+    def _write(self, state: JobState) -> None:
+        assert self._file is not None
+        status = replace(self._status, state=state)
+        if (now := self._last) is not None and self._began is not None:
+            seconds = time.monotonic() - self._began
+            rate = (now.done - self._first) / seconds if seconds > 1 else 0.0
+            failures = tuple(self._failure(*kind) for kind in by_kind(now.failures))
+            status = replace(status, done=now.kept, rate=rate, failures=failures)
+        self._file.write(status)
+
+    def _failure(self, problem: Problem, numbers: Sequence[int]) -> JobFailure:
+        items = listed([self._names(number) for number in numbers])
+        return JobFailure(items, len(numbers), str(TaskError(problem)), problem.traceback)
 
 
 @contextmanager
 def told_in_folder(
-    arguments: JobArguments, command: str, task: str, out: Path | str, total: int
+    arguments: JobArguments,
+    command: str,
+    task: str,
+    out: Path | None,
+    total: int,
+    names: Callable[[int], str],
 ) -> Iterator[ToldStatus]:
     """Write into a folder of recordings how far the job is, for a page that shows it.
 
     Args:
-        out: empty for none.
+        out: None for no folder.
+        names: the name of an item.
     """
     part = "" if arguments.shard is None else str(shard_of(arguments))
-    file = StatusFile(Path(out)) if out else None
+    file = None if out is None else StatusFile(out)
     status = JobStatus(command, task, 0, total, part=part)
     if file is not None:
         file.remove_old(status)
-    told = ToldStatus(file, status)
+    told = ToldStatus(file, status, names)
     try:
         yield told
     except BaseException:

@@ -35,7 +35,7 @@ from workbench.cli.terminal.output import (
 )
 from workbench.core.rules import FailOn, fails
 from workbench.jobs.pool.deal import Failure, PoolError
-from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.episodes import with_given_actions
 from workbench.jobs.record.run import chunk_of
 from workbench.jobs.record.solve import SolveOptions, solve
@@ -79,6 +79,10 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
     """Solve, print, and write the reports; returns the exit code. Ctrl-C keeps and reports what is done."""
     here = CurrentFolder()  # a task may change it
     failures: list[Failure] = []
+
+    def named(number: int) -> str:
+        return f"seed {what.options.seed + number}"
+
     try:
         if what.upload:
             require_place(what.upload)
@@ -96,7 +100,9 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
                 name,
             ),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
-            told_in_folder(run, "solve", what.task, "" if what.upload else what.out, count) as status,
+            told_in_folder(
+                run, "solve", what.task, None if what.upload else what.out, count, named
+            ) as status,
         ):
             with RecordBar(bar, count, "solving", what.options.seed) as shown:
                 report = solve(
@@ -134,14 +140,14 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
     else:
         print_report(report)
     if failures:
-        print_failures(failures, lambda number: f"seed {what.options.seed + number}")
+        print_failures(failures, named)
     print_part(run, "solve", report.stopped)
     if report.stopped:
         return refuse("interrupted; finished episodes were kept")
     return Exit.FAILED if failures or output.fails(report) else Exit.DONE
 
 
-def _job_of(what: SolveOptions) -> Job:
+def _job_of(what: SolveOptions) -> JobKey:
     return job_of("solve", what.task, what, ("out", "workers", "upload"))
 
 

@@ -32,7 +32,7 @@ from workbench.cli.terminal.output import (
 )
 from workbench.jobs.actions import needed_by
 from workbench.jobs.pool.deal import PoolError
-from workbench.jobs.pool.job_file import Job, job_of
+from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.episodes import Written
 from workbench.jobs.record.sweep import Point, Setting, SweepOptions, SweepReport, recordings_of, sweep
 from workbench.machine.files import replace_file
@@ -105,6 +105,10 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
     """Sweep, print, and write the results; returns the exit code. Ctrl-C keeps and reports what is done."""
     here = CurrentFolder()  # a task may change it
     points = what.points
+
+    def named(number: int) -> str:
+        return _named(what, points, number)
+
     try:
         job = job_path(run, "sweep")
         if (what.out / RESULTS).exists() and not (job is not None and job.exists()):
@@ -127,11 +131,9 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
                 name,
             ),
             progress_bar(MofNCompleteColumn(), TimeElapsedColumn(), *left) as bar,
-            told_in_folder(run, "sweep", what.task, what.out, total) as status,
+            told_in_folder(run, "sweep", what.task, what.out, total, named) as status,
         ):
-            with RecordBar(
-                bar, total, "sweeping", named=lambda number: _named(what, points, number)
-            ) as shown:
+            with RecordBar(bar, total, "sweeping", named=named) as shown:
                 report = sweep(
                     what,
                     shown.describe,
@@ -173,7 +175,7 @@ def _named(what: SweepOptions, points: Sequence[Point], number: int) -> str:
     return f"seed {what.options.seed + episode} of {points[point].folder}"
 
 
-def job_of_sweep(what: SweepOptions) -> Job:
+def job_of_sweep(what: SweepOptions) -> JobKey:
     """What a job file of this sweep is for. Raises OSError."""
     return job_of("sweep", what.task, what, ("out", "workers"), needed_by(what.task, what.actions).files)
 

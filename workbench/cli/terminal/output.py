@@ -132,13 +132,10 @@ def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> 
     Args:
         names: the name of an item.
     """
-    kinds: dict[object, list[Failure]] = {}
-    for failure in failures:
-        problem = failure.problem
-        kinds.setdefault((problem.stage, problem.file, problem.line), []).append(failure)
-    for alike in kinds.values():
-        print_problem(alike[0].problem)
-        numbers = sorted(number for failure in alike for number in failure.numbers)
+    from workbench.jobs.pool.deal import by_kind
+
+    for problem, numbers in by_kind(failures):
+        print_problem(problem)
         err.print(
             escape(f"    without a result: {listed([names(number) for number in numbers])}"), soft_wrap=True
         )

@@ -190,7 +190,7 @@ class OtherVersions(RuntimeError):
 
 
 @dataclass(eq=False)
-class _Actor:
+class _Started:
     """A worker, seen from here."""
 
     handle: Any
@@ -217,9 +217,9 @@ class _ActorPool:
         self._work_bytes = pickle.dumps((work.run, work.setup))
         self._actor = ray.remote(
             num_cpus=how.cpus_per_worker, num_gpus=how.gpus_per_worker, max_restarts=0, max_task_retries=0
-        )(Actor)
-        self._busy: dict[int, _Actor] = {}
-        self._ending: list[_Actor] = []
+        )(RayWorker)
+        self._busy: dict[int, _Started] = {}
+        self._ending: list[_Started] = []
         """Those that have said their last word, and put their folders away."""
         self._started = 0
 
@@ -299,7 +299,7 @@ class _ActorPool:
         self._started += 1
         handle = self._actor.remote(self._post, number, self._how.cpus_per_worker)
         ended = handle.run.remote(self._work_bytes, self._baggage, versions_here())
-        self._busy[number] = _Actor(handle, ended)
+        self._busy[number] = _Started(handle, ended)
 
     def _leave(self, number: int) -> None:
         if (actor := self._busy.pop(number, None)) is not None:
@@ -396,7 +396,7 @@ class Post:
 # --- a worker ----------------------------------------------------------------------------------------------
 
 
-class Actor:
+class RayWorker:
     """A worker, in its own process."""
 
     def __init__(self, post: Any, number: int, cpus: float) -> None:

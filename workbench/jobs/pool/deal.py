@@ -79,6 +79,19 @@ class Failure:
     problem: Problem
 
 
+def kind_of(problem: Problem) -> object:
+    """In what failures are alike: where they were raised."""
+    return problem.stage, problem.file, problem.line
+
+
+def by_kind(failures: Iterable[Failure]) -> list[tuple[Problem, list[int]]]:
+    """The first problem of each kind, and the items of all of them."""
+    found: dict[object, tuple[Problem, list[int]]] = {}
+    for failure in failures:
+        found.setdefault(kind_of(failure.problem), (failure.problem, []))[1].extend(failure.numbers)
+    return [(problem, sorted(numbers)) for problem, numbers in found.values()]
+
+
 @dataclass(frozen=True)
 class Shard:
     """One of the equal parts of a job."""
@@ -260,8 +273,7 @@ class Deal(Generic[Result, Update]):
         if not unbuilt and self._divide(last):
             return
         self._fail(last.missing, error.problem)
-        at = error.problem.stage, error.problem.file, error.problem.line
-        if self._alike(at, last) or unbuilt:
+        if self._alike(kind_of(error.problem), last) or unbuilt:
             self._give_up_group(last, error, error.problem)
 
     def died(self, worker: Hashable, how: str, code: int | None) -> None:

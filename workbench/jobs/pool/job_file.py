@@ -32,6 +32,8 @@ CREATE TABLE about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE kept (name TEXT PRIMARY KEY, value BLOB NOT NULL);
 CREATE TABLE result (number INTEGER PRIMARY KEY, value BLOB NOT NULL);
 """
+_OPTIONS = {"num_envs": "envs per worker"}
+"""Fields that have another name on the command line."""
 _DIFFERENT = 5
 """Differences that are named."""
 
@@ -43,7 +45,7 @@ class JobFileError(ValueError):
 
 
 @dataclass(frozen=True)
-class Job:
+class JobKey:
     """What a job file is for."""
 
     command: str
@@ -57,7 +59,7 @@ class Job:
 
 def job_of(
     command: str, task: str, request: Any, leaves_out: Iterable[str], files: Sequence[Path] = ()
-) -> Job:
+) -> JobKey:
     """The job of a command.
 
     Args:
@@ -79,7 +81,7 @@ def job_of(
         about[f"what {path.name} holds"] = _sum(path)
     about.update(_flat("", request, {"task", *leaves_out}))
     folder = getattr(request, "out", None)
-    return Job(command, about, pack(request), "" if folder is None else str(Path(folder).absolute()))
+    return JobKey(command, about, pack(request), "" if folder is None else str(Path(folder).absolute()))
 
 
 def _sum(path: Path) -> str:
@@ -96,13 +98,13 @@ def _flat(name: str, value: Any, leaves_out: Iterable[str] = ()) -> Iterator[tup
         for key, one in sorted(value.items()):
             yield from _flat(f"{name} {key}", one)
     else:
-        yield name.replace("_", " "), json.dumps(value, default=str)
+        yield _OPTIONS.get(name, name.replace("_", " ")), json.dumps(value, default=str)
 
 
 class JobFile:
     """The results of a job, by item. Used on one thread."""
 
-    def __init__(self, path: Path, job: Job) -> None:
+    def __init__(self, path: Path, job: JobKey) -> None:
         """Open or create the file.
 
         Raises:
@@ -132,7 +134,7 @@ class JobFile:
             self._database.close()
             raise
 
-    def _create(self, job: Job) -> None:
+    def _create(self, job: JobKey) -> None:
         self._database.execute(f"PRAGMA application_id = {_MAGIC}")
         for table in _TABLES.strip().splitlines():
             self._database.execute(table)
@@ -187,7 +189,7 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class Merged:
+class JobParts:
     """The results of several job files of one job."""
 
     command: str
@@ -215,7 +217,7 @@ class Merged:
             raise JobFileError(f"a result cannot be read ({error})") from error
 
 
-def write_whole(path: Path, merged: Merged) -> None:
+def write_whole(path: Path, merged: JobParts) -> None:
     """Write a job file with all results of the parts.
 
     Raises:
@@ -223,12 +225,12 @@ def write_whole(path: Path, merged: Merged) -> None:
         FileNotFoundError: its folder does not exist.
     """
     folder = next(iter(merged.folders.values()), "")
-    file = JobFile(path, Job(merged.command, merged.about, merged.request, folder))
+    file = JobFile(path, JobKey(merged.command, merged.about, merged.request, folder))
     with closing(file), _named(path):
         file.put(merged.values)
 
 
-def read_parts(files: Sequence[Path]) -> Merged:
+def read_parts(files: Sequence[Path]) -> JobParts:
     """The results of these job files.
 
     Raises:
@@ -238,6 +240,8 @@ def read_parts(files: Sequence[Path]) -> Merged:
     about: Mapping[str, str] | None = None
     values: dict[int, bytes] = {}
     folders: dict[int, str] = {}
+    owners: dict[int, Path] = {}
+    """The file that holds each item."""
     request = b""
     for path in files:
         if not path.is_file():
@@ -252,16 +256,17 @@ def read_parts(files: Sequence[Path]) -> Merged:
             _require_same(path, about, told)
             folder = os.fsdecode(_kept(database, "folder"))
             rows = database.execute("SELECT number, value FROM result").fetchall()
-        doubled = [number for number, _ in rows if number in values]
-        if doubled:
+        if (doubled := next((number for number, _ in rows if number in owners), None)) is not None:
             raise JobFileError(
-                f"{path} and another of the files both hold item {doubled[0]}: are they the same part twice?"
+                f"{owners[doubled]} and {path} hold the same results (number {doubled}, for one): they are the same part, so "
+                "leave one of them out"
             )
+        owners.update((number, path) for number, _ in rows)
         values.update(rows)
         folders.update((number, folder) for number, _ in rows)
     if about is None:
         raise JobFileError("name the job files to merge")
-    return Merged(about["command"], about, request, values, folders, tuple(files))
+    return JobParts(about["command"], about, request, values, folders, tuple(files))
 
 
 def _require_same(path: Path, mine: Mapping[str, str], there: Mapping[str, str]) -> None:

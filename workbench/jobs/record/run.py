@@ -163,6 +163,55 @@ def do_record(
             file.unlink(missing_ok=True)
 
 
+class ToldByWorkers:
+    """What the workers of a job tell of its episodes, for its progress."""
+
+    def __init__(self, on_activity: Callable[[str], None], on_finding: Callable[[Finding], None]) -> None:
+        self._on_activity, self._on_finding = on_activity, on_finding
+        self._running: dict[int, int] = {}
+        """Control steps so far of each item under way."""
+        self._steps = self._limit = 0
+        self._found: set[object] = set()
+        """Findings of all workers, to report each once."""
+        self._failures: tuple[Failure, ...] = ()
+
+    def take(self, update: RecordUpdate) -> bool:
+        """Take what one of them says; whether the progress is another one."""
+        if update.activity:
+            self._on_activity(update.activity)
+        if (finding := update.finding) is not None and finding.key not in self._found:
+            self._found.add(finding.key)
+            self._on_finding(finding)
+        if (underway := update.underway) is None:
+            return False
+        self._steps, self._limit = self._steps + underway.made, underway.limit
+        self._running.update(underway.steps)
+        return True
+
+    def over(self, number: int) -> None:
+        """An item has ended."""
+        self._running.pop(number, None)
+
+    def failed(self, failure: Failure) -> None:
+        """Items gave no result."""
+        self._failures += (failure,)
+        for number in failure.numbers:
+            self._running.pop(number, None)
+
+    def progress(
+        self, kept: int, over: tuple[int, Written | None] | None, limit: int, counts_parts: bool
+    ) -> RecordProgress:
+        """
+        Args:
+            limit: items from here on are not needed.
+            counts_parts: whether what is under way counts in part.
+        """
+        running = {number: steps for number, steps in self._running.items() if number < limit}
+        part = sum(min(steps / max(self._limit, 1), 1.0) for steps in running.values())
+        done = kept + (part if counts_parts else 0.0)
+        return RecordProgress(kept, self._steps, over, running, self._limit, done, self._failures)
+
+
 class _Recording:
     """Collects the results of all processes.
 
@@ -180,12 +229,9 @@ class _Recording:
     ) -> None:
         self._out, self._folder, self._wanted = what.out, what.out.absolute(), what.successes
         self._upload = what.upload
-        self._on_activity, self._on_progress, self._on_finding = on_activity, on_progress, on_finding
+        self._on_progress, self._told = on_progress, ToldByWorkers(on_activity, on_finding)
         self._kept: dict[int, Written] = {}
-        self._ended = self._steps = self._step_limit = 0
-        self._running: dict[int, int] = {}
-        self._found: set[object] = set()
-        """Findings of all processes, to report each once."""
+        self._ended = 0
         most = what.episodes if what.successes is None else what.tries
         assert most is not None
         self._most = most
@@ -209,7 +255,7 @@ class _Recording:
 
     def _over(self, number: int, written: Written | None) -> None:
         self._ended += 1
-        self._running.pop(number, None)
+        self._told.over(number)
         if written is not None:
             # As the person named the folder.
             self._kept[number] = replace(written, path=self._out / written.path.name)
@@ -222,29 +268,16 @@ class _Recording:
 
     def _failed(self, failure: Failure) -> None:
         self._ended += len(failure.numbers)
-        for number in failure.numbers:
-            self._running.pop(number, None)
+        self._told.failed(failure)
         self._tell()
 
     def _on_update(self, update: RecordUpdate) -> None:
-        if update.activity:
-            self._on_activity(update.activity)
-        if (underway := update.underway) is not None:
-            self._steps, self._step_limit = self._steps + underway.made, underway.limit
-            self._running.update(underway.steps)
+        if self._told.take(update):
             self._tell()
-        if (finding := update.finding) is not None and finding.key not in self._found:
-            self._found.add(finding.key)
-            self._on_finding(finding)
 
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
-        limit = self.deal.limit()
-        running = {number: steps for number, steps in self._running.items() if number < limit}
-        part = sum(min(steps / max(self._step_limit, 1), 1.0) for steps in running.values())
         kept = len(self._kept)
-        done = kept + (part if self._wanted is None else 0.0)
-        failures = tuple(self.deal.failures)
-        self._on_progress(RecordProgress(kept, self._steps, over, running, self._step_limit, done, failures))
+        self._on_progress(self._told.progress(kept, over, self.deal.limit(), self._wanted is None))
 
     def _remove(self, episode: Written) -> None:
         if self._upload:

@@ -24,7 +24,7 @@ from workbench.jobs.actions import SOLVE
 from workbench.jobs.pool.deal import Deal, Executor, Failure, ThisProcess
 from workbench.jobs.pool.processes import Processes
 from workbench.jobs.record.episodes import RecordOptions, RecordUpdate, Written, with_given_actions
-from workbench.jobs.record.run import TRIES, RecordProgress, chunk_of, do_record
+from workbench.jobs.record.run import TRIES, RecordProgress, ToldByWorkers, chunk_of, do_record
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.recording.sweeps import MOST_POINTS, SweepEpisode, SweepResults, value_text
@@ -256,11 +256,10 @@ class _Sweep:
         on_finding: Callable[[Finding], None],
     ) -> None:
         self._what, self._points, self._stride = what, what.points, what.stride
-        self._on_activity, self._on_progress, self._on_finding = on_activity, on_progress, on_finding
+        self._on_progress, self._told = on_progress, ToldByWorkers(on_activity, on_finding)
         self._rows: dict[int, SweepEpisode] = {}
-        self._running: dict[int, int] = {}
-        self._steps = self._limit = 0
-        self._found: set[object] = set()
+        self._kept = 0
+        """Rows that are no failures."""
         self.deal: Deal[Written | None, RecordUpdate] = Deal(
             what.items,
             self._over,
@@ -298,30 +297,20 @@ class _Sweep:
         )
 
     def _over(self, number: int, written: Written | None) -> None:
-        self._running.pop(number, None)
+        self._told.over(number)
         self._rows[number] = self._row(number, written)
+        self._kept += 1
         self._tell((number, written))
 
     def _failed(self, failure: Failure) -> None:
+        self._told.failed(failure)
         for number in failure.numbers:
-            self._running.pop(number, None)
             self._rows[number] = self._row(number, None, str(TaskError(failure.problem)))
         self._tell()
 
     def _on_update(self, update: RecordUpdate) -> None:
-        if update.activity:
-            self._on_activity(update.activity)
-        if (underway := update.underway) is not None:
-            self._steps, self._limit = self._steps + underway.made, underway.limit
-            self._running.update(underway.steps)
+        if self._told.take(update):
             self._tell()
-        if (finding := update.finding) is not None and finding.key not in self._found:
-            self._found.add(finding.key)
-            self._on_finding(finding)
 
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
-        part = sum(min(steps / max(self._limit, 1), 1.0) for steps in self._running.values())
-        kept = len(self._rows)
-        running, failures = dict(self._running), tuple(self.deal.failures)
-        done = kept + part
-        self._on_progress(RecordProgress(kept, self._steps, over, running, self._limit, done, failures))
+        self._on_progress(self._told.progress(self._kept, over, self.deal.limit(), counts_parts=True))

@@ -40,7 +40,7 @@ _SIDE = (".rrd", ".h5", ".json")
 
 
 @dataclass(frozen=True)
-class Code:
+class RescoredBy:
     """What rescores some recordings."""
 
     task: TaskName
@@ -108,7 +108,7 @@ class RescoreUpdate:
 class RescoreSetup:
     """What the workers rescore."""
 
-    codes: tuple[Code | None, ...]
+    codes: tuple[RescoredBy | None, ...]
     """None for recordings that are not rescored."""
     of_chunk: tuple[int, ...]
     """Which of the codes each chunk has."""
@@ -123,7 +123,7 @@ class RescoreSetup:
 
 
 def setup_of(
-    groups: Sequence[tuple[Code | None, Sequence[Recording]]], chunk: int, use_env_states: bool
+    groups: Sequence[tuple[RescoredBy | None, Sequence[Recording]]], chunk: int, use_env_states: bool
 ) -> RescoreSetup:
     """Number the recordings so that each chunk has those of one group alone."""
     items: dict[int, Recording] = {}
@@ -266,7 +266,7 @@ class _Rescorer:
     """Which code."""
     queue: ItemQueue
 
-    def run(self, code: Code, chunk: Chunk | None) -> Chunk | None:
+    def run(self, code: RescoredBy, chunk: Chunk | None) -> Chunk | None:
         """Rescore this chunk, and further ones as long as they are of the same code and nothing is raised: then its envs may
         be in any state. Returns the next chunk."""
         try:
@@ -336,7 +336,7 @@ class _Rescorer:
 
 
 @contextmanager
-def _opened(code: Code, queue: ItemQueue) -> Iterator[OpenedTask]:
+def _opened(code: RescoredBy, queue: ItemQueue) -> Iterator[OpenedTask]:
     """Raises TaskError, CannotEnterRecording."""
     if code.recorded is not None:
         with recorded_source(code.recorded) as reference:

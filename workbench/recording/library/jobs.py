@@ -81,9 +81,13 @@ class StatusFile:
         self._path = self._folder / f"{_PREFIX}{uuid.uuid4().hex[:12]}{_SUFFIX}"
         self._written_at = 0.0
 
+    def is_due(self) -> bool:
+        """Whether the last word of a running job is old enough for another one."""
+        return self._clock() - self._written_at >= _WRITE_SECONDS
+
     def write(self, status: JobStatus) -> None:
         now = self._clock()
-        if status.state == "running" and now - self._written_at < _WRITE_SECONDS:
+        if status.state == "running" and not self.is_due():
             return
         if not self._folder.is_dir():
             return  # nothing is recorded yet

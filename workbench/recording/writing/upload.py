@@ -100,6 +100,8 @@ def _place(address: str) -> tuple[Any, str]:
         system, path = fsspec.core.url_to_fs(address)
     except (ImportError, ValueError) as error:
         package = _INSTALL.get(address.partition("://")[0])
-        advice = f": pip install {package}" if package and isinstance(error, ImportError) else f" ({error})"
+        advice = f" ({error}): give an address such as s3://bucket/folder, gs://bucket/folder or sftp://host/folder"
+        if package and isinstance(error, ImportError):
+            advice = f": pip install {package}"
         raise RecordingError(f"Cannot record to {address}{advice}") from error
     return system, path.rstrip("/")
