@@ -233,6 +233,20 @@ def test_a_worker_that_fits_on_no_machine_is_refused(address: str, tmp_path: Pat
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("line", ["breakpoint()", "import pdb; pdb.set_trace()"])
+def test_a_line_that_stops_for_a_debugger_is_refused_and_not_waited_at(
+    line: str, address: str, task: Path
+) -> None:
+    task.write_text(TASK.replace("        far = self", f"        {line}\n        far = self"))
+    with pytest.raises(TaskError, match="this line stops for a debugger.*--workers 1 in a terminal"):
+        record(wanted("there"), executor=Cluster(address, 1))
+
+
+def test_a_breakpoint_here_does_what_it_did_before_a_cluster_was_joined(address: str) -> None:
+    assert not os.environ.get("PYTHONBREAKPOINT", "").startswith("ray.")
+
+
+@pytest.mark.slow
 def test_a_folder_that_a_machine_does_not_see_is_refused(
     address: str, task: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

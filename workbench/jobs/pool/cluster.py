@@ -44,6 +44,7 @@ _EXIT_SECONDS = 10.0
 _DEAF_SECONDS = 5.0
 _FOLDER = "workbench-job-"
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
+_BREAKPOINT = "PYTHONBREAKPOINT"
 
 
 class NoCluster(OSError):
@@ -141,17 +142,30 @@ def _left_here() -> str | None:
 
 
 def _connect(ray: Any, address: str, how: Mapping[str, Any]) -> None:
-    if address != LOCAL:
-        ray.init(address=address, **how)
-        return
-    with _only_for_this_user():
-        ray.init(address=LOCAL, num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **how)
+    with _breakpoints_kept():
+        if address != LOCAL:
+            ray.init(address=address, **how)
+            return
+        with _only_for_this_user():
+            ray.init(address=LOCAL, num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **how)
     if not ray.get_runtime_context().gcs_address.startswith("127.0.0.1:"):
         ray.shutdown()
         raise NoCluster(
             f"Ray {ray.__version__} would let other machines connect to the cluster that it starts: start one "
             "yourself with `ray start --head`, and give its address"
         )
+
+
+@contextmanager
+def _breakpoints_kept() -> Iterator[None]:
+    """Keep what ``breakpoint()`` does: Ray names its own debugger to this process and all that it starts from now on."""
+    before = os.environ.get(_BREAKPOINT)
+    try:
+        yield
+    finally:
+        os.environ.pop(_BREAKPOINT, None)
+        if before is not None:
+            os.environ[_BREAKPOINT] = before
 
 
 @contextmanager
@@ -416,6 +430,8 @@ class RayWorker:
         from workbench.machine.software_vulkan import use_private_driver
 
         _require_versions(versions)
+        # Or a line with breakpoint() waits for someone who attaches Ray's debugger.
+        os.environ.pop(_BREAKPOINT, None)
         refuse_breakpoints(ONE_PROCESS)
         treat_ctrl_c_as_error()
         use_private_driver()
