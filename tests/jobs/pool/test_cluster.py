@@ -131,7 +131,9 @@ def test_episodes_have_the_same_bits_as_in_this_process_and_name_the_files_here(
 
 
 @pytest.mark.slow
-def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(address: str, task: Path) -> None:
+def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(
+    address: str, task: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     here = bits(record(wanted("here")))
     killed = 0
 
@@ -147,6 +149,8 @@ def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(address: str,
     ids = [read_episode(path).info.id for path in Path("there").glob("*.rrd")]
     assert len(ids) == len(set(ids)) == 8
     assert not (Path("there") / ".writing").exists()
+    # Standard output is for results, as JSON for one; Ray would print there.
+    assert not capfd.readouterr().out
 
 
 @pytest.mark.slow

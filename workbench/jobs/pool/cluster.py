@@ -106,14 +106,15 @@ def connected(address: str = AUTO) -> Iterator[Any]:
     if address != LOCAL and (why := _why_deaf(address)) is not None:
         raise NoCluster(_no_cluster_text(address, why))
     how: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "namespace": "workbench"}
-    try:
-        _connect(ray, address, how)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise NoCluster(_no_cluster_text(address, str(error))) from error
-    try:
-        yield ray
-    finally:
-        ray.shutdown()
+    with _standard_output_kept():
+        try:
+            _connect(ray, address, how)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise NoCluster(_no_cluster_text(address, str(error))) from error
+        try:
+            yield ray
+        finally:
+            ray.shutdown()
 
 
 def _why_deaf(address: str) -> str | None:
@@ -154,6 +155,19 @@ def _connect(ray: Any, address: str, how: Mapping[str, Any]) -> None:
             f"Ray {ray.__version__} would let other machines connect to the cluster that it starts: start one "
             "yourself with `ray start --head`, and give its address"
         )
+
+
+@contextmanager
+def _standard_output_kept() -> Iterator[None]:
+    """Keep Ray's words on workers that died off it, where results are: the pool tells of them."""
+    from ray._private import worker
+
+    before = worker.print_to_stdstream
+    worker.print_to_stdstream = lambda data, ignore_prefix: None
+    try:
+        yield
+    finally:
+        worker.print_to_stdstream = before
 
 
 @contextmanager
