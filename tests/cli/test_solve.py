@@ -220,7 +220,7 @@ def test_a_real_ctrl_c_in_a_terminal_keeps_and_reports_what_is_done(lift: Path) 
     try:
         until(lambda: len(list(kept.glob("*.json"))) >= 2, "two episodes", seen=printed)
         os.write(ours, b"\x03")
-        assert process.wait(timeout=60) == 2
+        assert process.wait(timeout=60) == 130
     finally:
         process.kill()
         process.wait()

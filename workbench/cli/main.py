@@ -30,7 +30,7 @@ from workbench.cli.terminal.arguments import (
     plan_options,
     separated,
 )
-from workbench.cli.terminal.output import Exit, print_problem, print_text, refuse, warn
+from workbench.cli.terminal.output import Exit, interrupted, print_text, refuse, warn
 from workbench.core.rules import FailOn
 from workbench.jobs.task import RecordArguments, ShownPictures
 from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
@@ -555,7 +555,7 @@ def rescore(
     if _lacks_maniskill("rescore"):
         return Exit.REFUSED
     with quick_imports():
-        from workbench.cli.jobs.rescore import RescoreOptions, RescoreOutput, run_rescore
+        from workbench.cli.jobs.rescore import RescoreOptions, RescoreOutput, rescore_in_terminal
         from workbench.cli.jobs.run_by import require_job
 
     if task is not None and recorded_source:
@@ -572,25 +572,8 @@ def rescore(
     except ValueError as error:
         return refuse(str(error))
     use_private_driver()
-    from workbench.authoring.problem import TaskError
-    from workbench.cli.terminal.output import not_trusted_lines
-    from workbench.jobs.pool.deal import PoolError
-    from workbench.session.clearance import NotTrusted
-
     what = RescoreOptions(places, task, recorded_source, use_env_states, envs.envs_per_worker, base)
-    try:
-        return run_rescore(what, RescoreOutput(csv, csv_file, json, json_file), trust, run)
-    except NotTrusted as error:
-        for line in not_trusted_lines(error):
-            refuse(line)
-        return Exit.NOT_TRUSTED
-    except TaskError as error:
-        print_problem(error.problem)
-        return Exit.FAILED
-    except (OSError, ValueError, PoolError) as error:
-        return refuse(str(error))
-    except KeyboardInterrupt:
-        return refuse("interrupted")
+    return rescore_in_terminal(what, RescoreOutput(csv, csv_file, json, json_file), trust, run)
 
 
 @app.command
@@ -747,7 +730,7 @@ def main(args: Sequence[str] | None = None) -> None:
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
         )
     except KeyboardInterrupt:  # during the imports of a command: torch takes seconds
-        code = refuse("interrupted")
+        code = interrupted()
     except ImportError:
         # A package that is older than the range lacks what is imported of it.
         from workbench.machine.versions import unmet_lines

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from rich.progress import TimeRemainingColumn
 
-from workbench.cli.terminal.output import print_addresses, print_text, progress_bar, refuse, warn
+from workbench.cli.terminal.output import interrupted, print_addresses, print_text, progress_bar, refuse, warn
 
 if TYPE_CHECKING:
     from workbench.recording.episode.row import Source
@@ -97,7 +97,7 @@ def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]],
     except (OSError, RuntimeError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
-        return refuse("interrupted; what was finished is kept")
+        return interrupted("what was finished is kept")
     finally:
         for one in made:
             for path in one.paths:

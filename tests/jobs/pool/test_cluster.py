@@ -199,7 +199,9 @@ def test_seeds_that_fail_are_told_with_the_line_here_and_the_others_are_kept(
 
 def test_items_are_done_once_also_where_a_worker_dies(address: str, tmp_path: Path) -> None:
     run = Run(Setup("killed once", 4, folder=tmp_path), range(9), chunk=3, tries=3, goes_on=True)
-    run.by(Cluster(address, 2))
+    told: list[str] = []
+    run.by(Cluster(address, 2, on_death=told.append))
+    assert len(told) == 1 and told[0].startswith("a worker that squares is gone (")
     assert run.squares() == {number: number**2 for number in range(9)} and not run.failures
     pids = {result.pid for result in run.results.values()}
     assert os.getpid() not in pids and len(pids) > 1

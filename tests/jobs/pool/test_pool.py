@@ -161,7 +161,9 @@ def test_a_process_that_fails_ends_the_job_and_the_others_finish_what_they_have(
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_killed_process_is_replaced_and_its_chunk_done_again(workers: int, tmp_path: Path) -> None:
     run = Run(Setup("killed once", 4, folder=tmp_path), range(9), chunk=3, tries=3, goes_on=True)
-    run.by(Processes(workers))
+    told: list[str] = []
+    run.by(Processes(workers, told.append))
+    assert told == ["a process that squares was killed by SIGKILL; what it had begun is dealt again"]
     assert run.squares() == {number: number**2 for number in range(9)} and not run.failures
     assert len({result.pid for result in run.results.values()}) > 1
 

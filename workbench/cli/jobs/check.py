@@ -17,11 +17,12 @@ from workbench.authoring.problem import Problem, TaskError
 from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
 from workbench.cli.jobs.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
-from workbench.cli.jobs.run_by import job_path, print_part, run_by, shard_of
+from workbench.cli.jobs.run_by import print_part, run_by, shard_of
 from workbench.cli.terminal.arguments import JobArguments
 from workbench.cli.terminal.output import (
     Exit,
     err,
+    interrupted,
     out,
     print_problem,
     progress_bar,
@@ -129,10 +130,8 @@ def check_in_terminal(
     except (OSError, ValueError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
-        code = refuse("interrupted")
-        if job_path(run, "check") is not None:
-            print_part(run, "check", stopped=True)
-        return code
+        print_part(run, "check", stopped=True)
+        return interrupted()
     else:
         said = Reported(report, what, root, output.fail_on)
     try:

@@ -14,11 +14,12 @@ from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, Tim
 from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import TaskError
-from workbench.cli.jobs.run_by import is_recorded, items_of, print_part, run_by, told_in_folder
+from workbench.cli.jobs.run_by import EPISODES_KEPT, is_recorded, items_of, print_part, run_by, told_in_folder
 from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
 from workbench.cli.terminal.output import (
     Exit,
     err,
+    interrupted,
     print_failures,
     print_finding,
     print_problem,
@@ -161,7 +162,7 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
         _print_kept(what, before)
         return refuse(str(error))
     except KeyboardInterrupt:
-        return refuse("interrupted; finished episodes were kept")
+        return interrupted(EPISODES_KEPT)
     code = print_recorded(requested, recorded)
     print_part(run, "record", recorded.stopped)
     return code
@@ -203,7 +204,7 @@ def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
     if recorded.failures:
         print_failures(recorded.failures, _named)
     if recorded.stopped:
-        return refuse("interrupted; finished episodes were kept")
+        return interrupted(EPISODES_KEPT)
     if recorded.failures:
         return Exit.FAILED
     if requested.successes is not None and kept < requested.successes:

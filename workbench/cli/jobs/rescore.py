@@ -27,9 +27,13 @@ from workbench.cli.terminal.output import (
     Exit,
     TerminalPrompt,
     can_ask,
+    interrupted,
+    not_trusted_lines,
     out,
     print_finding,
+    print_problem,
     progress_bar,
+    refuse,
     stdout_to_stderr,
     warn,
 )
@@ -37,6 +41,7 @@ from workbench.core.backends import unused_gpu_text
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.from_recording import CannotEnterRecording, recorded_version
+from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.run import chunk_of
 from workbench.jobs.rescore.job import (
@@ -251,16 +256,28 @@ def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | Not
     return cleared
 
 
-def run_rescore(
-    what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments | None = None
-) -> int:
-    """Rescore, print, and write the requested tables; raises as `rescore_all`, and OSError for a table.
+def rescore_in_terminal(what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments) -> int:
+    """Rescore, print, and write the requested tables; returns the exit code."""
+    try:
+        _rescore(what, output, trust, run)
+    except NotTrusted as error:
+        for line in not_trusted_lines(error):
+            refuse(line)
+        return Exit.NOT_TRUSTED
+    except TaskError as error:
+        print_problem(error.problem)
+        return Exit.FAILED
+    except (OSError, ValueError, PoolError) as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        print_part(run, "rescore", stopped=True)
+        return interrupted()
+    return Exit.DONE
 
-    Args:
-        run: where the work runs; None for a process on each core.
-    """
+
+def _rescore(what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments) -> None:
+    """Raises as `rescore_all`, and OSError for a table."""
     here = CurrentFolder()  # a task may change it
-    run = run or JobArguments()
     if (left_alone := unused_gpu_text(what.base.backend)) is not None:
         warn(left_alone)
     asks = can_ask()  # before the bar takes the terminal
@@ -297,7 +314,6 @@ def run_rescore(
         print_verdicts(verdicts, out)
         print_part(run, "rescore", stopped=False)
     warn_of_verdicts(verdicts, notes)
-    return Exit.DONE
 
 
 def write_tables(verdicts: list[Verdict[Source]], output: RescoreOutput) -> None:

@@ -14,7 +14,7 @@ from rich.markup import escape
 
 from workbench.authoring.problem import Problem, TaskError
 from workbench.cli.terminal.arguments import JobArguments
-from workbench.cli.terminal.output import err
+from workbench.cli.terminal.output import err, warn
 from workbench.jobs.pool.cluster import Cluster
 from workbench.jobs.pool.deal import Executor, Shard, ThisProcess, by_kind, parse_shard
 from workbench.jobs.pool.job_file import JobFile, JobKey, Kept
@@ -23,6 +23,8 @@ from workbench.jobs.record.episodes import Written
 from workbench.jobs.record.run import RecordProgress
 from workbench.machine.text import listed
 from workbench.recording.library.jobs import JobFailure, JobState, JobStatus, StatusFile
+
+EPISODES_KEPT = "finished episodes were kept"
 
 
 def require_job(arguments: JobArguments) -> None:
@@ -81,11 +83,15 @@ def run_by(
         ValueError, OSError: as `JobFile`.
     """
     shard, path = shard_of(arguments), job_path(arguments, command)
-    here = min(arguments.workers or len(os.sched_getaffinity(0)), len(shard.part(chunks)))
-    executor: Executor = ThisProcess() if here <= 1 else Processes(here)
+    mine = len(shard.part(chunks))
+    if not mine:
+        told = f"part {shard} has nothing to do: the job has {chunks} batch{'' if chunks == 1 else 'es'}"
+        err.print(escape(told), soft_wrap=True)
+    here = min(arguments.workers or len(os.sched_getaffinity(0)), mine)
+    executor: Executor = ThisProcess() if here <= 1 else Processes(here, warn)
     if arguments.cluster is not None:
         how = arguments.cluster, arguments.workers, arguments.cpus_per_worker, arguments.gpus_per_worker
-        executor = Cluster(*how)
+        executor = Cluster(*how, warn)
     if path is None:
         yield executor, ""
         return

@@ -20,10 +20,11 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.rules import RULES
 from workbench.cli.jobs.check_reports import json_text, xml_text
 from workbench.cli.jobs.record import RecordBar
-from workbench.cli.jobs.run_by import is_recorded, items_of, print_part, run_by, told_in_folder
+from workbench.cli.jobs.run_by import EPISODES_KEPT, is_recorded, items_of, print_part, run_by, told_in_folder
 from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
 from workbench.cli.terminal.output import (
     Exit,
+    interrupted,
     out,
     print_failures,
     print_finding,
@@ -123,7 +124,7 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
     except (OSError, ValueError, PoolError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
-        return refuse("interrupted; finished episodes were kept")
+        return interrupted(EPISODES_KEPT)
     try:
         with here.again():
             for path, made in (
@@ -143,7 +144,7 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
         print_failures(failures, named)
     print_part(run, "solve", report.stopped)
     if report.stopped:
-        return refuse("interrupted; finished episodes were kept")
+        return interrupted(EPISODES_KEPT)
     return Exit.FAILED if failures or output.fails(report) else Exit.DONE
 
 

@@ -18,10 +18,11 @@ from rich.table import Table
 from workbench.authoring.problem import TaskError
 from workbench.cli.jobs.check_reports import json_text
 from workbench.cli.jobs.record import RecordBar
-from workbench.cli.jobs.run_by import job_path, print_part, run_by, shard_of, told_in_folder
+from workbench.cli.jobs.run_by import EPISODES_KEPT, job_path, print_part, run_by, shard_of, told_in_folder
 from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
 from workbench.cli.terminal.output import (
     Exit,
+    interrupted,
     out,
     print_failures,
     print_finding,
@@ -151,7 +152,7 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
     except (OSError, ValueError, PoolError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
-        return refuse("interrupted; finished episodes were kept")
+        return interrupted(EPISODES_KEPT)
     try:
         with here.again():
             # What a part has is in its job file; the parts would write over each other's table.
@@ -162,7 +163,7 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
         return refuse(str(error))
     code = print_report(report, what, has_table=run.shard is None)
     print_part(run, "sweep", report.stopped)
-    return refuse("interrupted; finished episodes were kept") if report.stopped else code
+    return interrupted(EPISODES_KEPT) if report.stopped else code
 
 
 def _is_recorded(out: Path) -> Callable[[Written | None], bool]:

@@ -36,6 +36,8 @@ class Exit(IntEnum):
     """Nothing was done: a wrong argument, a missing file."""
     NOT_TRUSTED = 4
     """Nothing was run: recordings name code that is not trusted (see ``--trust``)."""
+    INTERRUPTED = 130
+    """Ctrl-C, as shells have it; what was finished is kept."""
 
 
 class SafeConsole(Console):
@@ -108,6 +110,16 @@ def refuse(message: str) -> int:
     """Print why a command does nothing; returns the exit code."""
     err.print(f"[red]{escape(plain_text(message))}[/]", soft_wrap=True)
     return Exit.REFUSED
+
+
+def interrupted(kept: str = "") -> int:
+    """Print that Ctrl-C ended a command; returns the exit code.
+
+    Args:
+        kept: what is kept of it.
+    """
+    refuse(f"interrupted; {kept}" if kept else "interrupted")
+    return Exit.INTERRUPTED
 
 
 def warn(message: str) -> None:

@@ -17,7 +17,7 @@ import socket
 import tempfile
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +62,8 @@ class Cluster:
     """How many; None for as many as the cluster has room for now."""
     cpus_per_worker: float = 1
     gpus_per_worker: float = 0
+    on_death: Callable[[str], None] = lambda text: None
+    """As of `Listener`."""
 
     @property
     def elsewhere(self) -> bool:
@@ -238,7 +240,7 @@ class _ActorPool:
         baggage: Baggage,
     ) -> None:
         self._ray, self._how, self._work, self._deal = ray, how, work, deal
-        self._listener = Listener("a worker", work, deal)
+        self._listener = Listener("a worker", work, deal, how.on_death)
         self._read = Unpacker(MESSAGES).message
         self._post = ray.remote(num_cpus=0)(Post).remote()
         self._baggage = ray.put(baggage)

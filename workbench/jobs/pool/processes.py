@@ -7,6 +7,7 @@ import pickle
 import socket
 import subprocess
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -33,15 +34,16 @@ class Processes:
     def elsewhere(self) -> bool:
         return False
 
-    def __init__(self, workers: int) -> None:
+    def __init__(self, workers: int, on_death: Callable[[str], None] = lambda text: None) -> None:
         """
         Args:
             workers: how many processes; fewer where there are fewer chunks.
+            on_death: as of `Listener`.
         """
-        self._workers = workers
+        self._workers, self._on_death = workers, on_death
 
     def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
-        pool = _ProcessPool(work, deal, self._workers)
+        pool = _ProcessPool(work, deal, self._workers, self._on_death)
         try:
             pool.serve()
         finally:
@@ -63,10 +65,10 @@ class _Process:
 class _ProcessPool:
     """Starts the processes of one run, deals to them, and replaces those that fail."""
 
-    def __init__(self, work: Work, deal: Deal, workers: int) -> None:
+    def __init__(self, work: Work, deal: Deal, workers: int, on_death: Callable[[str], None]) -> None:
         self._work, self._deal = work, deal
         self._workers = max(1, deal.count_left(workers))
-        self._listener = Listener("a process", work, deal)
+        self._listener = Listener("a process", work, deal, on_death)
         self._processes: list[_Process] = []
 
     def serve(self) -> None:

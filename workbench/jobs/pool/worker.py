@@ -91,6 +91,8 @@ class Listener:
     """As in "*a process* that records was killed"."""
     work: Work[Any, Any, Any]
     deal: Deal[Any, Any]
+    on_death: Callable[[str], None]
+    """Called with a sentence where a worker is gone and the job goes on."""
     _unpacker: Unpacker = field(default_factory=Unpacker)
 
     def take(self, worker: Hashable, message: Message) -> Literal["asks", "goes on", "failed", "done"]:
@@ -123,6 +125,8 @@ class Listener:
     def died(self, worker: Hashable, how: str, code: int | None) -> None:
         """It is gone. Raises PoolError if the job is over."""
         self._named(lambda: self.deal.died(worker, how, code))
+        if self.deal.limit():
+            self.on_death(f"{self.kind} {self.work.name} {how}; what it had begun is dealt again")
 
     def _named(self, act: Callable[[], None]) -> None:
         """Begin the sentence of the deal's error."""
