@@ -45,6 +45,8 @@ CONTROL_SEEDS = 2
 CONTROL_STEPS = 100
 CARTPOLE_STEPS = 300
 PLAIN = {"render_backend": "none"}
+OWN_CONTROL = ("tasks/swing_up.py", "tasks/locomotion.py")
+"""Examples without a success; an episode has as many steps as their time limit."""
 DRAWN = ("PushT-v1",)
 """Tasks that cannot be built without a renderer."""
 
@@ -110,7 +112,8 @@ def tasks() -> list[str]:
 
 
 def is_control(task: str) -> bool:
-    return task.startswith("MS-")
+    """Whether it has no success."""
+    return task.startswith("MS-") or task in OWN_CONTROL
 
 
 # --- running ---------------------------------------------------------------------------------------------
@@ -141,7 +144,7 @@ def run(row: Row, options: Options, known: Known) -> None:
     from workbench.recording.reader.read_episode import read_episode
 
     control, task = is_control(row.task), row.task
-    steps = (CARTPOLE_STEPS if "Cartpole" in task else CONTROL_STEPS) if control else None
+    steps = (CARTPOLE_STEPS if "Cartpole" in task else CONTROL_STEPS) if task.startswith("MS-") else None
     most = options.seeds or (CONTROL_SEEDS if control else FEWER.get(task, SEEDS))
     first, before, began = len(row.episodes), row.seconds, _processor_seconds()
     ended: dict[int, dict[str, Any]] = {}
@@ -233,6 +236,8 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
         planned = f"{mean(one.reward.mean() for one in episodes):.3f}" if episodes else row.error
         others = " | ".join(f"{row.returns[name]:.3f}" if row.returns else "" for name in ("random", "zero"))
         steps = f"{median(one.steps for one in episodes):g}" if episodes else ""
+        if failed := sum(one.failed_at > 0 for one in episodes):
+            steps += f", {failed} failed"
         yield (
             f"| {row.task} | {row.mode} | {len(episodes)} | {steps} | {_cell([planned])} | {others} | {_seconds(row)} |"
         )

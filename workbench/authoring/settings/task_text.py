@@ -133,18 +133,25 @@ class TaskText:
         return next(reversed([*derived, *registered]), None)
 
     def _nothing(self, name: str, arguments: Sequence[str]) -> str:
-        known: dict[str, None] = {}
-        for owner, bindings in self._scopes():
-            for one, places in bindings.items():
-                if isinstance(self._constant(one, places), Constant):
-                    known[one] = known[f"{owner}.{one}"] = None
-        known |= dict.fromkeys(arguments)
+        owned = [
+            (owner, one)
+            for owner, bindings in self._scopes()
+            for one, places in bindings.items()
+            if isinstance(self._constant(one, places), Constant)
+        ]
+        asked, dot, _ = name.rpartition(".")
+        if dot:
+            known = [f"{owner}.{one}" for owner, one in owned]
+        else:
+            known = list(dict.fromkeys([*(one for _, one in owned), *arguments]))
         by_lower = {one.lower(): one for one in known}
         close = [by_lower[one] for one in difflib.get_close_matches(name.lower(), list(by_lower), n=3)]
         if close:
             hint = f"did you mean {' or '.join(close)}?"
+        elif dot and asked not in {owner for owner, _ in owned}:
+            hint = "only constants of this file can be set, not those of modules that it imports"
         else:
-            plain = [one for one in known if "." not in one and not one.startswith("__")]
+            plain = [one for one in known if not one.rpartition(".")[2].startswith("__")]
             hint = f"it has {listed(plain, 8)}" if plain else "it has none"
         return f"{self._file.name} has no constant and no constructor argument {name}; {hint}"
 
