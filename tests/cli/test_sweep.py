@@ -105,3 +105,24 @@ def test_a_job_goes_on_after_what_is_done(
     # Another one does not take its file.
     assert sweep("--set", "MOST=5,2", "--out", "other", "--job", "s.job") == 2
     assert "of another job" in capsys.readouterr().err
+
+
+def test_what_is_uploaded_is_a_whole_sweep_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    there = tmp_path / "there"
+    given = ("--set", "MOST=5,1", "--out", "here", "--upload", there.as_uri(), "--job", "s.job")
+    assert sweep(*given) == 0
+    results = read_results(there / RESULTS)
+    assert results == read_results(tmp_path / "here" / RESULTS) and len(results.episodes) == 6
+    assert all((there / row.recording).is_file() for row in results.episodes)
+    assert not list((tmp_path / "here").glob("*/*"))
+    said = capsys.readouterr().out
+    assert f"workbench review here, once what is below {there.as_uri()} is copied there" in said
+    made = {file: file.stat().st_mtime_ns for file in there.glob("*/*")}
+    assert sweep(*given) == 0
+    assert {file: file.stat().st_mtime_ns for file in there.glob("*/*")} == made
+    # What has been copied back is opened as what was made there.
+    assert run("merge", "s.job") == 0
+    assert read_results(there / RESULTS) == results

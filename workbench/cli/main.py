@@ -391,6 +391,7 @@ def sweep(
     max_steps: int | None = None,
     pictures: bool = False,
     out: Path | None = None,
+    upload: str = "",
     json_file: Path | None = None,
     csv_file: Path | None = None,
 ) -> int:
@@ -409,6 +410,8 @@ def sweep(
         max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
         pictures: record what every camera sees.
         out: folder for the recordings and results.parquet; else one in sweeps, with the name of the task.
+        upload: an address of fsspec, such as s3://bucket/folder: each episode goes there when it is over, and not into
+            the folder; results.parquet is in both.
         json_file: also write the results to this file, as JSON.
         csv_file: also write a row for each episode to this file, as CSV.
     """
@@ -438,7 +441,9 @@ def sweep(
     if out is None:
         named = split_reference(task)
         out = Path("sweeps", named[1] if named is not None else Path(task.partition(".py")[0]).name)
-    what = SweepOptions(task, varied, out, seeds, actions, pictures, max_steps, planned, options)
+    what = SweepOptions(
+        task, varied, out, seeds, actions, pictures, max_steps, planned, options, upload=upload
+    )
     return sweep_in_terminal(what, SweepOutput(json_file, csv_file), run)
 
 

@@ -13,12 +13,13 @@ import pyarrow.parquet as pq
 import pytest
 import viser
 
+from tests.drive.episodes import made
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
 from workbench.recording.library.library import Library
 from workbench.recording.sweeps import RESULTS, SweepEpisode, SweepResults, write_results
-from workbench.session.review.view import ReviewView
+from workbench.session.review.view import Opened, ReviewView
 from workbench.ui.review.sweep import SweepPanel, axes_of, best_first
 
 
@@ -31,12 +32,13 @@ class Tab:
         self.opened: list[tuple[str, ...]] = []
         self.panel = SweepPanel(server, self.library, self.opened.append, clock)
         self.panels, self.clock = Panels(server), clock
+        self.view = ReviewView()
         until(lambda: self.draw() or "Reading" not in self.panels.html("wb-note"), "the results")
 
     def draw(self) -> None:
         self.clock.passes()
-        self.panel.key(ReviewView())
-        self.panel.draw(ReviewView())
+        self.panel.key(self.view)
+        self.panel.draw(self.view)
 
     def press(self, key: str) -> None:
         self.panels.press(f"sweep {key}")
@@ -49,6 +51,10 @@ class Tab:
 
     def seeds(self) -> list[str]:
         return re.findall(r"seed (\d+)</td>", self.panels.html("wb-sweep-episodes"))
+
+
+def opened(id: str) -> Opened:
+    return Opened(id, f"{id}.rrd", made(), ())
 
 
 @pytest.fixture
@@ -97,6 +103,19 @@ def test_a_value_of_an_axis_leaves_the_other_points_out(tab: Tab) -> None:
     assert len(tab.points()) == 6
     tab.press("clear")
     assert len(tab.points()) == 9
+
+
+def test_the_point_of_the_open_episode_is_shown_until_another_one_is_chosen(tab: Tab) -> None:
+    place = "wb-sweep-point"
+    assert "reach_weight = 2, robot_uids = panda" in tab.panels.html(place)
+    tab.view = ReviewView(opened=(opened("p0s03"),))
+    tab.draw()
+    assert "reach_weight = 0.5, robot_uids = panda" in tab.panels.html(place)
+    tab.press("point 1")
+    assert "reach_weight = 0.5, robot_uids = fetch" in tab.panels.html(place)
+    tab.view = ReviewView(opened=(opened("p6s11"),))
+    tab.draw()
+    assert "reach_weight = 0.5, robot_uids = fetch" in tab.panels.html(place)
 
 
 def test_new_results_are_shown_by_themselves(tab: Tab, folder: Path) -> None:

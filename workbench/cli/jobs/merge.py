@@ -20,7 +20,7 @@ from workbench.cli.jobs.rescore import (
     write_tables,
 )
 from workbench.cli.jobs.solve import SolveOutput, as_json, print_report
-from workbench.cli.jobs.sweep import SweepOutput, write_reports
+from workbench.cli.jobs.sweep import SweepOutput, keep_results, write_reports
 from workbench.cli.jobs.sweep import print_report as print_report_of_sweep
 from workbench.cli.terminal.output import Exit, print_text, refuse
 from workbench.cli.terminal.output import out as out_console
@@ -34,7 +34,6 @@ from workbench.jobs.record.sweep import SweepOptions, collect_sweep
 from workbench.jobs.rescore.job import RescoredRecording
 from workbench.machine.files import new_file, replace_file
 from workbench.machine.text import listed
-from workbench.recording.sweeps import RESULTS, write_results
 from workbench.recording.writing.publish import RecordingError
 
 
@@ -118,7 +117,7 @@ def _print(merged: JobParts, json_file: Path | None) -> int:
         varied = merged.requested(SweepOptions)
         varied = replace(varied, out=Path(folder or varied.out))
         swept = collect_sweep(varied, known)
-        write_results(varied.out / RESULTS, swept.results)
+        keep_results(varied, swept.results)
         write_reports(swept.results, SweepOutput(json_file))
         code, missing = print_report_of_sweep(swept, varied, has_table=True), swept.missing
     else:

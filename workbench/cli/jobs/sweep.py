@@ -42,6 +42,7 @@ from workbench.machine.text import number_text
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.sweeps import RESULTS, PointSummary, SweepResults, value_text, write_results
 from workbench.recording.writing.publish import try_folder
+from workbench.recording.writing.upload import require_place, upload_file
 
 _MOST_POINTS = 50
 """That are printed."""
@@ -118,8 +119,11 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
             )
         recordings_of(what)
         try_folder(what.out)
-        for point in points:
-            recover_confined(what.out / point.folder)
+        if what.upload:
+            require_place(what.upload)
+        else:
+            for point in points:
+                recover_confined(what.out / point.folder)
         shard = shard_of(run)
         chunks = sorted({number // what.chunk for number in what.items})
         part = shard.part(len(chunks))
@@ -157,7 +161,7 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
         with here.again():
             # What a part has is in its job file; the parts would write over each other's table.
             if run.shard is None:
-                write_results(what.out / RESULTS, report.results)
+                keep_results(what, report.results)
             write_reports(report.results, output)
     except OSError as error:
         return refuse(str(error))
@@ -167,8 +171,10 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
 
 
 def _is_recorded(out: Path) -> Callable[[Written | None], bool]:
-    """Whether the episode of a result is still in the folder of its point."""
-    return lambda one: one is None or (out / one.path.parent.name / f"{one.path.stem}.json").exists()
+    """Whether the episode of a result is still in the folder of its point, if it was kept there."""
+    return lambda one: (
+        one is None or bool(one.address) or (out / one.path.parent.name / f"{one.path.stem}.json").exists()
+    )
 
 
 def _named(what: SweepOptions, points: Sequence[Point], number: int) -> str:
@@ -178,7 +184,17 @@ def _named(what: SweepOptions, points: Sequence[Point], number: int) -> str:
 
 def job_of_sweep(what: SweepOptions) -> JobKey:
     """What a job file of this sweep is for. Raises OSError."""
-    return job_of("sweep", what.task, what, ("out", "workers"), needed_by(what.task, what.actions).files)
+    return job_of(
+        "sweep", what.task, what, ("out", "workers", "upload"), needed_by(what.task, what.actions).files
+    )
+
+
+def keep_results(what: SweepOptions, results: SweepResults) -> None:
+    """Write the table beside the recordings. Raises OSError."""
+    what.out.mkdir(parents=True, exist_ok=True)
+    write_results(what.out / RESULTS, results)
+    if what.upload:
+        upload_file(what.out / RESULTS, what.upload)
 
 
 # --- text ------------------------------------------------------------------------------------------------
@@ -196,7 +212,8 @@ def print_report(report: SweepReport, what: SweepOptions, has_table: bool) -> in
         print_failures(report.failures, lambda number: _named(what, points, number))
     if has_table and any(one.steps is not None for one in report.results.episodes):
         table, folder = what.out / RESULTS, shlex.quote(str(what.out))
-        print_text(f"Each episode is a row of {table}. Look at them with: workbench review {folder}")
+        copied = f", once what is below {what.upload} is copied there" if what.upload else ""
+        print_text(f"Each episode is a row of {table}. Look at them with: workbench review {folder}{copied}")
     return Exit.FAILED if report.failures else Exit.DONE
 
 

@@ -65,6 +65,8 @@ class SweepOptions:
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=4))
     workers: int = 1
     """Processes, if no executor is given; the result is the same with any number."""
+    upload: str = ""
+    """As `RecordArguments.upload`; each point has a folder there."""
 
     @property
     def points(self) -> tuple[Point, ...]:
@@ -171,6 +173,7 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
             plan=what.plan,
             after_success=_AFTER_SUCCESS if planned else 0,
             source=source,
+            upload=f"{what.upload.rstrip('/')}/{point.folder}" if what.upload else "",
         )
         recording, runs = with_given_actions(recording)
         if runs:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 from workbench.recording.writing.finish import EpisodeFiles, stem_begin
@@ -57,6 +58,18 @@ def upload_episode(files: EpisodeFiles, address: str) -> None:
         ) from error
     for file in (files.json, files.h5, files.rrd):
         file.unlink()
+
+
+def upload_file(file: Path, address: str) -> None:
+    """Upload a file, which stays here. Raises RecordingError."""
+    system, path = _place(address)
+    try:
+        _make_place(system, path)
+        system.put_file(str(file), f"{path}/{file.name}")
+    except Exception as error:
+        raise RecordingError(
+            f"Cannot upload {file.name} to {address}: {type(error).__name__}: {error}"
+        ) from error
 
 
 def remove_uploaded(address: str, stem: str) -> None:

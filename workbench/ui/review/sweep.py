@@ -152,7 +152,7 @@ class Shown:
     column: str = "success"
     descending: bool = True
     chosen: int | None = None
-    """Index of a point."""
+    """Index of a point; None while nobody has chosen: it is the one of the open episode then, else the best one."""
     only: dict[str, set[str]] = field(default_factory=dict)
     """Of a set name, the values of the points that are shown; all if it has none."""
 
@@ -189,6 +189,8 @@ class SweepPanel(PagePart[ReviewView]):
         self._serial = 0
         """Grows with everything that is shown."""
         self.shown = Shown()
+        self._chosen: int | None = None
+        """The point whose episodes are listed."""
         self._pages = Paged(ROWS)
 
     # --- the file --------------------------------------------------------------------------------------
@@ -217,8 +219,8 @@ class SweepPanel(PagePart[ReviewView]):
         with self._lock:
             self._results, self._problem = results, problem
             self._summaries = [] if results is None else results.summaries()
-            if self.shown.chosen is None or self.shown.chosen >= len(self._summaries):
-                self.shown.chosen = self._summaries[0].index if self._summaries else None
+            if self.shown.chosen is not None and self.shown.chosen >= len(self._summaries):
+                self.shown.chosen = None
             self._serial += 1
 
     # --- drawing ---------------------------------------------------------------------------------------
@@ -235,11 +237,23 @@ class SweepPanel(PagePart[ReviewView]):
             if results is None:
                 self._plot.content = self._table.content = self._episodes.content = ""
                 return
+            self._chosen = self._first(results, view) if shown.chosen is None else shown.chosen
             kept = [one for one in self._summaries if self._is_kept(one)]
             self._plot.content = self._plot_html(results)
             self._table.content = self._table_html(results, kept)
-            chosen = next((one for one in self._summaries if one.index == shown.chosen), None)
+            chosen = next((one for one in self._summaries if one.index == self._chosen), None)
             self._episodes.content = "" if chosen is None else self._episodes_html(results, chosen, view)
+
+    def _first(self, results: SweepResults, view: ReviewView) -> int | None:
+        """The point of the episode that is open, else the best one."""
+        ids, opened = self._ids(), {one.id for one in view.opened}
+        places = {ids.get(str(self._library.folder / row.recording)): row.point for row in results.episodes}
+        of_opened = [places[id] for id in opened if id in places]
+        return of_opened[0] if of_opened else next((one.index for one in self._summaries), None)
+
+    def _ids(self) -> dict[str, str]:
+        """Of each file of the library, the id of its recording."""
+        return {str(path): row.id for row in self._library.view().rows for path in row.paths}
 
     def _note_html(self) -> str:
         if self._problem:
@@ -271,7 +285,7 @@ class SweepPanel(PagePart[ReviewView]):
                     "points": " ".join(known),
                     "kept": kept,
                     "part": round(100 * (rate or 0.0)),
-                    "chosen": one.index == self.shown.chosen,
+                    "chosen": one.index == self._chosen,
                     "failed": not one.episodes,
                     "press": self._press(("point", one.index), lambda one=one: self._choose(one.index))
                     if kept and len(self._summaries) <= MOST_PRESSED
@@ -333,7 +347,7 @@ class SweepPanel(PagePart[ReviewView]):
             rows.append(
                 {
                     "press": self._press(("point", one.index), lambda one=one: self._choose(one.index)),
-                    "chosen": one.index == self.shown.chosen,
+                    "chosen": one.index == self._chosen,
                     "values": [value_text(one.values[name]) for name in results.names],
                     "cells": [*_result_cells(one), *(_shown(one.means.get(name)) for name in terms)],
                     "episodes": one.episodes,
@@ -361,7 +375,7 @@ class SweepPanel(PagePart[ReviewView]):
             ]
         else:
             lists = [("Episodes, the best first", ordered)] if ordered else []
-        ids = {str(path): row.id for row in self._library.view().rows for path in row.paths}
+        ids = self._ids()
         opened = {one.id for one in view.opened}
         return render(
             "sweep_episodes",
@@ -411,7 +425,7 @@ class SweepPanel(PagePart[ReviewView]):
         self.shown.only.setdefault(name, set()).symmetric_difference_update({text})
         self._pages.go_to(0)
         kept = [one.index for one in self._summaries if self._is_kept(one)]
-        if kept and self.shown.chosen not in kept:
+        if kept and self._chosen not in kept:
             # They are the best first.
             self.shown.chosen = kept[0]
 
