@@ -385,6 +385,31 @@ def shoot_review(browser: Browser) -> None:
             page.close()
 
 
+def shoot_sweep(browser: Browser) -> None:
+    """Sizes of the cube and of the goal, each with the same seeds, and an episode of the best ones."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(shutil.copy(TASK, Path(folder) / TASK.name))
+        shutil.copy(POLICY, folder)
+        command = [sys.executable, "-m", "workbench.cli.main", "sweep", file.name, "--seeds", "8", *CONTROL]
+        command += ["--set", "CUBE_HALF_SIZE=0.015,0.02,0.03", "--set", "GOAL_RADIUS=0.03,0.05,0.08"]
+        command += ["--actions", f"{POLICY.name}:act", "--out", "sizes"]
+        subprocess.run(command, check=True, cwd=folder)
+        with open_workbench("sizes", cwd=Path(folder), what="review") as opened:
+            page, _ = new_page(browser)
+            page.goto(opened.url)
+            expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=120_000)
+            close_notice(page)
+            desk = Desk(page, file)
+            time.sleep(FRAME)
+            desk.tab("Sweep")
+            page.locator(".wb-sweep-scroll tr[data-press]").first.click()
+            page.locator(".wb-sweep-episodes tr[data-press]").first.click()
+            time.sleep(FRAME)
+            desk.press(*5 * ["ArrowRight"])
+            desk.shoot("sweep")
+            page.close()
+
+
 def shoot_tutorial(browser: Browser) -> None:
     """What the reader of the tutorial sees: the live page after each step, then the recorded success."""
     with live_page(browser, "--num-envs", "8", task=text_after(1), name=FILE, checks=True) as desk:
@@ -420,6 +445,7 @@ SHOTS: dict[str, Callable[[Browser], None]] = {
     "checks": shoot_checks,
     "solve": shoot_solve,
     "review": shoot_review,
+    "sweep": shoot_sweep,
     "tutorial": shoot_tutorial,
 }
 """``page`` takes run, cameras and banner too, ``review`` library and compare, ``tutorial`` all of its own."""

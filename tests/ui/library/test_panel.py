@@ -127,7 +127,7 @@ def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
     assert table.shown()[:3] == ["id00", "id01", "id02"]
     table.press("sort seed")
     assert table.shown()[0] == newest(0, 1)[0]
-    table.press("outcome failed")
+    table.press("outcome no success")
     assert len(table.shown()) == COUNT // 2 and table.shown()[0] == "id53"
     table.look_for("seed:7")
     assert table.shown() == ["id07"]
@@ -136,7 +136,7 @@ def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
 
 
 def test_all_selects_what_is_listed_and_leaves_the_filter(table: Table) -> None:
-    table.press("outcome failed")
+    table.press("outcome no success")
     failed = table.shown()
     table.press_row(failed[0])
     table.press("select all")

@@ -28,11 +28,11 @@ HINTS: dict[Column, str] = {
     "note": "Note",
     "name": "Name of its files",
 }
-Outcome = Literal["all", "success", "failed", "broken"]
+Outcome = Literal["all", "success", "no success", "broken"]
 MEANS: dict[Outcome, str] = {
     "all": "Every recording",
     "success": "Success at the last step",
-    "failed": "No success at the last step",
+    "no success": "No success at the last step",
     "broken": "Something is wrong with the files",
 }
 HASH = 7
@@ -52,7 +52,7 @@ def newest_sources(rows: Iterable[LibraryRow]) -> dict[str, str]:
 def has_outcome(row: LibraryRow, outcome: Outcome) -> bool:
     if outcome == "success":
         return row.success is True
-    if outcome == "failed":
+    if outcome == "no success":
         return row.success is False
     if outcome == "broken":
         return row.problem is not None
@@ -91,9 +91,13 @@ def chosen(
 def none_like_that(words: str, outcome: Outcome, task: str | None) -> str:
     """The message of a filter that nothing passes."""
     wanted = f" of {task}" if task is not None else ""
-    kind = {"all": "recording", "success": "successful recording", "failed": "failed recording"}.get(
-        outcome, f"{outcome} recording"
-    )
+    kinds: dict[Outcome, str] = {
+        "all": "recording",
+        "success": "successful recording",
+        "no success": "recording without success",
+        "broken": "broken recording",
+    }
+    kind = kinds[outcome]
     words = words.strip()
     return f"No {kind}{wanted} has \u201c{words}\u201d." if words else f"There is no {kind}{wanted}."
 
