@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -413,16 +414,19 @@ def test_the_command_as_a_job_in_ci_runs_it(place: Path, child_process: None) ->
     assert said["task"]["id"] == "PushCube-v1" and said["counts"] == {"kept": 2}
 
 
+MERGED = ("--junit", "merged.xml", "--sarif", "merged.sarif")
+
+
 @pytest.mark.slow
 def test_parts_that_are_merged_print_what_the_whole_would(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     few = ("bad.py", *FEW, "--select", "success-at-reset,entry-name,body-names")
-    whole = run(capsys, *few, "--json-file", "whole.json")
+    whole = run(capsys, *few, "--json-file", "whole.json", "--junit", "whole.xml", "--sarif", "whole.sarif")
     for part in ("1/2", "2/2"):
         assert f"Part {part} is in check-{part[0]}-of-2.job" in run(capsys, *few, "--shard", part).err
     with pytest.raises(SystemExit) as ended:
-        main(["merge", "check-1-of-2.job", "check-2-of-2.job", "--json-file", "merged.json"])
+        main(["merge", "check-1-of-2.job", "check-2-of-2.job", "--json-file", "merged.json", *MERGED])
     told = capsys.readouterr().out
     assert ended.value.code == whole.code == 1
     assert told.splitlines()[:-1] == whole.out.splitlines()[:-1]
@@ -433,6 +437,19 @@ def test_parts_that_are_merged_print_what_the_whole_would(
         for rule in one["rules"]:
             del rule["seconds"]
     assert merged == said
+    assert (place / "merged.sarif").read_text() == (place / "whole.sarif").read_text()
+    seconds = re.compile(r' time(stamp)?="[^"]*"')
+    whole_xml, merged_xml = (
+        seconds.sub("", (place / name).read_text()) for name in ("whole.xml", "merged.xml")
+    )
+    assert merged_xml == whole_xml
+    with pytest.raises(SystemExit) as ended:
+        main(["merge", "check-1-of-2.job", "check-2-of-2.job", "--csv-file", "merged.csv"])
+    assert ended.value.code == 2 and "leave out --csv-file" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as ended:
+        main(["merge", "check-1-of-2.job", "check-2-of-2.job", "--fail-on", "never"])
+    assert ended.value.code == 0
+    capsys.readouterr()
     with pytest.raises(SystemExit) as ended:
         main(["merge", "check-2-of-2.job"])
     assert ended.value.code == 1 and "groups of rules are in none of these files" in capsys.readouterr().out

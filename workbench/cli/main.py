@@ -455,6 +455,10 @@ def merge(
     job: Path | None = None,
     out: Path | None = None,
     json_file: Path | None = None,
+    csv_file: Path | None = None,
+    junit: Path | None = None,
+    sarif: Path | None = None,
+    fail_on: FailOn = "stop",
 ) -> int:
     """Put the parts of a job together that were run with --shard, and print what the whole command would have printed. Nothing
     is run. The exit code is 1 where parts are missing, or as of the command.
@@ -463,15 +467,21 @@ def merge(
         files: job files of all parts.
         job: also write one job file for the whole. With it the command goes on where parts are missing.
         out: copy the episodes of all parts into this folder.
-        json_file: also write the result to this file, as JSON, for commands that have one.
+        json_file: also write the result to this file, as JSON: of check, rescore, solve and sweep.
+        csv_file: likewise as CSV: of rescore, solve and sweep.
+        junit: likewise as JUnit's XML: of check and solve.
+        sarif: likewise as SARIF: of check.
+        fail_on: lowest degree of a finding that makes the exit code 1, as of check and solve.
     """
     for file in files:
         if not file.is_file():
             return refuse(f"there is no file {file}")
+    if (why := _without_folder(json_file, csv_file, junit, sarif)) is not None:
+        return refuse(why)
     with quick_imports():
-        from workbench.cli.jobs.merge import merge_in_terminal
+        from workbench.cli.jobs.merge import MergeOutput, merge_in_terminal
 
-    return merge_in_terminal(files, job, out, json_file)
+    return merge_in_terminal(files, job, out, MergeOutput(json_file, csv_file, junit, sarif, fail_on))
 
 
 @app.command

@@ -136,13 +136,7 @@ def check_in_terminal(
         said = Reported(report, what, root, output.fail_on)
     try:
         with here.again():
-            for path, made in (
-                (output.json_file, as_json),
-                (output.junit, as_junit),
-                (output.sarif, as_sarif),
-            ):
-                if path is not None:
-                    replace_file(path, made(said).encode())
+            write_reports(said, output)
     except OSError as error:
         return refuse(str(error))
     if output.json:
@@ -151,6 +145,13 @@ def check_in_terminal(
         print_report(said)
         print_part(run, "check", stopped=False)
     return exit_code(said)
+
+
+def write_reports(said: Reported, output: CheckOutput) -> None:
+    """Write the files that were asked for. Raises OSError."""
+    for path, made in ((output.json_file, as_json), (output.junit, as_junit), (output.sarif, as_sarif)):
+        if path is not None:
+            replace_file(path, made(said).encode())
 
 
 def exit_code(said: Reported) -> int:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from workbench.cli.jobs.check import CheckOutput, exit_code
 from workbench.cli.jobs.check import print_report as print_check
+from workbench.cli.jobs.check import write_reports as write_check_reports
 from workbench.cli.jobs.check_reports import Reported
-from workbench.cli.jobs.check_reports import as_json as check_as_json
 from workbench.cli.jobs.record import print_recorded
 from workbench.cli.jobs.rescore import (
     RescoreOutput,
@@ -19,11 +19,14 @@ from workbench.cli.jobs.rescore import (
     warn_of_verdicts,
     write_tables,
 )
-from workbench.cli.jobs.solve import SolveOutput, as_json, print_report
-from workbench.cli.jobs.sweep import SweepOutput, keep_results, write_reports
+from workbench.cli.jobs.solve import SolveOutput, print_report
+from workbench.cli.jobs.solve import write_reports as write_solve_reports
+from workbench.cli.jobs.sweep import SweepOutput, keep_results
 from workbench.cli.jobs.sweep import print_report as print_report_of_sweep
+from workbench.cli.jobs.sweep import write_reports as write_sweep_reports
 from workbench.cli.terminal.output import Exit, print_text, refuse
 from workbench.cli.terminal.output import out as out_console
+from workbench.core.rules import FailOn
 from workbench.jobs.check import CheckOptions, GroupOutcome
 from workbench.jobs.check import report_of as check_report_of
 from workbench.jobs.pool.job_file import JobFileError, JobParts, read_parts, write_whole
@@ -32,24 +35,55 @@ from workbench.jobs.record.run import collect
 from workbench.jobs.record.solve import SolveOptions, report_of
 from workbench.jobs.record.sweep import SweepOptions, collect_sweep
 from workbench.jobs.rescore.job import RescoredRecording
-from workbench.machine.files import new_file, replace_file
+from workbench.machine.files import new_file
 from workbench.machine.text import listed
 from workbench.recording.writing.publish import RecordingError
 
 
-def merge_in_terminal(
-    files: Sequence[Path], job: Path | None, out: Path | None, json_file: Path | None
-) -> int:
+@dataclass(frozen=True)
+class MergeOutput:
+    """What it gives besides its text, where the command that was run in parts has that."""
+
+    json_file: Path | None = None
+    csv_file: Path | None = None
+    junit: Path | None = None
+    sarif: Path | None = None
+    fail_on: FailOn = "stop"
+    """As of `CheckOutput` and `SolveOutput`."""
+
+
+_GIVES = {
+    "record": (),
+    "check": ("json_file", "junit", "sarif"),
+    "rescore": ("json_file", "csv_file"),
+    "solve": ("json_file", "csv_file", "junit"),
+    "sweep": ("json_file", "csv_file"),
+}
+"""The files that each command makes, as fields of `MergeOutput`."""
+
+
+def merge_in_terminal(files: Sequence[Path], job: Path | None, out: Path | None, output: MergeOutput) -> int:
     """Merge and print; returns the exit code."""
     try:
         merged = read_parts(files)
+        _require_known(merged, output)
         merged = _together(merged, out)
         if job is not None:
             write_whole(job, merged)
-        code = _print(merged, json_file)
+        code = _print(merged, output)
     except (OSError, ValueError) as error:
         return refuse(str(error))
     return code
+
+
+def _require_known(merged: JobParts, output: MergeOutput) -> None:
+    """Raise JobFileError for a command or a file that there is not."""
+    if merged.command not in _GIVES:
+        raise JobFileError(f"{merged.files[0]} is of workbench {merged.command}, which merge does not know")
+    for name in ("json_file", "csv_file", "junit", "sarif"):
+        if getattr(output, name) is not None and name not in _GIVES[merged.command]:
+            option = name.replace("_", "-")
+            raise JobFileError(f"workbench {merged.command} has no such result: leave out --{option}")
 
 
 def _together(merged: JobParts, out: Path | None) -> JobParts:
@@ -89,14 +123,12 @@ def _copy(rrd: Path, out: Path) -> None:
                 shutil.copyfile(source, temporary)
 
 
-def _print(merged: JobParts, json_file: Path | None) -> int:
-    """Print as the command does; returns its exit code."""
+def _print(merged: JobParts, output: MergeOutput) -> int:
+    """Print as the command does, and write its files; returns its exit code."""
     if merged.command == "check":
-        return _print_check(merged, json_file)
+        return _print_check(merged, output)
     if merged.command == "rescore":
-        return _print_rescore(merged, json_file)
-    if json_file is not None and merged.command not in ("solve", "sweep"):
-        raise JobFileError(f"workbench {merged.command} has no result as JSON: leave out --json-file")
+        return _print_rescore(merged, output)
     folder = next(iter(merged.folders.values()), "")
     known: dict[int, Written | None] = merged.results(Written | None)
     if merged.command == "record":
@@ -109,19 +141,19 @@ def _print(merged: JobParts, json_file: Path | None) -> int:
         asked = replace(asked, out=Path(folder or asked.out))
         recorded = collect(asked.recording(), known)
         report = report_of(asked, recorded, 0.0)
-        if json_file is not None:
-            replace_file(json_file, as_json(report, asked, SolveOutput()).encode())
+        files = SolveOutput(
+            json_file=output.json_file, csv_file=output.csv_file, junit=output.junit, fail_on=output.fail_on
+        )
+        write_solve_reports(report, asked, files)
         print_report(report)
-        code, missing = Exit.DONE if report.solved else Exit.FAILED, recorded.missing
-    elif merged.command == "sweep":
+        code, missing = Exit.FAILED if files.fails(report) else Exit.DONE, recorded.missing
+    else:
         varied = merged.requested(SweepOptions)
         varied = replace(varied, out=Path(folder or varied.out))
         swept = collect_sweep(varied, known)
         keep_results(varied, swept.results)
-        write_reports(swept.results, SweepOutput(json_file))
+        write_sweep_reports(swept.results, SweepOutput(output.json_file, output.csv_file))
         code, missing = print_report_of_sweep(swept, varied, has_table=True), swept.missing
-    else:
-        raise JobFileError(f"{merged.files[0]} is of workbench {merged.command}, which merge does not know")
     return _with_missing(code, missing, "episodes")
 
 
@@ -133,22 +165,21 @@ def _with_missing(code: int, missing: int, what: str) -> int:
     return code
 
 
-def _print_check(merged: JobParts, json_file: Path | None) -> int:
+def _print_check(merged: JobParts, output: MergeOutput) -> int:
     what = merged.requested(CheckOptions)
     report = check_report_of(what, merged.results(GroupOutcome))
-    said = Reported(report, what, Path.cwd(), CheckOutput().fail_on)
-    if json_file is not None:
-        replace_file(json_file, check_as_json(said).encode())
+    said = Reported(report, what, Path.cwd(), output.fail_on)
+    write_check_reports(said, CheckOutput(json_file=output.json_file, junit=output.junit, sarif=output.sarif))
     print_check(said)
     return _with_missing(exit_code(said), report.missing, "groups of rules")
 
 
-def _print_rescore(merged: JobParts, json_file: Path | None) -> int:
+def _print_rescore(merged: JobParts, output: MergeOutput) -> int:
     what = merged.requested(RescoreRequest)
     results: dict[int, RescoredRecording] = merged.results(RescoredRecording)
     ordered = sorted(results.values(), key=lambda result: result.place)
     verdicts = [result.verdict for result in ordered]
-    write_tables(verdicts, RescoreOutput(json_file=json_file))
+    write_tables(verdicts, RescoreOutput(json_file=output.json_file, csv_file=output.csv_file))
     print_verdicts(verdicts, out_console)
     warn_of_verdicts(verdicts, dict.fromkeys(result.note for result in ordered if result.note))
     return _with_missing(Exit.DONE, what.recordings - len(results), "recordings")

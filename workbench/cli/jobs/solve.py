@@ -127,13 +127,7 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
         return interrupted(EPISODES_KEPT)
     try:
         with here.again():
-            for path, made in (
-                (output.json_file, as_json),
-                (output.csv_file, as_csv),
-                (output.junit, as_junit),
-            ):
-                if path is not None:
-                    replace_file(path, made(report, what, output).encode())
+            write_reports(report, what, output)
     except OSError as error:
         return refuse(str(error))
     if output.json or output.csv:
@@ -195,6 +189,13 @@ def _print_verdict(verdict: RewardVerdict) -> None:
 
 
 # --- for programs ----------------------------------------------------------------------------------------
+
+
+def write_reports(report: SolveReport, what: SolveOptions, output: SolveOutput) -> None:
+    """Write the files that were asked for. Raises OSError."""
+    for path, made in ((output.json_file, as_json), (output.csv_file, as_csv), (output.junit, as_junit)):
+        if path is not None:
+            replace_file(path, made(report, what, output).encode())
 
 
 def as_json(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
