@@ -25,6 +25,7 @@ import yaml
 from tests.docs.commands import OPENS_A_PAGE, commands, opens
 from tests.docs.pages import PAGES, ROOT, Fence, fences, without_fences
 from workbench.cli import main
+from workbench.cli.jobs import commands as jobs
 
 KINDS = {
     *(("python", mark) for mark in ("", "slow", "fragment", "wrong")),
@@ -35,23 +36,11 @@ KINDS = {
     ("text", ""),
 }
 RUN = ("", "slow", "wrong")
-COMMANDS = {"open": main.open_page} | {
-    name: getattr(main, name)
-    for name in (
-        "new",
-        "record",
-        "check",
-        "solve",
-        "sweep",
-        "merge",
-        "review",
-        "rescore",
-        "share",
-        "export",
-        "view",
-        "doctor",
-    )
+JOBS = {name: getattr(jobs, name) for name in ("record", "check", "solve", "sweep", "merge", "rescore")}
+PAGES_AND_MORE = {
+    name: getattr(main, name) for name in ("new", "review", "share", "export", "view", "doctor")
 }
+COMMANDS = {"open": main.open_page, **JOBS, **PAGES_AND_MORE}
 TYPED = [
     page for page in PAGES if any(f.language in ("python", "sh") and f.mark in RUN for f in fences(page))
 ]

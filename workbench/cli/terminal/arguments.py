@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,8 @@ Rules = Annotated[
 ]
 """None is each rule's own degree; the command line has no word for it."""
 
-
+Task = Annotated[str, tyro.conf.Positional]
+"""A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""
 Imports = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="import")]
 
 
@@ -243,3 +245,20 @@ def history_bytes(text: str) -> int:
     if size is None or not 2**20 <= size <= 2**40:
         raise ValueError(f"--history takes a size from 1MB on, such as 256MB or 2GB; got {text!r}")
     return int(size)
+
+
+def why_unwritable(*files: Path | None) -> str | None:
+    """Make the folders of these files. Returns why one of the files cannot be written; None if each can."""
+    for file in files:
+        if file is None:
+            continue
+        folder = file.resolve().parent
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            return f"{file} cannot be written: the folder {folder} cannot be made ({error.strerror})"
+        if file.is_dir():
+            return f"{file} is a folder: name a file in it"
+        if not os.access(folder, os.W_OK):
+            return f"{file} cannot be written: you may not write into {folder}"
+    return None

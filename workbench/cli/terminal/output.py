@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.segment import Segment
 from rich.text import Text
 
+from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
 from workbench.machine.text import SafeStream, listed, plain_text
 from workbench.session.clearance import CodeFile, Consent, NotTrusted, Since, TrustQuestion, question_text
 
@@ -125,6 +126,16 @@ def interrupted(kept: str = "") -> int:
 def warn(message: str) -> None:
     """Print a warning."""
     err.print(f"[yellow]{escape(plain_text(message))}[/]", soft_wrap=True)
+
+
+def lacks_maniskill(command: str) -> bool:
+    """Say what to type where the command cannot do its work for want of ManiSkill, and warn of two that are mixed."""
+    lines = lines_if_lacking(f"workbench {command}", sys.argv[1:])
+    for line in lines or ():
+        refuse(line)
+    for line in lines_if_mixed() or ():
+        warn(line)
+    return lines is not None
 
 
 def print_problem(problem: Problem) -> None:
