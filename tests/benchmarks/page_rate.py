@@ -1,7 +1,7 @@
 """How often the page is really updated while the task plays, what that takes of the processor, and how soon a control has its
 effect.
 
-    python tests/benchmarks/page_rate.py [--num-envs 16] [--speed "4 ×"] [--draw page] [--cameras] [--solve]
+    python tests/benchmarks/page_rate.py [--num-envs 16] [--speed "4 ×"] [--draw page] [--cameras] [--solve] [--orbit]
 
 ``workbench open`` on the example task with a real Chromium before it. *Applied updates* are counted in
 the page: animation frames on which the robot's hand has poses that the frame before did not have. *Click
@@ -19,6 +19,9 @@ frame and a core. All else is done. ``--draw page`` replaces the draw calls alon
 everything on the processor, which then is the limit on a machine without a card; ``--draw as-with-a-card`` does so too, and tells
 the page that it has one, which leaves out what the page does to be drawn in less time. Without ``--cameras`` the pictures
 are unticked: on such a machine the renderer, the physics and the browser share the cores.
+
+``--orbit`` measures a second time, paused, while the mouse turns the camera: what a person does who looks for a mistake.
+*Drawn* are the frames of the 3-D view.
 
 ``--solve`` measures a second time, in the same page, while actions are planned by rollouts in a process beside. The envs
 then wait for their plans, so there is a new step, and an update, less often. The task is one that never succeeds, or the
@@ -38,6 +41,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import psutil
 import tyro
 from playwright.sync_api import Page, expect, sync_playwright
@@ -57,11 +61,21 @@ WebGL2RenderingContext.prototype.getParameter = function (what) {
     return what === UNMASKED_RENDERER ? 'NVIDIA GeForce RTX 3060' : ask.call(this, what);
 };
 """
+COUNT_DRAWN = """
+window.drawnFrames = 0;
+const clear = WebGL2RenderingContext.prototype.clear;
+WebGL2RenderingContext.prototype.clear = function (mask) {
+    if (this.canvas.isConnected) window.drawnFrames += 1;
+    return clear.call(this, mask);
+};
+"""
+"""A frame of the view begins with it."""
 TRANSPARENT = "() => { document.documentElement.style.opacity = 0; }"
 COUNT = """async (seconds) => {
     const nodes = () => window.__viserSceneTree.getState();
     const hand = Object.keys(nodes()).find((name) => name.includes('panda_hand'));
     let last = null, applied = 0, frames = 0;
+    const drawn = window.drawnFrames;
     const start = performance.now();
     await new Promise((done) => {
         const look = () => {
@@ -72,7 +86,7 @@ COUNT = """async (seconds) => {
         };
         requestAnimationFrame(look);
     });
-    return [applied / seconds, frames / seconds];
+    return [applied, frames, window.drawnFrames - drawn].map((count) => count / seconds);
 }"""
 ELAPSED = """() => {
     const row = [...document.querySelectorAll('tr')].find((r) => r.textContent.includes('elapsed steps'));
@@ -84,6 +98,8 @@ PACE = r"""() => {
     const found = document.body.innerText.match(/([0-9.]+) steps\/s/);
     return found ? found[1] : '';
 }"""
+FREE_OF_PANELS = 400, 420
+"""Pixels: a place in the view."""
 PROCESSES = ("worker", "server", "planner", "browser's page", "browser's drawing", "browser's rest")
 
 
@@ -101,6 +117,8 @@ class Options:
     """Leave the default pictures on."""
     solve: bool = False
     """Measure again while actions are planned."""
+    orbit: bool = False
+    """Measure again while the camera turns around what stands still."""
 
 
 def prepare(page: Page, options: Options, url: str) -> None:
@@ -108,6 +126,7 @@ def prepare(page: Page, options: Options, url: str) -> None:
         page.add_init_script(NO_DRAWING)
     if options.draw == "as-with-a-card":
         page.add_init_script(A_CARD)
+    page.add_init_script(COUNT_DRAWN)
     page.goto(url)
     expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
     page.get_by_role("tab", name="Cameras").click()
@@ -171,6 +190,7 @@ class Window:
 
     applied: float
     frames: float
+    drawn: float
     processor: dict[str, float]
     """Cores that each of `PROCESSES` took."""
     others: float
@@ -206,15 +226,36 @@ def name_of(is_server: bool, command: str, niceness: int) -> str:
     return "browser's page" if "--type=renderer" in command else drawing
 
 
-def watch(page: Page, server: int, seconds: float) -> Window:
+def watch(page: Page, server: int, seconds: float, orbit: bool = False) -> Window:
     (before, rest), begun = used(server), time.perf_counter()
-    applied, frames = page.evaluate(COUNT, seconds)
+    counting = page.evaluate_handle(f"(seconds) => ({{ counted: ({COUNT})(seconds) }})", seconds)
+    if orbit:
+        turn_camera(page, seconds)
+    applied, frames, drawn = counting.evaluate("({ counted }) => counted")
     (after, rest_after), took = used(server), time.perf_counter() - begun
     cores: defaultdict[str, float] = defaultdict(float)
     for pid, (name, spent) in after.items():
         cores[name] += (spent - before.get(pid, (name, 0.0))[1]) / took
     others = sum(spent - rest[pid] for pid, spent in rest_after.items() if pid in rest) / took
-    return Window(applied, frames, dict(cores), others, page.evaluate(PACE))
+    return Window(applied, frames, drawn, dict(cores), others, page.evaluate(PACE))
+
+
+def turn_camera(page: Page, seconds: float) -> None:
+    page.mouse.move(*FREE_OF_PANELS)
+    page.mouse.down()
+    end = time.perf_counter() + seconds
+    while (left := end - time.perf_counter()) > 0:
+        page.mouse.move(FREE_OF_PANELS[0] + 60 * np.sin(2 * left), FREE_OF_PANELS[1] + 10 * np.cos(2 * left))
+        time.sleep(1 / 60)
+    page.mouse.up()
+
+
+def told_of_view(windows: list[Window]) -> str:
+    """The window with the most frames of the view, and what one of them takes."""
+    best = max(windows, key=lambda window: window.drawn)
+    counts = ", ".join(f"{window.drawn:.1f}" for window in windows)
+    drawing = ", ".join(f"{1000 * w.processor.get(PROCESSES[4], 0.0) / max(w.drawn, 1e-9):.0f}" for w in windows)
+    return f"drawn frames a second: {best.drawn:.1f} (of windows: {counts}); processor, ms of drawing a frame: {drawing}"
 
 
 def told(windows: list[Window]) -> str:
@@ -278,8 +319,15 @@ def main(options: Options) -> None:
             timed_click(page, "Play", "Pause")
             time.sleep(2.0)
             server = opened.process.pid
-            print(told([watch(page, server, options.seconds) for _ in range(options.windows)]), flush=True)
+            windows = [watch(page, server, options.seconds) for _ in range(options.windows)]
+            print(f"{told(windows)}\n{told_of_view(windows)}", flush=True)
             say_clicks(clicks, steps)
+            if options.orbit:
+                timed_click(page, "Pause", "Play")
+                time.sleep(2.0)
+                windows = [watch(page, server, options.seconds, orbit=True) for _ in range(options.windows)]
+                print(f"paused, while the camera turns: {told_of_view(windows)}", flush=True)
+                timed_click(page, "Play", "Pause")
             if options.solve:
                 choose_source(page, "random", "solve")
                 # The envs of the rollouts are made, and the first plan.

@@ -19,6 +19,7 @@ from trimesh.triangles import closest_point
 
 from workbench.core.scene.shapes import Mesh
 from workbench.core.scene.simplify import (
+    cluster_mesh,
     coarsen_mesh,
     flat_rectangle,
     reduce_mesh,
@@ -33,6 +34,11 @@ _VERSION = 2
 _FEWEST_FACES = 24
 _LOST, _USELESS = 0.01, 0.1
 """Errors, in sizes of the mesh: from the first on a piece of it may be missing, from the second on no level is made."""
+_SIMPLE = 150
+"""Triangles. What is layered of thin discs, as ManiSkill's targets are, would lose a layer (see `from_afar`)."""
+_FEW = 32, 48, 72, 100, 144, 200, 280, 400, 800, 1600
+"""Triangles that are tried from afar, and of these grids, in cells."""
+_GRIDS = 12, 24, 48
 _LARGE = 20_000
 """Triangles."""
 _CHECKED_POINTS = 1500
@@ -80,11 +86,15 @@ def levels_of(mesh: Mesh) -> tuple[Level, ...]:
     if levels is None:
         levels = tuple(_made(mesh))
         _write(name, levels)
+    _keep(name, levels)
+    return levels
+
+
+def _keep(name: str, levels: tuple[Level, ...]) -> None:
     with _keeping:
         _kept[name] = levels
         if len(_kept) > _MOST_KEPT:
             _kept.popitem(last=False)
-    return levels
 
 
 def reduced_mesh(mesh: Mesh, max_faces: int) -> Mesh:
@@ -100,6 +110,33 @@ def reduced_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     made = share_vertices(made if made is mesh else rounded(share_smooth(made)))
     _write(name, (Level(made, 0.0),))
     return made
+
+
+def from_afar(mesh: Mesh, error: float) -> Mesh:
+    """`mesh` with few triangles, 99 % of its surface within `error` of them; kept on disk.
+
+    For what is some pixels large: unlike in `levels_of`, vertices on a coarse grid are joined first, without which hundreds
+    of loose pieces keep their triangles. Simple meshes and textured ones stay as they are. The first call for a mesh takes
+    some 0.2 s.
+    """
+    if len(mesh.faces) <= _SIMPLE or mesh.uvs is not None or error <= 0:
+        return mesh
+    name = f"{content_hash(mesh)}-afar-{error:.3g}"
+    with _keeping:
+        kept = _kept.get(name)
+    kept = kept or _read(name)
+    if not kept:
+        kept = (Level(next(_within(mesh, error), mesh), error),)
+        _write(name, kept)
+    _keep(name, kept)
+    return kept[0].mesh
+
+
+def _within(mesh: Mesh, error: float) -> Iterator[Mesh]:
+    for faces in (count for count in _FEW if count < 0.8 * len(mesh.faces)):
+        for coarser in (reduce_mesh(mesh, faces), *(cluster_mesh(mesh, faces, cells) for cells in _GRIDS)):
+            if len(coarser.faces) <= 1.5 * faces and deviation(mesh, coarser) <= error:
+                yield coarser
 
 
 def are_known(mesh: Mesh) -> bool:

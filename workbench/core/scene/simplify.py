@@ -79,6 +79,25 @@ def coarsen_mesh(mesh: Mesh, max_faces: int, source: Mesh, by_pieces: bool = Fal
     return share_vertices(coarse)
 
 
+def cluster_mesh(mesh: Mesh, max_faces: int, cells: int) -> Mesh:
+    """`mesh`, without texture, with about `max_faces` triangles after the vertices in each cell of a grid have become one.
+
+    Loose pieces grow together, and what is smaller than a cell is gone: for what is seen from afar.
+
+    Args:
+        cells: of the grid along the longest axis.
+    """
+    vertices, faces, _ = _weld(mesh.vertices, mesh.faces, None, cells)
+    if len(faces) > max_faces:
+        vertices, faces, _ = _collapse(vertices, faces, None, max_faces)
+    if len(faces) == 0:
+        return mesh
+    coarse = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
+    if mesh.normals is not None:
+        coarse = replace(coarse, normals=_normals_of_source(coarse, mesh))
+    return share_vertices(coarse)
+
+
 def share_vertices(mesh: Mesh) -> Mesh:
     """`mesh` with equal vertices only once: exporters give every triangle its own three. Normals that differ by half a
     degree count as equal."""

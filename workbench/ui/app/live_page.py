@@ -114,6 +114,8 @@ class Page:
         # For `tab_stays.js`: not the path itself, which may be long.
         which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
         server.gui.add_html(render("which", which=which, anew=False))
+        self._in_software = stage.in_software
+        self._in_software.ask()
         run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
@@ -278,7 +280,7 @@ class Page:
             self._layout = lay_out(task.geometry, step.poses)
             self._server.gui.set_panel_label(task.env_id)
             self._built = None
-        looks = self._view_panel.looks
+        looks = self._in_software.looks(self._view_panel.looks, task.geometry, self._layout, one)
         built = (one, looks)
         if built != self._built:
             self._built = built

@@ -101,6 +101,7 @@ class ReviewPage:
         )
         self._opening.add_button()
         server.gui.add_html(render("which", which="review", anew=place.wanted is not None))
+        place.stage.in_software.ask()
         self._add_way_back()
         review_tab, in_tabs = self._add_tabs(dark)
         self._timeline = ReviewTimeline(server, review, clock)

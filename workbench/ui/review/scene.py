@@ -181,7 +181,7 @@ class ReviewIn3D:
 
     def __init__(self, server: viser.ViserServer, review: Review, stage: Stage) -> None:
         self._review = review
-        self.bodies, self._framing = stage.scene, stage.framing
+        self.bodies, self._framing, self._in_software = stage.scene, stage.framing, stage.in_software
         self._mark = SelectionMark(server)
         self._names = [view_label(server, f"/names {index}", "top-center") for index in range(MOST_NAMED)]
         self._frustums = CameraFrustums(server)
@@ -218,6 +218,7 @@ class ReviewIn3D:
         if scene is None:
             self._draw_nothing(view)
             return
+        looks = self._in_software.looks(looks, scene.geometry, scene.layout, alone=False)
         if self._looks != looks:
             self._looks = looks
             self.bodies.build(scene.geometry, scene.layout, scene.poses(view.states), None, looks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,6 +11,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.core.scene.mesh_levels import from_afar
 from workbench.core.scene.shapes import SceneGeometry, fingerprint
 from workbench.core.scene.simplify import reduce_mesh
 from workbench.ui.scene.env_grid import EnvLayout, InView, place_of_plane, plane_normal
@@ -19,6 +21,8 @@ from workbench.ui.widgets.parts import Clock
 
 NAMES = ("/envs", "/floor")
 """Roots of its nodes in viser's tree."""
+LEAVES_AFTER = 0.7
+"""Seconds for which shapes stay whose place finer or coarser ones take: until the page has read those, nothing would be there."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,8 @@ class Looks:
     """Approximate limit; rich shapes are simplified to fit."""
     dark: bool = True
     """The page's theme: in the light one a dark floor is lighter than the task's."""
+    error: float = 0.0
+    """Metres by which shapes may be off, so that they have fewer triangles."""
 
 
 class SceneView:
@@ -47,7 +53,10 @@ class SceneView:
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         self._server, self._clock = server, clock
         self._rows: _Rows | None = None
-        self._drawn: dict[tuple[str, int, bool, int], _DrawnGroup] = {}
+        self._drawn: dict[tuple[Hashable, ...], _DrawnGroup] = {}
+        self._geometry: SceneGeometry | None = None
+        self._leaving: list[_DrawnGroup] = []
+        self._leave_at = 0.0
         self._number = 0
         look = {"cell_size": 0.5, "section_size": 1.0}
         colours = {"cell_color": (150, 150, 150), "section_color": (120, 120, 120)}
@@ -73,6 +82,7 @@ class SceneView:
         """
         shown_envs = geometry.num_envs if only_env is None else 1
         limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, looks.triangles)
+        self._remove_leaving()
         before, self._drawn, self._rows = self._drawn, {}, None
         for group in group_visuals(geometry):
             shape = fingerprint(group.visuals)
@@ -82,15 +92,18 @@ class SceneView:
             if any(normal is None for normal in normals):
                 once = None
             lighter = once is not None and not looks.dark
-            key = (shape, limit, lighter, sum(shape == known for known, *_ in self._drawn))
+            drawn_as = _DrawnAs(limit, looks.error, lighter)
+            key = (shape, drawn_as, sum(shape == known for known, *_ in self._drawn))
             drawn = before.pop(key, None)
             if drawn is None:
                 self._number += 1
-                drawn = _DrawnGroup(self._server, self._number, group, limit, lighter)
+                drawn = _DrawnGroup(self._server, self._number, group, drawn_as)
             drawn.set_instances(group, once)
             self._drawn[key] = drawn
-        for drawn in before.values():
-            drawn.handle.remove()
+        self._leaving = list(before.values())
+        if geometry is not self._geometry:
+            self._remove_leaving()
+        self._geometry, self._leave_at = geometry, self._clock() + LEAVES_AFTER
         if layout.has_floor:
             self._grid.draw()
         else:
@@ -107,11 +120,20 @@ class SceneView:
             layout: The grid of the envs.
             only_env: Show this env alone, at the origin; None shows all, on the grid.
         """
+        if self._leaving and self._clock() >= self._leave_at:
+            self._remove_leaving()
         if self._rows is None or not self._rows.is_for(layout, only_env):
-            self._rows = _Rows(tuple(self._drawn.values()), layout, only_env)
+            self._rows = _Rows((*self._drawn.values(), *self._leaving), layout, only_env)
         self._rows.move(poses, eyes_of(self._server), self._clock())
 
+    def _remove_leaving(self) -> None:
+        for group in self._leaving:
+            group.handle.remove()
+        if self._leaving:
+            self._leaving, self._rows = [], None
+
     def clear(self) -> None:
+        self._remove_leaving()
         for group in self._drawn.values():
             group.handle.remove()
         self._drawn.clear()
@@ -123,12 +145,25 @@ class SceneView:
         return tuple(group.handle for group in self._drawn.values())
 
 
+@dataclass(frozen=True)
+class _DrawnAs:
+    limit: int
+    """Triangles of a visual."""
+    error: float
+    lighter: bool
+
+
 class _DrawnGroup:
     def __init__(
-        self, server: viser.ViserServer, number: int, group: VisualGroup, limit: int, lighter: bool
+        self, server: viser.ViserServer, number: int, group: VisualGroup, drawn_as: _DrawnAs
     ) -> None:
-        parts = [(reduce_mesh(visual.mesh, limit), visual.material) for visual in group.visuals]
-        glb = as_glb([(mesh, lightened(material)) for mesh, material in parts] if lighter else parts)
+        parts = [
+            (reduce_mesh(from_afar(visual.mesh, drawn_as.error), drawn_as.limit), visual.material)
+            for visual in group.visuals
+        ]
+        if drawn_as.lighter:
+            parts = [(mesh, lightened(material)) for mesh, material in parts]
+        glb = as_glb(parts)
         # One instance far below the ground; the first move follows in the same batch.
         self.handle = server.scene.add_batched_glb(
             f"/envs/{number:03d} {group.name.replace('/', ' ')}",

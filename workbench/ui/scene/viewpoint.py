@@ -16,6 +16,7 @@ from workbench.session.live.view import SessionView
 from workbench.ui.scene.bodies import NAMES as BODIES
 from workbench.ui.scene.bodies import Looks, SceneView
 from workbench.ui.scene.env_grid import EnvLayout, box_corners
+from workbench.ui.scene.in_software import InSoftware
 from workbench.ui.server.viser_private import remove_nodes_but
 from workbench.ui.widgets.parts import Clock, PagePart
 
@@ -226,6 +227,7 @@ class Stage:
         server.initial_camera.far = 300.0
         self.scene = SceneView(server, clock)
         self.framing = Framing(server)
+        self.in_software = InSoftware(server, clock)
 
     def clear(self) -> None:
         """Remove everything of a page but the bodies and lights."""

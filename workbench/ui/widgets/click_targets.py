@@ -92,6 +92,15 @@ class Presses:
         pressed = self.id_of("unfolded", lambda _: unfolded())
         self._server.gui.add_html(render("unfolded", id=pressed), order=_LAST + 2)
 
+    def when_drawn_in_software(self, told: Callable[[viser.ClientHandle | None], None]) -> None:
+        """Call this with each page that draws its view in software (``drawn_in_software.js``).
+
+        Args:
+            told: called on a thread, in turn.
+        """
+        pressed = self.id_of("drawn in software", told)
+        self._server.gui.add_html(render("in_software", id=pressed), order=_LAST + 2)
+
     def number_id(self, key: Hashable, pressed: Callable[[int], None]) -> str:
         """The id to put into ``data-numbers`` around ``choosable.html``; the same key always gives the same input.
 

@@ -1,0 +1,111 @@
+"""Pages that draw their view in software, and how a scene is drawn for them: of few triangles."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Hashable
+from dataclasses import replace
+
+import numpy as np
+import viser
+
+from workbench.core.scene.mesh_levels import from_afar
+from workbench.core.scene.shapes import SceneGeometry
+from workbench.ui.scene.bodies import Looks
+from workbench.ui.scene.env_grid import EnvLayout
+from workbench.ui.scene.pixels import NEAREST, Eye, eyes_of
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.parts import Clock
+
+TOLERANCE = 1.5
+"""Pixels that a hundredth of a surface may be off; the most of it is much nearer."""
+STEADY = 1.6
+"""A tolerance stays until another is wanted that differs by this factor: each one is other meshes for the page."""
+AT_REST = 0.4
+"""Seconds without a motion of any page's camera."""
+
+
+class InSoftware:
+    """Which pages draw in software, and the looks for them. Outlives the pages of a server.
+
+    All pages of a server are sent the same shapes: simplified ones only while every open page draws in software.
+    """
+
+    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
+        self._server, self._clock = server, clock
+        self._told: set[int] = set()
+        self._eyes: tuple[Hashable, ...] = ()
+        self._since = clock()
+        self._made: tuple[SceneGeometry, float] | None = None
+        """What the simplified shapes are ready for: scene and tolerance."""
+        self._making: threading.Thread | None = None
+
+    def ask(self) -> None:
+        """Let the pages tell (``drawn_in_software.js``). Call it in the main panel of each new page."""
+        Presses(self._server).when_drawn_in_software(self._told_by)
+
+    def _told_by(self, client: viser.ClientHandle | None) -> None:
+        if client is not None:
+            self._told.add(client.client_id)
+
+    @property
+    def all_pages(self) -> bool:
+        """Whether there are open pages, and all of them draw in software."""
+        clients = self._server.get_clients().keys()
+        self._told &= clients
+        return bool(clients) and self._told >= clients
+
+    def looks(self, looks: Looks, geometry: SceneGeometry, layout: EnvLayout, alone: bool) -> Looks:
+        """These looks, or cheaper ones that differ by about a pixel in the pages that are open.
+
+        Shapes are simplified in a thread, and drawn so when they are ready. Who asks for finer ones than usual has them.
+
+        Args:
+            looks: As the person has chosen.
+            geometry: Of the scene.
+            layout: The grid of the envs.
+            alone: One env is shown, at the origin.
+        """
+        if not self.all_pages or looks.triangles > Looks().triangles:
+            return looks
+        eyes = eyes_of(self._server)
+        known = self._made is not None and self._made[0] is geometry
+        now = self._made[1] if known and self._made is not None else 0.0
+        if not eyes or (known and not self._rest(eyes)):
+            return replace(looks, error=now)
+        wanted = 2.0 ** (round(2 * np.log2(TOLERANCE * pixel_of(eyes, layout, alone))) / 2)
+        if not known or not 1 / STEADY < wanted / now < STEADY:
+            self._begin_to_make(geometry, wanted)
+        return replace(looks, error=now)
+
+    def _rest(self, eyes: tuple[Eye, ...]) -> bool:
+        seen = tuple((eye.position.tobytes(), eye.pixel) for eye in eyes)
+        if seen != self._eyes:
+            self._eyes, self._since = seen, self._clock()
+        return self._clock() - self._since >= AT_REST
+
+    def _begin_to_make(self, geometry: SceneGeometry, error: float) -> None:
+        if self._making is None or not self._making.is_alive():
+            self._making = threading.Thread(target=self._make, args=(geometry, error), daemon=True)
+            self._making.start()
+
+    def _make(self, geometry: SceneGeometry, error: float) -> None:
+        for visual in geometry.visuals:
+            from_afar(visual.mesh, error)
+        self._made = geometry, error
+
+
+def pixel_of(eyes: tuple[Eye, ...], layout: EnvLayout, alone: bool) -> float:
+    """Metres of a pixel at the env that is nearest to an eye.
+
+    Args:
+        alone: One env, at the origin.
+    """
+    offsets = np.zeros((1, 3)) if alone else layout.offsets
+    sizes = []
+    for eye in eyes:
+        at = eye.position - offsets
+        away = np.linalg.norm(at - np.clip(at, layout.low, layout.high), axis=1).min()
+        sizes.append(eye.pixel * max(float(away), NEAREST))
+    return min(sizes)
