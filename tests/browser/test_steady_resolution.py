@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image
 from playwright.sync_api import Browser, Page
 
 from tests.drive.waiting import until
-from tests.ui.scenes import box_mesh
+from tests.ui.scenes import box_mesh, table_scene
 from workbench.core.scene.shapes import Material
+from workbench.ui.scene.bodies import Looks
+from workbench.ui.scene.env_grid import lay_out
 from workbench.ui.scene.glb import as_glb
+from workbench.ui.scene.in_software import PATIENCE, InSoftware
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -43,6 +49,8 @@ WebGL2RenderingContext.prototype.shaderSource = function (shader, text) {
 ENOUGH_FRAMES = 60
 """viser decides after ten quarters of a second in which frames follow each other."""
 CANVAS = "document.querySelector('canvas[data-engine]')"
+SHOWN_PART = f"{CANVAS}.style.objectViewBox"
+RECTANGLE = f"() => JSON.stringify({CANVAS}.getBoundingClientRect())"
 Show = Callable[..., Page]
 
 
@@ -116,6 +124,7 @@ def test_a_page_with_a_graphics_card_is_sharp_and_still_adapts(gated_server: Gat
     page = show(A_CARD, SLOW_FRAMES)
     assert width(page) == 2 * 640
     draw_until(gated_server, page, f"{CANVAS}.width < {2 * 640}")
+    assert page.evaluate(SHOWN_PART) == ""
     page.close()
 
 
@@ -139,6 +148,65 @@ def test_a_page_drawn_in_software_is_drawn_in_less_time(gated_server: GatedServe
         assert cheaper in text
     for cheaper in ("material.dfg = vec2( 1.0, 0.0 )", "vec3 dxy = vec3( 0.0 )", "int x = j - y * size"):
         assert cheaper in text
+    page.close()
+
+
+def test_a_page_drawn_in_software_has_fewer_pixels_while_it_moves_and_is_sharp_at_rest(
+    gated_server: GatedServer, show: Show
+) -> None:
+    page = show(SLOW_FRAMES)
+    size = page.evaluate(f"(({RECTANGLE})())")
+    draw_until(gated_server, page, f"{SHOWN_PART} !== ''")
+    assert width(page) == 2 * 640
+    assert page.evaluate(f"(({RECTANGLE})())") == size
+    page.wait_for_function(f"() => {SHOWN_PART} === ''")
+    page.close()
+
+
+def test_what_is_drawn_with_fewer_pixels_is_in_its_place(gated_server: GatedServer, show: Show) -> None:
+    page = show(SLOW_FRAMES)
+    box = as_glb([(box_mesh((0.5, 0.5, 0.5)), Material((0.9, 0.1, 0.1, 1.0)))])
+    node = gated_server.server.scene.add_glb("/red", box)
+    page.wait_for_timeout(3000)
+    sharp = red_box(page)
+    draw_until(gated_server, page, f"{SHOWN_PART} !== ''")
+    page.evaluate("() => (window.requestAnimationFrame = () => 0)")  # The frame that is shown stays.
+    page.wait_for_timeout(500)
+    np.testing.assert_allclose(red_box(page), sharp, atol=3)
+    assert page.evaluate(f"{SHOWN_PART} !== ''")
+    node.remove()
+    page.close()
+
+
+def red_box(page: Page) -> NDArray[np.int64]:
+    """Where red is in the page: first and last column and row."""
+    pixels = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+    rows, columns = np.nonzero(pixels[..., 0] > pixels[..., 1:].max(axis=-1) + 60)
+    return np.array([columns.min(), columns.max(), rows.min(), rows.max()])
+
+
+def test_shapes_are_simpler_only_while_every_page_draws_in_software(
+    gated_server: GatedServer, show: Show
+) -> None:
+    now = 0.0
+    in_software = InSoftware(gated_server.server, clock=lambda: now)
+    page = show()
+    until(lambda: len(gated_server.server.get_clients()) == 1, "the page")
+    assert not in_software.all_pages
+    in_software.ask()
+    until(lambda: in_software.all_pages, "the page says so")
+    geometry, poses = table_scene(4)
+    layout = lay_out(geometry, poses)
+    until(lambda: in_software.looks(Looks(), geometry, layout, alone=False).error > 0, "simpler shapes")
+    assert in_software.looks(Looks(1_000_000), geometry, layout, alone=False).error == 0
+    other = show(A_CARD)
+    until(lambda: len(gated_server.server.get_clients()) == 2, "the other page")
+    assert in_software.all_pages
+    now = PATIENCE
+    assert not in_software.all_pages
+    assert in_software.looks(Looks(), geometry, layout, alone=False) == Looks()
+    other.close()
+    until(lambda: in_software.all_pages, "the other page is gone")
     page.close()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from workbench.core.scene.mesh_levels import reduced_mesh
+from workbench.core.scene.mesh_levels import deviation, from_afar, reduced_mesh
 from workbench.core.scene.shapes import Mesh
 
 
@@ -34,3 +34,30 @@ def test_a_reduced_mesh_is_read_from_disk_the_next_time_and_made_again_from_a_br
         np.testing.assert_array_equal(again.faces, made.faces)
         np.testing.assert_array_equal(again.normals, made.normals)
     assert reduced_mesh(mesh, 100) is not None and len(list(tmp_path.rglob("*.npz"))) == 2
+
+
+def test_a_mesh_from_afar_has_few_triangles_near_its_surface_and_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    # Forty loose pieces, as screws are, which a collapse of edges alone keeps.
+    balls = [trimesh.creation.icosphere(subdivisions=2, radius=0.004) for _ in range(40)]
+    for number, ball in enumerate(balls):
+        ball.apply_translation((0.1 * np.cos(number), 0.1 * np.sin(number), 0.0))
+    solid = trimesh.util.concatenate([trimesh.creation.icosphere(subdivisions=3, radius=0.1), *balls])
+    mesh = Mesh(solid.vertices.astype(np.float32), solid.faces.astype(np.uint32))
+    counts = [len(from_afar(mesh, error).faces) for error in (0.001, 0.01, 0.03)]
+    assert len(mesh.faces) > counts[0] > counts[1] > counts[2] > 0 and len(mesh.faces) > 10 * counts[1]
+    assert deviation(mesh, from_afar(mesh, 0.01)) <= 0.01
+    assert len(list(tmp_path.rglob("*.npz"))) == 3
+    assert from_afar(mesh, 0.0) is mesh
+
+
+def test_simple_and_textured_meshes_stay_from_afar_as_they_are() -> None:
+    disc = trimesh.creation.cylinder(0.1, 0.0005, sections=32)
+    thin = Mesh(disc.vertices.astype(np.float32), disc.faces.astype(np.uint32))
+    assert from_afar(thin, 0.1) is thin
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    uvs = np.zeros((len(ball.vertices), 2), np.float32)
+    textured = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32), uvs=uvs)
+    assert from_afar(textured, 0.1) is textured

@@ -9,8 +9,8 @@ import trimesh
 import viser
 
 from tests.ui.scenes import table_scene
-from workbench.core.scene.shapes import Material
-from workbench.ui.scene.bodies import Looks, SceneView
+from workbench.core.scene.shapes import Material, Mesh
+from workbench.ui.scene.bodies import LEAVES_AFTER, Looks, SceneView
 from workbench.ui.scene.env_grid import lay_out
 from workbench.ui.scene.glb import group_visuals
 
@@ -125,3 +125,31 @@ def test_a_dark_floor_is_lighter_in_the_light_theme_and_nothing_else_is_sent(
     assert floor.visual.material.baseColorFactor[:3].min() > 200
     view.build(geometry, layout, poses)
     assert {handle.glb_data for handle in view.handles} == set(before.values())
+
+
+def test_simpler_shapes_take_the_place_of_the_finer_ones_a_moment_later(server: viser.ViserServer) -> None:
+    now = 0.0
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32))
+    geometry, poses = table_scene(4)
+    cube = next(visual for visual in geometry.visuals if "cube" in visual.name)
+    visuals = tuple(replace(visual, mesh=mesh) if visual is cube else visual for visual in geometry.visuals)
+    geometry = replace(geometry, visuals=visuals)
+    layout = lay_out(geometry, poses)
+    view = SceneView(server, clock=lambda: now)
+    view.build(geometry, layout, poses)
+    fine = handle_named(view, "cube")
+    rest = [handle.name for handle in view.handles if handle is not fine]
+    view.build(geometry, layout, poses, looks=Looks(error=0.01))
+    simple = handle_named(view, "cube")
+    assert len(simple.glb_data) < 0.5 * len(fine.glb_data)
+    assert [handle.name for handle in view.handles if handle is not simple] == rest
+    poses[:, 3, 0] += 0.1
+    view.move(poses, layout, None)
+    # Both follow, so that nothing is seen of the change.
+    np.testing.assert_array_equal(fine.batched_positions, simple.batched_positions)
+    assert server.scene.get_handle_by_name(fine.name) is fine
+    now = LEAVES_AFTER
+    view.move(poses, layout, None)
+    assert server.scene.get_handle_by_name(fine.name) is None
+    assert server.scene.get_handle_by_name(simple.name) is simple

@@ -92,7 +92,7 @@ class SceneView:
             if any(normal is None for normal in normals):
                 once = None
             lighter = once is not None and not looks.dark
-            drawn_as = _DrawnAs(limit, looks.error, lighter)
+            drawn_as = _DrawnAs(limit, looks.error if _is_simpler(group, looks.error) else 0.0, lighter)
             key = (shape, drawn_as, sum(shape == known for known, *_ in self._drawn))
             drawn = before.pop(key, None)
             if drawn is None:
@@ -100,9 +100,13 @@ class SceneView:
                 drawn = _DrawnGroup(self._server, self._number, group, drawn_as)
             drawn.set_instances(group, once)
             self._drawn[key] = drawn
-        self._leaving = list(before.values())
-        if geometry is not self._geometry:
-            self._remove_leaving()
+        same = geometry is self._geometry
+        for drawn in before.values():
+            # Two floors of different brightness in one place would flicker.
+            if same and not drawn.is_plane:
+                self._leaving.append(drawn)
+            else:
+                drawn.handle.remove()
         self._geometry, self._leave_at = geometry, self._clock() + LEAVES_AFTER
         if layout.has_floor:
             self._grid.draw()
@@ -145,6 +149,10 @@ class SceneView:
         return tuple(group.handle for group in self._drawn.values())
 
 
+def _is_simpler(group: VisualGroup, error: float) -> bool:
+    return any(len(from_afar(visual.mesh, error).faces) < len(visual.mesh.faces) for visual in group.visuals)
+
+
 @dataclass(frozen=True)
 class _DrawnAs:
     limit: int
@@ -183,6 +191,10 @@ class _DrawnGroup:
         corners = [np.abs(visual.mesh.vertices).max(axis=0) for visual in group.visuals]
         self.reach = float(max(np.linalg.norm(corner) for corner in corners))
         """Metres around its frame within which it lies."""
+
+    @property
+    def is_plane(self) -> bool:
+        return self._once is not None
 
     def rows(
         self, layout: EnvLayout, only_env: int | None

@@ -24,6 +24,9 @@ STEADY = 1.6
 """A tolerance stays until another is wanted that differs by this factor: each one is other meshes for the page."""
 AT_REST = 0.4
 """Seconds without a motion of any page's camera."""
+PATIENCE = 3.0
+"""Seconds within which a page says that it draws in software. Until then nothing changes: a page that is loaded again would
+be sent fine shapes and then simple ones."""
 
 
 class InSoftware:
@@ -35,6 +38,9 @@ class InSoftware:
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         self._server, self._clock = server, clock
         self._told: set[int] = set()
+        self._came: dict[int, float] = {}
+        """By page: when it was seen first."""
+        self._all = False
         self._eyes: tuple[Hashable, ...] = ()
         self._since = clock()
         self._made: tuple[SceneGeometry, float] | None = None
@@ -51,10 +57,16 @@ class InSoftware:
 
     @property
     def all_pages(self) -> bool:
-        """Whether there are open pages, and all of them draw in software."""
-        clients = self._server.get_clients().keys()
+        """Whether all open pages draw in software."""
+        clients, now = self._server.get_clients().keys(), self._clock()
+        self._came = {page: self._came.get(page, now) for page in clients}
         self._told &= clients
-        return bool(clients) and self._told >= clients
+        untold = clients - self._told
+        if any(now - self._came[page] >= PATIENCE for page in untold):
+            self._all = False
+        elif clients and not untold:
+            self._all = True
+        return self._all
 
     def looks(self, looks: Looks, geometry: SceneGeometry, layout: EnvLayout, alone: bool) -> Looks:
         """These looks, or cheaper ones that differ by about a pixel in the pages that are open.
