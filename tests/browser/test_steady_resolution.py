@@ -5,16 +5,18 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
 from tests.drive.waiting import until
 from tests.ui.scenes import box_mesh, table_scene
-from workbench.core.scene.shapes import Material
+from workbench.core.scene.shapes import Material, Mesh
 from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import lay_out
 from workbench.ui.scene.glb import as_glb
@@ -195,9 +197,13 @@ def test_shapes_are_simpler_only_while_every_page_draws_in_software(
     assert not in_software.all_pages
     in_software.ask()
     until(lambda: in_software.all_pages, "the page says so")
-    geometry, poses = table_scene(4)
+    geometry, poses = table_scene(100)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    mesh = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32))
+    geometry = replace(geometry, visuals=tuple(replace(visual, mesh=mesh) for visual in geometry.visuals))
     layout = lay_out(geometry, poses)
     until(lambda: in_software.looks(Looks(), geometry, layout, alone=False).error > 0, "simpler shapes")
+    assert in_software.looks(Looks(), geometry, layout, alone=True) == Looks()
     assert in_software.looks(Looks(1_000_000), geometry, layout, alone=False).error == 0
     other = show(A_CARD)
     until(lambda: len(gated_server.server.get_clients()) == 2, "the other page")
