@@ -254,7 +254,9 @@ def told_of_view(windows: list[Window]) -> str:
     """The window with the most frames of the view, and what one of them takes."""
     best = max(windows, key=lambda window: window.drawn)
     counts = ", ".join(f"{window.drawn:.1f}" for window in windows)
-    drawing = ", ".join(f"{1000 * w.processor.get(PROCESSES[4], 0.0) / max(w.drawn, 1e-9):.0f}" for w in windows)
+    drawing = ", ".join(
+        f"{1000 * w.processor.get(PROCESSES[4], 0.0) / max(w.drawn, 1e-9):.0f}" for w in windows
+    )
     return f"drawn frames a second: {best.drawn:.1f} (of windows: {counts}); processor, ms of drawing a frame: {drawing}"
 
 

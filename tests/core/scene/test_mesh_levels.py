@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +45,7 @@ def test_a_mesh_from_afar_has_few_triangles_near_its_surface_and_is_kept(
     balls = [trimesh.creation.icosphere(subdivisions=2, radius=0.004) for _ in range(40)]
     for number, ball in enumerate(balls):
         ball.apply_translation((0.1 * np.cos(number), 0.1 * np.sin(number), 0.0))
-    solid = trimesh.util.concatenate([trimesh.creation.icosphere(subdivisions=3, radius=0.1), *balls])
+    solid: Any = trimesh.util.concatenate([trimesh.creation.icosphere(subdivisions=3, radius=0.1), *balls])
     mesh = Mesh(solid.vertices.astype(np.float32), solid.faces.astype(np.uint32))
     counts = [len(from_afar(mesh, error).faces) for error in (0.001, 0.01, 0.03)]
     assert len(mesh.faces) > counts[0] > counts[1] > counts[2] > 0 and len(mesh.faces) > 10 * counts[1]
