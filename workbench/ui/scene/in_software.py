@@ -12,6 +12,7 @@ import viser
 
 from workbench.core.scene.mesh_levels import from_afar
 from workbench.core.scene.shapes import SceneGeometry
+from workbench.machine.processes.watched_thread import report_failure
 from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import EnvLayout
 from workbench.ui.scene.pixels import NEAREST, Eye, eyes_of
@@ -47,6 +48,8 @@ class InSoftware:
         self._since = clock()
         self._made: tuple[SceneGeometry, float] | None = None
         """What the simplified shapes are ready for: scene and tolerance."""
+        self._unfit: SceneGeometry | None = None
+        """The scene whose shapes cannot be simplified."""
         self._making: threading.Thread | None = None
 
     def ask(self) -> None:
@@ -82,7 +85,9 @@ class InSoftware:
             layout: The grid of the envs.
             alone: One env is shown, at the origin.
         """
-        if not self.all_pages or looks.triangles > Looks().triangles or _triangles(geometry, alone) <= FEW:
+        if not self.all_pages or geometry is self._unfit:
+            return looks
+        if looks.triangles > Looks().triangles or _triangles(geometry, alone) <= FEW:
             return looks
         eyes = eyes_of(self._server)
         known = self._made is not None and self._made[0] is geometry
@@ -106,9 +111,15 @@ class InSoftware:
             self._making.start()
 
     def _make(self, geometry: SceneGeometry, error: float) -> None:
-        for visual in geometry.visuals:
-            from_afar(visual.mesh, error)
-        self._made = geometry, error
+        try:
+            for visual in geometry.visuals:
+                from_afar(visual.mesh, error)
+        except Exception as why:
+            # Else it would be tried again at each step.
+            self._unfit = geometry
+            report_failure("Shapes cannot be simplified for pages that draw in software", why)
+        else:
+            self._made = geometry, error
 
 
 def _triangles(geometry: SceneGeometry, alone: bool) -> int:
