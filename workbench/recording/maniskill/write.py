@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+import math
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -23,6 +23,11 @@ _LEVEL = 1
 """Of zlib. On numbers of a simulation level 4 saves 1 % more, in a third more time."""
 _MAKES_UTF8 = h5py.h5p.create(h5py.h5p.LINK_CREATE)
 _MAKES_UTF8.set_char_encoding(h5py.h5t.CSET_UTF8)
+_ORDERED = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
+_ORDERED.set_link_creation_order(h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED)
+_ORDERED.set_obj_track_times(False)
+_GROWS_BY = 256 << 10
+"""Bytes by which a file in memory grows."""
 
 
 def write_h5(episode: Episode, path: Path) -> None:
@@ -38,18 +43,19 @@ def write_h5(episode: Episode, path: Path) -> None:
         ValueError: HDF5 refuses a column.
     """
     # In memory: on a disk error HDF5 leaves files half open.
-    content = io.BytesIO()
-    with h5py.File(content, "w") as file:
+    with h5py.File(path, "w", driver="core", backing_store=False, block_size=_GROWS_BY) as file:
         put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
-    with path.open("xb") as file:
-        file.write(content.getbuffer())
+        file.flush()
+        content = file.id.get_file_image()
+    with path.open("xb") as written:
+        written.write(content)
     h5py.File(path, "r").close()  # fails on a truncated file
 
 
 def put_columns(episode: Episode, trajectory: h5py.Group) -> None:
     """Write the columns of an episode into its group, as `write_h5` says."""
     # Names in the file: asking h5py is slow.
-    groups: dict[tuple[str, ...], h5py.Group] = {(): trajectory}
+    groups: dict[tuple[str, ...], h5py.h5g.GroupID] = {(): trajectory.id}
     taken: set[tuple[str, ...]] = set()
 
     def add(path: str, values: NDArray) -> None:
@@ -61,7 +67,8 @@ def put_columns(episode: Episode, trajectory: h5py.Group) -> None:
                 leaf = "_".join([folder, *folders, leaf])
                 break
             if (*inside, folder) not in groups:
-                groups[(*inside, folder)] = groups[inside].create_group(folder, track_order=True)
+                parent = groups[inside]
+                groups[(*inside, folder)] = h5py.h5g.create(parent, folder.encode(), _MAKES_UTF8, _ORDERED)
             inside = (*inside, folder)
         while (*inside, leaf) in taken or (*inside, leaf) in groups:
             leaf += "_"
@@ -80,14 +87,15 @@ def put_columns(episode: Episode, trajectory: h5py.Group) -> None:
     add("rewards", episode.reward)
 
 
-def _put(parent: h5py.Group, name: str, values: NDArray) -> None:
+def _put(parent: h5py.h5g.GroupID, name: str, values: NDArray) -> None:
     """Write a dataset by HDF5's low-level calls: h5py's high-level ones take longer than writing the numbers."""
     kind, space = _kind(values.dtype), h5py.h5s.create_simple(values.shape)
-    row = int(np.prod(values.shape[1:])) * values.dtype.itemsize
+    row = math.prod(values.shape[1:]) * values.dtype.itemsize
     packing = _packed(values.shape, row) if row * values.shape[0] >= _WORTH_PACKING else _PLAIN
-    dataset = h5py.h5d.create(parent.id, name.encode(), kind, space, packing, _MAKES_UTF8)
+    dataset = h5py.h5d.create(parent, name.encode(), kind, space, packing, _MAKES_UTF8)
     if values.size:
-        dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(values))
+        # With its type: h5py makes it anew otherwise, which takes longer than writing.
+        dataset.write(h5py.h5s.ALL, h5py.h5s.ALL, np.ascontiguousarray(values), kind)
 
 
 @cache

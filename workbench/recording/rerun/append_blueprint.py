@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
+from typing import BinaryIO
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -99,12 +100,16 @@ def add_blueprint(path: Path, blueprint: BlueprintBytes) -> None:
     """
     with path.open("r+b") as file:
         index = read_index(file, path.name)
-        manifests = [with_packed_schema(manifest) for manifest in index.manifests]
-        manifests.append(blueprint.manifest_at(index.begin))
-        file.seek(index.begin)
-        file.write(blueprint.messages)
-        file.write(index_bytes(index.begin + len(blueprint.messages), manifests))
-        file.truncate()
+        write_end(file, index.begin, [with_packed_schema(each) for each in index.manifests], blueprint)
+
+
+def write_end(file: BinaryIO, end: int, manifests: Sequence[bytes], blueprint: BlueprintBytes) -> None:
+    """Write `blueprint` and the index behind the chunks of `file`, which end at `end`. Raises OSError."""
+    index = index_bytes(end + len(blueprint.messages), [*manifests, blueprint.manifest_at(end)])
+    file.seek(end)
+    file.write(blueprint.messages)
+    file.write(index)
+    file.truncate()
 
 
 def blueprint_stream(path: Path) -> bytes | None:

@@ -13,17 +13,15 @@ import numpy as np
 import pyarrow as pa
 from rerun.chunk import Chunk
 
-from workbench.recording.rerun.append_blueprint import BlueprintBytes
+from workbench.recording.rerun.append_blueprint import BlueprintBytes, write_end
 from workbench.recording.rerun.private_api import read_fields
 from workbench.recording.rerun.rrd_index import (
     ID,
     MESSAGE,
     PLACE,
     SIZE,
-    Index,
     Manifest,
     Schema,
-    index_bytes,
     moved,
     packed,
     read_index,
@@ -50,29 +48,6 @@ class _Kept:
     """In the index, with places counted from the first of `messages`."""
     schema: Schema
     """Of the whole file."""
-
-
-@dataclass(frozen=True)
-class _File:
-    """A complete ``.rrd`` with a recording alone."""
-
-    content: bytes
-    index: Index
-    manifest: Manifest
-
-    @staticmethod
-    def read(path: Path) -> _File:
-        with path.open("rb") as file:
-            index = read_index(file, path.name)
-            file.seek(0)
-            content = file.read()
-        return _File(content, index, Manifest.read(index.manifests[0]))
-
-    @property
-    def recording_id(self) -> bytes:
-        found = dict(read_fields(self.manifest.store))[_RECORDING_ID]
-        assert not isinstance(found, int)
-        return bytes(found)
 
 
 _kept: OrderedDict[Key, dict[bytes, _Kept]] = OrderedDict()
@@ -105,17 +80,20 @@ def keep(key: Key, whole: Path, rest: bytes) -> None:
 
     Raises OSError.
     """
-    file = _File.read(whole)
-    table = file.manifest.table
+    with whole.open("rb") as file:
+        manifest = Manifest.read(read_index(file, whole.name).manifests[0])
+        file.seek(0)
+        content = file.read()
+    table = manifest.table
     ids = {bytes.fromhex(id_.rpartition("_")[2]) for id_ in key[1:]}
     rows = np.flatnonzero([id_ in ids for id_ in table.column(ID).to_pylist()])
     places, sizes = (table.column(name).to_numpy().take(rows).tolist() for name in (PLACE, SIZE))
-    each = [file.content[place - MESSAGE.size : place + size] for place, size in zip(places, sizes)]
+    each = [content[place - MESSAGE.size : place + size] for place, size in zip(places, sizes)]
     ends = np.cumsum([len(message) for message in each])
     column = table.schema.get_field_index(PLACE)
     begins = pa.array((ends - np.array(sizes)).astype(np.uint64))
     table = table.take(pa.array(rows)).set_column(column, table.schema.field(column), begins)
-    id_, messages = file.recording_id, b"".join(each)
+    id_, messages = _recording_id(manifest), b"".join(each)
     with _keeping:
         kept = _kept.setdefault(key, {})
         for other in kept.values():  # with other chunks beside them, mostly the same bytes
@@ -124,7 +102,7 @@ def keep(key: Key, whole: Path, rest: bytes) -> None:
                 break
         if len(kept) >= _MOST_SHAPES:
             kept.clear()
-        kept[rest] = _Kept(id_, messages, table, packed(file.manifest.schema))
+        kept[rest] = _Kept(id_, messages, table, packed(manifest.schema))
 
 
 def schema_hash(path: Path) -> bytes:
@@ -133,43 +111,34 @@ def schema_hash(path: Path) -> bytes:
         return Manifest.read(read_index(file, path.name).manifests[0]).schema.hash
 
 
-def add_kept(path: Path, key: Key, first: int, blueprint: BlueprintBytes) -> bool:
-    """Add the kept chunks behind the `first` ones of the file at `path`, and a blueprint; whether there were any.
-
-    Raises OSError.
-    """
-    file = _File.read(path)
-    with _keeping:
-        kept = _kept.get(key, {}).get(file.manifest.schema.hash)
-    if kept is None:
-        return False
-    messages = kept.messages.replace(kept.recording_id, file.recording_id)
-    own = file.manifest.table
-    begin = own.column(PLACE)[first].as_py() - MESSAGE.size
-    table = _joined(own[:first], moved(kept.rows, begin), moved(own[first:], len(messages)))
-    manifest = replace(file.manifest, schema=kept.schema, table=table)
-    end = file.index.begin + len(messages)
-    manifests = [manifest.written(), blueprint.manifest_at(end)]
-    parts = (
-        file.content[:begin],
-        messages,
-        file.content[begin : file.index.begin],
-        blueprint.messages,
-        index_bytes(end + len(blueprint.messages), manifests),
-    )
-    with path.open("wb") as written:
-        written.writelines(parts)
+def add_kept(path: Path, key: Key, blueprint: BlueprintBytes) -> bool:
+    """Add the kept chunks behind those of the file at `path`, and a blueprint; whether there were any. Raises OSError."""
+    with path.open("r+b") as file:
+        index = read_index(file, path.name)
+        manifest = Manifest.read(index.manifests[0])
+        with _keeping:
+            kept = _kept.get(key, {}).get(manifest.schema.hash)
+        if kept is None:
+            return False
+        messages = kept.messages.replace(kept.recording_id, _recording_id(manifest))
+        table = _joined(manifest.table, moved(kept.rows, index.begin))
+        whole = replace(manifest, schema=kept.schema, table=table)
+        file.seek(index.begin)
+        file.write(messages)
+        write_end(file, index.begin + len(messages), [whole.written()], blueprint)
     return True
 
 
-def _joined(before: pa.RecordBatch, kept: pa.RecordBatch, behind: pa.RecordBatch) -> pa.RecordBatch:
-    """All rows. What the others lack are columns that say whether a chunk has a component for all times."""
-
-    def widened(own: pa.RecordBatch) -> pa.RecordBatch:
-        absent = pa.array(np.zeros(own.num_rows, np.bool_))
-        columns = [own.column(numbers[name]) if name in numbers else absent for name in kept.schema.names]
-        return pa.RecordBatch.from_arrays(columns, schema=kept.schema)
-
-    numbers = {name: number for number, name in enumerate(before.schema.names)}
-    rows = pa.Table.from_batches([widened(before), kept, widened(behind)])
+def _joined(own: pa.RecordBatch, kept: pa.RecordBatch) -> pa.RecordBatch:
+    """All rows. What `own` lacks are columns that say whether a chunk has a component for all times."""
+    numbers = {name: number for number, name in enumerate(own.schema.names)}
+    absent = pa.array(np.zeros(own.num_rows, np.bool_))
+    columns = [own.column(numbers[name]) if name in numbers else absent for name in kept.schema.names]
+    rows = pa.Table.from_batches([pa.RecordBatch.from_arrays(columns, schema=kept.schema), kept])
     return rows.combine_chunks().to_batches()[0]
+
+
+def _recording_id(manifest: Manifest) -> bytes:
+    found = dict(read_fields(manifest.store))[_RECORDING_ID]
+    assert not isinstance(found, int)
+    return bytes(found)

@@ -76,16 +76,16 @@ def _write_small(episode: Episode, path: Path, application_id: str, blueprint: B
     texts = [
         _texts_chunk(name, json_text(named.pop(name))) for name in ("versions", "source") if name in named
     ]
-    first, own = list(_property_chunks(episode, named)), list(own_chunks(episode))
+    own = [*_property_chunks(episode, named), *own_chunks(episode)]
     shared = [*texts, *shared_chunks(episode)]
     key = key_of(application_id, shared)
     rest = None
     if is_known(key):
-        write_chunks(chain(first, own), path, application_id)
-        if add_kept(path, key, len(first), blueprint):
+        write_chunks(own, path, application_id)
+        if add_kept(path, key, blueprint):
             return
         rest = schema_hash(path)
-    write_chunks(chain(first, shared, own), path, application_id)
+    write_chunks(chain(own, shared), path, application_id)
     if rest is not None:
         keep(key, path, rest)
     add_blueprint(path, blueprint)
