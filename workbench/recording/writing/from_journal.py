@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import msgspec
@@ -50,7 +50,7 @@ class Header:
 def header_text(header: Header) -> str:
     """`header` without its meshes, as JSON."""
     geometry = header.geometry
-    info = json_text(asdict(header.info))
+    info = json_text({**vars(header.info), "seal": None})
     return json_text(
         {
             "info": info,

@@ -11,10 +11,12 @@ import stat
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import fields
 from functools import lru_cache
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 from zipfile import BadZipFile
@@ -121,13 +123,9 @@ class Journal:
                 items, self._waiting = self._waiting, []
             entries, done, error = _resolve(items)
             if entries:
+                columns = zip(*_rows_joined(entries))
                 batch = pa.record_batch(
-                    [
-                        pa.array([entry.kind for entry in entries], pa.string()),
-                        pa.array([entry.number for entry in entries], pa.int32()),
-                        pa.array([entry.value for entry in entries], pa.binary()),
-                    ],
-                    schema=_SCHEMA,
+                    [pa.array(column, of.type) for of, column in zip(_SCHEMA, columns)], schema=_SCHEMA
                 )
                 try:
                     self._put(batch.serialize())
@@ -210,6 +208,15 @@ def _resolve(items: Sequence[JournalItem]) -> tuple[list[JournalEntry], int, OSE
         if item.kind == "row":
             whole, done = len(entries), number
     return entries, len(items), None
+
+
+def _rows_joined(entries: Iterable[JournalEntry]) -> Iterator[JournalEntry]:
+    """Consecutive rows of a layout as one entry: a hundred entries take as long as the files that are made of them."""
+    for (kind, number), run in groupby(entries, key=itemgetter(0, 1)):
+        if kind == "row":
+            yield JournalEntry(kind, number, b"".join([entry.value for entry in run]))
+        else:
+            yield from run
 
 
 def _size(entry: JournalEntry) -> int:
