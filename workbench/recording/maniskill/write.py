@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from functools import cache
@@ -26,8 +27,6 @@ _MAKES_UTF8.set_char_encoding(h5py.h5t.CSET_UTF8)
 _ORDERED = h5py.h5p.create(h5py.h5p.GROUP_CREATE)
 _ORDERED.set_link_creation_order(h5py.h5p.CRT_ORDER_TRACKED | h5py.h5p.CRT_ORDER_INDEXED)
 _ORDERED.set_obj_track_times(False)
-_GROWS_BY = 256 << 10
-"""Bytes by which a file in memory grows."""
 
 
 def write_h5(episode: Episode, path: Path) -> None:
@@ -43,12 +42,11 @@ def write_h5(episode: Episode, path: Path) -> None:
         ValueError: HDF5 refuses a column.
     """
     # In memory: on a disk error HDF5 leaves files half open.
-    with h5py.File(path, "w", driver="core", backing_store=False, block_size=_GROWS_BY) as file:
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
         put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
-        file.flush()
-        content = file.id.get_file_image()
-    with path.open("xb") as written:
-        written.write(content)
+    with path.open("xb") as file:
+        file.write(content.getbuffer())
     h5py.File(path, "r").close()  # fails on a truncated file
 
 
