@@ -56,8 +56,13 @@ def test_parts_and_what_they_lacked_are_the_whole(place: Path, capsys: pytest.Ca
     assert run("merge", *parts) == 2
     assert "the episodes are in 2 folders" in capsys.readouterr().err
     assert run("merge", *parts, "--out", "demos", "--job", "whole.job") == 1
-    assert "2 of the job's episodes are in none of these files." in capsys.readouterr().out
+    assert (
+        "2 of the job's episodes are in none of these files: number 2, number 3\n" in capsys.readouterr().out
+    )
+    capsys.readouterr()
     assert record("--out", "demos", "--job", "whole.job") == 0
+    # Those that are there already are no progress.
+    assert re.findall(r"^episode (\d):", capsys.readouterr().err, re.M) == ["2", "3"]
     assert bits(place / "demos") == bits(place / "whole") and len(bits(place / "demos")) == 6
     assert run("merge", "whole.job") == 0
     assert str(place / "demos") in capsys.readouterr().out

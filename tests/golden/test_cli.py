@@ -83,7 +83,7 @@ CALLS = {
         "record push.py --cpus-per-worker 0",
         "record push.py --shard 5/4",
         "record push.py --shard 1/4 --successes 2",
-        "record push.py --job gone/part.job --no-pictures",
+        "record push.py --job push.py --no-pictures",
         "record push.py --upload nonsense://place",
         "record push.py --actions gone.npy",
         "record push.py --actions gone.py:act",

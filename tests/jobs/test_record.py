@@ -380,7 +380,8 @@ def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.C
     assert record_in_terminal(what) == 1
     said = capsys.readouterr()
     assert "policy failed" in said.err and "tired" in said.err
-    assert "without a result: episode 1" in said.err
+    assert "without a result, 1 in all: episode 1" in said.err
+    assert "1 episode recorded, 1 without a result" in said.err
     assert "Look at them with: workbench review" in said.out
 
 

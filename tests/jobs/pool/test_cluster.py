@@ -244,7 +244,7 @@ def test_a_line_that_stops_for_a_debugger_is_refused_and_not_waited_at(
     line: str, address: str, task: Path
 ) -> None:
     task.write_text(TASK.replace("        far = self", f"        {line}\n        far = self"))
-    with pytest.raises(TaskError, match="this line stops for a debugger.*--workers 1 in a terminal"):
+    with pytest.raises(TaskError, match="this line stops for a debugger.*--workers 1 without --cluster"):
         record(wanted("there"), executor=Cluster(address, 1))
 
 

@@ -127,9 +127,9 @@ def test_a_result_of_another_type_is_refused(tmp_path: Path) -> None:
         read_parts([tmp_path / "a.job"]).results(Written)
 
 
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"there is no folder .*gone for a\.job"):
-        JobFile(tmp_path / "gone" / "a.job", JOB)
+def test_a_missing_folder_is_made(tmp_path: Path) -> None:
+    JobFile(tmp_path / "new" / "a.job", JOB).close()
+    assert (tmp_path / "new" / "a.job").is_file()
 
 
 # --- which job it is -------------------------------------------------------------------------------------

@@ -11,6 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.drive.waiting import until
+from tests.recording.library_files import describe
 from workbench.recording.library.jobs import (
     SILENT_SECONDS,
     JobFailure,
@@ -37,6 +39,23 @@ def test_a_job_is_seen_while_it_runs_and_a_while_after(tmp_path: Path) -> None:
     assert [one.state for one in read_jobs(tmp_path, now + 60)] == ["done"]
     assert read_jobs(tmp_path, now + 3601) == ()
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_jobs_of_folders_below_are_seen_with_their_place(tmp_path: Path) -> None:
+    below = tmp_path / "parts" / "1"
+    below.mkdir(parents=True)
+    describe(below, "one", id="one")
+    StatusFile(below).write(RUNS)
+    library = Library(tmp_path)
+    library.watch()
+    try:
+        until(lambda: library.view().jobs, "the job")
+        (job,) = library.view().jobs
+        assert job.place == "parts/1"
+        shown = render("library_jobs", jobs=[{"of": job, "how": "", "runs": True}])
+        assert "my_task.py into parts/1/" in shown
+    finally:
+        library.close()
 
 
 def test_it_is_written_once_a_second_and_its_end_at_once(tmp_path: Path) -> None:

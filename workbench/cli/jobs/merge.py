@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -130,12 +130,14 @@ def _print(merged: JobParts, output: MergeOutput) -> int:
     if merged.command == "rescore":
         return _print_rescore(merged, output)
     folder = next(iter(merged.folders.values()), "")
+    items: Iterable[int]
     known: dict[int, Written | None] = merged.results(Written | None)
     if merged.command == "record":
         what = merged.requested(RecordOptions)
         what = replace(what, out=Path(folder or what.out))
         recorded = collect(what, known)
         code, missing = print_recorded(what, recorded), recorded.missing
+        items = range(what.episodes or 0)
     elif merged.command == "solve":
         asked = merged.requested(SolveOptions)
         asked = replace(asked, out=Path(folder or asked.out))
@@ -147,6 +149,7 @@ def _print(merged: JobParts, output: MergeOutput) -> int:
         write_solve_reports(report, asked, files)
         print_report(report)
         code, missing = Exit.FAILED if files.fails(report) else Exit.DONE, recorded.missing
+        items = range(asked.seeds)
     else:
         varied = merged.requested(SweepOptions)
         varied = replace(varied, out=Path(folder or varied.out))
@@ -154,13 +157,15 @@ def _print(merged: JobParts, output: MergeOutput) -> int:
         keep_results(varied, swept.results)
         write_sweep_reports(swept.results, SweepOutput(output.json_file, output.csv_file))
         code, missing = print_report_of_sweep(swept, varied, has_table=True), swept.missing
-    return _with_missing(code, missing, "episodes")
+        items = varied.items
+    return _with_missing(code, missing, "episodes", (f"number {n}" for n in items if n not in known))
 
 
-def _with_missing(code: int, missing: int, what: str) -> int:
+def _with_missing(code: int, missing: int, what: str, names: Iterable[str] = ()) -> int:
     """Say what is missing; returns the exit code."""
     if missing:
-        print_text(f"{missing} of the job's {what} are in none of these files.")
+        told = listed(list(names), 20)
+        print_text(f"{missing} of the job's {what} are in none of these files{told and ': '}{told}")
         return Exit.FAILED
     return code
 

@@ -85,6 +85,10 @@ class RecordBar:
         self._bar.update(self._row, description=text, completed=kept)
 
     def show(self, now: RecordProgress) -> None:
+        if not now.steps and now.over is not None:
+            # Of the job file: the time left would be told by how fast they were read.
+            self._bar.reset(self._row, total=self._total, completed=int(now.done))
+            return
         self._began = self._began or time.monotonic()
         seconds = max(time.monotonic() - self._began, 1e-3)
         self._bar.update(self._row, completed=now.done)
@@ -203,6 +207,8 @@ def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
         print_text(f"Look at them with: workbench review {folder}")
     if recorded.failures:
         print_failures(recorded.failures, _named)
+        without = sum(len(failure.numbers) for failure in recorded.failures)
+        err.print(f"{_episodes(kept)} recorded, {without} without a result", soft_wrap=True)
     if recorded.stopped:
         return interrupted(EPISODES_KEPT)
     if recorded.failures:

@@ -119,7 +119,7 @@ class ToldStatus:
 
         def both(now: RecordProgress) -> None:
             show(now)
-            if self._began is None:
+            if self._began is None or not now.steps:  # what is in the job file comes first
                 self._began, self._first = time.monotonic(), now.kept
             self._last = now
             # It comes with every control step of every worker.

@@ -73,6 +73,8 @@ out = SafeConsole(highlight=False)
 err = SafeConsole(stderr=True, highlight=False)
 
 _LINES = "\n\t"
+_MOST_FAILED = 100
+"""Items that failed alike and are named."""
 _printed_notices: set[str] = set()
 """Notices of the task that were printed; each reload repeats them."""
 
@@ -159,9 +161,8 @@ def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> 
 
     for problem, numbers in by_kind(failures):
         print_problem(problem)
-        err.print(
-            escape(f"    without a result: {listed([names(number) for number in numbers])}"), soft_wrap=True
-        )
+        told = listed([names(number) for number in numbers], _MOST_FAILED)
+        err.print(escape(f"    without a result, {len(numbers)} in all: {told}"), soft_wrap=True)
 
 
 def print_finding(finding: Finding) -> None:

@@ -109,10 +109,9 @@ class JobFile:
 
         Raises:
             JobFileError: it is of another job (the text says what differs), another process has it open, or it is none.
-            FileNotFoundError: its folder does not exist.
+            OSError: its folder cannot be made.
         """
-        if not path.absolute().parent.is_dir():
-            raise FileNotFoundError(f"there is no folder {path.parent} for {path.name}")
+        path.absolute().parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.count = 0
         """Results that were in it."""
@@ -222,7 +221,7 @@ def write_whole(path: Path, merged: JobParts) -> None:
 
     Raises:
         JobFileError: there is a file of another job, or one that lacks none of them.
-        FileNotFoundError: its folder does not exist.
+        OSError: its folder cannot be made.
     """
     folder = next(iter(merged.folders.values()), "")
     file = JobFile(path, JobKey(merged.command, merged.about, merged.request, folder))

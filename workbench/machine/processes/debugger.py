@@ -148,7 +148,7 @@ def listening_text(port: int, waits: bool) -> str:
 
 
 OPEN_WITH_DEBUG = "remove this line, or open with --debug and attach a debugger"
-ONE_PROCESS = "remove this line, or use --workers 1 in a terminal, where Python's own debugger answers"
+ONE_PROCESS = "remove this line, or use --workers 1 without --cluster in a terminal, where Python's own debugger answers"
 
 
 class NoDebugger(RuntimeError):

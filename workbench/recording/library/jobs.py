@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -58,6 +58,8 @@ class JobStatus:
     """Of a part, as in ``3/64``."""
     written_at: float = 0.0
     """Seconds since 1970."""
+    place: str = ""
+    """Where it records, below the folder of the library; the reader fills it in."""
 
     @property
     def failed(self) -> int:
@@ -110,16 +112,22 @@ class StatusFile:
                     path.unlink()
 
 
-def read_jobs(folder: Path, now: float) -> tuple[JobStatus, ...]:
+def read_jobs(folder: Path, now: float, below: Iterable[Path] = ()) -> tuple[JobStatus, ...]:
     """The jobs of a folder that are running, or ended within the last hour; the last word first. The files may be anybody's:
-    what is no status is passed over, and texts are cleaned."""
+    what is no status is passed over, and texts are cleaned.
+
+    Args:
+        below: further folders, in it.
+    """
     found: list[JobStatus] = []
-    with contextlib.suppress(OSError):
-        for path in sorted(folder.glob(f"{_PREFIX}*{_SUFFIX}"))[:_MOST]:
-            with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeError):
-                status = msgspec.json.decode(read_regular_file(path, _MOST_BYTES), type=JobStatus)
-                if 0 <= now - status.written_at < _KEPT_SECONDS:
-                    found.append(_cleaned(status))
+    for place in dict.fromkeys((folder, *below)):
+        with contextlib.suppress(OSError):
+            for path in sorted(place.glob(f"{_PREFIX}*{_SUFFIX}"))[:_MOST]:
+                with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeError):
+                    status = msgspec.json.decode(read_regular_file(path, _MOST_BYTES), type=JobStatus)
+                    if 0 <= now - status.written_at < _KEPT_SECONDS:
+                        where = "" if place == folder else str(place.relative_to(folder))
+                        found.append(_cleaned(replace(status, place=where)))
     return tuple(sorted(found, key=lambda status: -status.written_at))
 
 
@@ -129,6 +137,7 @@ def _cleaned(status: JobStatus) -> JobStatus:
         command=clean_text(status.command, 40),
         task=clean_text(status.task, 200),
         part=clean_text(status.part, 20),
+        place=clean_text(status.place, 200),
         failures=tuple(
             JobFailure(
                 clean_text(one.items, 200),

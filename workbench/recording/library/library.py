@@ -36,6 +36,9 @@ from workbench.recording.reader.scan import DATASET_KEY, NOTES, RecordingFiles, 
 
 log = logging.getLogger(__name__)
 
+_MOST_PLACES = 64
+"""Folders below that are looked at for jobs."""
+
 SCAN_SECONDS = 1.0
 """Seconds between two checks of the folders' times."""
 LONGEST_PAUSE = 5.0
@@ -136,12 +139,17 @@ class Library:
                 self._index.close()
                 self._index = None
 
+    def _places(self) -> list[Path]:
+        """Folders below this one with recordings, those that were written to last."""
+        newest = sorted(self.view().rows, key=lambda row: -(row.written or 0.0))
+        return list(dict.fromkeys(row.paths[0].parent for row in newest if row.paths))[:_MOST_PLACES]
+
     def _watch(self) -> None:
         while not self._stopping.is_set():
             began = time.monotonic()
             try:
                 self.refresh(thorough=self._scan_requested.is_set())
-                self._publish(jobs=read_jobs(self.folder, time.time()))
+                self._publish(jobs=read_jobs(self.folder, time.time(), self._places()))
             except Exception:
                 # If the thread ended, the table would never change again.
                 log.exception("The library in %s could not be read; trying again.", self.folder)

@@ -273,11 +273,12 @@ class SweepPanel(PagePart[ReviewView]):
         lines = []
         by_return = [one.mean_return for one in self._summaries if one.mean_return is not None]
         low, high = min(by_return, default=0.0), max(by_return, default=0.0)
+        tell_apart = len({one.rate for one in self._summaries if one.rate is not None}) > 1
         for k, one in enumerate(self._summaries):
             points = [(axis.x, axis.heights[k]) for axis in axes]
             known = [f"{x:.1f},{y:.1f}" for x, y in points if y is not None]
             kept = self._is_kept(one)
-            rate = one.rate
+            rate = one.rate if tell_apart else None
             if rate is None and one.mean_return is not None and high > low:
                 rate = (one.mean_return - low) / (high - low)
             lines.append(
