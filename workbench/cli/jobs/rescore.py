@@ -68,6 +68,9 @@ from workbench.session.rescore.recordings import (
     with_renderer,
 )
 
+_MOST_ALIKE = 30
+"""Recordings up to which those are listed too that do not differ."""
+
 
 @dataclass(frozen=True)
 class RescoreOptions:
@@ -340,13 +343,18 @@ def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:
     table = Table(box=None, pad_edge=False)
     for name in ("episode", "seed", "steps", "return", "what changed", "drift"):
         table.add_column(name, justify="right" if name in ("seed", "steps") else "left", overflow="fold")
-    for verdict in verdicts:
+    shown = verdicts
+    if len(verdicts) > _MOST_ALIKE:
+        shown = [one for one in verdicts if one.differs or one.others or one.drifted or one.why_not]
+    for verdict in shown:
         table.add_row(*map(escape, _cells(verdict)), style=_style(verdict))
     if Measurement.get(out, out.options.update(max_width=10**6), table).maximum <= out.width:
         out.print(table)
     else:
-        for verdict in verdicts:
+        for verdict in shown:
             _print_lines(verdict, out)
+    if alike := len(verdicts) - len(shown):
+        out.print(f"{alike} that do not differ are not listed; --csv-file lists all", soft_wrap=True)
     out.print(escape(verdict_text.summary(verdicts)), soft_wrap=True)
 
 
