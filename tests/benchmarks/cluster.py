@@ -117,7 +117,8 @@ def result_cost(one: Written) -> tuple[int, float, float]:
     packed = [pack_message(Gives(number, pack(one))) for number in range(count)]
     deal: Deal[Written | None, None] = Deal(range(count), lambda number, result: None, chunk=count)
     work = Work(lambda setup, queue: None, None, Written | None, None, "that records")
-    listener, unpacker = Listener("a worker", work, deal), Unpacker((Gives,))
+    listener = Listener("a worker", work, deal, lambda text: None)
+    unpacker = Unpacker((Gives,))
     deal.next(0)
     began = time.perf_counter()
     for raw in packed:
