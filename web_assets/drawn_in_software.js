@@ -20,7 +20,7 @@
   const KEY = "fixedDpr"; // viser 1.1, DevSettingsStore.ts
   const SOFTWARE = /swiftshader|llvmpipe|softpipe|software/i; // as in its BrowserWarning.tsx
 
-  const TRIES = 20; // frames; the button may come after its element
+  const TRIES = 150; // of 200 ms; on a busy machine the button comes long after its element
   const [SHARP, LOWER, LOWEST] = [1, 0.7, 0.5]; // of the resolution along each side; the latter while something moves
   const SLOW = 60; // milliseconds from one frame to the next
   const SLOW_FRAMES = 3; // in a row; then LOWER
@@ -141,7 +141,7 @@
     function say(element, tries) {
       const button = document.getElementById(element.dataset.drawnInSoftware);
       if (button) button.click();
-      else if (tries > 0 && element.isConnected) requestAnimationFrame(() => say(element, tries - 1));
+      else if (tries > 0 && element.isConnected) setTimeout(() => say(element, tries - 1), 200);
     }
     new MutationObserver(() => {
       for (const element of document.querySelectorAll("[data-drawn-in-software]")) {
