@@ -39,7 +39,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "web_assets" / "docs" / "reference" / "solved_tasks.md"
 MARKS = "<!-- solved -->\n", "<!-- /solved -->"
 SEEDS = 16
-FEWER = {"TwoRobotPickCube-v1": 4, "TwoRobotStackCube-v1": 4}
+FEWER = {"TwoRobotStackCube-v1": 4}
 """Seeds of tasks whose episodes are long and whose steps are slow."""
 CONTROL_SEEDS = 2
 CONTROL_STEPS = 100
