@@ -6,13 +6,13 @@
 // pressed when the element comes into the page.
 "use strict";
 {
-  const TRIES = 20; // frames; the button may come after its element
+  const TRIES = 150; // of 200 ms; on a busy machine the button comes long after its element
   const said = new WeakSet();
 
   function say(element, tries) {
     const button = document.getElementById(element.dataset.unfolded);
     if (button) button.click();
-    else if (tries > 0 && element.isConnected) requestAnimationFrame(() => say(element, tries - 1));
+    else if (tries > 0 && element.isConnected) setTimeout(() => say(element, tries - 1), 200);
   }
 
   new MutationObserver(() => {
