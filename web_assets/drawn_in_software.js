@@ -20,7 +20,6 @@
   const KEY = "fixedDpr"; // viser 1.1, DevSettingsStore.ts
   const SOFTWARE = /swiftshader|llvmpipe|softpipe|software/i; // as in its BrowserWarning.tsx
 
-  const TRIES = 150; // of 200 ms; on a busy machine the button comes long after its element
   const [SHARP, LOWER, LOWEST] = [1, 0.7, 0.5]; // of the resolution along each side; the latter while something moves
   const SLOW = 60; // milliseconds from one frame to the next
   const SLOW_FRAMES = 3; // in a row; then LOWER
@@ -135,25 +134,9 @@
     history.replaceState(history.state, "", address);
   }
 
-  // Says so to the server, by a hidden button of viser's (`Presses.when_drawn_in_software`): it sends simpler shapes then.
-  function tell() {
-    const told = new WeakSet();
-    function say(element, tries) {
-      const button = document.getElementById(element.dataset.drawnInSoftware);
-      if (button) button.click();
-      else if (tries > 0 && element.isConnected) setTimeout(() => say(element, tries - 1), 200);
-    }
-    new MutationObserver(() => {
-      for (const element of document.querySelectorAll("[data-drawn-in-software]")) {
-        if (told.has(element)) continue;
-        told.add(element);
-        say(element, TRIES);
-      }
-    }).observe(document, { childList: true, subtree: true });
-  }
-
   const software = isDrawnInSoftware();
-  if (software) tell();
+  // For `unfolded.js`, which says so to the server (`Presses.when_drawn_in_software`): it sends simpler shapes then.
+  if (software) document.documentElement.dataset.drawnInSoftware = "yes";
   if (software) drawInLessTime();
   if (software && !new URLSearchParams(location.search).has(KEY)) {
     const beginsWith = Math.min(Math.max(devicePixelRatio, 1), 2); // as react-three-fiber's canvas by itself

@@ -13,8 +13,16 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from workbench.authoring.problem import TaskError
-from workbench.cli.jobs.run_by import EPISODES_KEPT, is_recorded, items_of, print_part, run_by, told_in_folder
+from workbench.cli.jobs.run_by import (
+    EPISODES_KEPT,
+    JOB_ENDS,
+    exit_after,
+    is_recorded,
+    items_of,
+    print_part,
+    run_by,
+    told_in_folder,
+)
 from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
 from workbench.cli.terminal.output import (
     Exit,
@@ -22,7 +30,6 @@ from workbench.cli.terminal.output import (
     interrupted,
     print_failures,
     print_finding,
-    print_problem,
     print_text,
     progress_bar,
     refuse,
@@ -30,7 +37,6 @@ from workbench.cli.terminal.output import (
 )
 from workbench.core.backends import unused_gpu_text
 from workbench.jobs.actions import SOLVE, needed_by
-from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.episodes import RecordOptions, Written, with_given_actions
 from workbench.jobs.record.run import Recorded, RecordProgress, chunk_of, record
@@ -85,8 +91,8 @@ class RecordBar:
         self._bar.update(self._row, description=text, completed=kept)
 
     def show(self, now: RecordProgress) -> None:
-        if not now.steps and now.over is not None:
-            # Of the job file: the time left would be told by how fast they were read.
+        if now.was_there:
+            # Else the time left would be told by how fast they were read.
             self._bar.reset(self._row, total=self._total, completed=int(now.done))
             return
         self._began = self._began or time.monotonic()
@@ -158,15 +164,11 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
                 )
             record_bar.describe("recorded", len(recorded.written))
             status.end("stopped" if recorded.stopped else "done")
-    except TaskError as error:
-        print_problem(error.problem)
-        _print_kept(what, before)
-        return 1
-    except (OSError, ValueError, PoolError) as error:
-        _print_kept(what, before)
-        return refuse(str(error))
-    except KeyboardInterrupt:
-        return interrupted(EPISODES_KEPT)
+    except JOB_ENDS as error:
+        code = exit_after(error)
+        if not isinstance(error, KeyboardInterrupt):
+            _print_kept(what, before)
+        return code
     code = print_recorded(requested, recorded)
     print_part(run, "record", recorded.stopped)
     return code

@@ -21,17 +21,15 @@ from rich.table import Table
 from workbench.authoring.loading.reference import RecordedTask, TaskName, named_file
 from workbench.authoring.loading.task_content import read_content
 from workbench.authoring.problem import TaskError
-from workbench.cli.jobs.run_by import print_part, run_by
+from workbench.cli.jobs.run_by import JOB_ENDS, exit_after, print_part, run_by
 from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
 from workbench.cli.terminal.output import (
     Exit,
     TerminalPrompt,
     can_ask,
-    interrupted,
     not_trusted_lines,
     out,
     print_finding,
-    print_problem,
     progress_bar,
     refuse,
     stdout_to_stderr,
@@ -41,7 +39,6 @@ from workbench.core.backends import unused_gpu_text
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.jobs.from_recording import CannotEnterRecording, recorded_version
-from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.run import chunk_of
 from workbench.jobs.rescore.job import (
@@ -267,14 +264,10 @@ def rescore_in_terminal(what: RescoreOptions, output: RescoreOutput, trust: bool
         for line in not_trusted_lines(error):
             refuse(line)
         return Exit.NOT_TRUSTED
-    except TaskError as error:
-        print_problem(error.problem)
-        return Exit.FAILED
-    except (OSError, ValueError, PoolError) as error:
-        return refuse(str(error))
-    except KeyboardInterrupt:
-        print_part(run, "rescore", stopped=True)
-        return interrupted()
+    except JOB_ENDS as error:
+        if isinstance(error, KeyboardInterrupt):
+            print_part(run, "rescore", stopped=True)
+        return exit_after(error, kept="")
     return Exit.DONE
 
 

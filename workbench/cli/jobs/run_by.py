@@ -14,9 +14,9 @@ from rich.markup import escape
 
 from workbench.authoring.problem import Problem, TaskError
 from workbench.cli.terminal.arguments import JobArguments
-from workbench.cli.terminal.output import err, warn
+from workbench.cli.terminal.output import Exit, err, interrupted, print_problem, refuse, warn
 from workbench.jobs.pool.cluster import Cluster
-from workbench.jobs.pool.deal import Executor, Shard, ThisProcess, by_kind, parse_shard
+from workbench.jobs.pool.deal import Executor, PoolError, Shard, ThisProcess, by_kind, parse_shard
 from workbench.jobs.pool.job_file import JobFile, JobKey, Kept
 from workbench.jobs.pool.processes import Processes
 from workbench.jobs.record.episodes import Written
@@ -25,6 +25,21 @@ from workbench.machine.text import listed
 from workbench.recording.library.jobs import JobFailure, JobState, JobStatus, StatusFile
 
 EPISODES_KEPT = "finished episodes were kept"
+JOB_ENDS = (TaskError, OSError, ValueError, PoolError, KeyboardInterrupt)
+"""What ends a command early: see `exit_after`."""
+
+
+def exit_after(error: BaseException, kept: str = EPISODES_KEPT) -> int:
+    """Print why a command ended early; returns the exit code.
+
+    Args:
+        error: one of `JOB_ENDS`.
+        kept: what is kept after Ctrl-C.
+    """
+    if isinstance(error, TaskError):
+        print_problem(error.problem)
+        return Exit.FAILED
+    return interrupted(kept) if isinstance(error, KeyboardInterrupt) else refuse(str(error))
 
 
 def require_job(arguments: JobArguments) -> None:
@@ -119,7 +134,7 @@ class ToldStatus:
 
         def both(now: RecordProgress) -> None:
             show(now)
-            if self._began is None or not now.steps:  # what is in the job file comes first
+            if self._began is None or now.was_there:
                 self._began, self._first = time.monotonic(), now.kept
             self._last = now
             # It comes with every control step of every worker.

@@ -16,11 +16,19 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from workbench.authoring.problem import TaskError
 from workbench.checks.rules import RULES
 from workbench.cli.jobs.check_reports import json_text, xml_text
 from workbench.cli.jobs.record import RecordBar
-from workbench.cli.jobs.run_by import EPISODES_KEPT, is_recorded, items_of, print_part, run_by, told_in_folder
+from workbench.cli.jobs.run_by import (
+    EPISODES_KEPT,
+    JOB_ENDS,
+    exit_after,
+    is_recorded,
+    items_of,
+    print_part,
+    run_by,
+    told_in_folder,
+)
 from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
 from workbench.cli.terminal.output import (
     Exit,
@@ -28,14 +36,13 @@ from workbench.cli.terminal.output import (
     out,
     print_failures,
     print_finding,
-    print_problem,
     print_text,
     progress_bar,
     refuse,
     stdout_to_stderr,
 )
 from workbench.core.rules import FailOn, fails
-from workbench.jobs.pool.deal import Failure, PoolError
+from workbench.jobs.pool.deal import Failure
 from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.episodes import with_given_actions
 from workbench.jobs.record.run import chunk_of
@@ -118,13 +125,8 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
                 )
             shown.describe("solved", len(report.seeds))
             status.end("stopped" if report.stopped else "done")
-    except TaskError as error:
-        print_problem(error.problem)
-        return Exit.FAILED
-    except (OSError, ValueError, PoolError) as error:
-        return refuse(str(error))
-    except KeyboardInterrupt:
-        return interrupted(EPISODES_KEPT)
+    except JOB_ENDS as error:
+        return exit_after(error)
     try:
         with here.again():
             write_reports(report, what, output)

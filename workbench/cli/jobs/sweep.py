@@ -15,10 +15,18 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from workbench.authoring.problem import TaskError
 from workbench.cli.jobs.check_reports import json_text
 from workbench.cli.jobs.record import RecordBar
-from workbench.cli.jobs.run_by import EPISODES_KEPT, job_path, print_part, run_by, shard_of, told_in_folder
+from workbench.cli.jobs.run_by import (
+    EPISODES_KEPT,
+    JOB_ENDS,
+    exit_after,
+    job_path,
+    print_part,
+    run_by,
+    shard_of,
+    told_in_folder,
+)
 from workbench.cli.terminal.arguments import ONE_WORKER, JobArguments
 from workbench.cli.terminal.output import (
     Exit,
@@ -26,13 +34,11 @@ from workbench.cli.terminal.output import (
     out,
     print_failures,
     print_finding,
-    print_problem,
     print_text,
     progress_bar,
     refuse,
 )
 from workbench.jobs.actions import needed_by
-from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.episodes import Written
 from workbench.jobs.record.sweep import Point, Setting, SweepOptions, SweepReport, recordings_of, sweep
@@ -150,13 +156,8 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
                 )
             shown.describe("swept", len(report.results.episodes))
             status.end("stopped" if report.stopped else "done")
-    except TaskError as error:
-        print_problem(error.problem)
-        return Exit.FAILED
-    except (OSError, ValueError, PoolError) as error:
-        return refuse(str(error))
-    except KeyboardInterrupt:
-        return interrupted(EPISODES_KEPT)
+    except JOB_ENDS as error:
+        return exit_after(error)
     try:
         with here.again():
             # What a part has is in its job file; the parts would write over each other's table.

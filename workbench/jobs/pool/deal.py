@@ -176,6 +176,8 @@ class Deal(Generic[Result, Update]):
         self._failed_alike: dict[int, list[tuple[object, int]]] = {}
         """Of the failures of each group since its last result: in what they are alike, and the first item of the chunk."""
         self._limit = NO_LIMIT
+        self.is_going_on = False
+        """Whether results of an earlier run are being taken."""
         self.results = 0
         self.failures: list[Failure] = []
 
@@ -193,11 +195,12 @@ class Deal(Generic[Result, Update]):
         Args:
             keep: called with each further result before anything else is done with it.
         """
-        self._known, self._keep = known, keep
+        self._known, self._keep, self.is_going_on = known, keep, True
         for number in sorted(known):
             self.results += 1
             self._with_results.add(number // self._group)
             self._on_result(number, known[number])
+        self.is_going_on = False
 
     # --- for the workers -------------------------------------------------------------------------------
 

@@ -49,6 +49,8 @@ class RecordProgress:
     """As `kept`; where every episode is kept, those under way count in part."""
     failures: tuple[Failure, ...] = ()
     """Episodes so far, by number, that gave no result."""
+    was_there: bool = False
+    """The episode that is over is one of an earlier run of the job."""
 
     def by_seed(self, first: int) -> dict[int, int]:
         """`running` by seed, where episode 0 has seed `first`."""
@@ -199,17 +201,23 @@ class ToldByWorkers:
             self._running.pop(number, None)
 
     def progress(
-        self, kept: int, over: tuple[int, Written | None] | None, limit: int, counts_parts: bool
+        self,
+        kept: int,
+        over: tuple[int, Written | None] | None,
+        deal: Deal[Written | None, RecordUpdate],
+        counts_parts: bool,
     ) -> RecordProgress:
         """
         Args:
-            limit: items from here on are not needed.
             counts_parts: whether what is under way counts in part.
         """
+        limit = deal.limit()
         running = {number: steps for number, steps in self._running.items() if number < limit}
         part = sum(min(steps / max(self._limit, 1), 1.0) for steps in running.values())
         done = kept + (part if counts_parts else 0.0)
-        return RecordProgress(kept, self._steps, over, running, self._limit, done, self._failures)
+        return RecordProgress(
+            kept, self._steps, over, running, self._limit, done, self._failures, deal.is_going_on
+        )
 
 
 class _Recording:
@@ -277,7 +285,7 @@ class _Recording:
 
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
         kept = len(self._kept)
-        self._on_progress(self._told.progress(kept, over, self.deal.limit(), self._wanted is None))
+        self._on_progress(self._told.progress(kept, over, self.deal, self._wanted is None))
 
     def _remove(self, episode: Written) -> None:
         if self._upload:

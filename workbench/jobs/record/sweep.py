@@ -316,4 +316,4 @@ class _Sweep:
             self._tell()
 
     def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
-        self._on_progress(self._told.progress(self._kept, over, self.deal.limit(), counts_parts=True))
+        self._on_progress(self._told.progress(self._kept, over, self.deal, counts_parts=True))

@@ -183,6 +183,8 @@ class SweepPanel(PagePart[ReviewView]):
         self._lock = threading.RLock()
         self._results: SweepResults | None = None
         self._summaries: list[PointSummary] = []
+        self._point_of: dict[str, int] = {}
+        """Of each recording's path."""
         self._problem = ""
         self._seen: object = None
         self._looked = -math.inf
@@ -219,6 +221,10 @@ class SweepPanel(PagePart[ReviewView]):
         with self._lock:
             self._results, self._problem = results, problem
             self._summaries = [] if results is None else results.summaries()
+            rows = () if results is None else results.episodes
+            self._point_of = {
+                str(self._library.folder / row.recording): row.point for row in rows if row.recording
+            }
             if self.shown.chosen is not None and self.shown.chosen >= len(self._summaries):
                 self.shown.chosen = None
             self._serial += 1
@@ -237,23 +243,19 @@ class SweepPanel(PagePart[ReviewView]):
             if results is None:
                 self._plot.content = self._table.content = self._episodes.content = ""
                 return
-            self._chosen = self._first(results, view) if shown.chosen is None else shown.chosen
+            self._chosen = self._first(view) if shown.chosen is None else shown.chosen
             kept = [one for one in self._summaries if self._is_kept(one)]
             self._plot.content = self._plot_html(results)
             self._table.content = self._table_html(results, kept)
             chosen = next((one for one in self._summaries if one.index == self._chosen), None)
             self._episodes.content = "" if chosen is None else self._episodes_html(results, chosen, view)
 
-    def _first(self, results: SweepResults, view: ReviewView) -> int | None:
+    def _first(self, view: ReviewView) -> int | None:
         """The point of the episode that is open, else the best one."""
-        ids, opened = self._ids(), {one.id for one in view.opened}
-        places = {ids.get(str(self._library.folder / row.recording)): row.point for row in results.episodes}
-        of_opened = [places[id] for id in opened if id in places]
-        return of_opened[0] if of_opened else next((one.index for one in self._summaries), None)
-
-    def _ids(self) -> dict[str, str]:
-        """Of each file of the library, the id of its recording."""
-        return {str(path): row.id for row in self._library.view().rows for path in row.paths}
+        opened = {one.id for one in view.opened}
+        paths = (str(path) for row in self._library.view().rows if row.id in opened for path in row.paths)
+        of_opened = (self._point_of[path] for path in paths if path in self._point_of)
+        return next(of_opened, next((one.index for one in self._summaries), None))
 
     def _note_html(self) -> str:
         if self._problem:
@@ -376,7 +378,7 @@ class SweepPanel(PagePart[ReviewView]):
             ]
         else:
             lists = [("Episodes, the best first", ordered)] if ordered else []
-        ids = self._ids()
+        ids = {str(path): row.id for row in self._library.view().rows for path in row.paths}
         opened = {one.id for one in view.opened}
         return render(
             "sweep_episodes",

@@ -93,10 +93,10 @@ class Presses:
         self._server.gui.add_html(render("unfolded", id=pressed), order=_LAST + 2)
 
     def when_drawn_in_software(self, told: Callable[[viser.ClientHandle | None], None]) -> None:
-        """Call this with each page that draws its view in software (``drawn_in_software.js``).
+        """Call this with each page that draws its view in software.
 
         Args:
-            told: called on a thread, in turn.
+            told: called on a thread, in turn, once a page (``unfolded.js``).
         """
         pressed = self.id_of("drawn in software", told)
         self._server.gui.add_html(render("in_software", id=pressed), order=_LAST + 2)
