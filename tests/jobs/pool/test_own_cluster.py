@@ -37,6 +37,12 @@ from workbench.jobs.pool.cluster import connected
 with connected() as ray:
     print(ray.get_runtime_context().gcs_address.partition(":")[0])
 """
+TAKES = """
+from workbench.jobs.pool.cluster import connected
+
+with connected() as ray:
+    print(ray.get_runtime_context().gcs_address)
+"""
 FINDS_NONE = """
 from workbench.jobs.pool.cluster import NoCluster, connected
 
@@ -88,6 +94,44 @@ def test_what_a_cluster_that_has_ended_left_is_passed_over(tmp_path: Path, ray_f
     left.parent.mkdir()
     left.write_text("127.0.0.1:1")
     assert run(AUTO, tmp_path, ray_folder) == ["127.0.0.1"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("asks_for_a_token", [True, False])
+def test_a_cluster_that_was_started_here_is_taken_also_where_it_asks_for_this_users_token(
+    asks_for_a_token: bool, tmp_path: Path, ray_folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / ".ray").mkdir()
+    (tmp_path / ".ray" / "auth_token").write_text("0" * 64)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    monkeypatch.delenv("RAY_AUTH_TOKEN", raising=False)
+    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
+    mode = {} if asks_for_a_token else {"RAY_AUTH_MODE": "disabled"}
+    start = (
+        "start",
+        "--head",
+        "--port",
+        "0",
+        "--node-ip-address",
+        "127.0.0.1",
+        "--include-dashboard",
+        "false",
+    )
+    try:
+        subprocess.run(
+            [sys.executable, "-m", "ray.scripts.scripts", *start],
+            check=True,
+            capture_output=True,
+            timeout=120,
+            env={**os.environ, "RAY_TMPDIR": ray_folder, **mode},
+        )
+        (its_address,) = run(TAKES, tmp_path, ray_folder)
+        assert its_address == (Path(ray_folder) / "ray" / "ray_current_cluster").read_text()
+    finally:
+        for process in psutil.process_iter(["cmdline"]):
+            if any(ray_folder in word for word in process.info["cmdline"] or ()):
+                process.kill()
 
 
 @pytest.mark.slow

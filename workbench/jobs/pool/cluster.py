@@ -97,6 +97,9 @@ def connected(address: str = AUTO) -> Iterator[Any]:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         # It would write over the library path of each actor that has no GPU, and warns of that.
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        if _has_token():
+            # `ray start` asks for a token where this user has one, and who connects gives none without being told.
+            os.environ.setdefault("RAY_AUTH_MODE", "token")
         import ray
     except ImportError as error:
         raise NoCluster(f"--cluster needs Ray, which is not installed: {_INSTALL}") from error
@@ -119,6 +122,12 @@ def connected(address: str = AUTO) -> Iterator[Any]:
             ray.shutdown()
 
 
+def _has_token() -> bool:
+    """Whether Ray finds a token of this user, as its pages on token authentication say."""
+    named = any(os.environ.get(name) for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"))
+    return named or (Path.home() / ".ray" / "auth_token").is_file()
+
+
 def _why_deaf(address: str) -> str | None:
     """Why nothing can be there; None if something listens. Ray itself tries for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
@@ -132,7 +141,10 @@ def _why_deaf(address: str) -> str | None:
 
 
 def _no_cluster_text(address: str, why: str) -> str:
-    return f"no Ray cluster answers at {address} ({why}). Start one with `ray start --head`, or give --cluster auto"
+    return (
+        f"no Ray cluster answers at {address} ({why}). Start one with `ray start --head`, or give --cluster auto; if it asks "
+        "for a token, give that in RAY_AUTH_TOKEN"
+    )
 
 
 def _left_here() -> str | None:
