@@ -197,6 +197,16 @@ def test_axes_are_in_order_and_within_the_plot(folder: Path) -> None:
     assert min(heights) >= 34 and max(heights) <= 196
 
 
+def test_a_term_that_is_called_success_is_a_number_and_no_rate(folder: Path) -> None:
+    results = sweep_folder(folder)
+    named = tuple(replace(row, means={"reward_terms/success": 2.0 * row.point}) for row in results.episodes)
+    results = replace(results, episodes=named)
+    *_, rate, _, term = axes_of(results, results.summaries())
+    assert rate.name == term.name == "success"
+    assert [label for label, _, _ in rate.ticks] == ["0 %", "100 %"]
+    assert [label for label, _, _ in term.ticks] == ["0", "14"]
+
+
 def test_the_earlier_success_is_better_then_the_higher_return() -> None:
     rows = [
         SweepEpisode(0, 0, False, False, None, 9, 5.0),

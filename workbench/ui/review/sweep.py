@@ -40,6 +40,7 @@ MOST_SHOWN = 5
 WIDTH, TOP, BOTTOM, SIDE = 500, 34, 196, 34
 """Pixels of the plot, and of its axes."""
 _TERMS = "reward_terms/"
+_RATE = "success"
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Ax
         texts = sorted({one.values[name] for one in summaries}, key=_in_order)
         places.append((name, texts))
     if any(one.rate is not None for one in summaries):
-        places.append(("success", [one.rate for one in summaries]))
+        places.append((_RATE, [one.rate for one in summaries]))
     places.append(("return", [one.mean_return for one in summaries]))
     for name in terms_of(summaries):
         places.append((name.removeprefix(_TERMS), [one.means.get(name) for one in summaries]))
@@ -73,7 +74,9 @@ def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Ax
         if k < len(results.names):
             made.append(_of_set(name, x, values, summaries))
         else:
-            made.append(_of_numbers(name, x, values))
+            # By its place: a term of the reward may be called so too.
+            is_rate = k == len(results.names) and name == _RATE
+            made.append(_of_numbers(name, x, values, is_rate))
     return made
 
 
@@ -115,16 +118,16 @@ def _spread(texts: Sequence[str]) -> Sequence[str]:
     return [texts[round(k * (len(texts) - 1) / (MOST_TICKS - 1))] for k in range(MOST_TICKS)]
 
 
-def _of_numbers(name: str, x: float, values: Sequence[float | None]) -> Axis:
+def _of_numbers(name: str, x: float, values: Sequence[float | None], is_rate: bool) -> Axis:
     known = [value for value in values if value is not None]
-    low, high = (0.0, 1.0) if name == "success" else (min(known, default=0.0), max(known, default=0.0))
+    low, high = (0.0, 1.0) if is_rate else (min(known, default=0.0), max(known, default=0.0))
     # Halved, or the distance of the largest numbers is infinite.
     span = high / 2 - low / 2
 
     def height(value: float) -> float:
         return (TOP + BOTTOM) / 2 if not span else BOTTOM - (value / 2 - low / 2) / span * (BOTTOM - TOP)
 
-    label: Callable[[float], str] = (lambda v: f"{100 * v:.0f} %") if name == "success" else _short_number
+    label: Callable[[float], str] = (lambda v: f"{100 * v:.0f} %") if is_rate else _short_number
     ends = (low, high) if span else (low,)
     ticks = tuple((label(end), height(end), "") for end in ends) if known else ()
     return Axis(name, x, tuple(None if value is None else height(value) for value in values), ticks)
