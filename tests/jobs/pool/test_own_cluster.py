@@ -38,10 +38,14 @@ with connected() as ray:
     print(ray.get_runtime_context().gcs_address.partition(":")[0])
 """
 TAKES = """
+import os
 from workbench.jobs.pool.cluster import connected
 
 with connected() as ray:
     print(ray.get_runtime_context().gcs_address)
+    # That it is connected does not say that a worker starts.
+    print(ray.get(ray.remote(lambda: 6 * 7).remote(), timeout=60))
+print(os.environ.get("RAY_AUTH_MODE"))
 """
 FINDS_NONE = """
 from workbench.jobs.pool.cluster import NoCluster, connected
@@ -126,7 +130,8 @@ def test_a_cluster_that_was_started_here_is_taken_also_where_it_asks_for_this_us
             timeout=120,
             env={**os.environ, "RAY_TMPDIR": ray_folder, **mode},
         )
-        (its_address,) = run(TAKES, tmp_path, ray_folder)
+        its_address, answer, mode_after = run(TAKES, tmp_path, ray_folder)
+        assert (answer, mode_after) == ("42", "None")
         assert its_address == (Path(ray_folder) / "ray" / "ray_current_cluster").read_text()
     finally:
         for process in psutil.process_iter(["cmdline"]):

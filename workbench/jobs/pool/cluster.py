@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,6 +45,7 @@ _DEAF_SECONDS = 5.0
 _FOLDER = "workbench-job-"
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
 _BREAKPOINT = "PYTHONBREAKPOINT"
+_AUTH_MODE = "RAY_AUTH_MODE"
 
 
 class NoCluster(OSError):
@@ -97,10 +98,8 @@ def connected(address: str = AUTO) -> Iterator[Any]:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         # It would write over the library path of each actor that has no GPU, and warns of that.
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-        if _has_token():
-            # `ray start` asks for a token where this user has one, and who connects gives none without being told.
-            os.environ.setdefault("RAY_AUTH_MODE", "token")
         import ray
+        from ray.exceptions import RayError
     except ImportError as error:
         raise NoCluster(f"--cluster needs Ray, which is not installed: {_INSTALL}") from error
     if ray.is_initialized():
@@ -111,10 +110,12 @@ def connected(address: str = AUTO) -> Iterator[Any]:
     if address != LOCAL and (why := _why_deaf(address)) is not None:
         raise NoCluster(_no_cluster_text(address, why))
     how: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "namespace": "workbench"}
-    with _standard_output_kept():
+    with ExitStack() as kept:
+        kept.enter_context(_standard_output_kept())
         try:
+            kept.enter_context(_token_given(ray, address))
             _connect(ray, address, how)
-        except (ConnectionError, ValueError, RuntimeError) as error:
+        except (RayError, ConnectionError, ValueError, RuntimeError) as error:
             raise NoCluster(_no_cluster_text(address, str(error))) from error
         try:
             yield ray
@@ -122,10 +123,33 @@ def connected(address: str = AUTO) -> Iterator[Any]:
             ray.shutdown()
 
 
-def _has_token() -> bool:
-    """Whether Ray finds a token of this user, as its pages on token authentication say."""
-    named = any(os.environ.get(name) for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"))
-    return named or (Path.home() / ".ray" / "auth_token").is_file()
+@contextmanager
+def _token_given(ray: Any, address: str) -> Iterator[None]:
+    """Within this, give this user's token if the cluster asks for one and ``RAY_AUTH_MODE`` says nothing.
+
+    ``ray start`` asks for one wherever this user has one. Who connects gives none without being told, and is refused after
+    twenty seconds; given to a cluster that asks for none, no worker starts.
+    """
+    if not _asks_for_token(ray, address):
+        yield
+        return
+    os.environ[_AUTH_MODE] = "token"
+    ray._raylet.Config.initialize("")  # it was read when Ray was imported
+    try:
+        yield
+    finally:
+        os.environ.pop(_AUTH_MODE)
+        ray._raylet.Config.initialize("")
+
+
+def _asks_for_token(ray: Any, address: str) -> bool:
+    if address == LOCAL or "://" in address or _AUTH_MODE in os.environ:
+        return False
+    try:
+        ray._raylet.GcsClient(address=address)
+    except ray.exceptions.AuthenticationError:
+        return True
+    return False
 
 
 def _why_deaf(address: str) -> str | None:
