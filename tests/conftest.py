@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import re
@@ -23,6 +24,8 @@ import psutil
 import pytest
 
 from tests.drive.waiting import until
+
+atexit.register(shutil.rmtree, os.environ["XDG_CONFIG_HOME"], ignore_errors=True)
 
 # Until the tests begin: what they import is no garbage, and neither are they. It takes a third of the time to collect them.
 gc.disable()

@@ -25,7 +25,8 @@ from typing import Any
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from workbench.jobs.pool.cluster import Cluster, Post, connected
+from workbench.jobs.pool.cluster import Cluster, Post
+from workbench.jobs.pool.connect import connected
 from workbench.jobs.pool.deal import Deal, Executor, Work
 from workbench.jobs.pool.job_file import JobFile, JobKey
 from workbench.jobs.pool.processes import Processes

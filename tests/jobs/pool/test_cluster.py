@@ -18,7 +18,8 @@ import pytest
 from tests.jobs.pool.work import Run, Setup
 from workbench.authoring.problem import TaskError
 from workbench.jobs.pool import cluster as seam
-from workbench.jobs.pool.cluster import Cluster, NoCluster, connected
+from workbench.jobs.pool.cluster import Cluster
+from workbench.jobs.pool.connect import NoCluster, connected
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import JobFile, Kept, job_of
 from workbench.jobs.record.episodes import RecordOptions

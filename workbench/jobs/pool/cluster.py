@@ -11,14 +11,11 @@ import asyncio
 import os
 import pickle
 import platform
-import secrets
 import shutil
-import socket
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +23,7 @@ from typing import Any
 import psutil
 
 from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
+from workbench.jobs.pool.connect import AUTO, BREAKPOINT, NoCluster, connected
 from workbench.jobs.pool.deal import NO_LIMIT, Chunk, Deal, PoolError, Result, Setup, Update, Work
 from workbench.jobs.pool.travel import Baggage, pack_baggage, relocated
 from workbench.jobs.pool.worker import MESSAGES, Asks, Listener, Message, WorkerQueue, work_on
@@ -34,22 +32,13 @@ from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
 from workbench.machine.versions import package_versions
 
-AUTO, LOCAL = "auto", "local"
 _LOOK_SECONDS = 0.1
 _SAY_SECONDS = 1.0
 """How often a worker says what it has made: the post takes some thousand messages a second from all of them."""
 _END_SECONDS = 120.0
 """How long a stopped worker may take to write the items that have ended."""
 _EXIT_SECONDS = 10.0
-_DEAF_SECONDS = 5.0
 _FOLDER = "workbench-job-"
-_INSTALL = "pip install 'maniskill-workbench[cluster]'"
-_BREAKPOINT = "PYTHONBREAKPOINT"
-_AUTH_MODE = "RAY_AUTH_MODE"
-
-
-class NoCluster(OSError):
-    """There is no such cluster, or it cannot run a worker; the text says what to do."""
 
 
 @dataclass(frozen=True)
@@ -85,162 +74,6 @@ class Cluster:
                 pool.serve()
             finally:
                 pool.end()
-
-
-@contextmanager
-def connected(address: str = AUTO) -> Iterator[Any]:
-    """The module ``ray``, connected. A cluster that is started here ends with this.
-
-    Raises:
-        NoCluster: Ray is not installed, or nothing answers at the address.
-    """
-    try:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        # It would write over the library path of each actor that has no GPU, and warns of that.
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-        import ray
-        from ray.exceptions import RayError
-    except ImportError as error:
-        raise NoCluster(f"--cluster needs Ray, which is not installed: {_INSTALL}") from error
-    if ray.is_initialized():
-        yield ray
-        return
-    if address == AUTO:
-        address = os.environ.get("RAY_ADDRESS") or _left_here() or LOCAL
-    if address != LOCAL and (why := _why_deaf(address)) is not None:
-        raise NoCluster(_no_cluster_text(address, why))
-    how: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "namespace": "workbench"}
-    with ExitStack() as kept:
-        kept.enter_context(_standard_output_kept())
-        try:
-            kept.enter_context(_token_given(ray, address))
-            _connect(ray, address, how)
-        except (RayError, ConnectionError, ValueError, RuntimeError) as error:
-            raise NoCluster(_no_cluster_text(address, str(error))) from error
-        try:
-            yield ray
-        finally:
-            ray.shutdown()
-
-
-@contextmanager
-def _token_given(ray: Any, address: str) -> Iterator[None]:
-    """Within this, give this user's token if the cluster asks for one and ``RAY_AUTH_MODE`` says nothing.
-
-    ``ray start`` asks for one wherever this user has one. Who connects gives none without being told, and is refused after
-    twenty seconds; given to a cluster that asks for none, no worker starts.
-    """
-    if not _asks_for_token(ray, address):
-        yield
-        return
-    os.environ[_AUTH_MODE] = "token"
-    ray._raylet.Config.initialize("")  # it was read when Ray was imported
-    try:
-        yield
-    finally:
-        os.environ.pop(_AUTH_MODE)
-        ray._raylet.Config.initialize("")
-
-
-def _asks_for_token(ray: Any, address: str) -> bool:
-    if address == LOCAL or "://" in address or _AUTH_MODE in os.environ:
-        return False
-    try:
-        ray._raylet.GcsClient(address=address)
-    except ray.exceptions.AuthenticationError:
-        return True
-    return False
-
-
-def _why_deaf(address: str) -> str | None:
-    """Why nothing can be there; None if something listens. Ray itself tries for minutes."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    try:
-        with socket.create_connection((host, int(port)), timeout=_DEAF_SECONDS):
-            return None
-    except ValueError:
-        return "it takes host:port"
-    except OSError as error:
-        return error.strerror or str(error)
-
-
-def _no_cluster_text(address: str, why: str) -> str:
-    return (
-        f"no Ray cluster answers at {address} ({why}). Start one with `ray start --head`, or give --cluster auto; if it asks "
-        "for a token, give that in RAY_AUTH_TOKEN"
-    )
-
-
-def _left_here() -> str | None:
-    """The address of a cluster that was started on this machine and still answers."""
-    from ray._private.services import find_bootstrap_address
-
-    # Ray keeps the address of one that has ended, and would try it for minutes.
-    address = find_bootstrap_address(None)
-    return address if address and _why_deaf(address) is None else None
-
-
-def _connect(ray: Any, address: str, how: Mapping[str, Any]) -> None:
-    with _breakpoints_kept():
-        if address != LOCAL:
-            ray.init(address=address, **how)
-            return
-        with _only_for_this_user():
-            ray.init(address=LOCAL, num_cpus=len(os.sched_getaffinity(0)), include_dashboard=False, **how)
-    if not ray.get_runtime_context().gcs_address.startswith("127.0.0.1:"):
-        ray.shutdown()
-        raise NoCluster(
-            f"Ray {ray.__version__} would let other machines connect to the cluster that it starts: start one "
-            "yourself with `ray start --head`, and give its address"
-        )
-
-
-@contextmanager
-def _standard_output_kept() -> Iterator[None]:
-    """Keep Ray's words on workers that died off it, where results are: the pool tells of them."""
-    from ray._private import worker
-
-    before = worker.print_to_stdstream
-    worker.print_to_stdstream = lambda data, ignore_prefix: None
-    try:
-        yield
-    finally:
-        worker.print_to_stdstream = before
-
-
-@contextmanager
-def _breakpoints_kept() -> Iterator[None]:
-    """Keep what ``breakpoint()`` does: Ray names its own debugger to this process and all that it starts from now on."""
-    before = os.environ.get(_BREAKPOINT)
-    try:
-        yield
-    finally:
-        os.environ.pop(_BREAKPOINT, None)
-        if before is not None:
-            os.environ[_BREAKPOINT] = before
-
-
-@contextmanager
-def _only_for_this_user() -> Iterator[None]:
-    """Let Ray start on the loopback address, with a token that no other user can read.
-
-    Who can connect to a cluster runs code in it, and Ray listens on all addresses of the machine otherwise.
-    """
-    from ray._private import ray_constants
-
-    before = ray_constants.ENABLE_RAY_CLUSTER
-    ray_constants.ENABLE_RAY_CLUSTER = False
-    # The first for the daemons, which import the constant anew.
-    os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"
-    # As local processes have it; Ray's own 15 is for machines that others work on.
-    os.environ.setdefault("RAY_worker_niceness", "0")
-    # Else Ray writes one into the home folder, where others may read it. It asks for tokens by itself.
-    os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
-    try:
-        yield
-    finally:
-        ray_constants.ENABLE_RAY_CLUSTER = before
-        os.environ.pop(ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR)
 
 
 def versions_here() -> dict[str, str]:
@@ -483,7 +316,7 @@ class RayWorker:
 
         _require_versions(versions)
         # Or a line with breakpoint() waits for someone who attaches Ray's debugger.
-        os.environ.pop(_BREAKPOINT, None)
+        os.environ.pop(BREAKPOINT, None)
         refuse_breakpoints(ONE_PROCESS)
         treat_ctrl_c_as_error()
         use_private_driver()

@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240)
 STARTS = """
 import os
 import psutil
-from workbench.jobs.pool.cluster import connected
+from workbench.jobs.pool.connect import connected
 
 with connected("local") as ray:
     family = [psutil.Process(), *psutil.Process().children(recursive=True)]
@@ -32,14 +32,14 @@ print(len(alive))
 """
 AUTO = """
 from pathlib import Path
-from workbench.jobs.pool.cluster import connected
+from workbench.jobs.pool.connect import connected
 
 with connected() as ray:
     print(ray.get_runtime_context().gcs_address.partition(":")[0])
 """
 TAKES = """
 import os
-from workbench.jobs.pool.cluster import connected
+from workbench.jobs.pool.connect import connected
 
 with connected() as ray:
     print(ray.get_runtime_context().gcs_address)
@@ -48,7 +48,7 @@ with connected() as ray:
 print(os.environ.get("RAY_AUTH_MODE"))
 """
 FINDS_NONE = """
-from workbench.jobs.pool.cluster import NoCluster, connected
+from workbench.jobs.pool.connect import NoCluster, connected
 
 try:
     with connected("127.0.0.1:1"):
