@@ -27,6 +27,8 @@ from tests.drive.waiting import until
 
 atexit.register(shutil.rmtree, os.environ["XDG_CONFIG_HOME"], ignore_errors=True)
 
+MANY_MODULES = 50
+
 # Until the tests begin: what they import is no garbage, and neither are they. It takes a third of the time to collect them.
 gc.disable()
 
@@ -109,18 +111,21 @@ def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copy(example, tmp_path_factory.mktemp("author")))
 
 
-@pytest.fixture(scope="session", autouse=True)
+_searched = 0
+"""How many modules there were when garbage was last searched for among all objects."""
+
+
+@pytest.fixture(scope="module", autouse=True)
 def imported_modules_are_not_searched_for_garbage() -> None:
-    """BaseEnv calls ``gc.collect()`` whenever it builds or closes: 0.25 s each over torch's own objects."""
-    gc.freeze()
+    """BaseEnv calls ``gc.collect()`` whenever it builds or closes: 0.25 s each over torch's own objects, and as long over what later
+    tests import."""
+    global _searched
+    if len(sys.modules) > _searched + MANY_MODULES:
+        _searched = len(sys.modules)
+        gc.unfreeze()
+        gc.collect()
+        gc.freeze()
     gc.enable()
-
-
-@pytest.fixture(scope="session", autouse=True)
-def configuration_folder_is_removed() -> Iterator[None]:
-    folder = os.environ["XDG_CONFIG_HOME"]
-    yield
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -7,6 +7,7 @@ import http.client
 import os
 import re
 import socket
+import string
 import subprocess
 import sys
 import threading
@@ -243,6 +244,19 @@ def test_viser_has_every_private_name_that_the_seam_relies_on(gated_server):
         here = gated_server.server
         for part in name.split("."):
             here = getattr(here, part)
+
+
+def test_icons_are_those_of_viser_and_its_archive_is_not_searched_for_each(gated_server):
+    names = [f"letter-{letter}" for letter in string.ascii_lowercase] + [f"number-{n}" for n in range(10)]
+    before = viser._icons.svg_from_icon.cache_info()
+    for _ in range(2):
+        buttons = [gated_server.server.gui.add_button("", icon=name) for name in names[:35]]
+        buttons[0].icon = names[35]
+        shown = [button._icon_html for button in buttons]
+        for button in buttons:
+            button.remove()
+    assert viser._icons.svg_from_icon.cache_info() == before
+    assert shown == [viser._icons.svg_from_icon(name) for name in [names[35], *names[1:35]]]
 
 
 @pytest.mark.parametrize("name", viser_private.PRIVATE_NAMES)

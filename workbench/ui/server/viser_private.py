@@ -11,15 +11,20 @@ import threading
 import time
 import traceback
 import warnings
+import zipfile
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import rich
 import viser
+import viser._gui_api
 import viser._gui_handles
+import viser._icons
 import viser._messages
 import viser.infra
 import viser.infra._infra
@@ -104,6 +109,20 @@ def element_id(handle: viser.GuiInputHandle | viser.GuiButtonHandle) -> str:
     """The control's id in the page; for a button or a number also the ``id`` of its element (viser's ``Button.tsx``,
     ``NumberInput.tsx``)."""
     return handle._impl.uuid
+
+
+@cache
+def read_icons_once() -> None:
+    """Let viser read a page's icons in a moment. Of each it reads an archive's list of thousands, 15 ms of the processor, and it keeps the
+    last 32; a page of ours has more, and this was most of what making one took."""
+    places = viser._gui_api, viser._gui_handles
+    archive = Path(viser._icons.__file__).parent / "_icons" / "tabler-icons.zip"
+    # A later viser may have none of this. Then it reads as it likes.
+    if archive.is_file() and all(hasattr(place, "svg_from_icon") for place in places):
+        icons = zipfile.ZipFile(archive)
+        read = cache(lambda name: icons.read(f"{name}.svg").decode())
+        for place in places:
+            place.svg_from_icon = read
 
 
 def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
@@ -368,6 +387,7 @@ def make_viser(
     if missing:
         listening.close()
         raise _moved("viser no longer has " + ", ".join(missing))
+    read_icons_once()
     real_serve = websockets.asyncio.server.serve
     serving: list[websockets.asyncio.server.serve] = []
     served: list[viser.ViserServer] = []
