@@ -39,8 +39,6 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "web_assets" / "docs" / "reference" / "solved_tasks.md"
 MARKS = "<!-- solved -->\n", "<!-- /solved -->"
 SEEDS = 16
-FEWER = {"TwoRobotStackCube-v1": 4}
-"""Seeds of tasks whose episodes are long and whose steps are slow."""
 CONTROL_SEEDS = 2
 CONTROL_STEPS = 100
 CARTPOLE_STEPS = 300
@@ -56,7 +54,7 @@ class Options:
     tasks: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Ids, or files of `tasks/`; all if none are named."""
     seeds: int | None = None
-    """16 if it is not given, and fewer for the slow ones."""
+    """16 if it is not given, and 2 for control tasks."""
     workers: int = len(os.sched_getaffinity(0))
     again: bool = False
     """Forget what is in the file of these tasks."""
@@ -145,7 +143,7 @@ def run(row: Row, options: Options, known: Known) -> None:
 
     control, task = is_control(row.task), row.task
     steps = (CARTPOLE_STEPS if "Cartpole" in task else CONTROL_STEPS) if task.startswith("MS-") else None
-    most = options.seeds or (CONTROL_SEEDS if control else FEWER.get(task, SEEDS))
+    most = options.seeds or (CONTROL_SEEDS if control else SEEDS)
     first, before, began = len(row.episodes), row.seconds, _processor_seconds()
     ended: dict[int, dict[str, Any]] = {}
 
