@@ -173,7 +173,11 @@ def test_what_could_not_be_read_is_tried_again_with_a_press(shown: Shown, folder
     for path, content in files.items():
         path.write_bytes(content)
     shown.panels.press(TRY_AGAIN)
-    until(lambda: len(shown.review.view().opened) == 1, "the recording")
+    until(
+        lambda: len(shown.review.view().opened) == 1,
+        "the recording",
+        seen=lambda: shown.review.view().problems,
+    )
     until(lambda: not shown.review.view().loading, "the end of it")
     shown.draw()
     assert not shown.panels.shows(TRY_AGAIN)
