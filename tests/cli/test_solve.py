@@ -25,7 +25,8 @@ from workbench.cli.jobs.record import RecordBar
 from workbench.cli.jobs.solve import SolveOutput, as_csv, as_json, as_junit
 from workbench.cli.main import main
 from workbench.core.rules import FailOn, Finding
-from workbench.jobs.check import CheckedTask, CheckReport
+from workbench.jobs.check.plan import CheckedTask
+from workbench.jobs.check.run import CheckReport
 from workbench.jobs.record.episodes import Written
 from workbench.jobs.record.run import RecordProgress
 from workbench.jobs.record.solve import SolveOptions, solve

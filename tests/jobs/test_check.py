@@ -14,7 +14,8 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.by_hook.run import RuleResult
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
-from workbench.jobs.check import CheckOptions, CheckReport, GroupOutcome, check, merged, report_of
+from workbench.jobs.check.plan import CheckOptions, GroupOutcome
+from workbench.jobs.check.run import CheckReport, check, merged, report_of
 from workbench.jobs.pool.deal import Shard, ThisProcess
 from workbench.jobs.pool.job_file import JobFile, Kept, job_of, read_parts
 from workbench.jobs.pool.processes import Processes

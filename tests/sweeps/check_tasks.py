@@ -49,7 +49,7 @@ def sweep(
         os.environ["MS_ASSET_DIR"] = nothing_downloaded
         # Forked from a process that has imported all, which takes ten seconds, and has used nothing.
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["mani_skill.envs", "workbench.jobs.check"])
+        context.set_forkserver_preload(["mani_skill.envs", "workbench.jobs.check.run"])
         for done in as_completed([pool.submit(_row, context, env_id, limit, select) for env_id in ids]):
             yield done.result()
 
@@ -114,7 +114,8 @@ def _needs(env_id: str) -> dict[str, Any] | None:
 
 
 def _checked(env_id: str, select: tuple[str, ...]) -> dict[str, Any]:
-    from workbench.jobs.check import CheckOptions, check
+    from workbench.jobs.check.plan import CheckOptions
+    from workbench.jobs.check.run import check
     from workbench.jobs.task import TaskOptions
 
     what = CheckOptions(env_id, TaskOptions(num_envs=NUM_ENVS), seeds=SEEDS, select=select, workers=1)

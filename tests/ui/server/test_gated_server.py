@@ -16,6 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 import viser
+import viser._icons
 import viser._messages
 import viser.infra._infra
 

@@ -32,16 +32,15 @@ from workbench.cli.terminal.output import (
 )
 from workbench.core.rules import FailOn, Finding
 from workbench.jobs.actions import needed_by
-from workbench.jobs.check import (
+from workbench.jobs.check.plan import (
     CheckedTask,
     CheckOptions,
-    CheckReport,
-    check,
     count_chunks,
     count_groups,
     count_rules,
     degrees_of_request,
 )
+from workbench.jobs.check.run import CheckReport, check
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.machine.files import replace_file

@@ -18,7 +18,8 @@ from workbench.authoring.problem import Problem
 from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
 from workbench.core.rules import FailOn, Finding, fails
-from workbench.jobs.check import CheckOptions, CheckReport
+from workbench.jobs.check.plan import CheckOptions
+from workbench.jobs.check.run import CheckReport
 from workbench.ui.app.help_pages import find_topic
 
 DISTRIBUTION = "maniskill-workbench"

@@ -129,7 +129,7 @@ def check(
     with quick_imports():
         from workbench.cli.jobs.check import CheckOutput, check_in_terminal
         from workbench.cli.jobs.run_by import require_job
-        from workbench.jobs.check import CheckOptions
+        from workbench.jobs.check.plan import CheckOptions
 
     try:
         require_job(run)

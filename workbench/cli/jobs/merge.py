@@ -27,8 +27,8 @@ from workbench.cli.jobs.sweep import write_reports as write_sweep_reports
 from workbench.cli.terminal.output import Exit, print_text, refuse
 from workbench.cli.terminal.output import out as out_console
 from workbench.core.rules import FailOn
-from workbench.jobs.check import CheckOptions, GroupOutcome
-from workbench.jobs.check import report_of as check_report_of
+from workbench.jobs.check.plan import CheckOptions, GroupOutcome
+from workbench.jobs.check.run import report_of as check_report_of
 from workbench.jobs.pool.job_file import JobFileError, JobParts, read_parts, write_whole
 from workbench.jobs.record.episodes import RecordOptions, Written
 from workbench.jobs.record.run import collect

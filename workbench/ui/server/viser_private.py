@@ -115,7 +115,7 @@ def element_id(handle: viser.GuiInputHandle | viser.GuiButtonHandle) -> str:
 def read_icons_once() -> None:
     """Let viser read a page's icons in a moment. Of each it reads an archive's list of thousands, 15 ms of the processor, and it keeps the
     last 32; a page of ours has more, and this was most of what making one took."""
-    places = viser._gui_api, viser._gui_handles
+    places: tuple[Any, ...] = viser._gui_api, viser._gui_handles
     archive = Path(viser._icons.__file__).parent / "_icons" / "tabler-icons.zip"
     # A later viser may have none of this. Then it reads as it likes.
     if archive.is_file() and all(hasattr(place, "svg_from_icon") for place in places):
