@@ -86,7 +86,7 @@ def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snaps
         NotImplementedError: a stock CPU env.
     """
     env = maniskill_private.open_env(env)
-    chosen = envs_of_batch(range(env.num_envs) if env_idx is None else env_idx, env.num_envs)
+    chosen = [*range(env.num_envs)] if env_idx is None else envs_of_batch(env_idx, env.num_envs)
     px = batched_system(env.scene)
     if px is not None:
         simulation: Any = read_cpu_state(env, chosen)
