@@ -282,7 +282,14 @@ def test_tidy_text_comes_of_it() -> None:
     assert 'return [\n            CameraConfig(\n                "top"' in back.new_text
 
 
-@pytest.mark.parametrize("name", WRITTEN)
+@pytest.mark.parametrize(
+    "name",
+    # How a file writes its cameras and how it ends its lines have little to do with each other.
+    [
+        pytest.param(name, marks=[pytest.mark.slow] if number % 7 else [])
+        for number, name in enumerate(WRITTEN)
+    ],
+)
 def test_a_file_of_windows_is_edited_as_any_other_and_keeps_its_line_ends(name: str) -> None:
     sources = (WRITTEN[name], WRITTEN[name].replace("\n", "\r\n"))
     now = cameras(sources[0])[next(key for key in cameras(sources[0]) if key[1] == "cam")]
