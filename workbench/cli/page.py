@@ -200,7 +200,8 @@ class _HowToOpen:
         check = kept_choices().check_after_save
         given = {"history_bytes": self.history_bytes, "worker": worker, "kept": kept, "check": check}
         session = Session(task, options, recordings=self.recordings, **given, **callbacks)
-        session.change(pictures=self.pictures)
+        if kept is None:
+            session.change(pictures=self.pictures)
         return session
 
 

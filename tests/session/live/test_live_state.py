@@ -77,6 +77,20 @@ def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on()
     assert shown.curves is not None and shown.curves.serial == 3
 
 
+def test_what_is_changed_before_there_is_a_task_leaves_the_env_that_was_selected_in_an_earlier_session() -> (
+    None
+):
+    state = LiveState("push.py", TaskOptions(), 10**8)
+    state.set(settings=Settings(selected_env=1))
+    state.change(speed=2.0)
+    state.loaded(loaded(), restored=False, stale=False)
+    assert (view(state).selected_env, view(state).settings.speed) == (1, 2.0)
+    state = LiveState("push.py", TaskOptions(), 10**8)
+    state.change(selected_env=2**40)
+    state.loaded(loaded(), restored=False, stale=False)
+    assert view(state).selected_env == N - 1
+
+
 def test_curves_stay_as_they_were_taken_and_are_of_the_selected_env() -> None:
     state = running()
     state.stepped(stepped(4, jumped=True))

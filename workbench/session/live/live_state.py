@@ -308,11 +308,11 @@ class LiveState:
     # --- requests of the page ----------------------------------------------------------------------
 
     def change(self, **settings: Any) -> bool:
-        """Change fields of `Settings`; the selected env is clipped to the batch. False if nothing changes."""
+        """Change fields of `Settings`; the selected env is clipped to the batch, once there is one. False if nothing changes."""
         before, task = self.now.settings, self.now.task
         new = replace(before, **settings)
-        last = 0 if task is None else task.num_envs - 1
-        new = replace(new, selected_env=min(max(int(new.selected_env), 0), last))
+        selected = max(int(new.selected_env), 0)
+        new = replace(new, selected_env=selected if task is None else min(selected, task.num_envs - 1))
         if new == before:
             return False
         self.set(settings=new)
