@@ -105,7 +105,7 @@ def degrees_of_request(what: CheckOptions) -> dict[str, Degree]:
 
 
 @dataclass(frozen=True)
-class Plan:
+class CheckPlan:
     """The items of a check: groups of rules on parts of the seeds. Those that do not depend on the seeds are looked at in the
     first part alone."""
 
@@ -142,10 +142,10 @@ class Plan:
         return range(part * self.part, min((part + 1) * self.part, seeds))
 
 
-def plan_of(what: CheckOptions, degrees: Mapping[str, Degree]) -> Plan:
+def plan_of(what: CheckOptions, degrees: Mapping[str, Degree]) -> CheckPlan:
     part = max(SEEDS_OF_PART, what.options.num_envs)
     over_seeds = frozenset(rule for rule in RULES_OVER_SEEDS if degrees[rule] != "off")
-    return Plan(groups_of(degrees), over_seeds, part, -(-what.seeds // part))
+    return CheckPlan(groups_of(degrees), over_seeds, part, -(-what.seeds // part))
 
 
 def count_chunks(what: CheckOptions) -> int:
