@@ -137,10 +137,10 @@ def test_no_command_runs_what_lies_in_the_current_folder(tmp_path: Path) -> None
     task.write_text(
         TASK.read_text() + "\nimport beside\nimport numpy, json\nassert numpy.zeros and json.dumps\n"
     )
-    plain = ("--num-envs", "2", "--env", "render_backend=none")
+    plain = ("--env", "render_backend=none")
     recording = start(
         tmp_path, "record", "minimal.py", "--episodes", "2", "--max-steps", "3", "--workers", "2",
-        "--no-pictures", "--out", "recordings", *plain,
+        "--no-pictures", "--envs-per-worker", "2", "--out", "recordings", *plain,
     )  # fmt: skip
     doctor = start(tmp_path, "doctor")
     said = finished(recording)
@@ -151,7 +151,7 @@ def test_no_command_runs_what_lies_in_the_current_folder(tmp_path: Path) -> None
     with page(tmp_path, "review", ".") as (url, _):
         await_on_page(url, episodes[0].stem)
     finished(start(tmp_path, "share", str(episodes[0].with_suffix(".rrd")), "--html", "--out", "made"))
-    with page(tmp_path, "open", "minimal.py", *plain) as (url, process):
+    with page(tmp_path, "open", "minimal.py", "--num-envs", "2", *plain) as (url, process):
         await_on_page(url, "json.py has the name of a library")
         assert process.stdout is not None
         said = ""
