@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
+from workbench.core.scene.normals import with_normals
 from workbench.core.scene.shapes import Mesh
-from workbench.core.scene.simplify import flat_rectangle, reduce_mesh, share_smooth, with_normals
+from workbench.core.scene.simplify import flat_rectangle, reduce_mesh
 
 
 def soup(mesh: trimesh.Trimesh) -> Mesh:
@@ -92,19 +93,6 @@ def test_texture_coordinates_survive_reduction_and_the_seam_stays_closed() -> No
     assert np.ptp(reduced.uvs[reduced.faces, 0], axis=1).max() < 0.5
 
 
-def test_normals_are_sharp_on_a_box_and_smooth_on_a_ball() -> None:
-    box = with_normals(Mesh(*shared(trimesh.creation.box())))
-    assert box.normals is not None and len(box.vertices) == 24
-    np.testing.assert_allclose(np.abs(box.normals).max(axis=1), 1.0, atol=1e-6)
-    ball = with_normals(Mesh(*shared(trimesh.creation.icosphere(subdivisions=3))))
-    assert ball.normals is not None and len(ball.vertices) == 642
-    assert (ball.normals * ball.vertices).sum(axis=1).min() > 0.99
-
-
-def shared(mesh: trimesh.Trimesh) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
-
-
 @settings(max_examples=50, deadline=None)
 @given(
     arrays(np.float32, (30, 3), elements=st.floats(-10, 10, width=32)),
@@ -158,20 +146,3 @@ def test_what_is_no_plain_rectangle_is_not_made_one() -> None:
     swirled.uvs[7] += 0.2
     assert flat_rectangle(swirled) is None
     assert flat_rectangle(soup(trimesh.creation.box())) is None
-
-
-@pytest.mark.parametrize("off, left", [(4.0, 4), (30.0, 6)])
-def test_vertices_at_one_place_are_one_where_they_are_lit_alike(off: float, left: int) -> None:
-    """Two triangles with an edge in common, the second's normals turned by `off` degrees."""
-    square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
-    turned = [0.0, np.sin(np.deg2rad(off)), np.cos(np.deg2rad(off))]
-    normals = np.array([[0, 0, 1]] * 3 + [turned] * 3, np.float32)
-    mesh = Mesh(square[[0, 1, 2, 1, 3, 2]], np.arange(6, dtype=np.uint32).reshape(2, 3), normals)
-    shared = share_smooth(mesh)
-    assert shared.normals is not None and len(shared.vertices) == left
-    np.testing.assert_array_equal(shared.vertices[shared.faces], mesh.vertices[mesh.faces])
-    np.testing.assert_allclose(np.linalg.norm(shared.normals, axis=1), 1, rtol=1e-6)
-    lit = np.einsum("fcd,fcd->fc", shared.normals[shared.faces], normals[mesh.faces])
-    assert (
-        np.rad2deg(np.arccos(np.minimum(lit, 1))).max() < off / 2 + 0.1 if left == 4 else (lit > 0.9999).all()
-    )

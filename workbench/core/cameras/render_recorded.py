@@ -10,8 +10,8 @@ import sapien.render
 from numpy.typing import NDArray
 
 from workbench.core.backends import find_renderer, give_brdf_table, keep_render_device
+from workbench.core.scene.normals import with_normals
 from workbench.core.scene.shapes import Material, SceneGeometry, Visual
-from workbench.core.scene.simplify import with_normals
 
 NEAR, FAR = 0.01, 300.0
 

@@ -17,19 +17,20 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
 
+from workbench.core.scene.normals import ShadedSurface, share_smooth
 from workbench.core.scene.shapes import Mesh
 from workbench.core.scene.simplify import (
     cluster_mesh,
     coarsen_mesh,
+    collapse_mesh,
     flat_rectangle,
     reduce_mesh,
     rounded,
-    share_smooth,
     share_vertices,
 )
 from workbench.machine.folders import cache_folder, read_private, write_private
 
-_VERSION = 2
+_VERSION = 3
 """Of the files; another one for other levels."""
 _FEWEST_FACES = 24
 _LOST, _USELESS = 0.01, 0.1
@@ -126,17 +127,23 @@ def from_afar(mesh: Mesh, error: float) -> Mesh:
         kept = _kept.get(name)
     kept = kept or _read(name)
     if not kept:
-        kept = (Level(next(_within(mesh, error), mesh), error),)
+        kept = (Level(_few_faces(mesh, error), error),)
         _write(name, kept)
     _keep(name, kept)
     return kept[0].mesh
 
 
-def _within(mesh: Mesh, error: float) -> Iterator[Mesh]:
+def _few_faces(mesh: Mesh, error: float) -> Mesh:
+    """The first of ever finer meshes that is near enough; `mesh` itself where none is."""
     for faces in (count for count in _FEW if count < 0.8 * len(mesh.faces)):
-        for coarser in (reduce_mesh(mesh, faces), *(cluster_mesh(mesh, faces, cells) for cells in _GRIDS)):
+        for coarser in (collapse_mesh(mesh, faces), *(cluster_mesh(mesh, faces, cells) for cells in _GRIDS)):
             if len(coarser.faces) <= 1.5 * faces and deviation(mesh, coarser) <= error:
-                yield coarser
+                return _shaded(coarser, None if mesh.normals is None else ShadedSurface(mesh))
+    return mesh
+
+
+def _shaded(coarser: Mesh, surface: ShadedSurface | None) -> Mesh:
+    return share_vertices(coarser) if surface is None else surface.shade(coarser)
 
 
 def are_known(mesh: Mesh) -> bool:
@@ -159,16 +166,17 @@ def _made(mesh: Mesh) -> Iterator[Level]:
     if flat is not None:
         yield Level(flat, 0.0)
         return
+    surface = None if mesh.normals is None else ShadedSurface(mesh)
     finer, faces, worst = mesh, len(mesh.faces), 0.0
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     while faces // 2 >= _FEWEST_FACES:
         faces //= 2
         # Nearest to the surface is what is made of the exact mesh; of a very large one that takes too long.
         source = mesh if len(mesh.faces) <= _LARGE else finer
-        coarser = coarsen_mesh(source, faces, mesh)
+        coarser = coarsen_mesh(source, faces)
         error = deviation(mesh, coarser)
         if error > _LOST * extent and mesh.uvs is None:
-            by_pieces = coarsen_mesh(source, faces, mesh, by_pieces=True)
+            by_pieces = coarsen_mesh(source, faces, by_pieces=True)
             fewer = len(by_pieces.faces) < 0.9 * len(finer.faces)
             if fewer and (other := deviation(mesh, by_pieces)) < error:
                 coarser, error = by_pieces, other
@@ -176,7 +184,7 @@ def _made(mesh: Mesh) -> Iterator[Level]:
             break
         # A level that happens to be nearer than the one before it is not finer.
         finer, worst = coarser, max(worst, error)
-        yield Level(coarser, worst)
+        yield Level(_shaded(coarser, surface), worst)
 
 
 def deviation(exact: Mesh, reduced: Mesh) -> float:

@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from workbench.core.scene.mesh_levels import reduced_mesh
+from workbench.core.scene.normals import with_normals
 from workbench.core.scene.scene_index import scene_index
 from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual, srgb
-from workbench.core.scene.simplify import drop_uvs, flat_rectangle, share_vertices, with_normals
+from workbench.core.scene.simplify import drop_uvs, flat_rectangle, share_vertices
 
 _FLAT_FACES = 100
 """Meshes with more faces are tested for being a flat rectangle."""
 _KEPT_MESHES = 1000
-MOST_FACES = 400
+MOST_FACES = 380
 """Most faces of a visual: a Panda of 136,000 triangles becomes 9,000 and looks the same."""
 MOST_TEXELS = 1024
 """On the longest side of a texture."""

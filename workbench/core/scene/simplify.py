@@ -12,10 +12,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from workbench.core.scene.normals import ShadedSurface, with_normals
 from workbench.core.scene.shapes import Mesh
 
-_CREASE_COSINE = float(np.cos(np.deg2rad(40.0)))
-"""Neighbouring faces at a smaller angle are shaded as one smooth surface."""
 _DENSE = 60_000
 """A mesh with more faces is a CAD assembly, whose vertices are first snapped to a grid: quadric collapse alone takes
 seconds and gets stuck."""
@@ -38,6 +37,16 @@ def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
 
     A mesh of many loose pieces may keep up to twice as many, and a textured one more: edges of its texture pieces stay.
     """
+    reduced = collapse_mesh(mesh, max_faces)
+    if reduced is mesh:
+        return mesh
+    if mesh.normals is None or len(mesh.faces) > _DENSE:
+        return share_vertices(reduced)
+    return ShadedSurface(mesh).shade(reduced)
+
+
+def collapse_mesh(mesh: Mesh, max_faces: int) -> Mesh:
+    """`reduce_mesh`, with normals of its own faces."""
     if len(mesh.faces) <= max_faces or not np.ptp(mesh.vertices, axis=0).any():
         return mesh
     cells = _WELD_CELLS if mesh.uvs is not None or len(mesh.faces) <= _DENSE else _CLUSTER_CELLS
@@ -53,18 +62,14 @@ def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
         welded = _weld(*welded, cells)
     if len(faces) == 0:
         return mesh
-    reduced = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
-    if mesh.normals is None or len(mesh.faces) > _DENSE:
-        return share_vertices(reduced)
-    return share_vertices(replace(reduced, normals=_normals_of_source(reduced, mesh)))
+    return with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
 
 
-def coarsen_mesh(mesh: Mesh, max_faces: int, source: Mesh, by_pieces: bool = False) -> Mesh:
+def coarsen_mesh(mesh: Mesh, max_faces: int, by_pieces: bool = False) -> Mesh:
     """`mesh` with at least `max_faces` triangles, and more where fewer would be another shape; slower than `reduce_mesh`,
-    and nearer to the surface.
+    nearer to the surface, and with normals of its own faces.
 
     Args:
-        source: the exact mesh, which `mesh` is or was made of; normals are taken from it.
         by_pieces: each connected piece by itself: small ones stay, where a whole one would otherwise be lost.
     """
     vertices, faces, uvs = _weld(mesh.vertices, mesh.faces, mesh.uvs, _WELD_CELLS)
@@ -73,14 +78,12 @@ def coarsen_mesh(mesh: Mesh, max_faces: int, source: Mesh, by_pieces: bool = Fal
         vertices, faces, uvs = _collapse(vertices, faces, uvs, max_faces, how)
     if len(faces) == 0:
         return mesh
-    coarse = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
-    if source.normals is not None:
-        coarse = replace(coarse, normals=_normals_of_source(coarse, source))
-    return share_vertices(coarse)
+    return with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
 
 
 def cluster_mesh(mesh: Mesh, max_faces: int, cells: int) -> Mesh:
-    """`mesh`, without texture, with about `max_faces` triangles after the vertices in each cell of a grid have become one.
+    """`mesh`, without texture, with about `max_faces` triangles after the vertices in each cell of a grid have become one, and
+    with normals of its own faces.
 
     Loose pieces grow together, and what is smaller than a cell is gone: for what is seen from afar.
 
@@ -92,10 +95,7 @@ def cluster_mesh(mesh: Mesh, max_faces: int, cells: int) -> Mesh:
         vertices, faces, _ = _collapse(vertices, faces, None, max_faces)
     if len(faces) == 0:
         return mesh
-    coarse = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
-    if mesh.normals is not None:
-        coarse = replace(coarse, normals=_normals_of_source(coarse, mesh))
-    return share_vertices(coarse)
+    return with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32)))
 
 
 def share_vertices(mesh: Mesh) -> Mesh:
@@ -117,36 +117,6 @@ def share_vertices(mesh: Mesh) -> Mesh:
     )
 
 
-def share_smooth(mesh: Mesh, degrees: float = 10.0) -> Mesh:
-    """`mesh` with vertices at one place (and of one uv) only once where their normals differ by less than `degrees`: the
-    corners of a reduced mesh take normals of different vertices of its source. Files and browsers have a sixth less to hold."""
-    if mesh.normals is None:
-        return mesh
-    rows = mesh.vertices if mesh.uvs is None else np.concatenate([mesh.vertices, mesh.uvs], axis=1)
-    _, place = np.unique(rows, axis=0, return_inverse=True)
-    place = place.reshape(-1)
-    leader = np.arange(len(place))
-    left, least = leader, np.cos(np.deg2rad(degrees))
-    while len(left):
-        # The first that is left at each place takes those that are like it.
-        _, first, of = np.unique(place[left], return_index=True, return_inverse=True)
-        takes = left[first][of.reshape(-1)]
-        alike = np.einsum("vk,vk->v", mesh.normals[left], mesh.normals[takes]) >= least
-        alike |= left == takes
-        leader[left[alike]] = takes[alike]
-        left = left[~alike]
-    kept, index = np.unique(leader, return_inverse=True)
-    index = index.reshape(-1)
-    normals = np.stack([np.bincount(index, mesh.normals[:, axis]) for axis in range(3)], axis=1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    return Mesh(
-        mesh.vertices[kept],
-        index[mesh.faces].astype(np.uint32),
-        normals.astype(np.float32),
-        None if mesh.uvs is None else mesh.uvs[kept],
-    )
-
-
 def rounded(mesh: Mesh) -> Mesh:
     """`mesh` with positions on a grid of some 4000 cells along each axis, and normals within half a degree of their own.
 
@@ -157,48 +127,8 @@ def rounded(mesh: Mesh) -> Mesh:
     on_grid = (np.round(mesh.vertices / cell) * cell).astype(np.float32)
     # Flat along an axis, it stays where it is.
     vertices = np.where(extent > 0, on_grid, mesh.vertices)
-    normals = None if mesh.normals is None else (np.round(mesh.normals * 64) / 64).astype(np.float32)
+    normals = None if mesh.normals is None else (np.round(mesh.normals * 48) / 48).astype(np.float32)
     return replace(mesh, vertices=vertices, normals=normals)
-
-
-def with_normals(mesh: Mesh) -> Mesh:
-    """`mesh` with normals made from its faces: smooth, but sharp at edges of more than 40 degrees.
-
-    Vertices are split where faces that meet there get different normals.
-    """
-    corners = mesh.faces.reshape(-1).astype(np.int64)
-    triangles = mesh.vertices[mesh.faces].astype(np.float64)
-    weighted = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    length = np.linalg.norm(weighted, axis=1, keepdims=True)
-    unit = weighted / np.maximum(length, 1e-20)
-
-    # Every pair (a, b) of corners that share a vertex: b's face counts for a's normal if the angle is small.
-    order = np.argsort(corners, kind="stable")
-    counts = np.bincount(corners, minlength=len(mesh.vertices))
-    start = np.concatenate([[0], np.cumsum(counts)])[:-1]
-    sharing = counts[corners[order]]
-    a = np.repeat(order, sharing)
-    step = np.arange(len(a)) - np.repeat(np.cumsum(sharing) - sharing, sharing)
-    b = order[np.repeat(start[corners[order]], sharing) + step]
-    smooth = np.einsum("ij,ij->i", unit[a // 3], unit[b // 3]) >= _CREASE_COSINE
-    normals = np.stack(
-        [np.bincount(a[smooth], weighted[b[smooth] // 3, k], minlength=len(corners)) for k in range(3)],
-        axis=1,
-    ).astype(np.float64)
-    # A face without area has a zero normal, which is drawn black.
-    empty = np.linalg.norm(normals, axis=1) < 1e-20
-    normals[empty] = [0.0, 0.0, 1.0]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-
-    key = np.concatenate([corners[:, None], np.round(normals * 64).astype(np.int64)], axis=1)
-    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    chosen = corners[first]
-    return Mesh(
-        vertices=mesh.vertices[chosen],
-        faces=inverse.reshape(-1, 3).astype(np.uint32),
-        normals=normals[first].astype(np.float32),
-        uvs=None if mesh.uvs is None else mesh.uvs[chosen],
-    )
 
 
 def flat_rectangle(mesh: Mesh) -> Mesh | None:
@@ -241,25 +171,6 @@ def flat_rectangle(mesh: Mesh) -> Mesh | None:
 def drop_uvs(mesh: Mesh) -> Mesh:
     """`mesh` without texture coordinates, for a material that has no texture."""
     return mesh if mesh.uvs is None else replace(mesh, uvs=None)
-
-
-def _normals_of_source(reduced: Mesh, source: Mesh) -> NDArray[np.float32]:
-    """(V, 3) normals of the nearest vertices of `source` that face the same way.
-
-    Shaded with its own normals, a round surface of few large faces looks dented.
-    """
-    assert reduced.normals is not None and source.normals is not None
-    count = min(8, len(source.vertices))
-    near = np.asarray(KDTree(source.vertices).query(reduced.vertices, k=count)[1]).reshape(-1, count)
-    candidates = source.normals[near]
-    alike = np.einsum("vkj,vj->vk", candidates, reduced.normals)
-    # The nearest that agrees; on a folded face none does, and the most similar is taken.
-    choice = np.where(
-        (alike > _CREASE_COSINE).any(axis=1), (alike > _CREASE_COSINE).argmax(axis=1), alike.argmax(axis=1)
-    )
-    every = np.arange(len(near))
-    chosen = candidates[every, choice]
-    return np.where(alike[every, choice][:, None] > 0, chosen, reduced.normals).astype(np.float32)
 
 
 def _weld(
