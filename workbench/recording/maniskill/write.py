@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from functools import cache
@@ -42,11 +41,12 @@ def write_h5(episode: Episode, path: Path) -> None:
         ValueError: HDF5 refuses a column.
     """
     # In memory: on a disk error HDF5 leaves files half open.
-    content = io.BytesIO()
-    with h5py.File(content, "w") as file:
-        put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as made:
+        put_columns(episode, made.create_group(TRAJECTORY, track_order=True))
+        made.flush()
+        content = made.id.get_file_image()
     with path.open("xb") as file:
-        file.write(content.getbuffer())
+        file.write(content)
     h5py.File(path, "r").close()  # fails on a truncated file
 
 

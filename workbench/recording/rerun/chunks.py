@@ -17,7 +17,6 @@ STEP = "step"
 SIM_TIME = "sim_time"
 LOOK = "look"
 """Component of a visual, JSON: its name, its colour as red, green, blue and alpha, how metallic and how rough it is."""
-_MOST_TIMES = 64
 SERIES_COLORS = (
     (86, 180, 233),
     (230, 159, 0),
@@ -136,11 +135,12 @@ class TimedChunks:
     def __init__(self, control_dt: float) -> None:
         """`control_dt` in seconds."""
         self._control_dt = control_dt
-        self._times: dict[bytes, list[rr.TimeColumn]] = {}  # by steps: most entities share them
 
     def of(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> Chunk:
         """`columns` with a row for each of `steps` (R,)."""
-        return Chunk.from_columns(entity, self._times_of(steps), columns)
+        return Chunk.from_columns(
+            entity, _times(np.asarray(steps, np.int64).tobytes(), self._control_dt), columns
+        )
 
     def poses(
         self, entities: Sequence[str], steps: NDArray[np.int64], poses: NDArray[np.float32]
@@ -179,19 +179,14 @@ class TimedChunks:
         ]
         return self.of(entity, np.array(steps, dtype=np.int64), columns)
 
-    def _times_of(self, steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
-        key = steps.tobytes()
-        if key not in self._times:
-            if len(self._times) >= _MOST_TIMES:
-                self._times.clear()
-            self._times[key] = [
-                rr.TimeColumn(STEP, sequence=steps),
-                # Rounded, because rerun truncates: 3 * 0.05 s would be 149999999 ns.
-                rr.TimeColumn(
-                    SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")
-                ),
-            ]
-        return self._times[key]
+
+@lru_cache(maxsize=64)
+def _times(steps: bytes, control_dt: float) -> tuple[rr.TimeColumn, ...]:
+    """Of these int64, which most entities share, and the next episode of the same length does too."""
+    numbers = np.frombuffer(steps, np.int64)
+    # Rounded, because rerun truncates: 3 * 0.05 s would be 149999999 ns.
+    seconds = np.rint(numbers * control_dt * 1e9).astype("timedelta64[ns]")
+    return rr.TimeColumn(STEP, sequence=numbers), rr.TimeColumn(SIM_TIME, duration=seconds)
 
 
 def static_pose(entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> Chunk:

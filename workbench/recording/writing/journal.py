@@ -383,6 +383,8 @@ def write_scene(geometry: SceneGeometry, path: Path) -> None:
         if _last is not None and _last[0]() is geometry and _last[1].parent == path.parent:
             try:
                 os.link(_last[1], path)
+                # The newest name is gone last: the next batch begins while the files of this one are made.
+                _last = (_last[0], path)
                 return
             except OSError:  # that episode's file is deleted, or the filesystem has no links
                 pass
