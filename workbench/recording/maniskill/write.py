@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from functools import cache
@@ -41,12 +42,11 @@ def write_h5(episode: Episode, path: Path) -> None:
         ValueError: HDF5 refuses a column.
     """
     # In memory: on a disk error HDF5 leaves files half open.
-    with h5py.File(path.name, "w", driver="core", backing_store=False) as made:
-        put_columns(episode, made.create_group(TRAJECTORY, track_order=True))
-        made.flush()
-        content = made.id.get_file_image()
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        put_columns(episode, file.create_group(TRAJECTORY, track_order=True))
     with path.open("xb") as file:
-        file.write(content)
+        file.write(content.getbuffer())
     h5py.File(path, "r").close()  # fails on a truncated file
 
 
