@@ -34,9 +34,8 @@ def test_it_is_the_one_that_sapien_computes_to_the_bit(tmp_path: Path, renderer:
     shader.write_text(text.replace(DRAWN, drawn))
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device("cpu"))])
     before = sapien.render.get_camera_shader_dir()
-    set_shader_pack(
-        PREBUILT_SHADER_CONFIGS["default"]
-    )  # floats: the last camera of the process may have had bytes
+    # Pictures of floats: the last camera of the process may have had bytes.
+    set_shader_pack(PREBUILT_SHADER_CONFIGS["default"])
     sapien.render.set_camera_shader_dir(str(tmp_path / "minimal"))
     try:
         theirs, ours = (scene.add_camera(name, 512, 512, 1.0, 0.01, 10.0) for name in ("theirs", "ours"))

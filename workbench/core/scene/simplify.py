@@ -118,7 +118,7 @@ def share_vertices(mesh: Mesh) -> Mesh:
 
 
 def rounded(mesh: Mesh) -> Mesh:
-    """`mesh` with positions on a grid of some 4000 cells along each axis, and normals within half a degree of their own.
+    """`mesh` with positions on a grid of some 4000 cells along each axis, and normals within a degree of their own.
 
     Files compress the numbers to two thirds.
     """

@@ -17,6 +17,8 @@ STEP = "step"
 SIM_TIME = "sim_time"
 LOOK = "look"
 """Component of a visual, JSON: its name, its colour as red, green, blue and alpha, how metallic and how rough it is."""
+_MOST_KEPT_STEPS = 2000
+"""Times of more are not kept: those of hours would be a hundred megabytes, for as long as the process lives."""
 SERIES_COLORS = (
     (86, 180, 233),
     (230, 159, 0),
@@ -138,9 +140,7 @@ class TimedChunks:
 
     def of(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> Chunk:
         """`columns` with a row for each of `steps` (R,)."""
-        return Chunk.from_columns(
-            entity, _times(np.asarray(steps, np.int64).tobytes(), self._control_dt), columns
-        )
+        return Chunk.from_columns(entity, _times_of(steps, self._control_dt), columns)
 
     def poses(
         self, entities: Sequence[str], steps: NDArray[np.int64], poses: NDArray[np.float32]
@@ -180,13 +180,22 @@ class TimedChunks:
         return self.of(entity, np.array(steps, dtype=np.int64), columns)
 
 
+def _times_of(steps: NDArray[np.int64], control_dt: float) -> tuple[rr.TimeColumn, ...]:
+    if len(steps) > _MOST_KEPT_STEPS:
+        return _times(steps, control_dt)
+    return _kept_times(np.asarray(steps, np.int64).tobytes(), control_dt)
+
+
 @lru_cache(maxsize=64)
-def _times(steps: bytes, control_dt: float) -> tuple[rr.TimeColumn, ...]:
-    """Of these int64, which most entities share, and the next episode of the same length does too."""
-    numbers = np.frombuffer(steps, np.int64)
+def _kept_times(steps: bytes, control_dt: float) -> tuple[rr.TimeColumn, ...]:
+    """Most entities share them, and so does the next episode of the same length."""
+    return _times(np.frombuffer(steps, np.int64), control_dt)
+
+
+def _times(steps: NDArray[np.int64], control_dt: float) -> tuple[rr.TimeColumn, ...]:
     # Rounded, because rerun truncates: 3 * 0.05 s would be 149999999 ns.
-    seconds = np.rint(numbers * control_dt * 1e9).astype("timedelta64[ns]")
-    return rr.TimeColumn(STEP, sequence=numbers), rr.TimeColumn(SIM_TIME, duration=seconds)
+    seconds = np.rint(steps * control_dt * 1e9).astype("timedelta64[ns]")
+    return rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(SIM_TIME, duration=seconds)
 
 
 def static_pose(entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> Chunk:
