@@ -49,7 +49,7 @@ _SAMPLES = 10_000
 _MOST_KEPT = 500
 """Meshes in memory."""
 _MOST_ON_DISK = 512 << 20
-"""Bytes; the files that were not used for longest go first."""
+"""Bytes, with what other versions have left; the files that were not used for longest go first."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ def _write(name: str, levels: tuple[Level, ...]) -> None:
 
 def _make_room() -> None:
     files = []
-    for path in _folder().glob("*.npz"):
+    for path in cache_folder().glob("meshes-*/*.npz"):
         status = path.stat()
         files.append((status.st_mtime, status.st_size, path))
     over = sum(size for _, size, _ in files) - _MOST_ON_DISK
