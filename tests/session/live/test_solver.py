@@ -68,10 +68,21 @@ def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(ses
     session.play()
     wait_until(session, lambda view: view.step is not None and view.step.elapsed_steps[0] >= 2, "two steps")
     session.pause()
-    view = wait_until(session, lambda view: not view.playing, "the pause")
+    view = wait_until(session, lambda view: not view.playing and view.solve.state == "none", "the pause")
     time.sleep(0.5)
     assert session.view().step_serial - view.step_serial <= 1
     assert session.view().solve.state == "none"
+
+
+def test_a_wish_that_comes_after_the_pause_was_sent_is_not_planned_for(session: Session) -> None:
+    start_over(session, 4)
+    # Some of these pauses meet the worker's wish on its way.
+    for after in np.linspace(0, 0.03, 7):
+        session.play()
+        time.sleep(after)
+        session.pause()
+        time.sleep(0.1)
+        wait_until(session, lambda view: not view.playing and view.solve.state == "none", "the end")
 
 
 def test_another_body_is_traced_and_all_envs_are_planned_for_in_turn(session: Session) -> None:

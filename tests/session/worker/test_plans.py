@@ -15,7 +15,7 @@ from workbench.jobs.open_task import OpenedTask, Opening, build_task
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import bodies_of
-from workbench.session.protocol.messages import CannotAnswer, FollowPlan, PlanWanted, Settings
+from workbench.session.protocol.messages import CannotAnswer, FollowPlan, PlanDropped, PlanWanted, Settings
 from workbench.session.protocol.questions import PlanActions, PlannedEnv
 from workbench.session.worker.plans import MOST_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
 
@@ -109,7 +109,15 @@ def test_a_live_env_with_other_bodies_than_the_rollouts_have_gets_no_plan(push: 
 
 def test_a_plan_is_asked_for_once_and_dropped_if_anything_else_moved_the_envs(push: OpenedTask) -> None:
     asked: list[PlanWanted] = []
-    followed = FollowedPlan(asked.append)
+    dropped: list[PlanDropped] = []
+
+    def send(event: PlanWanted | PlanDropped) -> None:
+        if isinstance(event, PlanWanted):
+            asked.append(event)
+        else:
+            dropped.append(event)
+
+    followed = FollowedPlan(send)
     assert not followed.ready(push, 5, [1]) and not followed.ready(push, 5, [1])
     assert [(one.number, one.env_idx) for one in asked] == [(5, (1,))] and followed.awaited
     assert pickle.loads(asked[0].snapshot).env_idx == (1,)
@@ -123,8 +131,11 @@ def test_a_plan_is_asked_for_once_and_dropped_if_anything_else_moved_the_envs(pu
     assert (action[1] == 0.25).all() and not (action[0] == 0.25).any()
     assert followed.ready(push, 6, [1]) and len(asked) == 1
     # A reset came between.
-    assert not followed.ready(push, 7, [1]) and len(asked) == 2
+    assert not followed.ready(push, 7, [1]) and len(asked) == 2 and not dropped
     followed.forget()
+    assert len(dropped) == 1
+    followed.forget()
+    assert len(dropped) == 1, "nothing was wanted since"
     followed.take(FollowPlan(7, (1,), actions))
     assert not followed.ready(push, 7, [1])
 

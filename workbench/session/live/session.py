@@ -39,6 +39,7 @@ from workbench.session.protocol.messages import (
     Loaded,
     LoadFailed,
     Placed,
+    PlanDropped,
     PlanWanted,
     Play,
     Progress,
@@ -234,7 +235,6 @@ class Session:
         self._set_playing(True)
 
     def pause(self) -> None:
-        self.solver.stop()
         self._set_playing(False)
 
     def step(self) -> None:
@@ -266,9 +266,6 @@ class Session:
             if not self._state.change(**settings):
                 return
             policy, folder = self._state.policy, self._state.folder
-            source = self._state.now.settings.action_source
-        if source != "solve":
-            self.solver.stop()
         self._send_settings()
         self._policy_file.follow(policy, folder)
         self._notify()
@@ -410,6 +407,7 @@ class Session:
 
     def _on_death(self, death: Death) -> None:
         self._recorder.stop()
+        self.solver.stop()
         self.studio.interrupted()
         problem, kept = self.versions.died(death, self._printed.tail(20))
         self._notify()
@@ -434,6 +432,8 @@ class Session:
             self._asker.take(event)
         elif isinstance(event, PlanWanted):
             self._on_plan_wanted(event)
+        elif isinstance(event, PlanDropped):
+            self.solver.stop()
         else:
             with self._lock:
                 self._state.take(event)

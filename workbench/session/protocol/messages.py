@@ -349,6 +349,11 @@ class PlanWanted:
 
 
 @dataclass(frozen=True)
+class PlanDropped:
+    """The worker waits for no plan any more: it was paused, or something else moved the envs."""
+
+
+@dataclass(frozen=True)
 class Pictures:
     """The newest pictures of the watched cameras of one kind."""
 
@@ -440,6 +445,7 @@ Event = (
     | LoadFailed
     | Stepped
     | PlanWanted
+    | PlanDropped
     | Pictures
     | Placed
     | PastPictures

@@ -24,6 +24,7 @@ from workbench.session.protocol.messages import (
     SCENE_KEPT,
     CannotAnswer,
     FollowPlan,
+    PlanDropped,
     PlanWanted,
     ReloadLevel,
     Settings,
@@ -37,13 +38,15 @@ MOST_PATHS = 24
 class FollowedPlan:
     """The actions of the worker that plays while they are planned. The worker goes on with its loop until a plan comes."""
 
-    def __init__(self, send: Callable[[PlanWanted], None]) -> None:
+    def __init__(self, send: Callable[[PlanWanted | PlanDropped], None]) -> None:
         """
         Args:
             send: sends to the server.
         """
         self._send = send
         self._asked: int | None = None
+        self._told = False
+        """Whether the server was told of a wish, and not that it is dropped."""
         self._at = -1
         """The moment that the next of `_actions` is for."""
         self._actions: deque[NDArray[np.float32]] = deque()
@@ -65,7 +68,7 @@ class FollowedPlan:
             return True
         self._actions.clear()
         if self._asked != moment:
-            self._asked = moment
+            self._asked, self._told = moment, True
             self._send(_wanted(opened, moment, tuple(envs)))
         return False
 
@@ -88,6 +91,10 @@ class FollowedPlan:
         """What moves the envs has changed: a plan that is under way is not followed."""
         self._asked = None
         self._actions.clear()
+        if self._told:
+            # From here: the server might hear of a wish after it has sent the pause, and plan for nobody.
+            self._told = False
+            self._send(PlanDropped())
 
 
 def envs_to_plan(settings: Settings, task: TaskEnv, last: StepResult) -> list[int]:
