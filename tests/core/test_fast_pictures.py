@@ -265,3 +265,20 @@ def test_a_body_that_comes_into_view_is_drawn(env: Any) -> None:
     exact, fast = (take_pictures(env, 0, request, degree=degree)[0] for degree in ("exact", "fast"))
     assert (fast.segmentation != exact.segmentation).mean() < 0.01
     assert (away.segmentation != exact.segmentation).mean() > 0.1
+
+
+def test_a_link_beside_the_view_whose_box_reaches_into_it_is_not_drawn(env: Any) -> None:
+    component = camera_components(env._sensors["base_camera"])[0]
+    request: list[Any] = [("base_camera", "sensor", ["rgb", "segmentation"])]
+    was = component.local_pose
+    base = env.agent.robot.links[0]._objs[0].entity
+    try:
+        # As in ManiSkill's RollBall: within the arm, right in front of the link that turns it.
+        seat = sapien.Pose([0.1, 0, 0.3], [0.98572, -0.00882, 0.15903, 0.05466])
+        component.local_pose = component.entity.pose.inv() * base.pose * seat
+        exact, fast = (take_pictures(env, 0, request, degree=degree)[0] for degree in ("exact", "fast"))
+        drawn = drawn_by(env, "base_camera")
+    finally:
+        component.local_pose = was
+    assert drawn["panda_link1"] == drawn["panda_link2"] == 0 < drawn["panda_link6"]
+    assert (fast.segmentation != exact.segmentation).mean() < 0.01

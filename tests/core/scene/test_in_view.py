@@ -10,7 +10,7 @@ import sapien
 import sapien.render
 
 from tests.ui.scenes import box_mesh
-from workbench.core.scene.in_view import are_outside, cut_to_view, planes_of
+from workbench.core.scene.in_view import Seen, corners_of, cut_to_view, how_far_seen, is_outside, planes_of
 
 
 @pytest.fixture
@@ -26,20 +26,46 @@ def test_a_point_is_in_view_where_its_pixel_is_in_the_picture(camera: Any) -> No
     k = camera.get_intrinsic_matrix()
     column, row = k[0, 2] - k[0, 0] * y / x, k[1, 2] - k[1, 1] * z / x
     seen = (x > 0.1) & (column > 0) & (column < 40) & (row > 0) & (row < 30)
-    outside = are_outside(
-        np.stack([points, points], axis=1).astype(np.float32), np.tile(planes_of(camera), (2000, 1, 1))
-    )
+    planes = planes_of(camera)
+    boxes = np.stack([points, points], axis=1).astype(np.float32)
+    outside = how_far_seen(boxes, np.tile(planes, (2000, 1, 1))) == Seen.NOTHING
     assert seen.any() and not (outside & seen).any()
+    np.testing.assert_array_equal([is_outside(point[None], planes) for point in points], outside)
     nearly = (x > 0.09) & (column > -2) & (column < 42) & (row > -2) & (row < 32)
     assert outside[~nearly].all()
 
 
-def test_a_box_around_the_camera_is_in_view_and_one_behind_it_is_not(camera: Any) -> None:
+def test_a_box_around_the_camera_is_partly_in_view_and_one_behind_it_is_not(camera: Any) -> None:
     boxes = np.array(
-        [[[-1, -1, -1], [1, 1, 1]], [[-3, -1, -1], [-2, 1, 1]], [[1, 5, -1], [2, 6, 1]]], np.float32
+        [
+            [[-1, -1, -1], [1, 1, 1]],
+            [[-3, -1, -1], [-2, 1, 1]],
+            [[1, 5, -1], [2, 6, 1]],
+            [[2, -0.1, -0.1], [3, 0.1, 0.1]],
+        ],
+        np.float32,
     )
-    outside = are_outside(boxes, np.tile(planes_of(camera), (3, 1, 1)))
-    np.testing.assert_array_equal(outside, [False, True, True])
+    seen = how_far_seen(boxes, np.tile(planes_of(camera), (len(boxes), 1, 1)))
+    np.testing.assert_array_equal(seen, [Seen.PART, Seen.NOTHING, Seen.NOTHING, Seen.ALL])
+
+
+def test_what_is_slanted_in_its_box_may_be_outside_where_its_box_is_not(camera: Any) -> None:
+    # A rod that goes away to the left of the view, with a thickness.
+    along = np.linspace([0.5, 0.6, 0], [3.5, 6.6, 0], 50)
+    rod = np.concatenate([along, along + [0, 0, 0.02], along + [0.02, 0, 0]])
+    box = np.array([[rod.min(axis=0), rod.max(axis=0)]], np.float32)
+    planes = planes_of(camera)
+    assert how_far_seen(box, planes[None]) == Seen.PART
+    assert is_outside(corners_of(rod), planes) and not is_outside(corners_of(rod - [0, 0.6, 0]), planes)
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_the_corners_of_points_are_around_all_of_them(flat: bool) -> None:
+    points = np.random.default_rng(1).normal(size=(500, 3)) * [1, 1, 0 if flat else 1]
+    corners = corners_of(points)
+    assert len(corners) < len(points)
+    for direction in np.random.default_rng(2).normal(size=(50, 3)):
+        assert (corners @ direction).max() >= (points @ direction).max() - 1e-9
 
 
 def test_triangles_behind_the_camera_are_cut_and_the_rest_keeps_its_normals(camera: Any) -> None:

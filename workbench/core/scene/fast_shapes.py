@@ -12,7 +12,17 @@ import sapien
 import sapien.render
 from numpy.typing import NDArray
 
-from workbench.core.scene.in_view import Planes, are_outside, cut_to_view, fixed_to, planes_of
+from workbench.core.scene.in_view import (
+    Planes,
+    Seen,
+    box_corners,
+    corners_of,
+    cut_to_view,
+    fixed_to,
+    how_far_seen,
+    is_outside,
+    planes_of,
+)
 from workbench.core.scene.mesh_levels import are_known, within
 from workbench.core.scene.read_scene import exact_part
 from workbench.core.scene.shapes import Mesh
@@ -74,6 +84,8 @@ class FastShapes:
         """By camera and name of the body."""
         self._cut: dict[tuple[Hashable, str], _Cut] = {}
         """By camera and name of a body that it is fixed to."""
+        self._corners: dict[tuple[int, float], NDArray[np.float64]] = {}
+        """By the id of an exact component and its tolerance."""
         self._of_camera: dict[tuple[Hashable, int], Bodies] = {}
         """By camera and env."""
 
@@ -99,11 +111,11 @@ class FastShapes:
         poses = [to_camera * _pose(entity, places) for entity, _ in of_env]
         planes = planes_of(component)
         in_bodies = planes @ np.array([pose.to_transformation_matrix() for pose in poses])
-        outside = are_outside(self._boxes[env], in_bodies)
+        seen = how_far_seen(self._boxes[env], in_bodies)
         fixed = fixed_to(component.entity)
         drawn: list[tuple[Any, Any]] = []
-        for (entity, body), is_outside, pose, here in zip(of_env, outside, poses, in_bodies, strict=True):
-            if is_outside:
+        for (entity, body), how_far, pose, here in zip(of_env, seen, poses, in_bodies, strict=True):
+            if how_far == Seen.NOTHING:
                 drawn.append((body, None))
                 continue
             name = _shared_name(entity, env)
@@ -114,8 +126,12 @@ class FastShapes:
                 if cut.is_for(pose, planes):
                     drawn.append((body, self._cut_body(body, key, cut, component, here)))
                     continue
-            simplified = self._simplified(body, self._tolerances[key][name])
-            if simplified is not None:
+            tolerance = self._tolerances[key][name]
+            simplified = self._simplified(body, tolerance)
+            # A link stands at a slant in its box, which may reach into view where it does not.
+            if how_far == Seen.PART and is_outside(self._corners_of(body, tolerance), here):
+                drawn.append((body, None))
+            elif simplified is not None:
                 drawn.append((body, simplified))
         self._of_camera[key, env] = tuple(drawn)
 
@@ -129,6 +145,7 @@ class FastShapes:
             if fast is not None:
                 fast.entity.remove_component(fast)
         self._components.clear()
+        self._corners.clear()
         self._of_camera.clear()
         self._tolerances.clear()
         self._cut.clear()
@@ -146,23 +163,19 @@ class FastShapes:
 
     def _box(self, body: Any) -> NDArray[np.float32]:
         """(2, 3) low and high corner of what is drawn, in the body's frame."""
-        corners = []
-        for shape in body.render_shapes:
-            frame = shape.local_pose.to_transformation_matrix()
-            for index, part in enumerate(shape.parts):
-                exact, scale = exact_part(shape, part, index)
-                low, high = self._chosen.box(exact)
-                eight = np.array(
-                    [
-                        [x, y, z]
-                        for x in (low[0], high[0])
-                        for y in (low[1], high[1])
-                        for z in (low[2], high[2])
-                    ]
-                )
-                corners.append((eight * scale) @ frame[:3, :3].T + frame[:3, 3])
-        every = np.concatenate(corners)
+        every = np.concatenate([_moved(self._chosen.box(part.exact), part.placed) for part in _parts(body)])
         return np.array([every.min(axis=0), every.max(axis=0)], np.float32)
+
+    def _corners_of(self, body: Any, tolerance: float) -> NDArray[np.float64]:
+        """(P, 3) points around what is drawn of it, in its frame."""
+        by = (id(body), tolerance)
+        if by not in self._corners:
+            each = [
+                _moved(self._chosen.corners(self._chosen.mesh(part, tolerance)), part.placed)
+                for part in _parts(body)
+            ]
+            self._corners[by] = np.concatenate(each)
+        return self._corners[by]
 
     def _nearest(self, body: Any, pose: sapien.Pose, planes: Planes) -> float:
         """Metres to the nearest vertex of a triangle that is in view, infinite where none is.
@@ -172,15 +185,11 @@ class FastShapes:
             planes: of the camera, in the body's frame.
         """
         eye, nearest = np.asarray(pose.inv().p), np.inf
-        for shape in body.render_shapes:
-            frame = shape.local_pose.to_transformation_matrix()
-            for index, part in enumerate(shape.parts):
-                exact, scale = exact_part(shape, part, index)
-                placed = frame @ np.diag([*scale, 1.0])
-                seen = cut_to_view(exact, planes @ placed).vertices
-                if len(seen):
-                    at = seen @ placed[:3, :3].T + placed[:3, 3]
-                    nearest = min(nearest, float(np.linalg.norm(at - eye, axis=1).min()))
+        for part in _parts(body):
+            seen = cut_to_view(part.exact, planes @ part.placed).vertices
+            if len(seen):
+                at = _moved(seen, part.placed)
+                nearest = min(nearest, float(np.linalg.norm(at - eye, axis=1).min()))
         return nearest
 
     def _cut_body(self, body: Any, key: Hashable, cut: _Cut, camera: Any, planes: Planes) -> Any:
@@ -259,25 +268,61 @@ def _has_tangents(body: Any) -> bool:
     )
 
 
+@dataclass(frozen=True)
+class _Part:
+    """Of what is drawn of a body."""
+
+    shape: Any
+    material: Any
+    exact: Mesh
+    scale: tuple[float, float, float]
+    placed: NDArray[np.float64]
+    """(4, 4) from points of the mesh, with its scale, to the body's frame."""
+
+
+def _parts(body: Any) -> Iterator[_Part]:
+    for shape in body.render_shapes:
+        frame = shape.local_pose.to_transformation_matrix().astype(np.float64)
+        for index, part in enumerate(shape.parts):
+            exact, scale = exact_part(shape, part, index)
+            yield _Part(shape, part.material, exact, scale, frame @ np.diag([*scale, 1.0]))
+
+
+def _moved(points: NDArray[np.floating], by: NDArray[np.float64]) -> NDArray[np.float64]:
+    return points @ by[:3, :3].T + by[:3, 3]
+
+
 class _Chosen:
     """Simplified meshes by the exact one, which is often that of all envs."""
 
     def __init__(self) -> None:
         self._made: dict[tuple[int, bool, float], tuple[Mesh, Mesh]] = {}
-        self._boxes: dict[int, tuple[Mesh, NDArray[np.float32]]] = {}
+        self._boxes: dict[int, tuple[Mesh, NDArray[np.float64]]] = {}
+        self._corners: dict[int, tuple[Mesh, NDArray[np.float64]]] = {}
 
-    def box(self, exact: Mesh) -> NDArray[np.float32]:
-        """(2, 3) low and high corner."""
+    def box(self, exact: Mesh) -> NDArray[np.float64]:
+        """(8, 3) its corners."""
         if id(exact) not in self._boxes:
-            corners = np.array([exact.vertices.min(axis=0), exact.vertices.max(axis=0)])
-            self._boxes[id(exact)] = exact, corners
+            self._boxes[id(exact)] = exact, box_corners(exact.vertices)
         return self._boxes[id(exact)][1]
 
-    def mesh(self, exact: Mesh, textured: bool, tolerance: float) -> Mesh:
-        key = (id(exact), textured, tolerance)
+    def corners(self, mesh: Mesh) -> NDArray[np.float64]:
+        """(P, 3) of what is around it."""
+        if id(mesh) not in self._corners:
+            self._corners[id(mesh)] = mesh, corners_of(mesh.vertices)
+        return self._corners[id(mesh)][1]
+
+    def mesh(self, part: _Part, tolerance: float) -> Mesh:
+        """What stands for a part of a body that may be off by `tolerance`."""
+        largest = max(map(abs, part.scale))
+        if largest == 0 or not _is_mesh(part.shape):
+            return part.exact
+        textured = _is_textured(part.material)
+        key = (id(part.exact), textured, tolerance / largest)
         if key not in self._made:
+            mesh = part.exact if textured else drop_uvs(part.exact)
             # With the exact one, whose id would else be another's.
-            self._made[key] = exact, within(exact if textured else drop_uvs(exact), tolerance)
+            self._made[key] = part.exact, within(mesh, tolerance / largest)
         return self._made[key][1]
 
 
@@ -295,19 +340,13 @@ def _simplified(
         planes: in the body's frame, to cut its triangles to; None for all of them.
     """
     shapes, fewer = [], False
-    for shape in body.render_shapes:
-        for index, part in enumerate(shape.parts):
-            exact, scale = exact_part(shape, part, index)
-            largest = max(map(abs, scale))
-            mesh = exact
-            if largest > 0 and _is_mesh(shape):
-                mesh = chosen.mesh(exact, _is_textured(part.material), tolerance / largest)
-            if planes is not None:
-                placed = shape.local_pose.to_transformation_matrix() @ np.diag([*scale, 1.0])
-                mesh = cut_to_view(mesh, planes @ placed)
-            fewer |= len(mesh.faces) < len(exact.faces)
-            if len(mesh.faces):
-                shapes.append(_shape(mesh, scale, shape, part.material))
+    for part in _parts(body):
+        mesh = chosen.mesh(part, tolerance)
+        if planes is not None:
+            mesh = cut_to_view(mesh, planes @ part.placed)
+        fewer |= len(mesh.faces) < len(part.exact.faces)
+        if len(mesh.faces):
+            shapes.append(_shape(mesh, part))
     if not shapes or (planes is None and not fewer):
         return None
     made = sapien.render.RenderBodyComponent()
@@ -319,14 +358,14 @@ def _simplified(
     return made
 
 
-def _shape(mesh: Mesh, scale: tuple[float, float, float], like: Any, material: Any) -> Any:
+def _shape(mesh: Mesh, like: _Part) -> Any:
     uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs
     normals: Any = mesh.normals
-    shape = sapien.render.RenderShapeTriangleMesh(mesh.vertices, mesh.faces, normals, uvs, material)
-    shape.set_scale(scale)
-    shape.local_pose = like.local_pose
-    shape.front_face = like.front_face if hasattr(like, "front_face") else "counterclockwise"
-    shape.name = like.name
+    shape = sapien.render.RenderShapeTriangleMesh(mesh.vertices, mesh.faces, normals, uvs, like.material)
+    shape.set_scale(like.scale)
+    shape.local_pose = like.shape.local_pose
+    shape.front_face = like.shape.front_face if hasattr(like.shape, "front_face") else "counterclockwise"
+    shape.name = like.shape.name
     return shape
 
 

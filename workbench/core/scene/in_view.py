@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import IntEnum
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ import sapien
 import sapien.render
 from numpy.typing import NDArray
 from sapien import physx
+from trimesh.convex import hull_points
 
 from workbench.core.scene.shapes import Mesh
 
@@ -39,10 +42,40 @@ def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
     return np.array(planes)
 
 
-def are_outside(boxes: NDArray[np.float32], planes: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(B,) whether boxes (B, 2, 3) are wholly outside one of the planes (B, 5, 4), each in the frame of its box."""
-    farthest = (planes[:, :, None, :3] * boxes[:, None]).max(axis=2).sum(axis=-1) + planes[..., 3]
-    return (farthest < 0).any(axis=1)
+class Seen(IntEnum):
+    """Of a box."""
+
+    NOTHING = 0
+    PART = 1
+    ALL = 2
+
+
+def how_far_seen(boxes: NDArray[np.float32], planes: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(B,) `Seen`: of boxes (B, 2, 3) wholly outside one of the planes (B, 5, 4), each in the frame of its box, nothing."""
+    sides = planes[:, :, None, :3] * boxes[:, None]
+    farthest = sides.max(axis=2).sum(axis=-1) + planes[..., 3]
+    nearest = sides.min(axis=2).sum(axis=-1) + planes[..., 3]
+    return np.where(
+        (farthest < 0).any(axis=1), Seen.NOTHING, np.where((nearest >= 0).all(axis=1), Seen.ALL, Seen.PART)
+    )
+
+
+def is_outside(points: NDArray[np.float64], planes: Planes) -> bool:
+    """Whether points (P, 3), and so what is between them, are wholly outside one of the planes, in whose frame they are."""
+    return bool((points @ planes[:, :3].T + planes[:, 3] < 0).all(axis=0).any())
+
+
+def corners_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(P, 3) those of their convex hull, or of their box where they are in one plane."""
+    try:
+        return np.asarray(hull_points(points), np.float64)
+    except RuntimeError:  # qhull's own error is one
+        return box_corners(points)
+
+
+def box_corners(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(8, 3) of the box around them."""
+    return np.array(list(product(*zip(points.min(axis=0), points.max(axis=0)))), np.float64)
 
 
 def cut_to_view(mesh: Mesh, planes: Planes) -> Mesh:
