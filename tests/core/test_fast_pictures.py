@@ -23,7 +23,7 @@ from workbench.core.cameras.render import take_pictures
 from workbench.core.env.hot_swap import exchange_cameras
 from workbench.core.env.task_env import BackendUnavailable, EnvOptions
 from workbench.core.maniskill_private import camera_components
-from workbench.core.scene.fast_shader import ALL, COLOR, shader_folder
+from workbench.core.scene.fast_shader import ALL, COLOR, FastCameras, shader_folder
 from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -115,6 +115,27 @@ def test_the_installed_sapien_has_the_shader_that_is_cut_down() -> None:
     for textures in (COLOR, ALL):
         folder = shader_folder(textures)
         assert folder is not None and (folder / "gbuffer.frag").exists()
+
+
+@pytest.mark.parametrize("textures", [COLOR, ALL])
+def test_the_shader_that_is_cut_down_draws_the_same_picture_of_the_same_shapes(
+    env: Any, textures: frozenset[str]
+) -> None:
+    # Table, floor, robot and cube: with and without textures, a normal map, metal, and what is smooth and rough.
+    sensor = env._sensors["base_camera"]
+    exact = camera_components(sensor)[0]
+    cameras = FastCameras(env.scene.sub_scenes)
+    cameras.follow(0, sensor.config, exact, textures)
+    beside = cameras.beside(exact, textures)
+    assert beside is not exact
+    env.scene.sub_scenes[0].update_render()
+    colours = []
+    for component in (exact, beside):
+        component.take_picture()
+        colours.append(np.asarray(component.get_picture("Color")))
+    off = np.abs(colours[0].astype(np.float64) - colours[1])[..., :3]
+    step = 1 if colours[0].dtype == np.uint8 else 1 / 255
+    assert colours[0].any() and off.max() <= step * 1.01 and (off > 0).mean() < 0.01
 
 
 def test_a_fast_picture_follows_its_camera(env: Any) -> None:

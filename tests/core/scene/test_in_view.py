@@ -10,7 +10,7 @@ import sapien
 import sapien.render
 
 from tests.ui.scenes import box_mesh
-from workbench.core.scene.in_view import Seen, corners_of, cut_to_view, how_far_seen, is_outside, planes_of
+from workbench.core.scene.in_view import corners_of, cut_to_view, is_outside, outside_and_inside, planes_of
 
 
 @pytest.fixture
@@ -28,7 +28,8 @@ def test_a_point_is_in_view_where_its_pixel_is_in_the_picture(camera: Any) -> No
     seen = (x > 0.1) & (column > 0) & (column < 40) & (row > 0) & (row < 30)
     planes = planes_of(camera)
     boxes = np.stack([points, points], axis=1).astype(np.float32)
-    outside = how_far_seen(boxes, np.tile(planes, (2000, 1, 1))) == Seen.NOTHING
+    outside, inside = outside_and_inside(boxes, np.tile(planes, (2000, 1, 1)))
+    np.testing.assert_array_equal(outside, ~inside, "a box without a size")
     assert seen.any() and not (outside & seen).any()
     np.testing.assert_array_equal([is_outside(point[None], planes) for point in points], outside)
     nearly = (x > 0.09) & (column > -2) & (column < 42) & (row > -2) & (row < 32)
@@ -45,8 +46,9 @@ def test_a_box_around_the_camera_is_partly_in_view_and_one_behind_it_is_not(came
         ],
         np.float32,
     )
-    seen = how_far_seen(boxes, np.tile(planes_of(camera), (len(boxes), 1, 1)))
-    np.testing.assert_array_equal(seen, [Seen.PART, Seen.NOTHING, Seen.NOTHING, Seen.ALL])
+    outside, inside = outside_and_inside(boxes, np.tile(planes_of(camera), (len(boxes), 1, 1)))
+    np.testing.assert_array_equal(outside, [False, True, True, False])
+    np.testing.assert_array_equal(inside, [False, False, False, True])
 
 
 def test_what_is_slanted_in_its_box_may_be_outside_where_its_box_is_not(camera: Any) -> None:
@@ -55,7 +57,7 @@ def test_what_is_slanted_in_its_box_may_be_outside_where_its_box_is_not(camera: 
     rod = np.concatenate([along, along + [0, 0, 0.02], along + [0.02, 0, 0]])
     box = np.array([[rod.min(axis=0), rod.max(axis=0)]], np.float32)
     planes = planes_of(camera)
-    assert how_far_seen(box, planes[None]) == Seen.PART
+    assert [sides.item() for sides in outside_and_inside(box, planes[None])] == [False, False]
     assert is_outside(corners_of(rod), planes) and not is_outside(corners_of(rod - [0, 0.6, 0]), planes)
 
 

@@ -49,6 +49,33 @@ _PIXELS: Edits = (
     ("out vec4 outColorRaw;", "out vec4 outColor;"),
     ("  outColorRaw = ", "  outColor = "),
 )  # fmt: skip
+# The same light with less arithmetic: of two unit vectors, the half between them follows from their angle.
+_LIGHT: Edits = (
+    ("  vec3 color = emission.rgb;\n", """  vec3 color = emission.rgb;
+  float nv = dot(normal, camDir);
+  float alpha = roughness * roughness;
+  float alpha2 = alpha * alpha;
+  float k = (alpha + 2 * roughness + 1.0) / 8.0;
+  float nom1 = clamp(nv, 1e-6, 1) * (1 - k) + k;
+"""),
+    ("""    color += computeDirectionalLight(
+        mat3(cameraBuffer.viewMatrix) * sceneBuffer.directionalLights[i].direction.xyz,
+        sceneBuffer.directionalLights[i].emission.rgb,
+        normal, camDir, diffuseAlbedo, roughness, fresnel);
+""", """    vec3 l = -(mat3(cameraBuffer.viewMatrix) * sceneBuffer.directionalLights[i].direction.xyz);
+    float nl = dot(normal, l);
+    float lv = dot(camDir, l);
+    float perH = inversesqrt(max(2 + 2 * lv, 1e-6));
+    float NoH = clamp((nl + nv) * perH, 1e-6, 1);
+    float VoH = clamp((1 + lv) * perH, 1e-6, 1);
+    float NoL = clamp(nl, 0, 1);
+    float nom0 = NoH * NoH * (alpha2 - 1) + 1;
+    float nom = clamp(nom0 * nom0 * nom1 * (NoL * (1 - k) + k), 1e-6 / 12.566370614359172, 1);
+    vec3 reflected = fresnel + (1 - fresnel) * exp2((-5.55473 * VoH - 6.98316) * VoH);
+    vec3 spread = diffuseAlbedo + reflected * (alpha2 / (4 * nom));
+    color += sceneBuffer.directionalLights[i].emission.rgb * (NoL / 3.141592653589793 * spread);
+"""),
+)  # fmt: skip
 _COLOR_VERTICES: Edits = (
     ("layout(location = 2) out flat uvec4 outSegmentation;\n", ""),
     ("  outSegmentation = objectDataBuffer.segmentation;\n", ""),
@@ -64,7 +91,7 @@ _COLOR_PIXELS: Edits = (
 def shader_folder(textures: frozenset[str]) -> Path | None:
     """SAPIEN's minimal shader, cut down to these textures (`COLOR` or `ALL`); None if the installed one is not the known one."""
     source = Path(sapien.__file__).parent / "vulkan_shader"
-    vertices, pixels = _VERTICES, _PIXELS
+    vertices, pixels = _VERTICES, _PIXELS + _LIGHT
     if textures == COLOR:
         vertices, pixels = vertices + _COLOR_VERTICES, pixels + _COLOR_PIXELS
     try:

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from workbench.core.scene.in_view import (
     Planes,
-    Seen,
     box_corners,
     corners_of,
     cut_to_view,
     fixed_to,
-    how_far_seen,
     is_outside,
+    outside_and_inside,
     planes_of,
 )
 from workbench.core.scene.mesh_levels import are_known, within
@@ -111,11 +110,12 @@ class FastShapes:
         poses = [to_camera * _pose(entity, places) for entity, _ in of_env]
         planes = planes_of(component)
         in_bodies = planes @ np.array([pose.to_transformation_matrix() for pose in poses])
-        seen = how_far_seen(self._boxes[env], in_bodies)
+        outside, inside = outside_and_inside(self._boxes[env], in_bodies)
         fixed = fixed_to(component.entity)
         drawn: list[tuple[Any, Any]] = []
-        for (entity, body), how_far, pose, here in zip(of_env, seen, poses, in_bodies, strict=True):
-            if how_far == Seen.NOTHING:
+        sides = zip(outside.tolist(), inside.tolist(), strict=True)
+        for (entity, body), (is_out, is_in), pose, here in zip(of_env, sides, poses, in_bodies, strict=True):
+            if is_out:
                 drawn.append((body, None))
                 continue
             name = _shared_name(entity, env)
@@ -129,7 +129,7 @@ class FastShapes:
             tolerance = self._tolerances[key][name]
             simplified = self._simplified(body, tolerance)
             # A link stands at a slant in its box, which may reach into view where it does not.
-            if how_far == Seen.PART and is_outside(self._corners_of(body, tolerance), here):
+            if not is_in and is_outside(self._corners_of(body, tolerance), here):
                 drawn.append((body, None))
             elif simplified is not None:
                 drawn.append((body, simplified))

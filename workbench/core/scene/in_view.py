@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import IntEnum
 from itertools import product
 from typing import Any
 
@@ -42,27 +41,20 @@ def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
     return np.array(planes)
 
 
-class Seen(IntEnum):
-    """Of a box."""
-
-    NOTHING = 0
-    PART = 1
-    ALL = 2
-
-
-def how_far_seen(boxes: NDArray[np.float32], planes: NDArray[np.float64]) -> NDArray[np.int64]:
-    """(B,) `Seen`: of boxes (B, 2, 3) wholly outside one of the planes (B, 5, 4), each in the frame of its box, nothing."""
+def outside_and_inside(
+    boxes: NDArray[np.float32], planes: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(B,) whether boxes (B, 2, 3) are wholly outside one of the planes (B, 5, 4), each in the frame of its box; and whether
+    they are wholly inside all."""
     sides = planes[:, :, None, :3] * boxes[:, None]
     farthest = sides.max(axis=2).sum(axis=-1) + planes[..., 3]
     nearest = sides.min(axis=2).sum(axis=-1) + planes[..., 3]
-    return np.where(
-        (farthest < 0).any(axis=1), Seen.NOTHING, np.where((nearest >= 0).all(axis=1), Seen.ALL, Seen.PART)
-    )
+    return farthest.min(axis=1) < 0, nearest.min(axis=1) >= 0
 
 
 def is_outside(points: NDArray[np.float64], planes: Planes) -> bool:
     """Whether points (P, 3), and so what is between them, are wholly outside one of the planes, in whose frame they are."""
-    return bool((points @ planes[:, :3].T + planes[:, 3] < 0).all(axis=0).any())
+    return bool((planes[:, :3] @ points.T + planes[:, 3:]).max(axis=1).min() < 0)
 
 
 def corners_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
