@@ -25,7 +25,7 @@ from workbench.core.scene.simplify import drop_uvs, flat_rectangle, share_vertic
 _FLAT_FACES = 100
 """Meshes with more faces are tested for being a flat rectangle."""
 _KEPT_MESHES = 1000
-MOST_FACES = 380
+MOST_FACES = 375
 """Most faces of a visual: a Panda of 136,000 triangles becomes 9,000 and looks the same."""
 MOST_TEXELS = 1024
 """On the longest side of a texture."""
