@@ -25,8 +25,8 @@ from workbench.cli.main import main
 ENV_ID = "PushIt-v1"
 UNTIL_LATER = {"3. The scene": {"kinematic-never-moved"}, "4. Where an episode begins": {"success-at-reset"}}
 """What the page says that a step leaves to the next one."""
-QUICK = {"record": ["--no-pictures"], "check": ["--workers", "1"]}
-"""Put behind what the page says to type: pictures take seconds of a process's first."""
+QUICK = {"record": ["--no-pictures", "--workers", "1"], "check": ["--workers", "1"]}
+"""Put behind what the page says to type: pictures take seconds of a process's first, and so does each process."""
 OF_NUMBERS = "... times"
 """In a quote that leaves out numbers which another machine computes a little differently."""
 _RULE = re.compile(rf"^{re.escape(FILE)}:\d+: ([\w-]+) \(", re.MULTILINE)

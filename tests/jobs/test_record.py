@@ -42,6 +42,7 @@ pytestmark = pytest.mark.usefixtures("child_process")
 TASKS = Path(__file__).parents[2] / "tasks"
 PUSHER = Path(__file__).parents[1] / "browser" / "pusher.py"
 PLAIN = {"render_backend": "none"}
+ONE_ENV = ("record", "PickCube-v1", "--workers", "1", "--envs-per-worker", "1")
 """Without a renderer, for whose shaders each process takes some seconds."""
 PUSHED = {"control_mode": "pd_ee_delta_pos", **PLAIN}
 
@@ -527,11 +528,8 @@ def test_arguments_are_refused_with_a_sentence(
         (["record", "PickCube-v1", "--actions", "demo.h5"], "demo.h5"),
         (["record", "PickCube-v1", "--actions", "gone.py:act"], "there is no file"),
         (["record", "PickCube-v1", "--actions", "randomly"], "module:function"),
-        (["record", "PickCube-v1", "--envs-per-worker", "1", "--actions", "gone:act"], "no module gone"),
-        (
-            ["record", "PickCube-v1", "--envs-per-worker", "1", "--actions", "json:act"],
-            "json has no function act",
-        ),
+        ([*ONE_ENV, "--actions", "gone:act"], "no module gone"),
+        ([*ONE_ENV, "--actions", "json:act"], "json has no function act"),
         (["record", "PickCube-v1", "--out", sys.executable], "is not a folder"),
     ],
 )

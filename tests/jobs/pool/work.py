@@ -17,6 +17,10 @@ from workbench.jobs.pool.deal import Deal, Executor, Failure, ItemQueue, Work
 PROBLEM = Problem("step", "it broke", "task.py", 3, "1 / 0", "Traceback")
 
 
+BEGUN = "begun-"
+"""And its number: a file for each item that was begun."""
+
+
 @dataclass(frozen=True)
 class Setup:
     how: str = ""
@@ -42,6 +46,7 @@ def square(setup: Setup, queue: ItemQueue) -> None:
         for number in sorted(chunk.wanted):
             if number >= queue.limit():
                 break
+            (setup.folder / f"{BEGUN}{number}").touch()
             if number == setup.at:
                 go_wrong(setup, queue)
             queue.send_update(1)
