@@ -70,6 +70,12 @@ def test_the_corners_of_points_are_around_all_of_them(flat: bool) -> None:
         assert (corners @ direction).max() >= (points @ direction).max() - 1e-9
 
 
+def test_a_mesh_that_is_no_numbers_counts_as_seen(camera: Any) -> None:
+    points = np.random.default_rng(3).normal(size=(20, 3))
+    points[7] = np.nan
+    assert not is_outside(corners_of(points), planes_of(camera))
+
+
 def test_triangles_behind_the_camera_are_cut_and_the_rest_keeps_its_normals(camera: Any) -> None:
     mesh = box_mesh((4.0, 0.2, 0.2))
     cut = cut_to_view(mesh, planes_of(camera))

@@ -11,6 +11,7 @@ import sapien
 import sapien.render
 from numpy.typing import NDArray
 from sapien import physx
+from scipy.spatial import QhullError
 from trimesh.convex import hull_points
 
 from workbench.core.scene.shapes import Mesh
@@ -58,10 +59,10 @@ def is_outside(points: NDArray[np.float64], planes: Planes) -> bool:
 
 
 def corners_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(P, 3) those of their convex hull, or of their box where they are in one plane."""
+    """(P, 3) those of their convex hull, or of their box where they have none: in one plane, or not numbers."""
     try:
         return np.asarray(hull_points(points), np.float64)
-    except RuntimeError:  # qhull's own error is one
+    except (QhullError, ValueError):
         return box_corners(points)
 
 
