@@ -117,7 +117,7 @@ def make(
 
 _FAST_PICTURES = (
     'pictures="fast" draws simplified meshes: a policy that is trained on these pictures sees others on a GPU, with stock '
-    "ManiSkill and with the default, exact. How much they differ is in `workbench help cameras`."
+    "ManiSkill and with the default, exact. How much they differ is in `workbench help benchmarks`."
 )
 
 

@@ -184,6 +184,7 @@ class Picture:
     """(H, W, 3) of unit length, in the same frame; 0 where the ray met nothing."""
     albedo: NDArray[np.uint8] | None = None
     """(H, W, 3) colour without light."""
+    degree: PictureDegree = "exact"
 
     @property
     def nbytes(self) -> int:

@@ -61,7 +61,7 @@ def test_every_env_is_asked_for_its_own_pictures_of_a_past_moment_and_once() -> 
 def test_a_moment_that_was_drawn_fast_is_drawn_exactly_unless_fast_pictures_are_chosen() -> None:
     timeline = played(3)
     number = timeline.history.at(1).number
-    timeline.history.add_pictures(Pictures((picture(1),), 5.0, number, "fast"))
+    timeline.history.add_pictures(Pictures((replace(picture(1), degree="fast"),), 5.0, number))
     timeline.seek(1)
     assert not timeline.view(1, (EYE,), "fast").wants_pictures and timeline.draw(1, (EYE,), "fast") is None
     assert timeline.view(1, (EYE,)).wants_pictures

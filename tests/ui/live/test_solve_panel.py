@@ -113,6 +113,12 @@ def test_it_tells_what_the_rollouts_earned_and_what_came_of_it(shown: Shown) -> 
     ]
 
 
+def test_an_episode_that_was_under_way_before_says_since_when_it_is_known() -> None:
+    assert "Since step 6 this episode has earned <b>1.8</b> in 3 steps" in solve_html(
+        replace(SOLVED, begins=6), 2
+    )
+
+
 def test_without_a_plan_it_says_what_to_press_and_why_there_is_none() -> None:
     assert "Press <i>Play</i>" in solve_html(SolveView(), 2)
     assert "building envs" in solve_html(SolveView("starting", activity="building envs"), 2)

@@ -114,7 +114,9 @@ def take_pictures(
 class PendingPictures:
     """Pictures that the renderer is drawing; see `begin_pictures`."""
 
-    _taken: tuple[tuple[Any, Any, str, CameraKind, int, tuple[str, ...], NDArray[np.float32]], ...]
+    _taken: tuple[
+        tuple[Any, Any, str, CameraKind, int, tuple[str, ...], NDArray[np.float32], PictureDegree], ...
+    ]
 
     def finish(self) -> tuple[Picture, ...]:
         """The pictures, in the order asked; waits until the renderer is done."""
@@ -166,7 +168,8 @@ def begin_pictures(
     ):
         batched = scene if isinstance(scene, BatchedCpuScene) else None
         needed = [_textures(cameras[kind, name], modalities) for name, kind, modalities in requests]
-        if batched is not None and (degree or batched.pictures) == "fast":
+        drawn = _degree_of(scene, degree)
+        if batched is not None and drawn == "fast":
             for (name, kind, _), textures in zip(requests, needed, strict=True):
                 batched.prepare_fast(env_index, (kind, name), textures, places)
         sub_scene.update_render()
@@ -179,8 +182,15 @@ def begin_pictures(
                 drawing = batched.take_picture(env_index, (kind, name), component, textures, degree)
             pose = component.get_global_pose()
             where = np.array([*pose.p, *pose.q], dtype=np.float32)
-            taken.append((cameras[kind, name], drawing, name, kind, env_index, tuple(modalities), where))
+            taken.append(
+                (cameras[kind, name], drawing, name, kind, env_index, tuple(modalities), where, drawn)
+            )
     return PendingPictures(tuple(taken))
+
+
+def _degree_of(scene: Any, asked: PictureDegree | None = None) -> PictureDegree:
+    """What a picture of the scene is, if this is asked for: only a batch on the CPU has fast ones."""
+    return (asked or scene.pictures) if isinstance(scene, BatchedCpuScene) else "exact"
 
 
 def _textures(camera: Any, modalities: Sequence[str]) -> set[str]:
@@ -275,6 +285,7 @@ def _read(
     env_index: int,
     modalities: tuple[str, ...],
     pose: NDArray[np.float32],
+    degree: PictureDegree,
 ) -> Picture:
     config = camera.config.shader_config
     made: dict[str, torch.Tensor] = {}
@@ -299,6 +310,7 @@ def _read(
         position=None if position is None else position.numpy().astype(np.float32) / np.float32(1000.0),
         normal=None if normal is None else np.ascontiguousarray(normal.numpy(), dtype=np.float32),
         albedo=np.ascontiguousarray(made["albedo"].numpy()) if "albedo" in made else None,
+        degree=degree,
     )
 
 
@@ -390,6 +402,7 @@ def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[P
                 rgb=None if "rgb" not in rows else rows["rgb"][at],
                 depth=None if depth is None else depth[at, ..., 0],
                 segmentation=None if segmentation is None else segmentation[at, ..., 0],
+                degree=_degree_of(scene),
             )
         )
     return found

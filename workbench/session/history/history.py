@@ -119,8 +119,6 @@ class Moment:
     """By env, kind and name of the camera."""
     outdated: set[tuple[int, CameraKind, str]] = field(default_factory=set)
     """Keys of pictures whose camera was moved since."""
-    fast: set[tuple[int, CameraKind, str]] = field(default_factory=set)
-    """Keys of pictures that are fast ones."""
     original_step: StepResult | None = None
     """`step` before a newer version replaced it; None if none did."""
 
@@ -277,10 +275,6 @@ class History:
                 self._pictured.append(moment.serial)
             moment.pictures[key] = picture
             moment.outdated.discard(key)
-            if isinstance(event, Pictures) and event.degree == "fast":
-                moment.fast.add(key)
-            else:
-                moment.fast.discard(key)
             change = picture.nbytes - (0 if before is None else before.nbytes)
             self._pictures_used += change
             self._used += change
@@ -469,7 +463,6 @@ class History:
     def _drop_pictures(self, moment: Moment) -> None:
         size = sum(picture.nbytes for picture in moment.pictures.values())
         moment.pictures = {}
-        moment.fast.clear()
         self._pictures_used -= size
         self._used -= size
 

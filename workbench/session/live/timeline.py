@@ -265,7 +265,7 @@ class Timeline:
             return (
                 picture is None
                 or key in moment.outdated
-                or (key in moment.fast and degree != "fast")
+                or (picture.degree == "fast" and degree != "fast")
                 or any(getattr(picture, m) is None for m in camera.modalities)
             )
 

@@ -17,7 +17,6 @@ from workbench.core.camera_data import (
     CameraKind,
     CameraSettings,
     Picture,
-    PictureDegree,
 )
 from workbench.core.capture.inspection import Inspection, Section
 from workbench.core.capture.recorded_run import RecordedRun
@@ -361,7 +360,6 @@ class Pictures:
     milliseconds: float
     number: int
     """`Stepped.number` of the moment that they show."""
-    degree: PictureDegree = "exact"
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -293,5 +293,7 @@ class PictureReader:
 
 def decode_picture(track: CameraTrack, index: int, modalities: tuple[str, ...], env: int) -> Picture:
     """Picture `index` of a camera."""
-    planes = {m: np.asarray(encoded[index]) for m, encoded in track.pictures.items() if m in modalities}
+    planes: dict[str, Any] = {
+        m: np.asarray(encoded[index]) for m, encoded in track.pictures.items() if m in modalities
+    }
     return Picture(track.info.name, track.info.kind, env, track.pose[index], **planes)

@@ -342,7 +342,7 @@ class WorkerCameras:
                 self._exact_at = done + _STILL
             pause = _PAUSE_SHARE * (done - self._round_began)
             self._next_round = max(self._round_began + _PERIOD, done + pause)
-        return Pictures(made, 1000 * took, begun.number, self._round_degree)
+        return Pictures(made, 1000 * took, begun.number)
 
     def _begin(self, env: TaskEnv) -> None:
         """Begin the next group of the round, if there is one."""

@@ -164,8 +164,8 @@ class Page:
                     get_args(ShownPictures),
                     initial_value="auto",
                     hint="Exact ones are SAPIEN's own; fast ones take a fraction of the time without a graphics card, of "
-                    "simplified meshes. Auto: fast while something moves, exact when it stands still. What is recorded "
-                    "is exact.",
+                    "simplified meshes. Auto: fast while something moves, exact when it stands still. What this page "
+                    "records is exact.",
                 ),
                 send=lambda degree: session.change(pictures=degree),
             )

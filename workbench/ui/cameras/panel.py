@@ -277,7 +277,7 @@ class CamerasPanel:
             pixels, caption = coloured
             if modality == COLOUR:
                 took = "" if seen.milliseconds is None else f"{seen.milliseconds:.0f}"
-                caption = render("rgb_caption", milliseconds=took)
+                caption = render("rgb_caption", milliseconds=took, degree=picture.degree)
             camera.images[modality].draw(modality, pixels)
             camera.captions[modality].content = caption
 
