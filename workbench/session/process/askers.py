@@ -24,6 +24,7 @@ _NICENESS = 10
 WAITING = "waiting for other work in the background"
 IDLE_SECONDS = 300.0
 """How long an idle process is kept."""
+_KEPT_OF_WORDS = 4096
 _PATIENCE = 3.0
 _LOAD_PATIENCE = 10.0
 """Seconds in which a process must answer a cancelled question, or is ended."""
@@ -123,6 +124,8 @@ class Background(Asker):
         self._idle: threading.Timer | None = None
         """Ends the process if it stays idle."""
         self._process: WorkerProcess | None = None
+        self._said = b""
+        """The end of what the process wrote to ``stderr``."""
         self._unanswered: Call | None = None
         self._loaded: Load | None = None
         """The last load; None after a failure."""
@@ -205,8 +208,9 @@ class Background(Asker):
         if self._process is not None:
             return
         try:
-            # The worker that plays shows the author's output; here it would appear twice.
-            self._process = WorkerProcess(lambda stream, piece: False, self._niceness)
+            # The worker that plays shows the author's output; here it would appear twice. Its last words tell why it died.
+            self._said = b""
+            self._process = WorkerProcess(self._hear, self._niceness)
         except OSError as error:
             raise JobFailed(f"no process could be started in the background: {error}") from error
 
@@ -275,10 +279,11 @@ class Background(Asker):
         try:
             return super().ask(check_turn, question, on_progress)
         except EOFError as error:
-            why = self._why_gone(error)
-            self.end()
+            why, failed = self._why_gone(error), (self._exit_code() or 0) > 0
+            self.end()  # all that it wrote is read then
             check()
-            raise JobFailed(f"the process in the background {why}") from None
+            last = self._said.decode(errors="replace").strip().rpartition("\n")[2] if failed else ""
+            raise JobFailed(f"the process in the background {why}" + (f": {last}" if last else "")) from None
 
     def end(self) -> None:
         """End the process, if there is one. `pid` stays its own until it has ended."""
@@ -326,7 +331,15 @@ class Background(Asker):
     def _why_gone(self, error: EOFError) -> str:
         if isinstance(error, Unreadable):
             return f"sent unreadable data ({error}) and was ended"
-        return describe_exit(None if self._process is None else self._process.exit_code())
+        return describe_exit(self._exit_code())
+
+    def _exit_code(self) -> int | None:
+        return None if self._process is None else self._process.exit_code()
+
+    def _hear(self, stream: str, piece: bytes) -> bool:
+        if stream == "stderr":
+            self._said = (self._said + piece)[-_KEPT_OF_WORDS:]
+        return False
 
 
 def _value(answer: Answer, question: Question[Value]) -> Value:
