@@ -41,7 +41,7 @@ def test_a_job_is_seen_while_it_runs_and_a_while_after(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_jobs_of_folders_below_are_seen_with_their_place(tmp_path: Path) -> None:
+def test_jobs_of_folders_below_are_seen_with_their_place(tmp_path: Path, child_process: None) -> None:
     below = tmp_path / "parts" / "1"
     below.mkdir(parents=True)
     describe(below, "one", id="one")
