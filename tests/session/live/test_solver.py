@@ -85,6 +85,16 @@ def test_a_wish_that_comes_after_the_pause_was_sent_is_not_planned_for(session: 
         wait_until(session, lambda view: not view.playing and view.solve.state == "none", "the end")
 
 
+def test_a_pressed_step_is_made_also_if_another_env_is_selected_while_it_is_planned(session: Session) -> None:
+    start_over(session, 4)
+    last = session.view().timeline.last
+    session.step()
+    wait_until(session, lambda view: view.solve.state == "planning", "the planning")
+    session.change(selected_env=1)
+    wait_until(session, lambda view: view.timeline.last > last, "the step")
+    session.change(selected_env=0)
+
+
 def test_another_body_is_traced_and_all_envs_are_planned_for_in_turn(session: Session) -> None:
     start_over(session, 5)
     session.change(solve_all=True, traced="cube", plan=replace(FEW, every=2))

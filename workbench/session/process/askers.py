@@ -25,6 +25,7 @@ WAITING = "waiting for other work in the background"
 IDLE_SECONDS = 300.0
 """How long an idle process is kept."""
 _KEPT_OF_WORDS = 4096
+"""Bytes of what a process writes to ``stderr``: the last line is quoted if it ends with an error."""
 _PATIENCE = 3.0
 _LOAD_PATIENCE = 10.0
 """Seconds in which a process must answer a cancelled question, or is ended."""
@@ -279,11 +280,16 @@ class Background(Asker):
         try:
             return super().ask(check_turn, question, on_progress)
         except EOFError as error:
-            why, failed = self._why_gone(error), (self._exit_code() or 0) > 0
+            if isinstance(error, Unreadable):
+                code, why = None, f"sent unreadable data ({error}) and was ended"
+            else:
+                code = None if self._process is None else self._process.exit_code()
+                why = describe_exit(code)
             self.end()  # all that it wrote is read then
             check()
-            last = self._said.decode(errors="replace").strip().rpartition("\n")[2] if failed else ""
-            raise JobFailed(f"the process in the background {why}" + (f": {last}" if last else "")) from None
+            if (code or 0) > 0 and (last := self._said.decode(errors="replace").strip().rpartition("\n")[2]):
+                why += f": {last}"
+            raise JobFailed(f"the process in the background {why}") from None
 
     def end(self) -> None:
         """End the process, if there is one. `pid` stays its own until it has ended."""
@@ -327,14 +333,6 @@ class Background(Asker):
         if isinstance(event, Answer):
             self._unanswered = None
         return event
-
-    def _why_gone(self, error: EOFError) -> str:
-        if isinstance(error, Unreadable):
-            return f"sent unreadable data ({error}) and was ended"
-        return describe_exit(self._exit_code())
-
-    def _exit_code(self) -> int | None:
-        return None if self._process is None else self._process.exit_code()
 
     def _hear(self, stream: str, piece: bytes) -> bool:
         if stream == "stderr":

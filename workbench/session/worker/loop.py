@@ -357,6 +357,8 @@ class Worker:
             old.selected_env,
         ):
             self._followed.forget()
+            # A pressed step that waits for its plan waits for one of the new settings.
+            self._one_planned_step = self._one_planned_step and self._is_planned and not self._plan_ready()
         if (new.action_source, new.policy, new.policy_folder) != (
             old.action_source,
             old.policy,
