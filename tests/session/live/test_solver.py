@@ -89,7 +89,7 @@ def test_a_pressed_step_is_made_also_if_another_env_is_selected_while_it_is_plan
     start_over(session, 4)
     last = session.view().timeline.last
     session.step()
-    wait_until(session, lambda view: view.solve.state == "planning", "the planning")
+    wait_until(session, lambda view: view.solve.state in ("starting", "planning"), "the planning")
     session.change(selected_env=1)
     wait_until(session, lambda view: view.timeline.last > last, "the step")
     session.change(selected_env=0)
