@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from workbench.core.scene.in_view import (
     outside_and_inside,
     planes_of,
 )
+from workbench.core.scene.lean_materials import LeanBody, LeanMaterials
 from workbench.core.scene.mesh_levels import are_known, within
 from workbench.core.scene.read_scene import exact_part
 from workbench.core.scene.shapes import Mesh
@@ -39,6 +41,8 @@ _NEAREST = 0.02
 _FINEST = 1e-4
 """Metres. Tolerances are this times powers of the fourth root of two, so that poses that differ a little give the same meshes."""
 
+_WORTH_FEWER_TEXTURES = 256 * 256
+"""Pixels. In a smaller picture a texture less saves no more than it costs to look whether the author has changed the material."""
 _SAME_PLACE = 1e-5, 1e-4
 """Metres and radians, about: a body that is so near to where it was, as seen from a camera, has not moved."""
 
@@ -74,6 +78,7 @@ class FastShapes:
 
     def __init__(self, sub_scenes: Sequence[sapien.Scene]) -> None:
         self._heavy = [[(body.entity, body) for body in heavy_bodies(scene)] for scene in sub_scenes]
+        self._lean = _lean_bodies(sub_scenes)
         self._chosen = _Chosen()
         self._boxes = [np.array([self._box(body) for _, body in of_env]) for of_env in self._heavy]
         """(B, 2, 3) of each env, in the frames of its bodies."""
@@ -104,8 +109,17 @@ class FastShapes:
         if key not in self._tolerances:
             self._tolerances[key] = self._tolerances_of(camera)
         component, of_env = camera[env], self._heavy[env]
-        if not of_env:
-            return
+        drawn: list[tuple[Any, Any]] = []
+        if component.width * component.height >= _WORTH_FEWER_TEXTURES:
+            drawn += [(body, lean.component) for body, lean in self._lean[env] if lean.is_like_exact()]
+        if of_env:
+            drawn += self._drawn_of_heavy(env, key, component, places)
+        self._of_camera[key, env] = tuple(drawn)
+
+    def _drawn_of_heavy(
+        self, env: int, key: Hashable, component: sapien.render.RenderCameraComponent, places: Places
+    ) -> list[tuple[Any, Any]]:
+        of_env = self._heavy[env]
         to_camera = component.get_global_pose().inv()
         poses = [to_camera * _pose(entity, places) for entity, _ in of_env]
         planes = planes_of(component)
@@ -133,7 +147,7 @@ class FastShapes:
                 drawn.append((body, None))
             elif simplified is not None:
                 drawn.append((body, simplified))
-        self._of_camera[key, env] = tuple(drawn)
+        return drawn
 
     def bodies(self, key: Hashable, env: int) -> Bodies:
         """What `prepare` chose last for this camera."""
@@ -144,6 +158,9 @@ class FastShapes:
         for _, fast in self._components.values():
             if fast is not None:
                 fast.entity.remove_component(fast)
+        for body, lean in chain.from_iterable(self._lean):
+            body.entity.remove_component(lean.component)
+        self._lean = [[] for _ in self._lean]
         self._components.clear()
         self._corners.clear()
         self._of_camera.clear()
@@ -211,8 +228,24 @@ class FastShapes:
     def _add(self, by: Hashable, body: Any, made: sapien.render.RenderBodyComponent | None) -> None:
         self._components[by] = body, made
         if made is not None:
-            made.visibility = 0.0
-            body.entity.add_component(made)
+            _add_hidden(made, body)
+
+
+def _add_hidden(component: Any, body: Any) -> None:
+    component.visibility = 0.0
+    body.entity.add_component(component)
+
+
+def _lean_bodies(sub_scenes: Sequence[sapien.Scene]) -> list[list[tuple[Any, LeanBody]]]:
+    """Of each env, bodies that stay as fine as they are, and what is drawn with fewer textures instead."""
+    materials, found = LeanMaterials(), []
+    for sub_scene in sub_scenes:
+        light = [body for body in _bodies(sub_scene) if not _is_heavy(body)]
+        made = [(body, lean) for body in light if (lean := materials.beside(body)) is not None]
+        for body, lean in made:
+            _add_hidden(lean.component, body)
+        found.append(made)
+    return found
 
 
 @dataclass(frozen=True)
@@ -243,9 +276,17 @@ def _pose(entity: sapien.Entity, places: Places) -> sapien.Pose:
 
 def heavy_bodies(sub_scene: sapien.Scene) -> Iterator[sapien.render.RenderBodyComponent]:
     """The bodies with so many triangles that they are simplified; not those with normal maps."""
+    return filter(_is_heavy, _bodies(sub_scene))
+
+
+def _is_heavy(body: Any) -> bool:
+    return _faces(body) > HEAVY and not _has_tangents(body)
+
+
+def _bodies(sub_scene: sapien.Scene) -> Iterator[Any]:
     for entity in sub_scene.entities:
-        body: Any = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-        if body is not None and _faces(body) > HEAVY and not _has_tangents(body):
+        body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        if body is not None:
             yield body
 
 

@@ -1,0 +1,134 @@
+"""Bodies drawn without textures that are the same everywhere: SAPIEN's shaders look each of them up for every pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien.render
+
+_VALUES = (
+    "base_color",
+    "emission",
+    "roughness",
+    "metallic",
+    "specular",
+    "ior",
+    "transmission",
+    "transmission_roughness",
+)
+_TEXTURES = ("base_color", "emission", "normal", "roughness", "metallic", "transmission")
+_KNOWN_FORMATS = ("R8G8B8A8Unorm", "R8Unorm")
+
+
+@dataclass(frozen=True)
+class LeanBody:
+    """A component beside an exact one of the same meshes, which has materials of its own."""
+
+    component: sapien.render.RenderBodyComponent
+    _exact: list[Any]
+    """Materials."""
+    _copied: list[list[Any]]
+    """What they said when they were copied."""
+
+    def is_like_exact(self) -> bool:
+        """Whether the author has changed nothing of the exact materials. SAPIEN does not draw each later change of a material
+        that was hidden meanwhile, so this one is for those that stay."""
+        now = [_read(material) for material in self._exact]
+        return all(map(_equal, now, self._copied))
+
+
+class LeanMaterials:
+    """Makes `LeanBody` for a scene, whose envs share the textures of their files."""
+
+    def __init__(self) -> None:
+        self._constants: list[tuple[Any, float | None]] = []
+        """By texture, which has no hash. A texture that the author changes in place is not looked at again."""
+
+    def beside(self, body: Any) -> LeanBody | None:
+        """None where all textures say something, and where the body is not of files alone: SAPIEN shares the materials of
+        any other mesh with its copies, and makes the tangents of normal maps from files alone."""
+        parts = [part for shape in body.render_shapes for part in shape.parts]
+        if all(self._metallic(part.material) is None for part in parts):
+            return None
+        made = sapien.render.RenderBodyComponent()
+        made.shading_mode = body.shading_mode
+        if body.is_render_id_disabled:
+            made.disable_render_id()
+        copies = []
+        for shape in body.render_shapes:
+            copy = _from_file(shape)
+            if copy is None:
+                return None
+            made.attach(copy)
+            copies += copy.parts
+        exact = [part.material for part in parts]
+        for material, copy in zip(exact, copies, strict=True):
+            self._copy(material, copy.material)
+        return LeanBody(made, exact, [_read(material) for material in exact])
+
+    def _copy(self, material: Any, to: Any) -> None:
+        for name in _VALUES:
+            setattr(to, name, getattr(material, name))
+        for name in _TEXTURES:
+            setattr(to, f"{name}_texture", getattr(material, f"{name}_texture"))
+        metallic = self._metallic(material)
+        if metallic is not None:
+            to.metallic_texture, to.metallic = None, metallic
+
+    def _metallic(self, material: Any) -> float | None:
+        """What stands for the metallic texture of a material, if it has one that is the same everywhere."""
+        texture = material.metallic_texture
+        if texture is None:
+            return None
+        for known, value in self._constants:
+            if known == texture:
+                return value
+        value = _constant(texture)
+        self._constants.append((texture, value))
+        return value
+
+
+def _constant(texture: Any) -> float | None:
+    """The number that a texture has everywhere, in its red and its blue: SAPIEN reads the one of a picture and the other
+    of a glTF file's, which holds the roughness in its green."""
+    if texture.is_srgb or texture.format not in _KNOWN_FORMATS:
+        return None
+    pixels = np.asarray(texture.download())
+    read = pixels.reshape(-1, pixels.shape[-1])[:, ::2]
+    return float(read[0, 0]) / 255 if len(read) and (read == read[0, 0]).all() else None
+
+
+def _from_file(shape: Any) -> Any:
+    """The same shape with materials of its own; None where it is no longer what its file gives."""
+    if not isinstance(shape, sapien.render.RenderShapeTriangleMesh) or not shape.filename:
+        return None
+    try:
+        copy = sapien.render.RenderShapeTriangleMesh(shape.filename, shape.scale)
+    except RuntimeError:  # the file is gone
+        return None
+    same = len(copy.parts) == len(shape.parts) and all(
+        np.array_equal(one.vertices, other.vertices) and np.array_equal(one.triangles, other.triangles)
+        for one, other in zip(copy.parts, shape.parts)
+    )
+    if not same:
+        return None
+    copy.local_pose = shape.local_pose
+    copy.front_face = shape.front_face
+    copy.name = shape.name
+    return copy
+
+
+def _read(material: Any) -> list[Any]:
+    return [getattr(material, name) for name in _VALUES] + [
+        getattr(material, f"{name}_texture") for name in _TEXTURES
+    ]
+
+
+def _equal(some: list[Any], others: list[Any]) -> bool:
+    # A texture cannot be compared with None.
+    return all(
+        (one is None) == (other is None) and (one is None or one == other)
+        for one, other in zip(some, others, strict=True)
+    )
