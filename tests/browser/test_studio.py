@@ -358,6 +358,7 @@ def test_the_picture_stays_in_sight_and_is_looked_at_in_another_size(page: Page)
     assert page.evaluate(on_top, [box["x"] + box["width"] / 2, box["y"] + 60])
     press(page, "full")
     until(lambda: image.evaluate("e => e.naturalWidth") == 128, "its own size")
+    expect(page.locator(".wb-took")).to_have_text(re.compile(r"^(fast|exact), \d+ ms$"))
     page.get_by_text("Matrices and files", exact=True).click()
     expect(by_matrix).to_be_hidden()
 

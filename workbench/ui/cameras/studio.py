@@ -247,9 +247,7 @@ class StudioPanel(PagePart[SessionView]):
             varies=VARIES if info.varies else "",
             hint=IN_ITS_EYE if self._in_its_eye else "",
             problem=view.studio.problem,
-            took=f"{view.picture_milliseconds:.0f}"
-            if view.picture_milliseconds and view.studio.preview_scale == 1.0
-            else "",
+            took=_took(camera, view),
             quick=_preview_text(camera, view.studio.preview_scale),
         )
 
@@ -411,6 +409,14 @@ class StudioPanel(PagePart[SessionView]):
 def _placed(camera: StudioCamera) -> CameraSettings:
     assert camera.now is not None
     return camera.now
+
+
+def _took(camera: StudioCamera, view: SessionView) -> str:
+    """Of the camera's picture: how it is drawn, and how long that took; empty for one of another size than the camera's."""
+    picture = view.pictures.get(camera.key)
+    if picture is None or not view.picture_milliseconds or view.studio.preview_scale != 1.0:
+        return ""
+    return f"{picture.degree}, {view.picture_milliseconds:.0f} ms"
 
 
 def _preview_text(camera: StudioCamera, scale: float) -> str:
