@@ -38,7 +38,9 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items[:] = browsers_apart(items)
     gpu_items = [item for item in items if item.get_closest_marker("gpu")]
     if not gpu_items:
         return
@@ -57,6 +59,31 @@ ONE_AFTER_THE_OTHER = {
 """Files that share a page's server with another (tests/browser/conftest.py), so that one process has to run both."""
 
 
+def run_together(nodeid: str) -> str:
+    """The file whose tests run in one process with this one."""
+    file = nodeid.split("::", 1)[0]
+    return ONE_AFTER_THE_OTHER.get(file, file)
+
+
+def browsers_apart(items: list[pytest.Item]) -> list[pytest.Item]:
+    """The files with a browser spread among the others, which keep their order.
+
+    A page, its server and its worker are three processes: beside another page they wait for each other four times as long as beside a
+    test of one process.
+    """
+    files: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(run_together(item.nodeid), []).append(item)
+    with_browser, others = [], []
+    for tests in files.values():
+        has_one = any(test.get_closest_marker("browser") for test in tests)
+        (with_browser if has_one else others).append(tests)
+    count = len(others)
+    places = [(i + 0.5) * count / max(len(with_browser), 1) for i in range(len(with_browser))]
+    ordered = sorted([*zip(range(count), others), *zip(places, with_browser)], key=lambda at: at[0])
+    return [test for _, tests in ordered for test in tests]
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
     """As ``--dist loadfile``, but for those."""
@@ -66,8 +93,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
 
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            file = nodeid.split("::", 1)[0]
-            return ONE_AFTER_THE_OTHER.get(file, file)
+            return run_together(nodeid)
 
     return Scheduling(config, log)
 
