@@ -82,6 +82,26 @@ def test_what_came_whole_is_received_before_the_end_and_without_a_time_it_is_wai
         ends.line.receive(None)
 
 
+def test_several_threads_may_ask_at_once_whether_something_waits(ends: Ends) -> None:
+    # The one that checks rules asks between two steps, and the one that gives the cores back when a person waits.
+    stop = threading.Event()
+
+    def ask() -> int:
+        count = 0
+        while not stop.is_set():
+            assert not ends.line.waits()
+            count += 1
+        return count
+
+    with ThreadPoolExecutor(3) as threads:
+        asked = [threads.submit(ask) for _ in range(3)]
+        try:
+            assert ends.line.receive(0.5) is None
+        finally:
+            stop.set()
+        assert all(one.result() > 10 for one in asked)
+
+
 def test_what_was_read_is_let_go_of_also_where_the_next_message_has_always_begun(ends: Ends) -> None:
     whole = framed(pack_message(Loading("x" * 100_000)))
     ends.theirs.sendall(whole[:1])

@@ -20,6 +20,8 @@ _VALUES = (
 )
 _TEXTURES = ("base_color", "emission", "normal", "roughness", "metallic", "transmission")
 _KNOWN_FORMATS = ("R8G8B8A8Unorm", "R8Unorm")
+_MOST_TEXELS = 1 << 24
+"""That are looked at in a scene: a million take 10 to 20 ms, and a furnished house has hundreds of millions."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class LeanMaterials:
     def __init__(self) -> None:
         self._constants: list[tuple[Any, float | None]] = []
         """By texture, which has no hash. A texture that the author changes in place is not looked at again."""
+        self._texels = 0
+        """Looked at."""
 
     def beside(self, body: Any) -> LeanBody | None:
         """None where all textures say something, and where the body is not of files alone: SAPIEN shares the materials of
@@ -85,7 +89,8 @@ class LeanMaterials:
         for known, value in self._constants:
             if known == texture:
                 return value
-        value = _constant(texture)
+        self._texels += texture.width * texture.height
+        value = _constant(texture) if self._texels <= _MOST_TEXELS else None
         self._constants.append((texture, value))
         return value
 

@@ -67,8 +67,14 @@ def value_type(question: type[Question[Any]]) -> Any:
 # --- lines -----------------------------------------------------------------------------------------
 
 
+def _poll(end: socket.socket) -> select.poll:
+    poll = select.poll()  # not select(): a server with many pages has descriptors beyond 1024
+    poll.register(end, select.POLLIN)
+    return poll
+
+
 class MessageSocket:
-    """One end of a socket. Another thread than the one that receives may send.
+    """One end of a socket. Another thread than the one that receives may send, and any may ask whether something `waits`.
 
     The author's code runs in the worker: it may write anything into the socket, and end in the middle of a message. So what
     comes is either data of the expected types or `Unreadable`. A message is msgpack that is read by its types, never a pickle:
@@ -88,8 +94,7 @@ class MessageSocket:
         """
         self.end = end
         self._unpacker = Unpacker(kinds, questions)
-        self._poll = select.poll()  # not select(): a server with many pages has descriptors beyond 1024
-        self._poll.register(end, select.POLLIN)
+        self._poll = _poll(end)
         self._came, self._piece = bytearray(), memoryview(bytearray(_PIECE))
         self._at = 0
         """Offset of the next message in `_came`."""
@@ -105,8 +110,9 @@ class MessageSocket:
             self.end.sendall(piece)
 
     def waits(self) -> bool:
-        """Whether bytes are waiting to be read."""
-        return bool(self._poll.poll(0))
+        """Whether bytes are waiting to be read; any thread may ask."""
+        # By a poll object of its own: one that two threads ask at once raises RuntimeError.
+        return bool(_poll(self.end).poll(0))
 
     def receive(self, timeout: float | None) -> Any:
         """The next message; None if none is complete within `timeout` seconds (None waits for ever).
