@@ -358,7 +358,8 @@ class Worker:
         ):
             self._followed.forget()
             # A pressed step that waits for its plan waits for one of the new settings.
-            self._one_planned_step = self._one_planned_step and self._is_planned and not self._plan_ready()
+            self._one_planned_step = self._one_planned_step and self._is_planned
+            self._take_planned_step()
         if (new.action_source, new.policy, new.policy_folder) != (
             old.action_source,
             old.policy,
@@ -403,9 +404,13 @@ class Worker:
 
     def _follow_plan(self, request: FollowPlan) -> None:
         self._followed.take(request)
+        self._take_planned_step()
+
+    def _take_planned_step(self) -> None:
+        """Make the pressed step, if its plan is there."""
         if self._one_planned_step and self._plan_ready():
             self._one_planned_step = False
-            self._task.guarded(self._step_once)
+            self._task.run("stepping", partial(self._task.guarded, self._step_once))
 
     @property
     def _is_planned(self) -> bool:
