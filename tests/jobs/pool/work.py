@@ -55,7 +55,7 @@ def square(setup: Setup, queue: ItemQueue) -> None:
 
 def go_wrong(setup: Setup, queue: ItemQueue) -> None:
     if setup.how == "killed" or (setup.how == "killed once" and not (setup.folder / "killed").exists()):
-        (setup.folder / "killed").touch()
+        (setup.folder / "killed").write_text(str(os.getpid()))
         os.kill(os.getpid(), signal.SIGKILL)
     elif setup.how == "left":
         os._exit(0)
