@@ -6,6 +6,7 @@ import fcntl
 import os
 import pty
 import re
+import signal
 import struct
 import subprocess
 import termios
@@ -89,3 +90,13 @@ def test_in_a_terminal_a_pager_has_it(child_process: None) -> None:
     assert process.wait(60) == 0
     lines = shown.decode().splitlines()
     assert len(lines) > 24 and all(line.startswith("PAGED ") for line in lines)
+
+
+def test_a_reader_that_has_left_ends_a_command_without_a_word(child_process: None) -> None:
+    """As of ``workbench open --help | head``."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = python_command("-m", "workbench.cli.main", "open", "--help")
+    ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (128 + signal.SIGPIPE, "")

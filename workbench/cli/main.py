@@ -23,7 +23,7 @@ from workbench.cli.terminal.arguments import (
     history_bytes,
     imported,
 )
-from workbench.cli.terminal.output import Exit, interrupted, lacks_maniskill, refuse
+from workbench.cli.terminal.output import Exit, end_quietly, interrupted, lacks_maniskill, refuse
 from workbench.jobs.task import ShownPictures
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.machine.text import guard_terminal
@@ -344,15 +344,21 @@ def main(args: Sequence[str] | None = None) -> None:
     if not given or (given[0].startswith("-") and given[0] not in ("-h", "--help")):
         given = ["start", *given]
     try:
-        code: Any = app.cli(
-            prog="workbench",
-            description="Workbench: write ManiSkill tasks in front of a live, batched view of them. Without a command it "
-            "opens a page to choose a task from.",
-            args=given,
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
-        )
+        try:
+            code: Any = app.cli(
+                prog="workbench",
+                description="Workbench: write ManiSkill tasks in front of a live, batched view of them. Without a command it "
+                "opens a page to choose a task from.",
+                args=given,
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
+            )
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()
     except KeyboardInterrupt:  # during the imports of a command: torch takes seconds
         code = interrupted()
+    except BrokenPipeError:  # ``workbench open --help | head``
+        code = end_quietly()
     except ImportError:
         # A package that is older than the range lacks what is imported of it.
         from workbench.machine.versions import unmet_lines

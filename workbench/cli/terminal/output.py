@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import select
+import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout
@@ -123,6 +125,20 @@ def interrupted(kept: str = "") -> int:
     """
     refuse(f"interrupted; {kept}" if kept else "interrupted")
     return Exit.INTERRUPTED
+
+
+def end_quietly() -> int:
+    """The exit code where whoever read our output has left, as that of a command that SIGPIPE ends.
+
+    To be called while the BrokenPipeError is handled, which is raised again if it is of another pipe.
+    """
+    looker = select.poll()
+    looker.register(sys.stdout.fileno(), 0)
+    if not any(event & select.POLLERR for _, event in looker.poll(0)):
+        raise
+    # Else Python says it once more when it flushes at its end.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 128 + signal.SIGPIPE
 
 
 def warn(message: str) -> None:
