@@ -36,13 +36,9 @@ def workers_of(server: psutil.Process) -> int:
     return sum("workbench.session.worker.start" in child.cmdline() for child in server.children())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "number",
-    [
-        # All that there can be hangs and is ended by Ctrl-C below.
-        pytest.param(signal.SIGINT, id="ctrl-c", marks=pytest.mark.slow),
-        pytest.param(signal.SIGKILL, id="kill -9"),
-    ],
+    "number", [pytest.param(signal.SIGINT, id="ctrl-c"), pytest.param(signal.SIGKILL, id="kill -9")]
 )
 def test_a_worker_that_hangs_ends_with_its_server(tmp_path: Path, number: signal.Signals) -> None:
     file = write_task(tmp_path)

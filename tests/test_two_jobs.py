@@ -135,7 +135,8 @@ def jobs(place: Path) -> Iterator[list[Rescoring | Filming]]:
         job.close()
 
 
-@pytest.mark.parametrize("which", [0, pytest.param(1, marks=pytest.mark.slow)], ids=["rescoring", "filming"])
+@pytest.mark.slow
+@pytest.mark.parametrize("which", [0, 1], ids=["rescoring", "filming"])
 def test_of_two_processes_of_a_page_one_is_killed(jobs: list[Rescoring | Filming], which: int) -> None:
     killed, other = jobs[which], jobs[1 - which]
     held: dict[int, int] = {}

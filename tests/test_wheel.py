@@ -74,6 +74,7 @@ def test_the_installed_command_is_not_the_clone(installed: Path, tmp_path: Path)
     assert "The first ten minutes" in _run([str(installed / "workbench"), "help", "overview"], tmp_path)
 
 
+@pytest.mark.slow
 def test_a_file_elsewhere_opens_is_served_and_ends_with_ctrl_c(installed: Path, tmp_path: Path) -> None:
     (carried,) = installed.parent.glob("lib/python*/site-packages/workbench/_tasks/minimal.py")
     shutil.copy(carried, tmp_path / "my_task.py")
@@ -107,6 +108,7 @@ def test_beside_a_laboratory_s_packages_no_version_changes_and_its_task_opens(
     _opens(binaries, "lab_tasks.envs:LabPush", away)
 
 
+@pytest.mark.slow
 def test_without_maniskill_it_says_what_to_type(wheel: Path, tmp_path: Path) -> None:
     """In an environment with all that this one has, but for ManiSkill."""
     binaries = _environment(tmp_path, but=("maniskill_workbench", "mani_skill"))

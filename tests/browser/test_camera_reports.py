@@ -16,7 +16,7 @@ from tests.drive.studio import press as press_tool
 from tests.drive.studio import tool
 from tests.drive.waiting import until
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ENVS = 2
 CAMERA = "base_camera"
 PICTURE = "img[src^='blob:']:visible"
@@ -89,7 +89,6 @@ COVERED = """() => [...document.querySelectorAll(".mantine-ScrollArea-scrollbar[
 """By how many pixels each scrollbar lies over the boxes that it scrolls."""
 
 
-@pytest.mark.slow
 def test_the_scrollbar_covers_no_box(page: Page) -> None:
     page.mouse.move(1100, 500)
     until(lambda: bool(page.evaluate(COVERED)), "the scrollbar")
@@ -183,7 +182,6 @@ def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:
     until(lambda: bool(np.allclose(shown_matrix(page), before, atol=1e-5)), "our own file's pose")
 
 
-@pytest.mark.slow
 def test_placements_are_suggested_with_pictures_and_taken(page: Page) -> None:
     before = shown_matrix(page)
     page.get_by_role("textbox", name="Resets").fill("1")

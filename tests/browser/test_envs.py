@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, Page, expect
 from tests.drive.page import page_on
 from tests.drive.waiting import until
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ENVS = 6
 
 

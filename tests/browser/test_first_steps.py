@@ -15,7 +15,7 @@ from tests.drive.waiting import until
 from workbench.ui.live.reward import CHOICE
 from workbench.ui.live.version_panel import LAST_LOADS
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 STEPS = 12
 
 
@@ -44,7 +44,6 @@ def charts(desk: Desk) -> Locator:
     return desk.page.locator(".u-over:visible")
 
 
-@pytest.mark.slow
 def test_the_first_page_has_hints_that_are_closed_for_good(desk: Desk) -> None:
     hints = desk.page.locator(".wb-hints")
     expect(hints.locator("li")).to_have_count(4)

@@ -117,6 +117,7 @@ def test_what_is_wrong_is_found(desk: Desk) -> None:
     assert faults(desk.page) == []
 
 
+@pytest.mark.slow
 def test_the_view_keeps_half_of_the_page_beside_the_envs(desk: Desk) -> None:
     table = desk.page.locator(".wb-env-table")
 
@@ -179,6 +180,7 @@ def test_what_a_control_says_of_itself_stands_beside_its_panel(desk: Desk) -> No
     expect(tooltip).to_have_count(0)
 
 
+@pytest.mark.slow
 def test_nothing_lies_over_what_is_looked_at_through_a_camera(desk: Desk) -> None:
     choose_camera(desk)
     timeline = desk.page.locator("[data-floating-window]")
@@ -202,6 +204,7 @@ def test_nothing_lies_over_what_is_looked_at_through_a_camera(desk: Desk) -> Non
     until(lambda: timeline.bounding_box() == high, "the timeline as it was")
 
 
+@pytest.mark.slow
 def test_the_light_theme_has_a_light_view(desk: Desk) -> None:
     clip: FloatRect = {"x": 420.0, "y": 10.0, "width": 200.0, "height": 60.0}
     dark = picture_of_view(desk.page, clip).mean()
@@ -239,6 +242,7 @@ def test_every_tab_of_the_review_in_all_sizes_and_both_themes(tmp_path: Path, br
         assert ({tab: said for tab, said in found.items() if said}, errors) == ({}, [])
 
 
+@pytest.mark.slow
 def test_a_browser_without_webgl_says_what_is_missing_and_what_to_do(
     example: At, browser: Browser, chromium_path: str
 ) -> None:

@@ -201,6 +201,7 @@ LIES_BESIDE = """() => {
 }"""
 
 
+@pytest.mark.slow
 def test_banner_and_timeline_are_as_narrow_as_the_view_and_cover_no_control(calm: Desk) -> None:
     page = calm.page
     calm.file.write_text("raise ValueError('not now')\n")
@@ -219,6 +220,7 @@ def test_a_message_with_markup_is_text_in_the_banner(calm: Desk) -> None:
     assert calm.page.evaluate("window.hacked") is None
 
 
+@pytest.mark.slow
 def test_the_mark_of_a_rule_that_only_warns_stands_until_the_file_is_mended(calm: Desk) -> None:
     text = TASK.read_text()
     hook = text.index("def _initialize_episode")
@@ -256,6 +258,7 @@ def test_record_keeps_an_episode(calm: Desk) -> None:
     expect(calm.page.get_by_text(written.name).first).to_be_visible()
 
 
+@pytest.mark.slow
 def test_what_is_typed_right_after_the_keys_that_open_a_window_goes_into_it(calm: Desk) -> None:
     page = calm.page
     dark = page.locator("html[data-mantine-color-scheme=dark]")

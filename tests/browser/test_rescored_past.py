@@ -12,7 +12,7 @@ from tests.browser.conftest import At
 from tests.drive.desk import Desk
 from tests.drive.waiting import until
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 STEPS = 60
 

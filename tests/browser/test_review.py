@@ -144,6 +144,7 @@ def test_compares_two_and_says_where_they_part(desk: tuple[Page, list[str]]) -> 
     assert [e for e in errors if LATE not in e] == []
 
 
+@pytest.mark.slow
 def test_the_librarys_keys_rest_while_it_is_folded_and_a_folded_panel_leaves_the_others_as_they_look(
     desk: tuple[Page, list[str]],
 ) -> None:
@@ -187,6 +188,7 @@ def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) 
     assert [e for e in errors if LATE not in e] == []
 
 
+@pytest.mark.slow
 def test_of_rerun_and_the_library_the_one_unfolded_last_folds_the_other_where_there_is_no_room_for_both(
     desk: tuple[Page, list[str]],
 ) -> None:

@@ -148,6 +148,7 @@ def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_
     page.get_by_role("button", name="Close", exact=True).click()
 
 
+@pytest.mark.slow
 def test_typed_and_nudged_and_undone(page: Page) -> None:
     unfold(page, "Lens and image", page.get_by_label("Vertical fov"))
     page.get_by_label("Vertical fov").fill("90")
@@ -169,6 +170,7 @@ def test_typed_and_nudged_and_undone(page: Page) -> None:
     page.get_by_text("Lens and image", exact=True).click()
 
 
+@pytest.mark.slow
 def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) -> None:
     at = "[document.activeElement.textContent, document.activeElement.ariaPressed]"
     tool(page, "pose")
@@ -201,6 +203,7 @@ def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) 
     until(lambda: numbers(page, "Looks at") == [0.23, 0, 0], "the target, which goes along")
 
 
+@pytest.mark.slow
 def test_tab_goes_on_where_the_page_changes_while_it_leaves_a_part(page: Page) -> None:
     tool(page, "pose")
     page.evaluate(
@@ -214,6 +217,7 @@ def test_tab_goes_on_where_the_page_changes_while_it_leaves_a_part(page: Page) -
     page.evaluate("document.activeElement.blur()")
 
 
+@pytest.mark.slow
 def test_keys_that_follow_a_click_at_once_keep_what_they_walked_to(page: Page) -> None:
     tool(page, "pose")
     kept = page.evaluate(
@@ -230,6 +234,7 @@ def test_keys_that_follow_a_click_at_once_keep_what_they_walked_to(page: Page) -
     page.evaluate("document.activeElement.blur()")
 
 
+@pytest.mark.slow
 def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
     press(page, "Look through")
     tool(page, "Back to my view")
@@ -242,6 +247,7 @@ def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
     until(lambda: end_of_the_left_arrow(page) is not None, "the gizmo again")
 
 
+@pytest.mark.slow
 def test_a_copy_is_planned_and_left(page: Page, task_file: Path) -> None:
     text = task_file.read_text()
     unfold(page, "Add, copy, rename, remove", page.get_by_role("button", name="Rename", exact=True))
@@ -261,6 +267,7 @@ def test_a_copy_is_planned_and_left(page: Page, task_file: Path) -> None:
     page.get_by_text("Add, copy, rename, remove", exact=True).click()
 
 
+@pytest.mark.slow
 def test_turned_with_the_mouse(page: Page) -> None:
     until(lambda: arc_about_x(page) is not None and picture(page) != "", "the handles")
     before, start = picture(page), numbers(page, "Degrees")
@@ -277,6 +284,7 @@ def test_turned_with_the_mouse(page: Page) -> None:
     until(lambda: numbers(page, "Degrees") == start, "the turn undone")
 
 
+@pytest.mark.slow
 def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path) -> None:
     text = task_file.read_text()
     unfold(page, "Lens and image", page.locator(field(page, "Lens as")))
@@ -310,6 +318,7 @@ def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path)
     page.get_by_text("Lens and image", exact=True).click()
 
 
+@pytest.mark.slow
 def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_file: Path) -> None:
     before = task_file.read_text()
     unfold(page, "Add, copy, rename, remove", page.get_by_role("button", name="Rename", exact=True))
@@ -341,6 +350,7 @@ def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_
     page.get_by_text("Add, copy, rename, remove", exact=True).click()
 
 
+@pytest.mark.slow
 def test_the_picture_stays_in_sight_and_is_looked_at_in_another_size(page: Page) -> None:
     choose(page, "base_camera · sensor")
     until(lambda: picture(page) != "", "the picture")

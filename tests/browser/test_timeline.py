@@ -82,6 +82,7 @@ def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk)
     desk.page.get_by_role("button", name="zoom out").click()
 
 
+@pytest.mark.slow
 def test_keys_work_after_a_click_on_a_tab_a_checkbox_or_a_dropdown_but_not_in_a_field(desk: Desk) -> None:
     page = desk.page
     page.get_by_role("tab", name="Inspect").click()
@@ -126,6 +127,7 @@ def empty(field: Locator) -> None:
     until(emptied, "an empty field")
 
 
+@pytest.mark.slow
 def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_again(desk: Desk) -> None:
     page = desk.page
     said, past = (
@@ -184,6 +186,7 @@ def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_a
     page.get_by_role("tab", name="Reward").click()
 
 
+@pytest.mark.slow
 def test_the_timeline_keeps_its_height_when_it_offers_to_go_on(desk: Desk) -> None:
     panel = ".mantine-Paper-root:has(.wb-timeline)"
     live = desk.box(panel)
@@ -217,6 +220,7 @@ def test_a_reset_is_undone_by_a_key(desk: Desk) -> None:
     desk.comes_to(STEPS)
 
 
+@pytest.mark.slow
 def test_space_is_for_the_button_that_was_walked_to(desk: Desk) -> None:
     desk.page.get_by_role("button", name="‹ step", exact=True).focus()
     desk.page.keyboard.press("Space")

@@ -137,7 +137,8 @@ def test_a_task_and_a_request_full_of_escapes_do_nothing_to_the_terminal(
     assert "\x1b[1;32mgreen\x1b[0m and hidden" in text, "colours are kept, and nothing is hidden"
 
 
-@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", ["1", "2"])
 def test_a_task_that_is_recorded_does_nothing_to_the_terminal(
     child_process: None, workers: str, tmp_path: Path
 ) -> None:

@@ -29,7 +29,8 @@ CASES = (
     ("LiftPegUpright-v1", 4, 3),
     ("TwoRobotPickCube-v1", 4, 3),  # an action for each robot
     ("TriFingerRotateCubeLevel4-v1", 4, 3),  # three fingers push a cube all the time
-    ("RotateSingleObjectInHandLevel1-v1", 4, 3),  # a hand, and another object in each env
+    # a hand, and another object in each env
+    pytest.param("RotateSingleObjectInHandLevel1-v1", 4, 3, marks=pytest.mark.slow),
     ("RotateValveLevel1-v1", 4, 3),  # another articulation in each env
     ("SO100GraspCube-v1", 4, 3),  # controllers that remember their target
     ("MS-CartpoleBalance-v1", 4, 3),  # from MJCF, no contacts

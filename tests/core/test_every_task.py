@@ -99,6 +99,7 @@ def test_a_fault_that_upstream_mended_is_found_out(renderer: None, monkeypatch: 
 # --- downloads ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_must_be_downloaded_is_named_without_a_question_and_without_the_network(
     child_process: None,
     monkeypatch: pytest.MonkeyPatch,

@@ -82,6 +82,7 @@ def test_a_rule_of_gpu_simulation_is_looked_at_where_no_other_is(tmp_path: Path)
     assert states(check(options(task_of(tmp_path), "rows-lost"))) == {"rows-lost": "kept"}
 
 
+@pytest.mark.slow
 def test_a_finding_of_gpu_simulation_that_a_comment_silences_is_listed(
     tmp_path: Path, child_process: None
 ) -> None:

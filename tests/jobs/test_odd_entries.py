@@ -157,6 +157,7 @@ def session(file: Path) -> Any:
         yield session
 
 
+@pytest.mark.slow
 def test_the_page_plays_and_records_it(session: Session, file: Path) -> None:
     def shown(step: StepResult | None) -> bool:
         return step is not None and "best" in step.others and step.others["best"].numbers is not None

@@ -75,6 +75,7 @@ def test_a_base_class_is_not_opened_in_place_of_its_tasks(file: Path) -> None:
     assert caught.value.classes[0] == "TwoEnv"
 
 
+@pytest.mark.slow
 def test_the_chooser_stays_while_the_one_that_was_tried_fails(
     child_process: None, file: Path, tmp_path: Path
 ) -> None:

@@ -93,7 +93,8 @@ def test_points_that_all_fail_end_the_sweep(tmp_path: Path) -> None:
         sweep(options(tmp_path, "control_mode=nix,nox", seeds=1))
 
 
-@pytest.mark.parametrize("executor", [Processes(2), pytest.param(Processes(4), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("executor", [Processes(2), Processes(4)])
 def test_the_numbers_are_the_same_on_any_number_of_workers(
     swept: SweepReport, executor: Executor, tmp_path: Path
 ) -> None:

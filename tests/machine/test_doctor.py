@@ -17,6 +17,7 @@ def findings(child_process: None) -> dict[str, DoctorFinding]:
     return {finding.topic: finding for finding in diagnose()}
 
 
+@pytest.mark.slow
 def test_every_topic_is_answered_and_this_machine_runs_the_workbench(
     findings: dict[str, DoctorFinding],
 ) -> None:

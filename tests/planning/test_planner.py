@@ -159,7 +159,7 @@ def test_every_says_how_many_actions_of_a_plan_are_taken(task: Path) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("trouble", ["nan", "fail"])
+@pytest.mark.parametrize("trouble", [pytest.param("nan", marks=pytest.mark.slow), "fail"])
 def test_a_rollout_earns_nothing_after_a_fail_and_counts_as_worst_with_nan(task: Path, trouble: str) -> None:
     env = workbench.make(task, 1, trouble=trouble, **MADE)
     planner = workbench.Planner(env, rollouts=32, horizon=0.5)

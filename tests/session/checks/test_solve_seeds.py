@@ -64,6 +64,7 @@ def test_a_task_that_a_recording_names_is_not_run_from_the_disk(solver: SeedsSol
     assert solver.view.state == "failed" and "open its file" in solver.view.why
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_it_when_the_session_closes(solver: SeedsSolver) -> None:
     solver.solve(Load(str(TASKS / "push_cube.py"), MADE), 2, FEW)
     solver.close()

@@ -55,10 +55,22 @@ def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(ses
     assert np.isfinite(view.solve.predicted).all() and view.solve.predicted[-1] == pytest.approx(1, abs=0.6)
 
 
+@pytest.mark.slow
 def test_the_solved_episode_is_saved_like_any_other(session: Session) -> None:
     session.save_past((0,))
     view = wait_until(session, lambda view: bool(view.recording.saving.message), "the recording")
     assert view.recording.saving.message.startswith("saved 1 episode") and not view.recording.saving.failed
+
+
+def test_a_pressed_step_is_made_also_if_the_env_selected_meanwhile_needs_no_plan(session: Session) -> None:
+    # Env 0 is solved.
+    last = session.view().timeline.last
+    session.change(selected_env=1)
+    session.step()
+    wait_until(session, lambda view: view.solve.state in ("starting", "planning"), "the planning")
+    session.change(selected_env=0)
+    view = wait_until(session, lambda view: view.timeline.last > last, "the step")
+    assert view.timeline.last == last + 1 and not view.playing
 
 
 def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(session: Session) -> None:
@@ -93,6 +105,30 @@ def test_a_pressed_step_is_made_also_if_another_env_is_selected_while_it_is_plan
     session.change(selected_env=1)
     wait_until(session, lambda view: view.timeline.last > last, "the step")
     session.change(selected_env=0)
+
+
+def test_a_pressed_step_that_waited_for_its_plan_is_found_hanging_and_can_be_interrupted(
+    session: Session, file: Path, tmp_path: Path
+) -> None:
+    text = file.read_text()
+    hangs = tmp_path / "hangs"
+    # Rollouts are more than two.
+    loop = f"        while self.num_envs == 2 and __import__('os').path.exists({str(hangs)!r}):\n            pass\n"
+    serial = session.view().task_serial
+    file.write_text(text.replace("        return reward\n", f"{loop}        return reward\n"))
+    wait_until(session, lambda view: view.task_serial > serial, "the version that can hang")
+    start_over(session, 4)
+    hangs.touch()
+    session.step()
+    view = wait_until(session, lambda view: view.busy is not None, "that it hangs")
+    assert view.busy is not None and view.busy.file == str(file)
+    session.interrupt()
+    view = wait_until(session, lambda view: view.problem is not None and view.busy is None, "the interrupt")
+    assert view.problem is not None and view.problem.interrupted
+    hangs.unlink()
+    step(session)
+    file.write_text(text)
+    wait_until(session, lambda view: view.task_serial > serial + 1, "the version before")
 
 
 def test_another_body_is_traced_and_all_envs_are_planned_for_in_turn(session: Session) -> None:

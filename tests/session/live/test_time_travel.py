@@ -223,6 +223,7 @@ def test_the_newest_snapshot_is_a_plain_pickle(session: Session) -> None:
     assert snapshot.num_envs == N and snapshot.memory.elapsed_steps.tolist() == [2] * N
 
 
+@pytest.mark.slow
 def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None:
     start = fresh(session)
     view = step(session, 12)

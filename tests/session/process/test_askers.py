@@ -152,6 +152,7 @@ def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another
     assert background.pid is not None
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_with_an_error_is_quoted(background: Background, tmp_path: Path) -> None:
     file, job = write_task(tmp_path), a_job()
     file.write_text("import os, sys\nprint('one\\nout of luck', file=sys.stderr)\nos._exit(7)\n")

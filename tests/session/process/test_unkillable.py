@@ -199,6 +199,7 @@ def test_a_death_is_told_with_its_line_and_the_moment_comes_back(
     assert session.worker_pid != worker and not psutil.pid_exists(worker)
 
 
+@pytest.mark.slow
 def test_a_new_version_that_kills_whoever_imports_it_costs_one_worker(
     session: Session, risky_file: Path
 ) -> None:

@@ -230,6 +230,7 @@ def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session)
     assert episode.length == 2 and episode.info.acted_by == ((0, "random"), (1, "zero"))
 
 
+@pytest.mark.slow
 def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Session) -> None:
     session.reset()
     wait_until(session, lambda view: view.step is not None and not view.step.elapsed_steps.any(), "a reset")

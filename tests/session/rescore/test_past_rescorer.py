@@ -218,6 +218,7 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
     assert any(verdict.differs for verdict in desk.rescored("done").verdicts)
 
 
+@pytest.mark.slow
 def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk, record) -> None:
     slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD}")
@@ -239,6 +240,7 @@ def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk
     assert desk.session._background.pid == second
 
 
+@pytest.mark.slow
 def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with_the_judgement(
     desk: Desk, record
 ) -> None:

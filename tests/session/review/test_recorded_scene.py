@@ -84,6 +84,7 @@ def test_stops_when_it_is_told(recorded: Any) -> None:
     assert make({0: read_maniskill(recorded[0], "traj_0")}, stop=True) == {}
 
 
+@pytest.mark.slow
 def test_what_the_process_sends_and_cannot_be_read_is_told(recorded: Any, tmp_path: Path) -> None:
     file = tmp_path / "sends.py"
     file.write_text("import os, sys, time\nos.write(int(sys.argv[1]), b'print(1)\\n')\ntime.sleep(3600)\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import viser
 
 from tests.drive.panels import Clock, Panels
@@ -14,6 +15,7 @@ from workbench.ui.app.live_page import Page
 from workbench.ui.live.banners import FILL
 
 
+@pytest.mark.slow
 def test_an_empty_file_becomes_a_running_task_by_a_press(child_process: None, tmp_path: Path) -> None:
     file = tmp_path / "stack_two.py"
     file.write_text("# to be written\n")

@@ -413,6 +413,7 @@ def test_the_refusal_page_says_what_to_do_and_asks_nothing_of_the_network(gated_
 
 
 @pytest.mark.browser
+@pytest.mark.slow
 def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(gated_server, browser):
     """With one of each thing that the page's policy could break: blobs, data, workers, wasm, eval."""
     import numpy as np

@@ -93,6 +93,7 @@ def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
     assert not [path for path in (tmp_path / "films").iterdir() if path.suffix != ".mp4"]
 
 
+@pytest.mark.slow
 def test_a_dataset_is_stopped_in_the_middle_of_an_episode(recordings: Path, tmp_path: Path) -> None:
     told = Told()
     told.making.start(
