@@ -102,6 +102,21 @@ SIGHTS = Path(__file__).parents[1] / "test-results"
 """Where a failed test leaves what its pages showed."""
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_fixture_setup() -> None:
+    name_no_test()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call() -> None:
+    name_no_test()
+
+
+def name_no_test() -> None:
+    """pytest's variable is another in each test, and a worker is forked only where the environment is as it was."""
+    os.environ["PYTEST_CURRENT_TEST"] = "a test"
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     report = yield
@@ -166,8 +181,10 @@ def no_process_left_behind() -> Iterator[None]:
     """Workers and browsers that tests started must be gone when the tests are."""
     yield
     if "workbench.recording.reader.reading" in sys.modules:
-        # It serves the whole process, for as long as that lives.
+        # Both serve the whole process, for as long as that lives.
         sys.modules["workbench.recording.reader.reading"].stop_reading()
+    if "workbench.session.process.worker_start" in sys.modules:
+        sys.modules["workbench.session.process.worker_start"].worker_forks.end()
     until(lambda: not _children(), "the end of all processes that tests started", 10, seen=_children)
 
 

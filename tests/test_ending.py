@@ -11,6 +11,7 @@ import psutil
 import pytest
 
 from tests.drive.page import open_workbench
+from tests.drive.processes import workers_of
 from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import provoke, provoked, write_task
@@ -29,11 +30,6 @@ def gone(processes: list[psutil.Process]) -> bool:
 def signal_thread(pid: int, thread: int, number: signal.Signals) -> None:
     if ctypes.CDLL(None, use_errno=True).tgkill(pid, thread, int(number)) != 0:
         raise OSError(ctypes.get_errno(), "tgkill")
-
-
-def workers_of(server: psutil.Process) -> int:
-    """Each is one child of the server, its keeper."""
-    return sum("workbench.session.worker.start" in child.cmdline() for child in server.children())
 
 
 @pytest.mark.slow
@@ -80,7 +76,7 @@ def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:
         until(lambda: list((tmp_path / "recordings").glob("*.rrd")), "the first episodes")
         file.write_text(file.read_text().replace("> 0.05}", "> 0.06}"))
         opened.wait_for_line("patched", 90)
-        until(lambda: workers_of(server) == 3, "the spare worker and the judging one")
+        until(lambda: len(workers_of(server)) == 3, "the spare worker and the judging one")
         provoke(file, "evaluate", "catch")
         until(lambda: provoked(file), "the loop")
         processes = [server, *server.children(recursive=True)]

@@ -17,6 +17,7 @@ import numpy as np
 import psutil
 import pytest
 
+from tests.drive.processes import workers_of
 from tests.drive.waiting import until
 from tests.golden.make import GOLDEN
 from workbench.recording.episode.episode import Episode
@@ -70,7 +71,7 @@ class Rescoring:
         self._rescorer.start(self._files)
 
     def pids(self) -> list[int]:
-        return running("workbench.session.worker.start")
+        return [worker.pid for keeper in workers_of(psutil.Process()) for worker in keeper.children()]
 
     def ended(self) -> bool:
         return self._rescorer.rescoring.view.state in ("done", "failed")

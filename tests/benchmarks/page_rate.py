@@ -218,7 +218,7 @@ def used(server: int) -> tuple[dict[int, tuple[str, float]], dict[int, float]]:
 def name_of(is_server: bool, command: str, niceness: int) -> str:
     if is_server:
         return "server"
-    if "session.worker.start" in command:
+    if "session.worker." in command:
         # What works beside the worker that plays gives way to it.
         return "planner" if niceness else "worker"
     drawing = "browser's drawing" if "--type=gpu-process" in command else "browser's rest"

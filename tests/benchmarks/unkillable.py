@@ -30,6 +30,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import NO_DRAWING
 from tests.drive.page import launch, new_page, open_workbench
+from tests.drive.processes import workers_of
 from tests.session.hazards import calm, provocation, provoke, write_task
 from workbench.machine.doctor import find_chromium, how_to_get_chromium
 
@@ -104,10 +105,7 @@ class Desk:
     options: Options
 
     def workers(self) -> list[psutil.Process]:
-        found = [
-            p for p in self.server.children() if "workbench.session.worker.start" in " ".join(p.cmdline())
-        ]
-        return sorted(found, key=lambda process: process.create_time())
+        return workers_of(self.server)
 
     def says(self, text: str) -> bool:
         return text in self.page.evaluate("() => document.body.textContent")

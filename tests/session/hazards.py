@@ -15,7 +15,7 @@ from workbench.jobs.task import Stepped
 from workbench.machine.processes.wire import pack, pack_message
 
 _MISCHIEF = """
-import ctypes as _ctypes, os as _os, signal as _signal, sys as _sys, threading as _threading, time as _time
+import ctypes as _ctypes, os as _os, signal as _signal, socket as _socket, sys as _sys, threading as _threading, time as _time
 from pathlib import Path as _Path
 
 
@@ -24,7 +24,15 @@ def _raise_enough(*_):
 
 
 def _line_to_server():
-    return int(_sys.argv[1])
+    for name in sorted(_os.listdir("/proc/self/fd"), key=int):
+        try:
+            end = _socket.socket(fileno=_os.dup(int(name)))
+        except OSError:
+            continue  # no socket
+        with end:
+            if (end.family, end.type) == (_socket.AF_UNIX, _socket.SOCK_STREAM):
+                return int(name)
+    raise AssertionError("there is no line to the server")
 
 
 def hazard(place):

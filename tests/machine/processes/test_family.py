@@ -213,15 +213,15 @@ def test_the_memory_of_a_family_counts_what_is_shared_once(
     assert sum(map(resident_memory, everyone)) > 5 * 64 * 2**20
     together = proportional_memory(everyone)
     assert 64 * 2**20 < together < 2 * 64 * 2**20
-    memory = FamilyMemory(keeper.pid)
-    assert 64 * 2**20 < memory.measure(limit=2 * 64 * 2**20) < 2 * 64 * 2**20
+    memory = FamilyMemory()
+    assert 64 * 2**20 < memory.measure(keeper.pid, limit=2 * 64 * 2**20) < 2 * 64 * 2**20
     end_family(keeper)
-    assert memory.measure() == 0
+    assert memory.measure(keeper.pid) == 0
 
 
 def test_the_memory_of_what_detached_itself_is_counted(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
     keeper = begin("hold")
-    alone = FamilyMemory(keeper.pid).measure()
+    alone = FamilyMemory().measure(keeper.pid)
     assert alone == resident_memory(children(keeper.pid)[0]) > 64 * 2**20
     end_family(keeper)
 

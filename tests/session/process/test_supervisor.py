@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +19,7 @@ import pytest
 from tests.drive.waiting import until
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import Call
-from workbench.session.process import supervisor, worker_process
+from workbench.session.process import supervisor, worker_process, worker_start
 from workbench.session.process.heartbeat import Busy
 from workbench.session.process.supervisor import Death, SpareWorker, Supervisor, WorkerOptions
 from workbench.session.protocol.messages import Event, Load, Loading, Request, WarmUp
@@ -108,7 +109,8 @@ def small_workers(monkeypatch: pytest.MonkeyPatch) -> None:
         assert (dash_m, module) == ("-m", "workbench.session.worker.start")
         return [sys.executable, "-P", str(SMALL_WORKER), *arguments]
 
-    monkeypatch.setattr(worker_process, "python_command", command)
+    monkeypatch.setattr(worker_start, "python_command", command)
+    monkeypatch.setattr(worker_process, "worker_forks", SimpleNamespace(start=worker_start.start_anew))
     # What takes seconds for the sake of slow machines takes tenths here.
     for name, seconds in (("_BUSY", 0.8), ("_STACK_EVERY", 0.3), ("_IGNORED_AFTER", 0.3), ("_HEADLESS", 0.8)):
         monkeypatch.setattr(supervisor, name, seconds)
@@ -358,14 +360,14 @@ def test_a_greeting_that_fails_three_times_in_a_row_is_tried_again_when_somebody
 def test_where_no_worker_can_be_started_it_gives_up_until_somebody_asks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    command, failures = worker_process.python_command, iter(range(4))
+    command, failures = worker_start.python_command, iter(range(4))
 
     def fails(*arguments: str) -> list[str]:
         if next(failures, None) is not None:
             raise OSError("no more processes")
         return command(*arguments)
 
-    monkeypatch.setattr(worker_process, "python_command", fails)
+    monkeypatch.setattr(worker_start, "python_command", fails)
     one = Minded(WorkerOptions())
     one.worker.start()
     try:

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NoReturn
+from typing import IO, NoReturn, Protocol
 
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
@@ -166,7 +166,25 @@ def end_with_parent(parent: int) -> None:
         os._exit(1)
 
 
-def end_family(keeper: subprocess.Popen[bytes]) -> None:
+class Keeper(Protocol):
+    """A process that called `begin_family`, as the server has it: a ``subprocess.Popen``, or what does as much of it."""
+
+    stdout: IO[bytes] | None
+    stderr: IO[bytes] | None
+
+    @property
+    def pid(self) -> int: ...
+
+    def poll(self) -> int | None: ...
+
+    def wait(self, timeout: float | None = None) -> int: ...
+
+    def terminate(self) -> None: ...
+
+    def kill(self) -> None: ...
+
+
+def end_family(keeper: Keeper) -> None:
     """End a process that called `begin_family` and all that it started; returns when all have ended."""
     keeper.terminate()
     try:

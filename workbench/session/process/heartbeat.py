@@ -236,9 +236,10 @@ class Beat:
 
 
 def make_heartbeat() -> int:
-    """Shared memory as a file descriptor for the child; the caller closes it."""
+    """Shared memory as a file descriptor for the child; the caller closes it. Until the child writes, it is starting."""
     fd = os.memfd_create("workbench-heartbeat")
     os.ftruncate(fd, mmap.PAGESIZE)
+    os.pwrite(fd, _LAYOUT.pack(0, time.monotonic(), _DOINGS.index("starting")), 0)
     return fd
 
 

@@ -70,18 +70,17 @@ class FamilyMemory:
     two seconds, and at once where the memory seems above the limit. In between, new memory counts as not shared.
     """
 
-    def __init__(self, pid: int) -> None:
-        """
-        Args:
-            pid: not counted itself.
-        """
-        self._pid = pid
+    def __init__(self) -> None:
         self._shared = 0
         self._counted = 0.0
 
-    def measure(self, limit: int | None = None) -> int:
-        """Bytes; exact where the quick estimate is above `limit`."""
-        members = family(self._pid)[1:]
+    def measure(self, pid: int, limit: int | None = None) -> int:
+        """Bytes; exact where the quick estimate is above `limit`.
+
+        Args:
+            pid: not counted itself.
+        """
+        members = family(pid)[1:]
         resident = sum(map(resident_memory, members))
         if len(members) < 2:
             self._shared = 0

@@ -96,9 +96,9 @@ class Vitals:
 class SpareWorker:
     """A second, warmed-up worker that replaces one that dies. Used on one thread, which must live as long as it.
 
-    A new worker imports torch, SAPIEN and ManiSkill (4 s and more), makes a render system and compiles its shaders. The
-    spare does this in the background once a task runs, and then sleeps; it costs memory (`memory`). After it is taken, the
-    next one is started a while later.
+    A new worker makes a render system and compiles its shaders, and where it is no fork (`worker_start`) it imports torch,
+    SAPIEN and ManiSkill, 4 s and more. The spare does this in the background once a task runs, and then sleeps; it costs
+    memory (`memory`). After it is taken, the next one is started a while later.
     """
 
     def __init__(self, warm_up: WarmUp) -> None:

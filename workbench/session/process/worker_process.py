@@ -15,7 +15,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import get_args
 
-from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.family import end_family, main_thread_ended
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import MessageSocket
@@ -27,6 +26,7 @@ from workbench.session.process.heartbeat import (
     make_heartbeat,
 )
 from workbench.session.process.memory_limit import FamilyMemory
+from workbench.session.process.worker_start import worker_forks
 from workbench.session.protocol.messages import (
     Event,
     Load,
@@ -48,8 +48,8 @@ _PIECE = 1 << 20
 _FLOOD_PAUSE = 0.005
 """Seconds between two reads of a flood: with pieces of a megabyte that drains 200 MB a second."""
 _F_SETPIPE_SZ = 1031
-_BEGINS = 10.0
-"""Seconds in which a worker starts, also on a busy machine."""
+_BEGINS = 60.0
+"""Seconds in which a worker starts, also on a busy machine and where it is the first."""
 
 Output = Callable[[str, bytes], bool]
 """Gets ``stdout`` or ``stderr`` and new bytes (none at its end); True asks for a pause."""
@@ -58,8 +58,8 @@ Output = Callable[[str, bytes], bool]
 class WorkerProcess:
     """One worker. `receive` is called on one thread, all else on any.
 
-    Start it on a thread that outlives the worker: the kernel ends a worker with the thread that started it, so that none
-    is left behind when the server is killed.
+    Start it on a thread that outlives the worker: where it is no fork (`worker_start`) the kernel ends it with the thread
+    that started it, so that none is left behind when the server is killed.
 
     It has no standard input, so that a task that reads it gets end of file and does not hang, and its own process group,
     so that Ctrl-C in the terminal reaches the server alone. The author's code may keep it from reading, writing and
@@ -82,18 +82,7 @@ class WorkerProcess:
         fds = [theirs.fileno(), heartbeat, self._stacks]
         try:
             # This starts the worker's keeper, which starts the worker and ends with its exit code.
-            self._process = subprocess.Popen(
-                python_command(
-                    "-m", "workbench.session.worker.start", *map(str, [*fds, os.getpid(), niceness])
-                ),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                bufsize=0,
-                pass_fds=fds,
-                process_group=0,
-                env=child_environment(PYTHONUNBUFFERED="1"),
-            )
+            self._process = worker_forks.start(fds, niceness)
             self._heartbeat = HeartbeatReader(heartbeat)
         except BaseException:
             ours.close()
@@ -103,7 +92,7 @@ class WorkerProcess:
             theirs.close()
             os.close(heartbeat)
         self._line = MessageSocket(ours, get_args(Event))
-        self._memory = FamilyMemory(self._process.pid)
+        self._memory = FamilyMemory()
         self._output = output
         self._waiting: deque[Request] = deque()
         self._wake = threading.Condition()
@@ -121,11 +110,18 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process that runs the task. Waits until it has started, some 50 ms."""
+        """Of the process that runs the task. Waits until it has started: some 50 ms, of the first worker seconds.
+
+        Raises:
+            ProcessLookupError: it did not.
+        """
         deadline = time.monotonic() + _BEGINS
         while self._heartbeat.pid == 0 and self._process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.005)
-        return self._heartbeat.pid or self._process.pid
+        pid = self._heartbeat.pid or self._process.pid
+        if pid == 0:  # for `os.kill` that is this process and its group
+            raise ProcessLookupError("the worker has not started")
+        return pid
 
     # --- messages ----------------------------------------------------------------------------------
 
@@ -168,7 +164,7 @@ class WorkerProcess:
 
     def memory(self, limit: int | None = None) -> int:
         """Bytes of memory, with all processes that it started; see `FamilyMemory.measure`."""
-        return self._memory.measure(limit)
+        return self._memory.measure(self._process.pid, limit)
 
     def main_thread_ended(self) -> bool:
         """Whether the main thread has ended while another keeps the process alive."""
@@ -233,9 +229,11 @@ class WorkerProcess:
         # Or the writer would block for ever if a process that left the group holds the other end.
         self._line.end.shutdown(socket.SHUT_RDWR)
         self._writer.join()
+        # What was not forked yet has said nothing, and the fork server holds its pipes while it imports.
+        patience = 1.0 if self._process.pid else 0.0
         for reader in self._readers:
             # A process that left the group may hold the pipe: its reader thread is left behind.
-            reader.join(timeout=1.0)
+            reader.join(timeout=patience)
         self._line.end.close()
         os.close(self._stacks)
 

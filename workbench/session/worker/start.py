@@ -19,13 +19,17 @@ from workbench.machine.versions import untested_text
 
 
 def main() -> None:
-    """Run a worker: ``python -m workbench.session.worker.start SOCKET HEARTBEAT STACKS SERVER NICENESS``.
+    """Run a worker: ``python -m workbench.session.worker.start SOCKET HEARTBEAT STACKS SERVER NICENESS``; see `run`."""
+    run(*map(int, sys.argv[1:6]))
 
-    The first three are file descriptors (see `WorkerProcess`), SERVER is the server's process id. Heavy modules are
+
+def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: int) -> None:
+    """Continue as a worker in a child of this process, and as its keeper in this one.
+
+    The first three are file descriptors (see `WorkerProcess`), `server` is the process id of the parent. Heavy modules are
     imported last: by then a crash writes its stack, the server can read the stack by a signal, the kernel ends this
     process first when memory is short, and the process ends with its server (`family`).
     """
-    connection, heartbeat_fd, stacks, server, niceness = map(int, sys.argv[1:6])
     begin_family(server)
     if niceness:
         os.nice(niceness)

@@ -1,0 +1,17 @@
+"""The worker processes of a page's server, and of a test."""
+
+from __future__ import annotations
+
+import psutil
+
+
+def workers_of(server: psutil.Process) -> list[psutil.Process]:
+    """The keeper of each, the oldest first; a worker is its only child."""
+    keepers: list[psutil.Process] = []
+    for child in server.children():
+        command = " ".join(child.cmdline())
+        if "workbench.session.worker.start" in command:
+            keepers.append(child)
+        elif "workbench.session.worker.fork_server" in command:
+            keepers += child.children()
+    return sorted(keepers, key=lambda process: process.create_time())
