@@ -175,10 +175,28 @@ def test_with_a_gpu_of_nvidia_no_worker_is_a_fork(
     forks: WorkerForks, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "nvidiactl").touch()
-    monkeypatch.setattr(worker_start, "_NVIDIA", str(tmp_path / "nvidiactl"))
+    monkeypatch.setattr(worker_start, "_GPUS", (str(tmp_path / "no"), str(tmp_path / "nvidiactl")))
     worker = started()
     assert "fork_server" not in command_of(worker)
     worker.stop(0)
+
+
+def test_those_that_are_ended_at_once_leave_the_others_alone(forks: WorkerForks) -> None:
+    worker = started()
+    assert listens(worker)
+    for pause in (0.0, 0.0, 0.005, 0.01, 0.02, 0.04, 0.08):
+        ended = started()
+        time.sleep(pause)
+        ended.stop(0)
+    unread = started()
+    until(lambda: len(workers_of(psutil.Process())) == 2, "the fork")
+    unread._process._told.close()  # type: ignore[attr-defined]
+    unread._process._code = -signal.SIGTERM  # type: ignore[attr-defined]
+    unread.stop(0)
+    assert worker.exit_code() is None
+    until(lambda: len(workers_of(psutil.Process())) == 1, "the end of the others")
+    worker.stop()
+    assert worker.exit_code() == 0
 
 
 def test_a_wait_for_one_that_runs_ends_in_time(forks: WorkerForks) -> None:

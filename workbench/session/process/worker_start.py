@@ -18,9 +18,9 @@ from workbench.machine.processes.child_python import child_environment, python_c
 from workbench.machine.processes.family import Keeper
 from workbench.machine.processes.wire import Unpacker, pack
 
-_NVIDIA = "/dev/nvidiactl"
-"""There is a GPU of NVIDIA. No worker is forked then: CUDA does not work in a fork of a process that has used it, and whether
-an import does is not in our hands."""
+_GPUS = ("/dev/nvidiactl", "/dev/dxg")
+"""One of these is there where CUDA may be (the second in WSL). No worker is forked then: CUDA does not work in a fork of a
+process that has used it, and whether an import does is not in our hands."""
 _LONGEST = 1 << 12
 _UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
@@ -143,7 +143,7 @@ class WorkerForks:
             OSError
         """
         with self._lock:
-            control = None if os.path.exists(_NVIDIA) else self._fork_server()
+            control = None if any(map(os.path.exists, _GPUS)) else self._fork_server()
             if control is not None:
                 try:
                     return _forked(control, fds, niceness)
@@ -158,7 +158,7 @@ class WorkerForks:
 
     def _fork_server(self) -> socket.socket | None:
         """The socket that it listens to; None if it would not give what a worker started here and now is."""
-        come_from = (child_environment(**_UNBUFFERED), os.getcwd())
+        come_from = (child_environment(**_UNBUFFERED), _current_folder())
         if self._control is None:
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             with theirs:
@@ -181,6 +181,13 @@ class WorkerForks:
             self._process.kill()
             self._process.wait()
         self._control = self._process = None
+
+
+def _current_folder() -> str:
+    try:
+        return os.getcwd()
+    except FileNotFoundError:  # it was removed
+        return ""
 
 
 def _forked(control: socket.socket, fds: Sequence[int], niceness: int) -> ForkedKeeper:

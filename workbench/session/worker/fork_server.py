@@ -91,7 +91,10 @@ class _ForkServer:
 
     def _signal(self, pid: int, end: socket.socket) -> None:
         """Who started a worker sends the number of a signal, or has left."""
-        asked = end.recv(LONGEST)
+        try:
+            asked = end.recv(LONGEST)
+        except ConnectionResetError:  # it left without having read what we told
+            asked = b""
         # It is our child, and its number is free only after we have waited for it.
         os.kill(pid, Unpacker().unpack(asked, int) if asked else signal.SIGTERM)
         if not asked:
@@ -109,18 +112,25 @@ class _ForkServer:
         end = socket.socket(fileno=fds[0])
         looker = select.poll()
         looker.register(end, select.POLLIN)
-        if looker.poll(0):  # it was ended while we imported
-            pid = 0
-            _tell(end, Ended(-signal.SIGTERM))
+        pid, server = 0, os.getpid()
+        if looker.poll(0):
+            _tell(end, Ended(-signal.SIGTERM))  # it was ended while we imported
         else:
-            server = os.getpid()
-            pid = os.fork()
-            if pid == 0:
-                self._become_worker(request, server, end, fds[1:])
+            try:
+                pid = os.fork()
+            except OSError as error:  # no memory, or too many processes; those that run are to go on
+                os.write(fds[-1], f"workbench: no worker can be started: {error}\n".encode())
+                _tell(end, Ended(1))
+            else:
+                if pid == 0:
+                    self._become_worker(request, server, end, fds[1:])
+        if pid:
             _tell(end, Forked(pid))
             with suppress(OSError):
                 os.setpgid(pid, pid)  # also here: its group may be signalled before it has made it
             self._workers[pid] = end
+        else:
+            end.close()
         for fd in fds[1:]:
             os.close(fd)
 
