@@ -3,7 +3,8 @@
     python tests/benchmarks/first_picture.py [--num-envs 4] [--rounds 3] [--no-parts]
 
 A real session on the example task with both its cameras looked through, as `workbench open` has it, without a browser. The
-machine's disk caches are warm after the first round, which is left out. Then what a worker does until then, one after the
+machine's disk caches are warm after the first round, which is left out. Once with workers that are forks of a process that has
+done the imports, once with workers that import for themselves. Then what a worker does until then, one after the
 other in one process: seconds of the wall, and of the processor, which count also on a busy machine.
 """
 
@@ -18,15 +19,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
+import psutil
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.page import TASK
 from workbench.jobs.task import TaskOptions
+from workbench.machine.processes.family import proportional_memory
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.process import worker_process
 from workbench.session.process.supervisor import WorkerOptions
+from workbench.session.process.worker_start import start_anew, worker_forks
 from workbench.session.protocol.messages import CameraRequest
 
 CAMERAS = (CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human"))
@@ -50,36 +56,64 @@ def wait(session: Session, reached: Callable[[SessionView], bool], patience: flo
     raise SystemExit(f"it did not come within {patience:.0f} s")
 
 
-def waits(options: Options) -> dict[str, list[float]]:
-    """Seconds of each round."""
-    found: dict[str, list[float]] = {}
+WAYS = {"forked": worker_forks.start, "anew": start_anew}
+"""Workers as forks of a process that has done the imports, and workers that import for themselves."""
+
+
+def waits(options: Options) -> dict[str, dict[str, list[float]]]:
+    """What each round found, of each way to start a worker, one after the other in turn."""
+    found: dict[str, dict[str, list[float]]] = {way: {} for way in WAYS}
     for _ in range(options.rounds + 1):
-        with tempfile.TemporaryDirectory() as folder:
-            began = time.monotonic()
-            session = Session(
-                str(TASK),
-                TaskOptions(num_envs=options.num_envs),
-                recordings=Path(folder),
-                worker=WorkerOptions(spare=True),
-            )
-            try:
-                session.change(cameras=CAMERAS)
-                session.set_clients(1)
-                wait(session, lambda view: view.timeline.moments == 1)
-                found.setdefault("the task's first moment", []).append(time.monotonic() - began)
-                wait(session, lambda view: bool(view.pictures))
-                found.setdefault("its first picture", []).append(time.monotonic() - began)
-                wait(session, lambda view: view.vitals.spare_ready)
+        for way, start in WAYS.items():
+            worker_forks.end()
+            setattr(worker_process, "worker_forks", SimpleNamespace(start=start))  # noqa: B010
+            for what, number in opened_and_restarted(options.num_envs):
+                found[way].setdefault(what, []).append(number)
+    return found
+
+
+def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
+    def after(reached: Callable[[SessionView], bool]) -> float:
+        wait(session, reached)
+        return time.monotonic() - began
+
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.monotonic()
+        session = Session(
+            str(TASK),
+            TaskOptions(num_envs=num_envs),
+            recordings=Path(folder),
+            worker=WorkerOptions(spare=True),
+        )
+        try:
+            session.change(cameras=CAMERAS)
+            session.set_clients(1)
+            yield "the task's first moment, s", after(lambda view: view.timeline.moments == 1)
+            yield "its first picture, s", after(lambda view: bool(view.pictures))
+            wait(session, lambda view: view.vitals.spare_ready)
+            yield "processor until then and until the spare is warm, s", processor()
+            yield "memory of both, MB", memory()
+            for restarted in ("a restarted worker's, with the spare warm, s", "without a spare, s"):
                 before = session.view().pictures
                 began = time.monotonic()
                 session.versions.restart_worker()
-                wait(session, lambda view, old=before: bool(view.pictures) and view.pictures is not old)
-                found.setdefault("a restarted worker's, with the spare warm", []).append(
-                    time.monotonic() - began
+                yield (
+                    restarted,
+                    after(lambda view, old=before: bool(view.pictures) and view.pictures is not old),
                 )
-            finally:
-                session.close()
-    return found
+        finally:
+            session.close()
+
+
+def processor() -> float:
+    """Seconds of all that this process started and that still runs."""
+    times = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
+    return sum(time.user + time.system for time in times)
+
+
+def memory() -> float:
+    """Of the same, megabytes; what they share counts once."""
+    return proportional_memory(child.pid for child in psutil.Process().children(recursive=True)) / 2**20
 
 
 # --- parts ----------------------------------------------------------------------------------------------
@@ -124,9 +158,12 @@ def parts(num_envs: int) -> None:
 
 
 def main(options: Options) -> None:
-    for what, seconds in waits(options).items():
-        each = ", ".join(f"{one:.2f}" for one in seconds[1:])
-        print(f"{what:45s} {statistics.median(seconds[1:]):6.2f} s ({each})", flush=True)
+    found = waits(options)
+    for what in found["forked"]:
+        for way in WAYS:
+            numbers = found[way][what][1:]
+            each = ", ".join(f"{one:.2f}" for one in numbers)
+            print(f"{what:52s} {way:7s} {statistics.median(numbers):8.2f} ({each})", flush=True)
     if options.parts:
         print(f"parts of a worker's start: {'':27s}   wall    processor, s", flush=True)
         call = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import first_picture; first_picture.parts({options.num_envs})"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.drive.page import page_on
+from tests.drive.page import open_tab, page_on
 from tests.drive.waiting import until
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -27,7 +27,7 @@ def page(task_file: Path, browser: Browser) -> Iterator[Page]:
     arguments = ("--num-envs", str(ENVS), "--env", "render_backend=none")
     with page_on(task_file, *arguments, browser=browser) as (page, errors, _):
         assert envs(page) == []
-        page.get_by_role("tab", name="Inspect").click()
+        open_tab(page, "Inspect")
         expect(page.get_by_text("panda_joint7", exact=True)).to_be_visible()
         page.keyboard.press("b")
         until(lambda: envs(page) == list(range(ENVS)), "the rows")
@@ -69,7 +69,7 @@ def cell(page: Page, env: int, column: int) -> str:
 
 
 def play_until_step(page: Page, steps: int) -> None:
-    page.get_by_role("tab", name="Run").click()
+    open_tab(page, "Run")
     page.get_by_role("button", name="Play", exact=True).click()
     until(lambda: int(cell(page, 0, 2)) > steps, "steps in the table")
     page.get_by_role("button", name="Pause", exact=True).click()
@@ -77,7 +77,7 @@ def play_until_step(page: Page, steps: int) -> None:
 
 
 def test_a_row_is_pressed_and_its_env_selected_also_while_the_envs_play(page: Page) -> None:
-    page.get_by_role("tab", name="Run").click()
+    open_tab(page, "Run")
     page.get_by_role("button", name="Play", exact=True).click()
     for env in (3, 1, 5):
         press(page, f"tr[data-env='{env}']")
@@ -128,7 +128,7 @@ def show(page: Page, what: str) -> None:
 
 
 def test_the_selected_env_is_read_out_and_changes_are_marked(page: Page) -> None:
-    page.get_by_role("tab", name="Inspect").click()
+    open_tab(page, "Inspect")
     show(page, "joints")
     expect(page.get_by_text("panda_joint7", exact=True)).to_be_visible()
     show(page, "observation")
@@ -146,7 +146,7 @@ def test_the_selected_env_is_read_out_and_changes_are_marked(page: Page) -> None
 
 
 def test_a_pose_is_copied(page: Page) -> None:
-    page.get_by_role("tab", name="Inspect").click()
+    open_tab(page, "Inspect")
     show(page, "poses")
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     expect(page.locator(".wb-leaves").get_by_text("cube", exact=True)).to_be_visible()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from playwright.sync_api import FloatRect, Locator, Page, expect
 
-from tests.drive.page import TASK, Opened
+from tests.drive.page import TASK, Opened, open_tab
 from tests.drive.waiting import until
 
 
@@ -21,9 +21,7 @@ class Desk:
     opened: Opened
 
     def tab(self, name: str) -> None:
-        tab = self.page.get_by_role("tab", name=name)
-        tab.click()
-        expect(tab).to_have_attribute("aria-selected", "true")
+        open_tab(self.page, name)
 
     def button(self, name: str) -> Locator:
         return self.page.get_by_role("button", name=name, exact=True)

@@ -264,6 +264,17 @@ def picture_of_view(page: Page, clip: FloatRect) -> NDArray[np.uint8]:
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
 
 
+def open_tab(page: Page, name: str) -> None:
+    """Click it until it is open: a mark that comes above the tabs moves them away from under the mouse."""
+    tab = page.get_by_role("tab", name=name)
+
+    def opened() -> bool:
+        tab.click()
+        return tab.get_attribute("aria-selected") == "true"
+
+    until(opened, f"the tab {name}")
+
+
 def close_notice(page: Page) -> None:
     """Press away viser's notice that the browser draws in software: it lies over what is below it."""
     notice = page.locator(".mantine-Notification-closeButton")
