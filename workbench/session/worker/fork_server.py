@@ -17,12 +17,12 @@ from workbench.machine.processes.wire import Unpacker, pack_message
 from workbench.session.process.worker_start import Ended, Forked, NewWorker
 from workbench.session.worker import start
 
-LONGEST = 1 << 12
+_LONGEST = 1 << 12
 _STANDARD = (1, 2)
 """stdout and stderr."""
 _MOST_PRINTED = 1 << 15
 """Bytes of what the imports printed: as many as fit into a pipe that nobody has read yet."""
-FDS = 6
+_FDS = 6
 """Of a request: the socket that tells of its end, those of `start.run`, its stdout and its stderr."""
 
 
@@ -44,7 +44,10 @@ def main() -> None:
         versions = None  # each worker imports for itself, and says what is wrong
     else:
         versions = _versions()
-    _ForkServer(control, versions, [os.pread(fd, _MOST_PRINTED, 0) for fd in printed]).serve()
+    texts = [os.pread(fd, _MOST_PRINTED, 0) for fd in printed]
+    for fd in printed:
+        os.close(fd)
+    _ForkServer(control, versions, texts).serve()
 
 
 def _versions() -> dict[str, int]:
@@ -81,10 +84,10 @@ class _ForkServer:
                 if end.fileno() in ready:
                     self._signal(pid, end)
             if self._woken.fileno() in ready:
-                self._woken.recv(LONGEST)
+                self._woken.recv(_LONGEST)
                 self._reap()
             if self._control.fileno() in ready:
-                message, fds, _, _ = socket.recv_fds(self._control, LONGEST, FDS)
+                message, fds, _, _ = socket.recv_fds(self._control, _LONGEST, _FDS)
                 if not message:
                     os._exit(0)  # the kernel ends the workers
                 self._fork(Unpacker().unpack(message, NewWorker), fds)
@@ -92,7 +95,7 @@ class _ForkServer:
     def _signal(self, pid: int, end: socket.socket) -> None:
         """Who started a worker sends the number of a signal, or has left."""
         try:
-            asked = end.recv(LONGEST)
+            asked = end.recv(_LONGEST)
         except ConnectionResetError:  # it left without having read what we told
             asked = b""
         # It is our child, and its number is free only after we have waited for it.
