@@ -31,7 +31,7 @@ from tests.drive.studio import (
 from tests.drive.waiting import until
 from workbench.ui.cameras.studio import NO_CAMERA
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 FILE = "push_cube.py"
 EYE = re.compile(
     r'look_at\(eye=\[([-\d., ]+)\], target=\[([-\d., ]+)\]\)\n +return \[CameraConfig\("base_camera"'
@@ -148,7 +148,6 @@ def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_
     page.get_by_role("button", name="Close", exact=True).click()
 
 
-@pytest.mark.slow
 def test_typed_and_nudged_and_undone(page: Page) -> None:
     unfold(page, "Lens and image", page.get_by_label("Vertical fov"))
     page.get_by_label("Vertical fov").fill("90")
@@ -170,7 +169,6 @@ def test_typed_and_nudged_and_undone(page: Page) -> None:
     page.get_by_text("Lens and image", exact=True).click()
 
 
-@pytest.mark.slow
 def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) -> None:
     at = "[document.activeElement.textContent, document.activeElement.ariaPressed]"
     tool(page, "pose")
@@ -203,7 +201,6 @@ def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) 
     until(lambda: numbers(page, "Looks at") == [0.23, 0, 0], "the target, which goes along")
 
 
-@pytest.mark.slow
 def test_tab_goes_on_where_the_page_changes_while_it_leaves_a_part(page: Page) -> None:
     tool(page, "pose")
     page.evaluate(
@@ -217,7 +214,6 @@ def test_tab_goes_on_where_the_page_changes_while_it_leaves_a_part(page: Page) -
     page.evaluate("document.activeElement.blur()")
 
 
-@pytest.mark.slow
 def test_keys_that_follow_a_click_at_once_keep_what_they_walked_to(page: Page) -> None:
     tool(page, "pose")
     kept = page.evaluate(
@@ -234,7 +230,6 @@ def test_keys_that_follow_a_click_at_once_keep_what_they_walked_to(page: Page) -
     page.evaluate("document.activeElement.blur()")
 
 
-@pytest.mark.slow
 def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
     press(page, "Look through")
     tool(page, "Back to my view")
@@ -247,7 +242,6 @@ def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
     until(lambda: end_of_the_left_arrow(page) is not None, "the gizmo again")
 
 
-@pytest.mark.slow
 def test_a_copy_is_planned_and_left(page: Page, task_file: Path) -> None:
     text = task_file.read_text()
     unfold(page, "Add, copy, rename, remove", page.get_by_role("button", name="Rename", exact=True))
@@ -267,7 +261,6 @@ def test_a_copy_is_planned_and_left(page: Page, task_file: Path) -> None:
     page.get_by_text("Add, copy, rename, remove", exact=True).click()
 
 
-@pytest.mark.slow
 def test_turned_with_the_mouse(page: Page) -> None:
     until(lambda: arc_about_x(page) is not None and picture(page) != "", "the handles")
     before, start = picture(page), numbers(page, "Degrees")
@@ -284,7 +277,6 @@ def test_turned_with_the_mouse(page: Page) -> None:
     until(lambda: numbers(page, "Degrees") == start, "the turn undone")
 
 
-@pytest.mark.slow
 def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path) -> None:
     text = task_file.read_text()
     unfold(page, "Lens and image", page.locator(field(page, "Lens as")))
@@ -318,7 +310,6 @@ def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path)
     page.get_by_text("Lens and image", exact=True).click()
 
 
-@pytest.mark.slow
 def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_file: Path) -> None:
     before = task_file.read_text()
     unfold(page, "Add, copy, rename, remove", page.get_by_role("button", name="Rename", exact=True))
@@ -350,7 +341,6 @@ def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_
     page.get_by_text("Add, copy, rename, remove", exact=True).click()
 
 
-@pytest.mark.slow
 def test_the_picture_stays_in_sight_and_is_looked_at_in_another_size(page: Page) -> None:
     choose(page, "base_camera · sensor")
     until(lambda: picture(page) != "", "the picture")
@@ -392,7 +382,6 @@ def test_files_for_opencv_and_ros_say_what_the_page_says(page: Page) -> None:
     page.get_by_text("Matrices and files", exact=True).click()
 
 
-@pytest.mark.slow
 def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_be_stopped(page: Page) -> None:
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("r")

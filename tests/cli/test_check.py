@@ -404,6 +404,7 @@ def test_other_tasks_of_the_file_are_named(place: Path, capsys: pytest.CaptureFi
     assert "Not checked, as one task is checked at a time: good.py:Second" in ended.err
 
 
+@pytest.mark.slow
 def test_the_command_as_a_job_in_ci_runs_it(place: Path, child_process: None) -> None:
     """In processes of its own, with an id that has no file here, and no terminal."""
     words = ["check", "PushCube-v1", "--envs-per-worker", "2", "--seeds", "2", "--workers", "2"]

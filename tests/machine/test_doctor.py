@@ -83,6 +83,7 @@ def test_a_question_that_takes_too_long_is_told_without_its_program(
         assert "again" in (found[topic].advice or "")
 
 
+@pytest.mark.slow
 def test_gpu_physics_is_looked_for_without_fetching_it(
     child_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -122,6 +122,7 @@ def test_a_worker_of_another_environment_or_folder_is_no_fork(
         worker.stop(0)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_imported_is_said_by_each_worker(
     own_forks: WorkerForks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,6 +137,7 @@ def test_what_cannot_be_imported_is_said_by_each_worker(
     assert b"ImportError: broken by the test" in b"".join(said)
 
 
+@pytest.mark.slow
 def test_one_that_is_ended_before_it_has_been_forked_never_runs(own_forks: WorkerForks) -> None:
     worker = started()
     began = time.monotonic()
