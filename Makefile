@@ -32,7 +32,10 @@ else
 $(error MANISKILL is release or nightly, not "$(MANISKILL)")
 endif
 BIN := $(VENV)/bin
-# Without compiling: half of the time, for modules of which two thirds are never imported. Python does it when it imports one.
+# Without compiling: half of the time, for modules of which two thirds are never imported. Python does it when it imports one,
+# unless it is told not to, as in many containers: then each process compiles ten thousand files, and takes thrice as long.
+unexport PYTHONDONTWRITEBYTECODE
+COMPILE := $(BIN)/python -c 'import workbench.session.worker.loop, workbench.ui.app.live_page' >/dev/null 2>&1 || true
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -q --no-compile -c constraints.txt
 
 # The first Python that runs and that every pinned package has a release for. A pyenv shim can be on PATH and
@@ -142,11 +145,13 @@ $(VENV)/pyvenv.cfg: $(BROKEN_VENV)
 $(VENV)/.installed: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time, nothing the next."
 	$(PIP_INSTALL) -e '.[$(EXTRA)]'
+	@$(COMPILE)
 	@touch $@
 
 $(VENV)/.installed-test: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time, nothing the next."
 	$(PIP_INSTALL) -e '.[$(EXTRA),test]'
+	@$(COMPILE)
 	@touch $(VENV)/.installed $@
 
 $(VENV)/.installed-mutants: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
