@@ -62,7 +62,7 @@ help:
 	@echo "make mutants   would a test notice? Slips are planted in copies of MODULES (ui/server/access ..., or all)"
 	@echo "make test-gpu  on a machine with CUDA: what of GPU simulation and GPU pictures works, within 8 minutes"
 	@echo "               (without a network: WHEELS=DIR, filled by make gpu-wheels WHEELS=DIR elsewhere, and PHYSX_GPU=FILE)"
-	@echo "make lint      ruff and pyright"
+	@echo "make lint      ruff and pyright, the tests' types too"
 	@echo "make wheel     dist/*.whl"
 	@echo "make doctor    what this machine can do, and what to do about the rest"
 	@echo "make clean     remove what building and testing left; .venv stays"
@@ -71,6 +71,8 @@ open: set-up
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
 	exec $(BIN)/workbench open $(TASK) $(ARGS)
 
+# The types of the tests are two fifths of pyright's time: `make lint` and `make test-all` check them.
+test: TYPED := workbench tasks
 test: lint
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
 	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
@@ -109,7 +111,7 @@ lint: set-up-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 # The types are those of the release.
-	$(if $(filter release,$(MANISKILL)),$(BIN)/pyright --threads $(WORKERS))
+	$(if $(filter release,$(MANISKILL)),$(BIN)/pyright --threads $(WORKERS) $(TYPED))
 
 wheel: set-up-test
 	$(BIN)/python -m build --wheel

@@ -94,13 +94,15 @@ def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
             yield "processor until then and until the spare is warm, s", processor()
             yield "memory of both, MB", memory()
             for restarted in ("a restarted worker's, with the spare warm, s", "without a spare, s"):
-                before = session.view().pictures
+                before = session.view()
                 began = time.monotonic()
                 session.versions.restart_worker()
-                yield (
-                    restarted,
-                    after(lambda view, old=before: bool(view.pictures) and view.pictures is not old),
-                )
+
+                def drawn(view: SessionView, before: SessionView = before) -> bool:
+                    again = view.task_serial > before.task_serial
+                    return again and bool(view.pictures) and view.pictures is not before.pictures
+
+                yield restarted, after(drawn)
         finally:
             session.close()
 

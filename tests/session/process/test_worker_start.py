@@ -58,6 +58,13 @@ def command_of(worker: WorkerProcess) -> str:
     return " ".join(psutil.Process(worker.pid).cmdline())
 
 
+def has_ended(process: psutil.Process) -> bool:
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
 def test_workers_are_forks_that_end_apart_from_each_other_and_say_how(forks: WorkerForks) -> None:
     one, other = started(), started()
     assert listens(one) and listens(other)
@@ -163,10 +170,7 @@ def test_when_the_fork_server_is_killed_its_workers_end_and_the_next_has_another
         until(lambda: worker.receive(0.1), "its end")
     assert worker.exit_code() == -signal.SIGKILL
     worker.stop(0)
-    until(
-        lambda: not task.is_running() or task.status() == psutil.STATUS_ZOMBIE,
-        "the end of the task's process",
-    )
+    until(lambda: has_ended(task), "the end of the task's process")
     following = [started(), started()]
     assert all(listens(one) for one in following)
     for one in following:

@@ -8,6 +8,7 @@ import select
 import signal
 import socket
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
@@ -22,6 +23,7 @@ _STANDARD = (1, 2)
 """stdout and stderr."""
 _MOST_PRINTED = 1 << 15
 """Bytes of what the imports printed: as many as fit into a pipe that nobody has read yet."""
+_JUST_NOW = 0.2
 _FDS = 6
 """Of a request: the socket that tells of its end, those of `start.run`, its stdout and its stderr."""
 
@@ -66,6 +68,7 @@ def _written(file: str) -> int:
 class _ForkServer:
     def __init__(self, control: socket.socket, versions: dict[str, int] | None, printed: list[bytes]) -> None:
         self._control, self._versions, self._printed = control, versions, printed
+        self._began = time.monotonic()
         self._workers: dict[int, socket.socket] = {}
         """By process id of their keeper."""
         self._woken, self._wakes = socket.socketpair()
@@ -147,7 +150,7 @@ class _ForkServer:
             os.dup2(fd, standard)
             os.close(fd)
         arguments = [*fds[:-2], server, request.niceness]
-        if self._versions is None or any(_written(file) != at for file, at in self._versions.items()):
+        if self._versions is None or self._is_old(self._versions):
             for fd in fds[:-2]:
                 os.set_inheritable(fd, True)
             command = python_command("-m", start.__name__, *map(str, arguments))
@@ -162,6 +165,11 @@ class _ForkServer:
         sys.argv[:] = [str(Path(start.__file__))]
         start.run(*arguments)
         sys.exit()
+
+    def _is_old(self, versions: dict[str, int]) -> bool:
+        """Whether a file was saved since it was imported. Looking takes 50 ms, for which the first worker need not wait."""
+        first = not self._workers and time.monotonic() - self._began < _JUST_NOW
+        return not first and any(_written(file) != at for file, at in versions.items())
 
 
 def _tell(end: socket.socket, message: Forked | Ended) -> None:
