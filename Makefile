@@ -33,7 +33,8 @@ $(error MANISKILL is release or nightly, not "$(MANISKILL)")
 endif
 BIN := $(VENV)/bin
 # Without compiling: half of the time, for modules of which two thirds are never imported. Python does it when it imports one,
-# unless it is told not to, as in many containers: then each process compiles ten thousand files, and takes thrice as long.
+# unless it is told not to, as in many containers: then each process compiles three thousand files again, and its imports
+# take three times as long. What cannot be imported here is told by the command that needs it.
 unexport PYTHONDONTWRITEBYTECODE
 COMPILE := $(BIN)/python -c 'import workbench.session.worker.loop, workbench.ui.app.live_page' >/dev/null 2>&1 || true
 PIP_INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -q --no-compile -c constraints.txt

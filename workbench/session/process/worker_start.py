@@ -40,7 +40,7 @@ class Forked:
 
 
 @dataclass(frozen=True)
-class Ended:
+class ForkEnded:
     code: int
     """As of ``subprocess``."""
 
@@ -75,7 +75,7 @@ class ForkedKeeper:
                     said = self._told.recv(_LONGEST)
                 except ConnectionResetError:
                     said = b""
-                news = Unpacker((Forked, Ended)).message(said) if said else Ended(-signal.SIGKILL)
+                news = Unpacker((Forked, ForkEnded)).message(said) if said else ForkEnded(-signal.SIGKILL)
                 if isinstance(news, Forked):
                     self._pid = news.pid
                 else:

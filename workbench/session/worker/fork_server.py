@@ -8,14 +8,13 @@ import select
 import signal
 import socket
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
 from workbench.machine.processes.child_python import python_command, quick_imports
 from workbench.machine.processes.wire import Unpacker, pack_message
-from workbench.session.process.worker_start import Ended, Forked, NewWorker
+from workbench.session.process.worker_start import Forked, ForkEnded, NewWorker
 from workbench.session.worker import start
 
 _LONGEST = 1 << 12
@@ -23,7 +22,6 @@ _STANDARD = (1, 2)
 """stdout and stderr."""
 _MOST_PRINTED = 1 << 15
 """Bytes of what the imports printed: as many as fit into a pipe that nobody has read yet."""
-_JUST_NOW = 0.2
 _FDS = 6
 """Of a request: the socket that tells of its end, those of `start.run`, its stdout and its stderr."""
 
@@ -68,7 +66,6 @@ def _written(file: str) -> int:
 class _ForkServer:
     def __init__(self, control: socket.socket, versions: dict[str, int] | None, printed: list[bytes]) -> None:
         self._control, self._versions, self._printed = control, versions, printed
-        self._began = time.monotonic()
         self._workers: dict[int, socket.socket] = {}
         """By process id of their keeper."""
         self._woken, self._wakes = socket.socketpair()
@@ -111,7 +108,7 @@ class _ForkServer:
             while (found := os.waitpid(-1, os.WNOHANG))[0]:
                 pid, status = found
                 if (end := self._workers.pop(pid, None)) is not None:
-                    _tell(end, Ended(os.waitstatus_to_exitcode(status)))
+                    _tell(end, ForkEnded(os.waitstatus_to_exitcode(status)))
                     end.close()
 
     def _fork(self, request: NewWorker, fds: list[int]) -> None:
@@ -120,13 +117,13 @@ class _ForkServer:
         looker.register(end, select.POLLIN)
         pid, server = 0, os.getpid()
         if looker.poll(0):
-            _tell(end, Ended(-signal.SIGTERM))  # it was ended while we imported
+            _tell(end, ForkEnded(-signal.SIGTERM))  # it was ended while we imported
         else:
             try:
                 pid = os.fork()
             except OSError as error:  # no memory, or too many processes; those that run are to go on
                 os.write(fds[-1], f"workbench: no worker can be started: {error}\n".encode())
-                _tell(end, Ended(1))
+                _tell(end, ForkEnded(1))
             else:
                 if pid == 0:
                     self._become_worker(request, server, end, fds[1:])
@@ -150,7 +147,7 @@ class _ForkServer:
             os.dup2(fd, standard)
             os.close(fd)
         arguments = [*fds[:-2], server, request.niceness]
-        if self._versions is None or self._is_old(self._versions):
+        if self._versions is None or any(_written(file) != at for file, at in self._versions.items()):
             for fd in fds[:-2]:
                 os.set_inheritable(fd, True)
             command = python_command("-m", start.__name__, *map(str, arguments))
@@ -166,13 +163,8 @@ class _ForkServer:
         start.run(*arguments)
         sys.exit()
 
-    def _is_old(self, versions: dict[str, int]) -> bool:
-        """Whether a file was saved since it was imported. Looking takes 50 ms, for which the first worker need not wait."""
-        first = not self._workers and time.monotonic() - self._began < _JUST_NOW
-        return not first and any(_written(file) != at for file, at in versions.items())
 
-
-def _tell(end: socket.socket, message: Forked | Ended) -> None:
+def _tell(end: socket.socket, message: Forked | ForkEnded) -> None:
     with suppress(OSError):  # who started it has left
         end.send(pack_message(message))
 
