@@ -62,17 +62,6 @@ def test_the_solved_episode_is_saved_like_any_other(session: Session) -> None:
     assert view.recording.saving.message.startswith("saved 1 episode") and not view.recording.saving.failed
 
 
-def test_a_pressed_step_is_made_also_if_the_env_selected_meanwhile_needs_no_plan(session: Session) -> None:
-    # Env 0 is solved.
-    last = session.view().timeline.last
-    session.change(selected_env=1)
-    session.step()
-    wait_until(session, lambda view: view.solve.state in ("starting", "planning"), "the planning")
-    session.change(selected_env=0)
-    view = wait_until(session, lambda view: view.timeline.last > last, "the step")
-    assert view.timeline.last == last + 1 and not view.playing
-
-
 def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(session: Session) -> None:
     start_over(session, 4)
     view = step(session)
