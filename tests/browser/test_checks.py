@@ -59,6 +59,7 @@ def test_a_broken_save_is_found_with_its_line_and_mending_it_clears_the_list(des
     expect(card).to_have_count(0)
 
 
+@pytest.mark.slow
 def test_a_check_can_be_stopped_and_asked_for_and_nothing_went_wrong_in_the_console(desk: Desk) -> None:
     # A check of the version before, stopped, would say so for as long as the new one takes to load.
     expect(desk.page.get_by_text(re.compile(r"^\d+ rules checked in "))).to_be_visible(timeout=180_000)

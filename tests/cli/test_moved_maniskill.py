@@ -89,6 +89,7 @@ def test_what_has_moved_is_named_with_what_it_disables_and_the_task_opens(tmp_pa
     assert f"pip install {installed[0]}=={installed[1]}" in said
 
 
+@pytest.mark.slow
 def test_one_that_cannot_be_imported_is_named_with_the_tested_versions(tmp_path: Path) -> None:
     copy_of_maniskill(tmp_path, {"class RenderCamera": "class CameraOfAnotherYear"})
     said = printed_by_open(tmp_path, "The tested versions")

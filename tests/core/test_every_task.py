@@ -21,7 +21,11 @@ from tests.sweeps.upstream_faults import FAULTS, Fault, where_it_fails
 from workbench.core.env.task_env import TaskEnv
 
 ROOT = Path(__file__).parents[2]
-WITH_CAMERAS = ("PushCube-v1", "TriFingerRotateCubeLevel4-v1", "MS-CartpoleBalance-v1")
+WITH_CAMERAS = (
+    "PushCube-v1",
+    pytest.param("TriFingerRotateCubeLevel4-v1", marks=pytest.mark.slow),
+    "MS-CartpoleBalance-v1",
+)
 
 
 def rows_of_the_page() -> dict[str, list[str]]:

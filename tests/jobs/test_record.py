@@ -114,7 +114,12 @@ def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(recorded: Recor
 
 @pytest.mark.parametrize(
     ("num_envs", "workers", "executor"),
-    [(1, 1, None), pytest.param(1, 1, Processes(1), marks=pytest.mark.slow), (1, 3, None), (3, 1, None)],
+    [
+        (1, 1, None),
+        pytest.param(1, 1, Processes(1), marks=pytest.mark.slow),
+        pytest.param(1, 3, None, marks=pytest.mark.slow),
+        (3, 1, None),
+    ],
 )
 def test_the_episodes_are_the_same_on_any_number_of_envs_and_processes(
     recorded: Recorded, num_envs: int, workers: int, executor: Executor | None, tmp_path: Path

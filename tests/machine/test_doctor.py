@@ -38,6 +38,7 @@ def test_every_topic_is_answered_and_this_machine_runs_the_workbench(
     assert all(finding.advice for finding in findings.values() if finding.ok is not True)
 
 
+@pytest.mark.slow
 def test_versions_are_shown_and_what_they_mean(findings: dict[str, DoctorFinding]) -> None:
     installed = {name: versions.installed(name) for name in (*versions.TESTED, "torch", "numpy")}
     shown = findings["packages"].what

@@ -78,6 +78,7 @@ def run(script: str, tmp_path: Path, ray_folder: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_it_can_be_reached_from_this_machine_with_a_token_only_and_ends_with_the_job(
     tmp_path: Path, ray_folder: str
 ) -> None:

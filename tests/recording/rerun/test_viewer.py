@@ -64,6 +64,7 @@ def listening(pid: int) -> set[str]:
     return {c.laddr.ip for c in connections if c.status == psutil.CONN_LISTEN}
 
 
+@pytest.mark.slow
 def test_the_native_viewer_shows_the_whole_layout(headless: ViewerClient, file: Path, tmp_path: Path) -> None:
     opened = headless.open(str(file))
     assert len(opened.store_ids) == 1

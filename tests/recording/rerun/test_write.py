@@ -103,6 +103,7 @@ def test_options_of_a_reset_that_json_has_no_words_for_are_said_as_text(
     assert read_episode(files.json).info.reset_options == {"at": "/there"}
 
 
+@pytest.mark.slow
 def test_threads_that_write_episodes_of_one_scene_share_its_meshes(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:

@@ -29,7 +29,10 @@ def recorded(make_episode: Maker, folder: Path) -> EpisodeWriter:
     return writer
 
 
-@pytest.mark.parametrize("again, then", [("finish", 0), ("recover", 0), ("recover", errno.EROFS)])
+@pytest.mark.parametrize(
+    "again, then",
+    [("finish", 0), pytest.param("recover", 0, marks=pytest.mark.slow), ("recover", errno.EROFS)],
+)
 def test_whatever_call_fails_the_next_try_makes_the_files_once(
     make_episode: Maker, tmp_path: Path, again: str, then: int
 ) -> None:

@@ -117,6 +117,7 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
     studio.file.drop_plan()
 
 
+@pytest.mark.slow
 def test_a_camera_to_be_added_is_seen_before_and_what_is_left_for_another_plan_is_said(
     session: Session,
 ) -> None:

@@ -127,6 +127,7 @@ def test_a_camera_that_is_dragged_is_seen_from_where_it_came_to_rest_and_is_one_
     wait_until(session, seen_from(BASE, rest), "the placement again")
 
 
+@pytest.mark.slow
 def test_size_and_lens_change_the_live_camera_and_the_observation(session: Session) -> None:
     start = camera(session, BASE).now
     other = replace(start, width=40, height=30, fov=0.8)

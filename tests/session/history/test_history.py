@@ -312,7 +312,7 @@ def test_the_first_reward_of_an_episode_that_is_no_number_is_an_event() -> None:
     assert history.events(0, 1, 99) == [(4, RESET)]
 
 
-@pytest.mark.parametrize("count", [1, 1023, 1024, 1025, 5000])
+@pytest.mark.parametrize("count", [1, 1023, 1024, 1025, pytest.param(5000, marks=pytest.mark.slow)])
 def test_rows_stay_with_their_moments_however_many_there_are(count: int) -> None:
     history = filled(count, 3_000_000)
     expected = [float(m.step.reward[0]) for m in history.between(0, count)]

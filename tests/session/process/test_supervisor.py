@@ -435,6 +435,7 @@ def test_nothing_is_kept_beside_the_worker_that_nobody_asked_for() -> None:
     assert (kept.spare, kept.memory_limit, kept.debug_port, kept.debug_wait) == (False, None, None, False)
 
 
+@pytest.mark.slow
 def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("workbench.session.process.supervisor._SPARE_DELAY", 0.0)
     with minded(WorkerOptions(spare=True)) as one:

@@ -93,6 +93,7 @@ def test_two_forks_do_not_draw_the_same_random_numbers(tmp_path: Path) -> None:
     assert all(a != b for a, b in zip(*drawn))
 
 
+@pytest.mark.slow
 def test_after_a_save_of_what_was_imported_a_worker_imports_it_itself(
     own_forks: WorkerForks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -122,6 +122,7 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
     assert not view.warnings
 
 
+@pytest.mark.slow
 def test_code_that_comes_to_the_same_differs_nowhere(desk: Desk, record) -> None:
     desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
     view = desk.rescored()
