@@ -35,7 +35,7 @@ BESIDES = {
     "nudge_ball": {"loop-over-envs"},
 }
 """Rules that the same mistake breaks too."""
-QUICK = {"nudge_ball", "touch_cube"}
+QUICK = {"knock_can", "nudge_ball", "touch_cube"}
 """One of each kind; every rule has tests of its own in the files beside this one."""
 
 
