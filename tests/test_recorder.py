@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.drive.envs import CPU
+from workbench.machine.processes.family import children
 from workbench.recording.episode.episode import NO_SEED, Episode
 from workbench.recording.reader.read_episode import read_episode, read_maniskill, trajectories
 from workbench.recording.writing.finish import recover
@@ -83,6 +85,30 @@ def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_pa
             np.testing.assert_array_equal(values, other.env_states[name], err_msg=name)
         flat = np.concatenate([v.reshape(one.length + 1, -1) for v in one.obs.values()], axis=1)
         np.testing.assert_array_equal(flat, other.obs[""])
+
+
+@pytest.mark.parametrize(("envs", "cores", "begun"), [(4, 2, 1), (4, 1, 0), (3, 2, 0)])
+def test_where_it_pays_a_process_makes_the_files(
+    child_process: None, tmp_path: Path, envs: int, cores: int, begun: int
+) -> None:
+    """Not of a few envs, and not where there is no core for it."""
+    all_cores = os.sched_getaffinity(0)
+    if len(all_cores) < cores:
+        pytest.skip("this machine has one core")
+    env = workbench.make("PushCube-v1", envs, **CPU)
+    before = children(os.getpid())
+    try:
+        os.sched_setaffinity(0, sorted(all_cores)[:cores])
+        env = workbench.Recorder(env, tmp_path)
+    finally:
+        os.sched_setaffinity(0, all_cores)
+    assert len(set(children(os.getpid())) - set(before)) == begun
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.finish()
+    assert set(children(os.getpid())) <= set(before)
+    assert [episode.length for episode in episodes_in(tmp_path)] == [1] * envs
+    env.close()
 
 
 def test_a_full_disk_warns_once_and_the_run_goes_on(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import draws_its_own_seeds, last_observation, open_env, task_class
+from workbench.core.simulation.stepping import usable_cores
 from workbench.jobs.open_task import describe
 from workbench.jobs.record.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.task import Stepped, TaskDescription
@@ -39,6 +40,9 @@ _MOST_PENDING = 2048
 """Steps times envs that wait at most: 3 MB; fewer after half a second, or when an episode begins."""
 _MOST_PICTURES = 1 << 25
 """Bytes of pictures that wait at most."""
+
+_MANY_ENVS = 4
+"""From here on the files are made in a process: those of fewer envs are made before one has started, or cost the env little."""
 
 
 class _PendingStep(NamedTuple):
@@ -114,7 +118,8 @@ class Recorder(gym.Wrapper):
             if notice := recovered_text(recovered):
                 logger.warning("%s", notice)
         self._task = TaskEnv(base)
-        self._finisher = EpisodeFinisher()
+        many = len(chosen) >= _MANY_ENVS and usable_cores() > 1
+        self._finisher = EpisodeFinisher(in_process=many)
         self._made: list[Future[EpisodeFiles | str]] = []
         """Files of finished episodes that are being written."""
         self._gatherer: EpisodeGatherer | None = None

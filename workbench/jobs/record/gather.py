@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -24,6 +26,7 @@ from workbench.recording.episode.columns import BatchPacker
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.side_files import side_files
 from workbench.recording.writing.episode_writer import NO_OTHERS, EpisodeFiles, EpisodeWriter
+from workbench.recording.writing.files_process import FilesProcess
 from workbench.recording.writing.publish import RecordingError
 
 NOWHERE: Mapping[str, str] = MappingProxyType({})
@@ -323,7 +326,7 @@ class EpisodeFinisher:
     """Writes the files of finished episodes one by one on a thread. Thread-safe.
 
     A second thread would take turns with it for the interpreter: also at the end, when nothing else wants it, two take a quarter longer
-    (measured).
+    (measured). A process does not; then the one that closes makes files too.
     """
 
     def __init__(
@@ -331,17 +334,24 @@ class EpisodeFinisher:
         on_change: Callable[[], None] = lambda: None,
         first: Callable[[], None] | None = None,
         then: Callable[[EpisodeFiles], None] | None = None,
+        in_process: bool = False,
     ) -> None:
         """
         Args:
-            on_change: called on the thread when an episode's files are written, or have failed.
+            on_change: called when an episode's files are written, or have failed: on the thread, or by `close`.
             first: called first on the thread.
             then: called with the files of each episode, which is not finished before.
+            in_process: make the files in a process, for a caller that needs the interpreter: it takes a second of a core to start.
         """
         self._on_change, self._then = on_change, then
         self._lock = threading.Lock()
         self._finished = Finished()
-        self._waiting = 0
+        self._waiting: deque[tuple[GatheredEpisode, Future[EpisodeFiles | str]]] = deque()
+        self._at_work = 0
+        self._process: FilesProcess | None = None
+        if in_process:
+            with suppress(OSError):  # no memory, or too many processes: the thread makes them
+                self._process = FilesProcess()
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="episode-files")
         if first is not None:
             self._pool.submit(first)
@@ -355,23 +365,46 @@ class EpisodeFinisher:
     def waiting(self) -> int:
         """Episodes whose files are not written yet."""
         with self._lock:
-            return self._waiting
+            return len(self._waiting) + self._at_work
 
     def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | str]:
         """Write the files; the result is the reason if that failed. `finished` has it too, until another one succeeds."""
+        made: Future[EpisodeFiles | str] = Future()
         with self._lock:
-            self._waiting += 1
-        return self._pool.submit(self._finish, episode)
+            self._waiting.append((episode, made))
+        self._pool.submit(self._finish_next)
+        return made
 
     def close(self) -> None:
         """Wait for the files under way."""
+        while self._process is not None and self._process.is_ready and self._finish_one(None):
+            pass
         self._pool.shutdown(wait=True)
+        if self._process is not None:
+            self._process.close()
 
-    def _finish(self, episode: GatheredEpisode) -> EpisodeFiles | str:
+    def _finish_next(self) -> None:
+        self._finish_one(self._process if self._process is not None and self._process.is_ready else None)
+
+    def _finish_one(self, process: FilesProcess | None) -> bool:
+        """Whether one waited."""
+        with self._lock:
+            if not self._waiting:
+                return False
+            episode, made = self._waiting.popleft()
+            self._at_work += 1
+        try:
+            made.set_result(self._finish(episode, process))
+        except BaseException as error:
+            made.set_exception(error)
+            raise
+        return True
+
+    def _finish(self, episode: GatheredEpisode, process: FilesProcess | None) -> EpisodeFiles | str:
         size = 0
         made: EpisodeFiles | str
         try:
-            made = episode.writer.finish()
+            made = episode.writer.finish(process)
             size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))
             if self._then is not None:
                 self._then(made)
@@ -381,7 +414,7 @@ class EpisodeFinisher:
                 report_failure(f"An episode of env {episode.env} could not be written", error)
             made = f"an episode of env {episode.env} could not be written: {error}"
         with self._lock:
-            self._waiting -= 1
+            self._at_work -= 1
             now = self._finished
             if isinstance(made, str):
                 self._finished = replace(now, problem=made)

@@ -19,8 +19,9 @@ from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.episode.columns import TEXT, Layout, TextWriter
 from workbench.recording.episode.encoded_pictures import Modality, encode
 from workbench.recording.episode.episode import EpisodeInfo
+from workbench.recording.writing.files_process import FilesProcess
 from workbench.recording.writing.finish import EpisodeFiles as EpisodeFiles
-from workbench.recording.writing.finish import make_files
+from workbench.recording.writing.finish import make_files, make_files_again
 from workbench.recording.writing.from_journal import Header, header_text
 from workbench.recording.writing.journal import (
     FOLDER,
@@ -155,8 +156,8 @@ class EpisodeWriter:
         except OSError as error:
             raise self._failed(error) from error
 
-    def finish(self) -> EpisodeFiles:
-        """Make the files of the episode. After an error it can be called again, or `close`.
+    def finish(self, process: FilesProcess | None = None) -> EpisodeFiles:
+        """Make the files of the episode, in `process` if it can. After an error it can be called again, or `close`.
 
         Raises:
             ValueError: there is no state yet.
@@ -169,13 +170,20 @@ class EpisodeWriter:
         except OSError as error:
             raise self._failed(error) from error
         try:
-            self._finished = make_files(self._journal.path, self._header, self._folder, self._states)
+            self._finished = self._make_files(process)
         except Exception:
             self._journal.sync()
             self.close()
             raise
         self.discard()
         return self._finished
+
+    def _make_files(self, process: FilesProcess | None) -> EpisodeFiles:
+        rest = self._journal.path, self._header, self._folder, self._states
+        if process is None:
+            return make_files(*rest)
+        made = process.make(self._journal, self._states)
+        return make_files_again(*rest) if made is None else made
 
     def close(self) -> None:
         """Release the journal, which stays for `recover`."""

@@ -79,6 +79,28 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
                 path.unlink(missing_ok=True)
 
 
+def make_files_again(journal: Path, header: Header, folder: Path, states: int) -> EpisodeFiles:
+    """`make_files` where another process was asked for it and ended, at any moment of its work. Raises as `make_files`."""
+    try:
+        stem = _already_made(header.info, journal, folder)
+        if stem is None:
+            return make_files(journal, header, folder, states)
+        with contextlib.closing(JournalReader(journal)) as reader:
+            episode = episode_in(reader, header)
+    except RecordingError:
+        raise
+    except OSError as error:
+        raise RecordingError(
+            f"Cannot write the recording of {header.info.task} to {folder}: {reason(error, folder)}"
+        ) from error
+    assert episode is not None  # else there were no files
+    for path in temporary_files(journal):
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+    rrd, h5, json = (folder / f"{stem}{suffix}" for suffix in SUFFIXES)
+    return EpisodeFiles(rrd, h5, json, episode.solved_at, episode.means)
+
+
 def temporary_files(journal: Path) -> tuple[Path, ...]:
     """Paths of an episode's files until they are complete."""
     return tuple(journal.with_suffix(suffix) for suffix in SUFFIXES)
@@ -163,7 +185,7 @@ def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
         files = None
         with contextlib.closing(JournalReader(journal)) as reader:
             header = read_header(reader, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
-            if header is not None and not _already_made(header.info, journal, folder):
+            if header is not None and _already_made(header.info, journal, folder) is None:
                 header = mark_recovered(header)
                 episode = episode_in(reader, header)
                 if episode is not None and episode.length > 0:
@@ -174,19 +196,19 @@ def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
         os.close(descriptor)
 
 
-def _already_made(info: EpisodeInfo, journal: Path, folder: Path) -> bool:
-    """Whether the writer had published its files; deletes files of an incomplete publication."""
+def _already_made(info: EpisodeInfo, journal: Path, folder: Path) -> str | None:
+    """The stem of its files, if the writer had published them; deletes files of an incomplete publication."""
     temporaries = dict(zip(SUFFIXES, temporary_files(journal)))
     for stem in _stems(folder, episode_stem(info)):
         if _id_of(folder / f"{stem}.json") == info.id:
-            return True
+            return stem
         if (folder / f"{stem}.json").exists():
             continue
         for suffix, temporary in temporaries.items():
             path = folder / f"{stem}{suffix}"
             if path.exists() and temporary.exists() and os.path.samefile(path, temporary):
                 path.unlink()
-    return False
+    return None
 
 
 def _stems(folder: Path, stem: str) -> Iterator[str]:

@@ -89,6 +89,11 @@ class Journal:
         _journal_thread.watch(self)
 
     @property
+    def descriptor(self) -> int:
+        """Of the open file, which holds its lock."""
+        return self._descriptor
+
+    @property
     def size(self) -> int:
         """Bytes written and waiting."""
         return self._size + self._waiting_bytes

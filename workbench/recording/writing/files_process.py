@@ -1,0 +1,172 @@
+"""A process that makes the files of episodes while this one goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+from workbench.core.scene.shapes import Visual
+from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.wire import Unpacker, Unreadable, pack, pack_message
+from workbench.recording.writing.finish import EpisodeFiles, make_files
+from workbench.recording.writing.from_journal import read_header
+from workbench.recording.writing.journal import SCENE_SUFFIX, Journal, JournalReader, read_visuals
+
+_LONGEST = 1 << 16
+"""Bytes of a message."""
+
+
+@dataclass(frozen=True)
+class _Make:
+    journal: Path
+    states: int
+
+
+@dataclass(frozen=True)
+class _Ready:
+    """It has done its imports."""
+
+
+@dataclass(frozen=True)
+class _Made:
+    rrd: str
+    h5: str
+    json: str
+    """Names."""
+    solved_at: int | None
+    means: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _NotMade:
+    """Whoever asked finds out why, by making them."""
+
+
+class FilesProcess:
+    """Makes files from journals, which hold all that they need. One thread may call `make`, any `is_ready`.
+
+    On a thread it would take turns for the interpreter with the env: PhysX's calls keep the lock. It takes a second of a core to start, and
+    110 MB (measured).
+    """
+
+    def __init__(self) -> None:
+        """Start it, not waiting for it. Raises OSError."""
+        self._end, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._is_ready = False
+        self._asking = threading.Lock()
+        self._unpacker = Unpacker((_Ready, _Made, _NotMade))
+        with theirs:
+            try:
+                self._process = subprocess.Popen(
+                    python_command("-m", __name__, str(theirs.fileno())),
+                    env=child_environment(),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    pass_fds=[theirs.fileno()],
+                    process_group=0,  # Ctrl-C is for the program that records, which still needs it
+                )
+            except OSError:
+                self._end.close()
+                raise
+
+    @property
+    def is_ready(self) -> bool:
+        """False until it has done its imports, and once it has ended."""
+        with self._asking:
+            if not self._is_ready and self._end.fileno() >= 0 and _has_come(self._end):
+                self._is_ready = isinstance(self._receive(), _Ready)
+            return self._is_ready
+
+    def make(self, journal: Journal, states: int) -> EpisodeFiles | None:
+        """`make_files` there, with the folder of the journal's; None if it could not, and may have begun."""
+        path = journal.path.absolute()
+        try:
+            # With the descriptor goes the lock: nobody recovers the journal while it is at work, also if we are killed.
+            socket.send_fds(self._end, [pack(_Make(path, states))], [journal.descriptor])
+            made = self._receive()
+        except OSError:
+            made = None
+        if isinstance(made, _Made):
+            folder = journal.path.parent.parent
+            return EpisodeFiles(
+                folder / made.rrd, folder / made.h5, folder / made.json, made.solved_at, made.means
+            )
+        if made is None:
+            self.close()
+        return None
+
+    def close(self) -> None:
+        """End it, at once."""
+        self._is_ready = False
+        self._end.close()
+        self._process.kill()
+        self._process.wait()
+
+    def _receive(self) -> _Ready | _Made | _NotMade | None:
+        """None if it has ended."""
+        try:
+            said = self._end.recv(_LONGEST)
+            return self._unpacker.message(said) if said else None
+        except (OSError, Unreadable):
+            return None
+
+
+def _has_come(end: socket.socket) -> bool:
+    looker = select.poll()
+    looker.register(end, select.POLLIN)
+    return bool(looker.poll(0))
+
+
+# --- in the process ----------------------------------------------------------------------------
+
+
+def main() -> None:
+    """``python -m workbench.recording.writing.files_process SOCKET``. It ends when its socket closes."""
+    end = socket.socket(fileno=int(sys.argv[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    scenes: dict[tuple[int, ...], tuple[Visual, ...]] = {}
+    unpacker = Unpacker()
+    with contextlib.suppress(ConnectionError):
+        end.send(pack_message(_Ready()))
+        while True:
+            message, fds, _, _ = socket.recv_fds(end, _LONGEST, 1)
+            if not message:
+                return
+            try:
+                made = _make(unpacker.unpack(message, _Make), scenes)
+            finally:
+                for fd in fds:
+                    os.close(fd)
+            end.send(pack_message(made))
+
+
+def _make(what: _Make, scenes: dict[tuple[int, ...], tuple[Visual, ...]]) -> _Made | _NotMade:
+    try:
+        # Episodes of a scene have one file, by hard links, and share what is made of its meshes.
+        path = what.journal.with_suffix(SCENE_SUFFIX)
+        file = os.stat(path)
+        key = (file.st_dev, file.st_ino, file.st_mtime_ns, file.st_size)
+        if key not in scenes:
+            scenes.clear()
+            scenes[key] = read_visuals(path)
+        with contextlib.closing(JournalReader(what.journal)) as reader:
+            header = read_header(reader, scenes[key])
+        if header is None:
+            return _NotMade()
+        files = make_files(what.journal, header, what.journal.parent.parent, what.states)
+    except Exception:
+        return _NotMade()
+    return _Made(files.rrd.name, files.h5.name, files.json.name, files.solved_at, dict(files.means))
+
+
+if __name__ == "__main__":
+    main()
