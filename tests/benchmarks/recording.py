@@ -9,12 +9,14 @@ content, which is all but the .rrd without a camera and everything with one, and
 What a recorder takes is what a step takes beyond the env's own, which is measured within the same step: on a machine that others use
 too, two runs differ by more than a recorder takes. Stepping is that. The whole run is some episodes, one after the other, until the files
 of the last are there, without what the env took of it. RecordEpisode makes the files of an episode when the next one begins, ours while it
-happens, on another thread; what that takes of the processor is a row of its own, as the env may have wanted it, and so is the whole
-run with the env, which shows what it waited. Times are medians of the rounds. Bytes a step are a difference of two lengths, so that neither side's fixed parts (the scene's meshes, the sources' texts) count.
+happens, in a process where there are many envs, else on another thread; what that takes of the processor, the process's start with it,
+is a row of its own, as the env may have wanted it, and so is the whole run with the env, which shows what it waited. Where there is
+a process, a run without one is beside it, which also gives the processor time of the same content. Times are medians of the rounds. Bytes a step are a difference of two lengths, so that neither side's fixed parts (the scene's meshes, the sources' texts) count.
 """
 
 from __future__ import annotations
 
+import resource
 import shutil
 import statistics
 import sys
@@ -34,9 +36,12 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 import workbench
+from workbench import recorder as recorder_module
 from workbench.recording.writing import finish as make_files
 
 SIDES = ("RecordEpisode", "Recorder")
+THREAD = "on a thread"
+"""`Recorder` without its process."""
 
 
 @dataclass
@@ -99,6 +104,12 @@ def on_threads() -> float:
     return alive + RecordersThread.ended
 
 
+def in_processes() -> float:
+    """The same, of processes that have ended."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return ended.ru_utime + ended.ru_stime
+
+
 @dataclass(frozen=True)
 class Run:
     """Seconds of all its episodes."""
@@ -112,9 +123,9 @@ class Run:
     env_and_all: float
     """All that the run took: the env's own steps are slower where another thread wants the interpreter meanwhile."""
     processor: float
-    """The whole, of the processor, all threads of the recorder."""
+    """The whole, of the processor, all threads of the recorder, and its process."""
     rrd: float
-    """Of `processor`, what the .rrd took."""
+    """Of `processor`, what the .rrd took; not where a process made it."""
     size: dict[str, int]
     """Bytes by suffix."""
 
@@ -142,17 +153,19 @@ class _Rrd:
 
 
 rrd = _Rrd()
+many_envs = recorder_module._MANY_ENVS
 
 
 def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes: int = 1) -> Run:
     folder = Path(tempfile.mkdtemp(prefix="recording-"))
     timed = Timed(env)
+    began, at_first = time.perf_counter(), time.thread_time() + on_threads() + in_processes()
     if side == "RecordEpisode":
         recorder: Any = RecordEpisode(timed, str(folder), save_video=False, trajectory_name="run")  # type: ignore[arg-type]
     else:
+        recorder_module._MANY_ENVS = 10**9 if side == THREAD else many_envs
         recorder = workbench.Recorder(timed, folder, pictures=("base_camera",) if camera else False)
     rrd.taken = 0.0
-    began, at_first = time.perf_counter(), time.thread_time() + on_threads()
     stepping = 0.0
     for episode in range(episodes):
         recorder.reset(seed=episode)
@@ -162,7 +175,7 @@ def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes
         stepping += time.perf_counter() - clock
     finish(side, recorder)
     whole = time.perf_counter() - began
-    processor = time.thread_time() + on_threads() - at_first
+    processor = time.thread_time() + on_threads() + in_processes() - at_first
     size = {
         suffix: sum(p.stat().st_size for p in folder.glob(f"*{suffix}"))
         for suffix in (".h5", ".json", ".rrd")
@@ -184,7 +197,7 @@ def finish(side: str, wrapped: Any) -> None:
     if side == "RecordEpisode":
         wrapped.flush_trajectory()
         wrapped._h5_file.close()
-    elif side == "Recorder":
+    else:
         wrapped.finish()
 
 
@@ -196,14 +209,15 @@ def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: i
     rng = np.random.default_rng(0)
     shape = (steps, num_envs, env.action_space.shape[-1])  # type: ignore[index]
     actions = list(torch.from_numpy(rng.uniform(-1, 1, shape).astype(np.float32)))
-    runs: dict[str, list[Run]] = {side: [] for side in SIDES}
-    for side in SIDES:
+    sides = SIDES if camera or num_envs < many_envs else (*SIDES, THREAD)
+    runs: dict[str, list[Run]] = {side: [] for side in sides}
+    for side in sides:
         run(side, env, actions[:3], camera)  # first imports, first shaders
     for number in range(rounds):
-        for side in SIDES if number % 2 else SIDES[::-1]:
+        for side in sides if number % 2 else sides[::-1]:
             runs[side].append(run(side, env, actions, camera, options.episodes))
     sizes = {}
-    for side in SIDES:
+    for side in sides:
         half, whole = (run(side, env, some, camera).size for some in (actions[: steps // 2], actions))
         rest = (steps - steps // 2) * num_envs
         sizes[side] = {suffix: (whole[suffix] - half[suffix]) / rest for suffix in whole}
@@ -225,15 +239,26 @@ def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: i
         ("ms a step: stepping", lambda side: took(side, "stepping")),
         ("ms a step: the whole run", lambda side: took(side, "whole")),
         ("ms a step: the whole run, with the env", lambda side: took(side, "env_and_all")),
-        ("ms a step: processor, same content", lambda side: took(side, processor)),
+        (
+            "ms a step: processor, same content",
+            lambda side: took(sides[-1] if side == "Recorder" else side, processor),
+        ),
         ("ms a step: processor, everything", lambda side: took(side, "processor")),
         ("bytes a step and env: same content", lambda side: weighs(side, *same)),
         ("bytes a step and env: everything", lambda side: weighs(side, *whole)),
     ]
-    print(f"  {'':38s} {'Recorder':>14s} {'RecordEpisode':>14s} {'ratio':>6s}")
+    print(
+        f"  {'':38s} {'Recorder':>14s} {'RecordEpisode':>14s} {'ratio':>6s}"
+        + f" {THREAD:>14s} {'ratio':>6s}" * (len(sides) > 2)
+    )
     for name, of in rows:
-        ours, theirs = of("Recorder"), of("RecordEpisode")
-        print(f"  {name:38s} {ours:14.3f} {theirs:14.3f} {ours / theirs:6.2f}", flush=True)
+        theirs = of("RecordEpisode")
+        ours = [of(side) for side in sides[1:]]
+        print(
+            f"  {name:38s} {ours[0]:14.3f} {theirs:14.3f} {ours[0] / theirs:6.2f}"
+            + "".join(f" {one:14.3f} {one / theirs:6.2f}" for one in ours[1:]),
+            flush=True,
+        )
 
 
 def main(options: Options) -> None:

@@ -53,8 +53,8 @@ class _NotMade:
 class FilesProcess:
     """Makes files from journals, which hold all that they need. One thread may call `make`, any `is_ready`.
 
-    On a thread it would take turns for the interpreter with the env: PhysX's calls keep the lock. It takes a second of a core to start, and
-    110 MB (measured).
+    A thread would take turns for the interpreter with the env, whose calls of PhysX keep the lock. It takes a second of a core to start, and
+    110 MB. The lowest priority was no faster, and would let journals pile up where all cores are busy.
     """
 
     def __init__(self) -> None:
