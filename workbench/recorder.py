@@ -73,7 +73,7 @@ class Recorder(gym.Wrapper):
     Writes the files of the page and of ``workbench record``, one set per episode: .rrd, .h5 and .json. An episode of an env
     lasts from its reset to its next one, so partial resets, auto-resets and wrappers that continue after success work. The
     env's own state, observation and reward are recorded, so it goes directly around the env of `make`, inside all wrappers
-    that change actions.
+    that change actions. From four envs on, a process makes the files.
 
     A training loop must not end because a disk is full: an error of the files is one warning, ends the recording, and is
     kept in `problem`.
