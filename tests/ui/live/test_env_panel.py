@@ -41,7 +41,9 @@ class Envs:
 
 @pytest.fixture
 def envs(panels: Panels, session: Session, clock: Clock) -> Envs:
-    return Envs(Parts((EnvPanel(panels.server, session),), clock), panels, session)
+    envs = Envs(Parts((EnvPanel(panels.server, session),), clock), panels, session)
+    panels.press("unfolded")
+    return envs
 
 
 def test_pages_filters_and_rows_are_pressed(envs: Envs) -> None:
@@ -95,3 +97,28 @@ def test_a_step_is_in_the_table_a_moment_later_and_a_chosen_env_at_once(envs: En
     clock.passes()
     envs.shown()
     assert envs.panels.html() != before
+
+
+def test_a_folded_table_is_not_drawn_while_steps_go_on(panels: Panels, session: Session, clock: Clock) -> None:
+    panel = EnvPanel(panels.server, session)
+    envs = Envs(Parts((panel,), clock), panels, session)
+
+    def stepped() -> str:
+        last = session.view().timeline.last
+        session.step()
+        wait_until(session, lambda view: view.timeline.last == last + 1, "a step")
+        clock.passes()
+        envs.shown()
+        return panels.html()
+
+    assert envs.shown() == list(range(MOST_ROWS))  # it does not open empty
+    before = panels.html()
+    assert stepped() == before
+    panel.unfold()
+    envs.shown()
+    shown = panels.html()
+    assert shown != before and stepped() != shown
+    panel.fold()
+    envs.shown()
+    before = panels.html()
+    assert stepped() == before

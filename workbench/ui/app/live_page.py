@@ -248,8 +248,10 @@ class Page:
     def _toggle_envs(self) -> None:
         self._envs_open = not self._envs_open
         if self._envs_open:
+            self._envs.unfold()
             self._env_window.expand()
         else:
+            self._envs.fold()
             self._env_window.minimize()
 
     def _count_clients(self) -> int:

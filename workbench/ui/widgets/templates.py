@@ -92,6 +92,7 @@ def _environment() -> jinja2.Environment:
         finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,
+        auto_reload=False,  # else every panel looks at its file on every drawing
     )
     filters = (place, size, percent, counted, short_text, letter, colour)
     environment.filters.update({filter.__name__: filter for filter in filters})
