@@ -99,7 +99,9 @@ def test_a_step_is_in_the_table_a_moment_later_and_a_chosen_env_at_once(envs: En
     assert envs.panels.html() != before
 
 
-def test_a_folded_table_is_not_drawn_while_steps_go_on(panels: Panels, session: Session, clock: Clock) -> None:
+def test_a_folded_table_is_not_drawn_while_steps_go_on(
+    panels: Panels, session: Session, clock: Clock
+) -> None:
     panel = EnvPanel(panels.server, session)
     envs = Envs(Parts((panel,), clock), panels, session)
 

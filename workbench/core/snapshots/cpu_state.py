@@ -13,6 +13,7 @@ import sapien
 import sapien.physx as physx
 from numpy.typing import NDArray
 
+from workbench.core.backends import give_brdf_table
 from workbench.core.scene.scene_index import hidden_poses, once_a_scene, scene_index
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
 from workbench.core.simulation.state_layout import BODY
@@ -466,14 +467,18 @@ def _keeps_entity_ids(scene: sapien.Scene) -> bool:
     return [entity.per_scene_id for entity in scene.entities] == [*range(1, len(scene.entities) + 1)]
 
 
-def _moved(old: sapien.Scene, system: physx.PhysxCpuSystem) -> sapien.Scene:
-    """A scene over `system` that has all entities of `old`, in their order, and its render system."""
+def _moved(old: sapien.Scene, physics: physx.PhysxCpuSystem) -> sapien.Scene:
+    """A scene over `physics` that has all entities of `old`, in their order, and its render system."""
     entities = old.entities
-    new = sapien.Scene([system, *_render_systems(old)])
+    systems = _render_systems(old)
+    new = sapien.Scene([physics, *systems])
     for entity in entities:
         entity.remove_from_scene()
     for entity in entities:
         new.add_entity(entity)
+    for system in systems:
+        for camera in system.cameras:
+            give_brdf_table(camera)  # it has a new renderer, which would compute one for seconds
     return new
 
 
