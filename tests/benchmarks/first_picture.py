@@ -90,6 +90,7 @@ def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
             session.set_clients(1)
             yield "the task's first moment, s", after(lambda view: view.timeline.moments == 1)
             yield "its first picture, s", after(lambda view: bool(view.pictures))
+            yield "its first exact picture, s", after(is_exact)
             wait(session, lambda view: view.vitals.spare_ready)
             yield "processor until then and until the spare is warm, s", processor()
             yield "memory of both, MB", memory()
@@ -105,6 +106,11 @@ def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
                 yield restarted, after(drawn)
         finally:
             session.close()
+
+
+def is_exact(view: SessionView) -> bool:
+    """Until then a page that stands still gets a fast one, and a worker that draws an exact one answers nothing."""
+    return bool(view.pictures) and all(picture.degree == "exact" for picture in view.pictures.values())
 
 
 def processor() -> float:
@@ -145,12 +151,15 @@ def parts(num_envs: int) -> None:
     torch.set_num_threads(1)
     from workbench.core.cameras.render import take_pictures
     from workbench.core.scene.read_scene import read_geometry
+    from workbench.core.snapshots.snapshot import begin_anew
     from workbench.jobs.open_task import open_task
 
     with part("the render device"):
         sapien.render.RenderSystem(sapien.Device("cpu"))
     with part("open the task"):
         opened = open_task(str(TASK), TaskOptions(num_envs=num_envs))
+    with part("begin anew, as a worker does"):
+        begin_anew(opened.env.env, list(range(num_envs)))
     with part("its shapes for the page"):
         read_geometry(opened.env.env)
     for name, kind, modalities in CAMERAS:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -175,3 +177,24 @@ def test_a_group_of_no_such_name_is_missing_and_not_refused(tmp_path: Path) -> N
             file["traj_1"]
     with open_h5(write(tmp_path, external_link)) as other, pytest.raises(RefusedH5):
         other["traj_0/obs"]
+
+
+PLUGINS = """
+import ctypes, os, re
+before = dict(os.environ)
+import workbench.recording.maniskill.safe_h5
+assert dict(os.environ) == before
+(hdf5,) = set(re.findall(r"/.*libhdf5[-.].*", open("/proc/self/maps").read()))
+state = ctypes.c_uint(99)
+assert ctypes.CDLL(hdf5).H5PLget_loading_state(ctypes.byref(state)) == 0
+print(state.value)
+"""
+
+
+def test_no_plugin_is_loaded_and_the_environment_stays(child_process: None) -> None:
+    """A file may name a filter. Workers inherit the environment, and one that differs from the first one's is not forked."""
+    environment = {name: value for name, value in os.environ.items() if name != "HDF5_PLUGIN_PRELOAD"}
+    said = subprocess.run(
+        [sys.executable, "-c", PLUGINS], capture_output=True, text=True, env=environment, check=True
+    )
+    assert said.stdout == "0\n"

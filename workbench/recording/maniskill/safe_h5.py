@@ -8,14 +8,31 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-# HDF5 searches for filter plugins when it is loaded; "::" turns that off.
-os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")
-
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.machine.files import open_regular_file
+
+_PLUGINS = "HDF5_PLUGIN_PRELOAD"
+
+
+def _without_plugins() -> None:
+    """Turn HDF5's filter plugins off, which a file may name, and which are libraries in a folder that the environment names.
+
+    HDF5 reads the variable when its plugins are first asked for. It is not left behind: workers, which run the author's code, inherit
+    the environment.
+    """
+    before = os.environ.get(_PLUGINS)
+    os.environ[_PLUGINS] = before or "::"
+    try:
+        h5py.h5pl.size()
+    finally:
+        if before is None:
+            del os.environ[_PLUGINS]
+
+
+_without_plugins()
 
 MOST_BYTES = 1 << 30
 """Numbers that are read from one open file."""
