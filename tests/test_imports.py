@@ -27,7 +27,6 @@ FEWEST_LINES = 60
 SHORT_FOR_A_REASON = {
     "core/env_numbers": "snapshots, cameras and resets read the numbers of envs by it, and none of them may import another",
     "machine/parse_python": "core, authoring, checks, jobs and session parse by it, under one lock",
-    "machine/processes/child_python": "every process is started by it",
     "machine/processes/own_path": "it is imported before anything else, so that nothing else is imported from the wrong place",
 }
 """Modules below `FEWEST_LINES` lines, each with why it stays apart."""

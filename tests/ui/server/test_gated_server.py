@@ -478,3 +478,24 @@ def _small_picture():
 
 def test_the_usual_port_is_the_default():
     assert ServerOptions().port == DEFAULT_PORT == 8080
+
+
+PICTURE = """
+import os
+before = dict(os.environ)
+import numpy as np
+from workbench.ui.server.gated_server import ServerOptions, open_server
+door = open_server(ServerOptions(port=0))
+door.server.gui.add_image(np.zeros((8, 8, 3), np.uint8))
+door.close()
+print({name: value for name, value in os.environ.items() if before.get(name) != value})
+"""
+
+
+def test_a_picture_on_the_page_leaves_the_environment(child_process: None) -> None:
+    """Children have it: OpenCV has libraries looked for in the current folder too, which may be one of downloaded recordings."""
+    environment = {name: value for name, value in os.environ.items() if name != "LD_LIBRARY_PATH"}
+    said = subprocess.run(
+        [sys.executable, "-c", PICTURE], capture_output=True, text=True, env=environment, check=True
+    )
+    assert said.stdout.splitlines()[-1] == "{}"

@@ -1,4 +1,4 @@
-"""Starts Python child processes, and speeds up slow imports."""
+"""Starts Python child processes, and speeds up slow imports or undoes what they leave."""
 
 from __future__ import annotations
 
@@ -29,6 +29,21 @@ def child_environment(**further: str) -> dict[str, str]:
     environment = {**os.environ, **further}
     entries = [entry for entry in environment.pop("PYTHONPATH", "").split(os.pathsep) if entry]
     return environment if not entries else {**environment, "PYTHONPATH": os.pathsep.join(entries)}
+
+
+@contextmanager
+def unchanged_environment() -> Iterator[None]:
+    """Undo what an import within this sets: children inherit it, and a worker is forked only where the environment is the
+    first one's."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        for name in {*before, *os.environ}:
+            if name not in before:
+                del os.environ[name]
+            elif os.environ.get(name) != before[name]:
+                os.environ[name] = before[name]
 
 
 @contextmanager

@@ -13,26 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.machine.files import open_regular_file
+from workbench.machine.processes.child_python import unchanged_environment
 
-_PLUGINS = "HDF5_PLUGIN_PRELOAD"
-
-
-def _without_plugins() -> None:
-    """Turn HDF5's filter plugins off, which a file may name, and which are libraries in a folder that the environment names.
-
-    HDF5 reads the variable when its plugins are first asked for. It is not left behind: workers, which run the author's code, inherit
-    the environment.
-    """
-    before = os.environ.get(_PLUGINS)
-    os.environ[_PLUGINS] = before or "::"
-    try:
-        h5py.h5pl.size()
-    finally:
-        if before is None:
-            del os.environ[_PLUGINS]
-
-
-_without_plugins()
+with unchanged_environment():
+    # HDF5 reads it when plugins are first asked for: "::" means none. A file names a filter, and a folder of libraries may hold it.
+    os.environ.setdefault("HDF5_PLUGIN_PRELOAD", "::")
+    h5py.h5pl.size()
 
 MOST_BYTES = 1 << 30
 """Numbers that are read from one open file."""

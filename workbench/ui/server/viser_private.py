@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from workbench.machine.processes.child_python import unchanged_environment
 from workbench.machine.versions import command_for_tested_versions
 from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
 from workbench.ui.server.line import CompressWhenFar, Line
@@ -437,6 +438,9 @@ def make_viser(
     served.append(server)
     for name in REFUSED_FROM_CLIENTS:
         server._websock_server.unregister_handler(getattr(viser._messages, name))
+    with unchanged_environment():
+        # For its first picture viser imports OpenCV, which adds the current folder to where all children look for libraries.
+        server.gui.add_image(np.zeros((1, 1, 3), np.uint8)).remove()
     return GatedViser(server, serving[0])
 
 
