@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, expect
@@ -12,6 +13,7 @@ from tests.drive.desk import Desk
 from tests.drive.page import page_on
 from tests.drive.waiting import until
 from tests.session.hazards import calm, provoke, write_task
+from workbench.machine.processes.family import family
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ARGUMENTS = "--num-envs 2 --env render_backend=none".split()
@@ -57,6 +59,10 @@ def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
     desk.button("Restart").click()
     expect(desk.page.get_by_text(re.compile("is restored where it was"))).to_be_visible()
     assert desk.opened.wait_for_line("worker failed.*stopped by hand in evaluate")
+    # The new one is a fork, and so is the next spare: none has done the imports for itself.
+    every = [Path(f"/proc/{pid}/cmdline").read_text() for pid in family(desk.opened.process.pid)]
+    assert any("worker.fork_server" in one for one in every)
+    assert not any("session.worker.start" in one for one in every)
 
 
 def test_the_log_shows_what_was_printed_and_forgets_it(desk: Desk) -> None:
