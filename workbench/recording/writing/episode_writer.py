@@ -182,7 +182,7 @@ class EpisodeWriter:
         rest = self._journal.path, self._header, self._folder, self._states
         if process is None:
             return make_files(*rest)
-        made = process.make(self._journal, self._states)
+        made = process.make(self._journal, self._header, self._states)
         return make_files_again(*rest) if made is None else made
 
     def close(self) -> None:

@@ -17,7 +17,7 @@ from workbench.core.scene.shapes import Visual
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.wire import Unpacker, Unreadable, pack, pack_message
 from workbench.recording.writing.finish import EpisodeFiles, make_files
-from workbench.recording.writing.from_journal import read_header
+from workbench.recording.writing.from_journal import Header, read_header
 from workbench.recording.writing.journal import SCENE_SUFFIX, Journal, JournalReader, read_visuals
 
 _LONGEST = 1 << 16
@@ -28,6 +28,8 @@ _LONGEST = 1 << 16
 class _Make:
     journal: Path
     states: int
+    visuals: int
+    """Meshes of the scene; a file of it that lacks some is broken."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +88,13 @@ class FilesProcess:
                 self._is_ready = isinstance(self._receive(), _Ready)
             return self._is_ready
 
-    def make(self, journal: Journal, states: int) -> EpisodeFiles | None:
-        """`make_files` there, with the folder of the journal's; None if it could not, and may have begun."""
+    def make(self, journal: Journal, header: Header, states: int) -> EpisodeFiles | None:
+        """`make_files` there, in the folder of the journal's; None if it could not, and may have begun."""
         path = journal.path.absolute()
         try:
             # With the descriptor goes the lock: nobody recovers the journal while it is at work, also if we are killed.
-            socket.send_fds(self._end, [pack(_Make(path, states))], [journal.descriptor])
+            asked = _Make(path, states, len(header.geometry.visuals))
+            socket.send_fds(self._end, [pack(asked)], [journal.descriptor])
             made = self._receive()
         except OSError:
             made = None
@@ -160,7 +163,7 @@ def _make(what: _Make, scenes: dict[tuple[int, ...], tuple[Visual, ...]]) -> _Ma
             scenes[key] = read_visuals(path)
         with contextlib.closing(JournalReader(what.journal)) as reader:
             header = read_header(reader, scenes[key])
-        if header is None:
+        if header is None or len(header.geometry.visuals) != what.visuals:
             return _NotMade()
         files = make_files(what.journal, header, what.journal.parent.parent, what.states)
     except Exception:
