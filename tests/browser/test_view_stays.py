@@ -6,7 +6,7 @@ import threading
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, expect
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
@@ -23,8 +23,11 @@ def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
         gated_server.server,
         [Command("step", stepped.set, "S"), Command("a step back", walked.set, "arrowleft")],
     )
+    # It comes after them: a key that is pressed before the page knows the commands is lost.
+    gated_server.server.gui.add_markdown("the commands are there")
     try:
         with page_at(browser, gated_server.url, 1000, 600) as (page, _):
+            expect(page.get_by_text("the commands are there")).to_be_visible(timeout=60_000)
             until(lambda: len(gated_server.server.get_clients()) == 1, "the page")
             (client,) = gated_server.server.get_clients().values()
             until(lambda: client.camera.image_width > 300, "the view")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +22,20 @@ from workbench.ui.app.live_page import Page
 from workbench.ui.live.run_panel import RESET_ALL
 from workbench.ui.widgets.hotkeys import add_hints
 
+WAITS = """
+
+import pathlib, time
+while not pathlib.Path(__file__).with_name("drawn").exists():
+    time.sleep(0.01)
+"""
+"""A worker that was forked has loaded the task before a busy page is drawn for the first time."""
+
 
 @pytest.fixture(scope="module")
 def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return Path(shutil.copy(TASKS / "minimal.py", tmp_path_factory.mktemp("author") / "minimal.py"))
+    file = tmp_path_factory.mktemp("author") / "minimal.py"
+    file.write_text((TASKS / "minimal.py").read_text() + WAITS)
+    return file
 
 
 @dataclass
@@ -62,6 +71,7 @@ def opened(
     panels, clock = Panels(server), Clock()
     page = Page(server, session, clock=clock)
     page.redraw()
+    task_file.with_name("drawn").touch()
     yield Opened(page, session, panels, clock)
     session.close()
     server.stop()
