@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
+import termios
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -47,6 +49,13 @@ def started() -> FilesProcess:
 
 def pid_of(process: FilesProcess) -> int:
     return process._process.pid
+
+
+def unread(process: FilesProcess) -> int:
+    """Bytes that it was sent and has not received."""
+    count = array("i", [0])
+    fcntl.ioctl(process._end, termios.TIOCOUTQ, count)
+    return count[0]
 
 
 def content(rrd: Path) -> dict[str, dict[str, object]]:
@@ -167,7 +176,7 @@ def test_nobody_recovers_what_it_works_on(tmp_path: Path, process: FilesProcess)
     os.kill(pid_of(process), signal.SIGSTOP)
     waiting = EpisodeFinisher()
     future = waiting._pool.submit(writer.finish, process)
-    time.sleep(0.1)
+    until(lambda: unread(process) > 0, "it is asked")
     writer.close()
     assert claim(path) is None
     os.kill(pid_of(process), signal.SIGCONT)

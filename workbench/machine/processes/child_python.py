@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
+import socket
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,6 +31,35 @@ def child_environment(**further: str) -> dict[str, str]:
     environment = {**os.environ, **further}
     entries = [entry for entry in environment.pop("PYTHONPATH", "").split(os.pathsep) if entry]
     return environment if not entries else {**environment, "PYTHONPATH": os.pathsep.join(entries)}
+
+
+def start_with_socket(
+    module: str, environment: dict[str, str], new_session: bool = False
+) -> tuple[subprocess.Popen[bytes], socket.socket]:
+    """Start ``python -m MODULE SOCKET``, which prints nowhere; returns it and the other end of that socket, of whole messages.
+
+    Ctrl-C does not reach it: it is for this process, which still needs it. Raises OSError.
+
+    Args:
+        new_session: give it a session of its own, not only a group.
+    """
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        try:
+            process = subprocess.Popen(
+                python_command("-m", module, str(theirs.fileno())),
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                process_group=None if new_session else 0,
+                start_new_session=new_session,
+            )
+        except OSError:
+            ours.close()
+            raise
+    return process, ours
 
 
 @contextmanager

@@ -73,6 +73,15 @@ def _poll(end: socket.socket) -> select.poll:
     return poll
 
 
+def has_come(end: socket.socket, seconds: float | None = 0.0) -> bool:
+    """Whether something can be read within `seconds` (None waits for ever), be it that the other end is closed; any thread may ask.
+
+    False where another thread has closed `end`.
+    """
+    # By a poll object of its own: one that two threads ask at once raises RuntimeError.
+    return end.fileno() >= 0 and bool(_poll(end).poll(None if seconds is None else 1000 * seconds))
+
+
 class MessageSocket:
     """One end of a socket. Another thread than the one that receives may send, and any may ask whether something `waits`.
 
@@ -111,8 +120,7 @@ class MessageSocket:
 
     def waits(self) -> bool:
         """Whether bytes are waiting to be read; any thread may ask."""
-        # By a poll object of its own: one that two threads ask at once raises RuntimeError.
-        return bool(_poll(self.end).poll(0))
+        return has_come(self.end)
 
     def receive(self, timeout: float | None) -> Any:
         """The next message; None if none is complete within `timeout` seconds (None waits for ever).

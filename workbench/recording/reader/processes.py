@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_python import child_environment, start_with_socket
 from workbench.machine.processes.family import describe_exit
 from workbench.machine.processes.wire import MessageSocket, Unpacker, Unreadable, pack
 from workbench.recording.reader.requests import Answer, CloseEpisodes, GetExitCode, NewReader, Request
@@ -101,19 +101,11 @@ class _ForkServer:
     def _start(self) -> socket.socket:
         if self._control is None or self._process is None or self._process.poll() is not None:
             self._end()
-            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            with theirs:
-                self._process = subprocess.Popen(
-                    python_command("-m", "workbench.recording.reader.fork_server", str(theirs.fileno())),
-                    env=child_environment(**FOR_READING),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    pass_fds=[theirs.fileno()],
-                    start_new_session=True,
-                )
-            ours.settimeout(START_SECONDS)
-            self._control = ours
+            self._process, control = start_with_socket(
+                "workbench.recording.reader.fork_server", child_environment(**FOR_READING), new_session=True
+            )
+            control.settimeout(START_SECONDS)
+            self._control = control
         return self._control
 
     @staticmethod

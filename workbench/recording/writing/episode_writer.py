@@ -21,7 +21,7 @@ from workbench.recording.episode.encoded_pictures import Modality, encode
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.writing.files_process import FilesProcess
 from workbench.recording.writing.finish import EpisodeFiles as EpisodeFiles
-from workbench.recording.writing.finish import make_files, make_files_again
+from workbench.recording.writing.finish import make_files
 from workbench.recording.writing.from_journal import Header, header_text
 from workbench.recording.writing.journal import (
     FOLDER,
@@ -179,11 +179,10 @@ class EpisodeWriter:
         return self._finished
 
     def _make_files(self, process: FilesProcess | None) -> EpisodeFiles:
-        rest = self._journal.path, self._header, self._folder, self._states
-        if process is None:
-            return make_files(*rest)
-        made = process.make(self._journal, self._header, self._states)
-        return make_files_again(*rest) if made is None else made
+        made = process and process.make(self._journal, self._header, self._states)
+        return made or make_files(
+            self._journal.path, self._header, self._folder, self._states, again=process is not None
+        )
 
     def close(self) -> None:
         """Release the journal, which stays for `recover`."""

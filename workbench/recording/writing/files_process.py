@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import signal
 import socket
-import subprocess
 import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.core.scene.shapes import Visual
-from workbench.machine.processes.child_python import child_environment, python_command
-from workbench.machine.processes.wire import Unpacker, Unreadable, pack, pack_message
+from workbench.machine.processes.child_python import child_environment, start_with_socket
+from workbench.machine.processes.wire import Unpacker, Unreadable, has_come, pack, pack_message
 from workbench.recording.writing.finish import EpisodeFiles, make_files
 from workbench.recording.writing.from_journal import Header, read_header
 from workbench.recording.writing.journal import SCENE_SUFFIX, Journal, JournalReader, read_visuals
@@ -61,30 +59,16 @@ class FilesProcess:
 
     def __init__(self) -> None:
         """Start it, not waiting for it. Raises OSError."""
-        self._end, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._is_ready = False
         self._asking = threading.Lock()
         self._unpacker = Unpacker((_Ready, _Made, _NotMade))
-        with theirs:
-            try:
-                self._process = subprocess.Popen(
-                    python_command("-m", __name__, str(theirs.fileno())),
-                    env=child_environment(),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    pass_fds=[theirs.fileno()],
-                    process_group=0,  # Ctrl-C is for the program that records, which still needs it
-                )
-            except OSError:
-                self._end.close()
-                raise
+        self._process, self._end = start_with_socket(__name__, child_environment())
 
     @property
     def is_ready(self) -> bool:
         """False until it has done its imports, and once it has ended."""
         with self._asking:
-            if not self._is_ready and self._end.fileno() >= 0 and _has_come(self._end):
+            if not self._is_ready and has_come(self._end):
                 self._is_ready = isinstance(self._receive(), _Ready)
             return self._is_ready
 
@@ -121,12 +105,6 @@ class FilesProcess:
             return self._unpacker.message(said) if said else None
         except (OSError, Unreadable):
             return None
-
-
-def _has_come(end: socket.socket) -> bool:
-    looker = select.poll()
-    looker.register(end, select.POLLIN)
-    return bool(looker.poll(0))
 
 
 # --- in the process ----------------------------------------------------------------------------

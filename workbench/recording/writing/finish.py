@@ -42,8 +42,14 @@ class EpisodeFiles:
     """As `Episode.means`."""
 
 
-def make_files(journal: Path, header: Header, folder: Path, states: int | None = None) -> EpisodeFiles:
-    """Write the episode in `journal` to `folder`; the journal stays. `states`, if given, is checked.
+def make_files(
+    journal: Path, header: Header, folder: Path, states: int | None = None, again: bool = False
+) -> EpisodeFiles:
+    """Write the episode in `journal` to `folder`; the journal stays.
+
+    Args:
+        states: how many there must be, if given.
+        again: another process was asked for it and ended, at any moment: files that it has published are those.
 
     Raises:
         RecordingError: the files cannot be written; none of them exists then.
@@ -58,6 +64,9 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
             if states is not None and episode.length + 1 != states:
                 there = f"{episode.length + 1} of {states} states"
                 raise OSError(errno.EIO, f"{there} can be read back from {journal.name}")
+            if again and (stem := _already_made(header.info, journal, folder)) is not None:
+                rrd, h5, json = (folder / f"{stem}{suffix}" for suffix in SUFFIXES)
+                return EpisodeFiles(rrd, h5, json, episode.solved_at, episode.means)
             for path in temporaries:
                 path.unlink(missing_ok=True)
             rrd, h5, json = temporaries
@@ -77,28 +86,6 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
             # `recover` deletes what stays; an error here must not hide the one above.
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
-
-
-def make_files_again(journal: Path, header: Header, folder: Path, states: int) -> EpisodeFiles:
-    """`make_files` where another process was asked for it and ended, at any moment of its work. Raises as `make_files`."""
-    try:
-        stem = _already_made(header.info, journal, folder)
-        if stem is None:
-            return make_files(journal, header, folder, states)
-        with contextlib.closing(JournalReader(journal)) as reader:
-            episode = episode_in(reader, header)
-    except RecordingError:
-        raise
-    except OSError as error:
-        raise RecordingError(
-            f"Cannot write the recording of {header.info.task} to {folder}: {reason(error, folder)}"
-        ) from error
-    assert episode is not None  # else there were no files
-    for path in temporary_files(journal):
-        with contextlib.suppress(OSError):
-            path.unlink(missing_ok=True)
-    rrd, h5, json = (folder / f"{stem}{suffix}" for suffix in SUFFIXES)
-    return EpisodeFiles(rrd, h5, json, episode.solved_at, episode.means)
 
 
 def temporary_files(journal: Path) -> tuple[Path, ...]:

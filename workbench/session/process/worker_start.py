@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import os
-import select
 import signal
 import socket
 import subprocess
@@ -14,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import IO
 
-from workbench.machine.processes.child_python import child_environment, python_command
+from workbench.machine.processes.child_python import child_environment, python_command, start_with_socket
 from workbench.machine.processes.family import Keeper
-from workbench.machine.processes.wire import Unpacker, pack
+from workbench.machine.processes.wire import Unpacker, has_come, pack
 
 _GPUS = ("/dev/nvidiactl", "/dev/dxg")
 """One of these is there where CUDA may be (the second in WSL). No worker is forked then: CUDA does not work in a fork of a
@@ -70,7 +69,7 @@ class ForkedKeeper:
     def poll(self) -> int | None:
         """Its exit code; None while it runs. A killed fork server has killed it too."""
         with self._lock:
-            while self._code is None and _has_come(self._told, 0):
+            while self._code is None and has_come(self._told):
                 try:
                     said = self._told.recv(_LONGEST)
                 except ConnectionResetError:
@@ -95,7 +94,7 @@ class ForkedKeeper:
             if left is not None and left <= 0:
                 assert timeout is not None
                 raise subprocess.TimeoutExpired("a worker", timeout)
-            _has_come(self._told, left)
+            has_come(self._told, left)
         return code
 
     def terminate(self) -> None:
@@ -113,14 +112,6 @@ class ForkedKeeper:
                     self._told.send(pack(int(number)))
                 except OSError:
                     pass  # it has ended; `poll` says how
-
-
-def _has_come(end: socket.socket, seconds: float | None) -> bool:
-    if end.fileno() < 0:  # another thread has heard of the end
-        return False
-    looker = select.poll()
-    looker.register(end, select.POLLIN)
-    return bool(looker.poll(None if seconds is None else 1000 * seconds))
 
 
 class WorkerForks:
@@ -160,18 +151,10 @@ class WorkerForks:
         """The socket that it listens to; None if it would not give what a worker started here and now is."""
         come_from = (child_environment(**_UNBUFFERED), _current_folder())
         if self._control is None:
-            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            with theirs:
-                self._process = subprocess.Popen(
-                    python_command("-m", "workbench.session.worker.fork_server", str(theirs.fileno())),
-                    env=come_from[0],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    pass_fds=[theirs.fileno()],
-                    process_group=0,
-                )
-            self._control, self._from = ours, come_from
+            self._process, self._control = start_with_socket(
+                "workbench.session.worker.fork_server", come_from[0]
+            )
+            self._from = come_from
         return self._control if self._from == come_from else None
 
     def _end(self) -> None:

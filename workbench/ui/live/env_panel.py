@@ -234,7 +234,7 @@ HINTS = {
 class EnvPanel(PagePart[SessionView]):
     """The table of envs in the present container. Sorting and filter are the same for all open pages.
 
-    While it is folded in every page only a new task is drawn: 64 rows were half of what the server did while a task played.
+    While it is folded in every page only a new task is drawn: 64 rows were half of what the panels took while a task played.
     """
 
     every = 0.3
