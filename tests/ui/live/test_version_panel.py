@@ -9,6 +9,7 @@ from tests.ui.scenes import problem, running
 from workbench.session.live.view import PastLoad
 from workbench.session.protocol.messages import ReloadReport
 from workbench.ui.live.version_panel import MOST_SHOWN, VersionPanel, took, version_html
+from workbench.ui.widgets.parts import Parts
 
 
 class StillSession:
@@ -53,7 +54,7 @@ def test_before_the_first_reload_it_says_what_saving_does() -> None:
 
 def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(panels: Panels) -> None:
     """It spoke of the good save before, as if that were what had just been saved."""
-    panel = VersionPanel(panels.server, cast(Any, StillSession()))
+    panel = Parts([VersionPanel(panels.server, cast(Any, StillSession()))])
     good = ReloadReport("patched", "only evaluate changed")
     panel.draw(running(4, reload=good))
     assert "not loaded" not in panels.html()
@@ -87,7 +88,7 @@ def test_what_the_author_should_know_stands_there_before_and_after_a_reload() ->
 def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fails(
     panels: Panels,
 ) -> None:
-    panel = VersionPanel(panels.server, cast(Any, StillSession()))
+    panel = Parts([VersionPanel(panels.server, cast(Any, StillSession()))])
     panel.draw(running(4))
     assert not panels.shows("Task")
     failed = running(4, task=None, state="error", refused=problem(), choices=("TwoEnv", "OneEnv"))
@@ -97,7 +98,7 @@ def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fail
 
 
 def test_the_last_loads_are_listed_newest_first_with_level_reason_and_time(panels: Panels) -> None:
-    panel = VersionPanel(panels.server, cast(Any, StillSession()))
+    panel = Parts([VersionPanel(panels.server, cast(Any, StillSession()))])
     first = PastLoad(1_000_000_000.0, None, "the first version", 900.0)
     panel.draw(running(4, loads=(first,)))
     assert "the first version" not in panels.html(), "one load is no list"
@@ -110,3 +111,11 @@ def test_the_last_loads_are_listed_newest_first_with_level_reason_and_time(panel
         for words in ("patched", "43 ms", "only evaluate", "refused", "push.py:88", "900 ms")
     ]
     assert places == sorted(places) and "&lt;goal&gt;" in told
+
+
+def test_while_steps_go_on_it_is_not_drawn_again(panels: Panels) -> None:
+    panel = VersionPanel(panels.server, cast(Any, StillSession()))
+    # Each number that a view is made with is another object.
+    assert panel.key(running(4, load_milliseconds=43.0, step_serial=1)) == panel.key(
+        running(4, load_milliseconds=float("43.0"), step_serial=2)
+    )

@@ -18,6 +18,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.tasks.env_options import EnvOptionsPanel, merged, options_html
+from workbench.ui.widgets.parts import Parts
 
 ROBOT = Keyword("robot_uids", "choice", '"panda"', choices=('"panda"', '"fetch"'))
 CONTROL = Keyword("control_mode", "choice", '"pd_joint_pos"', choices=('"pd_joint_pos"', '"pd_ee_pose"'))
@@ -46,10 +47,11 @@ class Form:
         monkeypatch.setattr(session, "view", lambda: self.view)
         monkeypatch.setattr(session.versions, "apply_options", self.applied.append)
         self.panel = EnvOptionsPanel(panels.server, session)
+        self.parts = Parts([self.panel])
         self.draw()
 
     def draw(self) -> None:
-        self.panel.draw(self.view)
+        self.parts.draw(self.view)
 
     def set(self, name: str, value: object) -> None:
         self.panels.set(name, value)
@@ -174,6 +176,15 @@ def test_the_page_shows_driver_further_arguments_and_a_quoted_command(form: Form
     assert "pictures on llvmpipe" in text and "render_backend = &#34;none&#34;" in text
     assert "workbench open &#39;/w/my push.py&#39; --num-envs 4 --seed 7" in text
     assert "data-copy=" in text
+
+
+def test_while_steps_go_on_the_form_is_not_drawn_again(form: Form) -> None:
+    """It was, fifteen times a second, and asked the disk for the file's place each time."""
+    key = form.panel.key(form.view)
+    form.view = replace(running(4, step_serial=2), task=form.view.task, options=TaskOptions(4))
+    assert form.panel.key(form.view) == key
+    form.panels.set("size", 0.5)
+    assert form.panel.key(form.view) != key
 
 
 VALUES = st.booleans() | st.integers(-5, 5) | st.floats(-5, 5) | st.text(max_size=3) | st.none()

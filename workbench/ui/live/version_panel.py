@@ -58,6 +58,18 @@ class VersionPanel(PagePart[SessionView]):
             with self._loads_folder:
                 self._loads = server.gui.add_html("")
 
+    def key(self, view: SessionView) -> object:
+        notices = None if view.task is None else view.task.notices
+        return (
+            view.state,
+            view.choices,
+            view.reload,
+            view.load_milliseconds,
+            notices,
+            view.refused,
+            view.loads,
+        )
+
     def draw(self, view: SessionView) -> None:
         task = view.task
         can_load = view.state != "stopped"

@@ -74,6 +74,13 @@ class EnvOptionsPanel(PagePart[SessionView]):
         self._apply.on_click(lambda event: self._apply_form(event.client))
         self._discard.on_click(lambda _: self._discard_form())
 
+    def key(self, view: SessionView) -> object:
+        # The command names the file by its place on the disk, which is not asked for with every step.
+        task = None if view.task is None else (view.task.made, view.task.device)
+        form = self._num_envs.value, [field.text() for field in self._fields]
+        options = view.options, view.seed, view.options_refused
+        return task, options, form, view.state, self._session.present_reference
+
     def draw(self, view: SessionView) -> None:
         made = (HowMade() if view.task is None else view.task.made), replace(view.options, seed=0)
         before = self._made
