@@ -6,6 +6,7 @@ import ast
 import builtins
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -48,12 +49,22 @@ def parameters(node: ast.AST) -> set[str] | None:
 
 
 FILES = sorted(PACKAGE.rglob("*.py"))
-TREES = {file: ast.parse(file.read_text()) for file in FILES}
-DEFINED = {node.name for tree in TREES.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+
+
+@cache
+def trees() -> dict[Path, ast.Module]:
+    return {file: ast.parse(file.read_text()) for file in FILES}
+
+
+@cache
+def defined() -> set[str]:
+    """Names of the package's classes."""
+    nodes = (node for tree in trees().values() for node in ast.walk(tree))
+    return {node.name for node in nodes if isinstance(node, ast.ClassDef)}
 
 
 def documented() -> Iterator[tuple[str, ast.AST, str]]:
-    for file, tree in TREES.items():
+    for file, tree in trees().items():
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
                 doc = ast.get_docstring(node)
@@ -75,12 +86,12 @@ def test_what_stands_under_args_is_a_parameter() -> None:
 def test_what_stands_under_raises_is_an_exception_that_there_is() -> None:
     imported = {
         alias.asname or alias.name
-        for tree in TREES.values()
+        for tree in trees().values()
         for node in ast.walk(tree)
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    known = DEFINED | imported | set(vars(builtins))
+    known = defined() | imported | set(vars(builtins))
     wrong = [
         (place, name)
         for place, _, doc in documented()

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -57,7 +58,10 @@ def imported(file: Path) -> Iterator[tuple[int, str]]:
                 yield getattr(node, "lineno", 0), path
 
 
-IMPORTS = {module: tuple(imported(file)) for module, file in MODULES.items()}
+@cache
+def imports() -> dict[str, tuple[tuple[int, str], ...]]:
+    """Of each module. Not of the file's own import: every process of the tests has that, and reads the whole package with it."""
+    return {module: tuple(imported(file)) for module, file in MODULES.items()}
 
 
 def layer_of(module: str) -> str:
@@ -76,7 +80,7 @@ def test_imports_run_one_way(layer: str) -> None:
         f"{module}:{line} imports {name}"
         for module in MODULES
         if layer_of(module) == layer
-        for line, name in IMPORTS[module]
+        for line, name in imports()[module]
         if layer_of(name) not in below
     ]
     assert any(layer_of(module) == layer for module in MODULES) and wrong == []
@@ -87,7 +91,7 @@ def test_what_users_import_needs_no_session_and_no_page() -> None:
         f"{module}:{line} imports {name}"
         for module in MODULES
         if layer_of(module) == ""
-        for line, name in IMPORTS[module]
+        for line, name in imports()[module]
         if layer_of(name) in ("cli", "ui", "session")
     ]
     assert wrong == []
@@ -95,7 +99,7 @@ def test_what_users_import_needs_no_session_and_no_page() -> None:
 
 def test_no_folder_imports_one_that_imports_it() -> None:
     below: dict[str, set[str]] = defaultdict(set)
-    for module, names in IMPORTS.items():
+    for module, names in imports().items():
         below[folder_of(module)] |= {folder_of(name) for _, name in names} - {folder_of(module)}
     reached: dict[str, set[str]] = {}
 
@@ -138,7 +142,7 @@ def test_the_architecture_page_tells_of_each_folder_what_it_holds_and_what_it_im
             folder_of(name)
             for module in MODULES
             if folder_of(module) == folder
-            for _, name in IMPORTS[module]
+            for _, name in imports()[module]
         }
         same_layer = {name for name in names - {folder} if layer_of(f"{name}/") == layer_of(f"{folder}/")}
         assert told.get(folder) == (" ".join(holds.split()), same_layer), folder

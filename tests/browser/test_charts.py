@@ -19,7 +19,7 @@ from tests.ui.scenes import running, step_of
 from workbench.session.history.curves import Curves, StepCurves
 from workbench.ui.live.reward import CurvesPanel
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ENVS = 3
 
 

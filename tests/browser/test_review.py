@@ -224,6 +224,7 @@ def test_of_rerun_and_the_library_the_one_unfolded_last_folds_the_other_where_th
     del errors[before:]  # what rerun says of this
 
 
+@pytest.mark.slow
 def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Browser) -> None:
     """The env is there as it was."""
     task = Path(__file__).parents[2] / "tasks" / "minimal.py"

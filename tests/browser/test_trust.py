@@ -15,7 +15,7 @@ from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 from workbench.ui.app.trust_dialog import DO_NOT, ONCE
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 PATIENT = 120_000
 
 
