@@ -80,7 +80,13 @@ class FastShapes:
         self._heavy = [[(body.entity, body) for body in heavy_bodies(scene)] for scene in sub_scenes]
         self._lean = _lean_bodies(sub_scenes)
         self._chosen = _Chosen()
-        self._boxes = [np.array([self._box(body) for _, body in of_env]) for of_env in self._heavy]
+        self._parts = {id(body): tuple(_parts_of(body)) for _, body in chain.from_iterable(self._heavy)}
+        self._corner_points = [[self._corners_of_parts(body) for _, body in of_env] for of_env in self._heavy]
+        """(P, 3) of each body of each env, in its frame."""
+        self._boxes = [
+            np.array([(points.min(axis=0), points.max(axis=0)) for points in of_env], np.float32)
+            for of_env in self._corner_points
+        ]
         """(B, 2, 3) of each env, in the frames of its bodies."""
         self._components: dict[Hashable, tuple[Any, Any]] = {}
         """By the id of the exact one, which is kept beside it, and by how it is simplified."""
@@ -171,17 +177,19 @@ class FastShapes:
         """In metres, by the name of the body: the same in all envs, where equal states are to look alike."""
         finest: dict[str, float] = {}
         for env, (component, of_env) in enumerate(zip(camera, self._heavy, strict=True)):
-            position = np.asarray(component.get_global_pose().p, np.float32)
-            for entity, body in of_env:
+            position = component.get_global_pose().p
+            for (entity, _), points in zip(of_env, self._corner_points[env], strict=True):
                 name = _shared_name(entity, env)
-                off = _tolerance(component, _distance(position, np.asarray(body.get_global_aabb_fast())))
+                # SAPIEN's `get_global_aabb_fast` goes through all vertices each time: a millisecond a link.
+                at = _moved(points, entity.pose.to_transformation_matrix())
+                off = _tolerance(component, _distance(position, at.min(axis=0), at.max(axis=0)))
                 finest[name] = min(finest.get(name, np.inf), off)
         return {name: _rounded(off) for name, off in finest.items()}
 
-    def _box(self, body: Any) -> NDArray[np.float32]:
-        """(2, 3) low and high corner of what is drawn, in the body's frame."""
-        every = np.concatenate([_moved(self._chosen.box(part.exact), part.placed) for part in _parts(body)])
-        return np.array([every.min(axis=0), every.max(axis=0)], np.float32)
+    def _corners_of_parts(self, body: Any) -> NDArray[np.float64]:
+        """(P, 3) corners of the boxes around the parts of what is drawn, in the body's frame."""
+        parts = self._parts[id(body)]
+        return np.concatenate([_moved(self._chosen.box(part.exact), part.placed) for part in parts])
 
     def _corners_of(self, body: Any, tolerance: float) -> NDArray[np.float64]:
         """(P, 3) points around what is drawn of it, in its frame."""
@@ -189,7 +197,7 @@ class FastShapes:
         if by not in self._corners:
             each = [
                 _moved(self._chosen.corners(self._chosen.mesh(part, tolerance)), part.placed)
-                for part in _parts(body)
+                for part in self._parts[id(body)]
             ]
             self._corners[by] = np.concatenate(each)
         return self._corners[by]
@@ -202,7 +210,7 @@ class FastShapes:
             planes: of the camera, in the body's frame.
         """
         eye, nearest = np.asarray(pose.inv().p), np.inf
-        for part in _parts(body):
+        for part in self._parts[id(body)]:
             seen = cut_to_view(part.exact, planes @ part.placed).vertices
             if len(seen):
                 at = _moved(seen, part.placed)
@@ -215,14 +223,14 @@ class FastShapes:
         by = (id(body), key)
         if by not in self._components:
             tolerance = _rounded(_tolerance(camera, cut.nearest))
-            made = _simplified(body, tolerance, self._chosen, planes)
+            made = _simplified(body, self._parts[id(body)], tolerance, self._chosen, planes)
             self._add(by, body, made)
         return self._components[by][1]
 
     def _simplified(self, body: Any, tolerance: float) -> sapien.render.RenderBodyComponent | None:
         by = (id(body), tolerance)
         if by not in self._components:
-            self._add(by, body, _simplified(body, tolerance, self._chosen))
+            self._add(by, body, _simplified(body, self._parts[id(body)], tolerance, self._chosen))
         return self._components[by][1]
 
     def _add(self, by: Hashable, body: Any, made: sapien.render.RenderBodyComponent | None) -> None:
@@ -314,19 +322,24 @@ class _Part:
     """Of what is drawn of a body."""
 
     shape: Any
-    material: Any
+    part: Any
+    """SAPIEN's, whose material the author may exchange."""
     exact: Mesh
     scale: tuple[float, float, float]
     placed: NDArray[np.float64]
     """(4, 4) from points of the mesh, with its scale, to the body's frame."""
 
+    @property
+    def material(self) -> Any:
+        return self.part.material
 
-def _parts(body: Any) -> Iterator[_Part]:
+
+def _parts_of(body: Any) -> Iterator[_Part]:
     for shape in body.render_shapes:
         frame = shape.local_pose.to_transformation_matrix().astype(np.float64)
         for index, part in enumerate(shape.parts):
             exact, scale = exact_part(shape, part, index)
-            yield _Part(shape, part.material, exact, scale, frame @ np.diag([*scale, 1.0]))
+            yield _Part(shape, part, exact, scale, frame @ np.diag([*scale, 1.0]))
 
 
 def _moved(points: NDArray[np.floating], by: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -373,7 +386,11 @@ def _is_textured(material: Any) -> bool:
 
 
 def _simplified(
-    body: Any, tolerance: float, chosen: _Chosen, planes: Planes | None = None
+    body: Any,
+    parts: Sequence[_Part],
+    tolerance: float,
+    chosen: _Chosen,
+    planes: Planes | None = None,
 ) -> sapien.render.RenderBodyComponent | None:
     """None where nothing of it can be simplified, or nothing is in view.
 
@@ -381,7 +398,7 @@ def _simplified(
         planes: in the body's frame, to cut its triangles to; None for all of them.
     """
     shapes, fewer = [], False
-    for part in _parts(body):
+    for part in parts:
         mesh = chosen.mesh(part, tolerance)
         if planes is not None:
             mesh = cut_to_view(mesh, planes @ part.placed)
@@ -435,8 +452,9 @@ def _pixel(camera: sapien.render.RenderCameraComponent) -> float:
     return 1.0 / float(max(k[0, 0], k[1, 1]))
 
 
-def _distance(point: NDArray[np.float32], box: NDArray[np.float32]) -> float:
-    return float(np.linalg.norm(np.maximum(0.0, np.maximum(box[0] - point, point - box[1]))))
+def _distance(point: NDArray[np.floating], low: NDArray[np.floating], high: NDArray[np.floating]) -> float:
+    """Metres to the box between these corners; 0 within it."""
+    return float(np.linalg.norm(np.maximum(0.0, np.maximum(low - point, point - high))))
 
 
 def _rounded(tolerance: float) -> float:
