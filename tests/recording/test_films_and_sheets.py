@@ -19,7 +19,7 @@ from workbench.recording.episode.encoded_pictures import EncodedPictures, encode
 from workbench.recording.episode.episode import Episode
 from workbench.recording.films import (
     Encoding,
-    Eye,
+    FilmEye,
     camera_of,
     cameras_by_name,
     chosen_states,
@@ -154,12 +154,12 @@ def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Ep
 @pytest.mark.parametrize(
     "eye",
     [
-        Eye((1.0, 2.0, 3.0), (0.0, 0.0, 0.0)),
-        Eye((0.0, 0.0, 2.0), (0.0, 0.0, 0.0)),
-        Eye((0.0, 0.0, -2.0), (0.0, 0.0, 1.0)),
+        FilmEye((1.0, 2.0, 3.0), (0.0, 0.0, 0.0)),
+        FilmEye((0.0, 0.0, 2.0), (0.0, 0.0, 0.0)),
+        FilmEye((0.0, 0.0, -2.0), (0.0, 0.0, 1.0)),
     ],
 )
-def test_an_eye_looks_where_it_is_told(eye: Eye) -> None:
+def test_an_eye_looks_where_it_is_told(eye: FilmEye) -> None:
     w, x, y, z = eye.pose[3:].astype(float)
     assert abs(np.linalg.norm([w, x, y, z]) - 1) < 1e-6
     forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]

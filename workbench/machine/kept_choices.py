@@ -15,7 +15,7 @@ MOST_FOLDERS, MOST_POLICIES = 100, 10
 log = logging.getLogger(__name__)
 
 
-class Choices(msgspec.Struct, frozen=True):
+class KeptChoices(msgspec.Struct, frozen=True):
     """The file's content. A field that a later version adds has a default."""
 
     hints_closed: bool = False
@@ -26,14 +26,14 @@ class Choices(msgspec.Struct, frozen=True):
     """Policies that were used, by the folder where the command was started; the newest first."""
 
 
-def kept_choices() -> Choices:
+def kept_choices() -> KeptChoices:
     """The choices so far; those of a file that cannot be read are none, with a warning."""
     try:
         content = read_private(FILE)
-        return Choices() if content is None else msgspec.json.decode(content, type=Choices)
+        return KeptChoices() if content is None else msgspec.json.decode(content, type=KeptChoices)
     except (OSError, msgspec.MsgspecError, RecursionError) as error:
         log.warning("What was chosen on earlier pages is not known: %s", error)
-        return Choices()
+        return KeptChoices()
 
 
 def close_hints() -> None:
@@ -54,7 +54,7 @@ def used_policies(folder: Path) -> tuple[str, ...]:
 def keep_policy(folder: Path, reference: str) -> None:
     """Keep a policy that was used in this folder."""
 
-    def change(kept: Choices) -> Choices:
+    def change(kept: KeptChoices) -> KeptChoices:
         known = [one for one in kept.policies.get(str(folder), ()) if one != reference]
         others = {place: used for place, used in kept.policies.items() if place != str(folder)}
         newest = dict([*others.items()][-(MOST_FOLDERS - 1) :])
@@ -64,7 +64,7 @@ def keep_policy(folder: Path, reference: str) -> None:
     _change(change)
 
 
-def _change(change: Callable[[Choices], Choices]) -> None:
+def _change(change: Callable[[KeptChoices], KeptChoices]) -> None:
     try:
         with locked(FILE):
             write_private(FILE, msgspec.json.encode(change(kept_choices())))

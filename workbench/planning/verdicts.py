@@ -38,7 +38,7 @@ class RewardVerdict:
 
 
 @dataclass(frozen=True)
-class Episodes:
+class PlannedEpisodes:
     """The planned episodes of a task, and what is compared within them."""
 
     all: tuple[PlannedEpisode, ...]
@@ -73,7 +73,7 @@ class Episodes:
 
 def of_episodes(episodes: Sequence[PlannedEpisode]) -> list[RewardVerdict]:
     """The verdicts on a task's reward, each at most once."""
-    every = Episodes(tuple(episodes))
+    every = PlannedEpisodes(tuple(episodes))
     return [verdict for find in RULES.values() if (verdict := find(every)) is not None]
 
 
@@ -86,7 +86,7 @@ def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> s
     if episode.cut_off:
         steps = f"{episode.steps} step{'' if episode.steps == 1 else 's'}"
         return f"its time was up after {steps} (--seconds-per-seed)"
-    every = Episodes(tuple(episodes))
+    every = PlannedEpisodes(tuple(episodes))
     if every.without_reward:
         return "no rollout earned more than another"
     if _earns_like_success(every, episode):
@@ -101,7 +101,7 @@ def in_the_way(episode: PlannedEpisode, episodes: Sequence[PlannedEpisode]) -> s
 # --- one function each -----------------------------------------------------------------------------------
 
 
-def exploited(episodes: Episodes) -> RewardVerdict | None:
+def exploited(episodes: PlannedEpisodes) -> RewardVerdict | None:
     """Episodes without success that earn at their end at least what successful ones earn when they succeed."""
     found = [one for one in episodes.unsolved if _earns_like_success(episodes, one)]
     if not found:
@@ -117,7 +117,7 @@ def exploited(episodes: Episodes) -> RewardVerdict | None:
     )
 
 
-def flat(episodes: Episodes) -> RewardVerdict | None:
+def flat(episodes: PlannedEpisodes) -> RewardVerdict | None:
     """Unsolved episodes at whose end all rollouts earned the same, so that nothing leads on."""
     if episodes.without_reward and episodes.unsolved:
         return RewardVerdict(
@@ -145,7 +145,7 @@ def flat(episodes: Episodes) -> RewardVerdict | None:
     )
 
 
-def stuck(episodes: Episodes) -> RewardVerdict | None:
+def stuck(episodes: PlannedEpisodes) -> RewardVerdict | None:
     """Unsolved episodes at whose end no rollout earned more than one that holds still, nor than the episode did already."""
     found = [
         one
@@ -169,7 +169,7 @@ def stuck(episodes: Episodes) -> RewardVerdict | None:
     )
 
 
-def against(episodes: Episodes) -> RewardVerdict | None:
+def against(episodes: PlannedEpisodes) -> RewardVerdict | None:
     """Solved episodes on whose way the reward fell."""
     falls = [(one, *_largest_fall(one.reward[: one.solved_at])) for one in episodes.solved]
     found = [
@@ -190,7 +190,7 @@ def against(episodes: Episodes) -> RewardVerdict | None:
     )
 
 
-def lost(episodes: Episodes) -> RewardVerdict | None:
+def lost(episodes: PlannedEpisodes) -> RewardVerdict | None:
     """Solved episodes that were not solved any more a few steps later, though the reward was sought all the time."""
     found = [one for one in episodes.solved if not one.success[one.solved_at - 1 :].all()]
     if not _are_most(found, episodes.solved):
@@ -205,7 +205,7 @@ def lost(episodes: Episodes) -> RewardVerdict | None:
     )
 
 
-def failing_pays(episodes: Episodes) -> RewardVerdict | None:
+def failing_pays(episodes: PlannedEpisodes) -> RewardVerdict | None:
     """Episodes that failed where each step costs, so that an early end earns more than going on."""
     found = [one for one in episodes.unsolved if one.failed_at and float(one.reward.mean()) < 0]
     if not _are_most(found, episodes.all):
@@ -220,7 +220,7 @@ def failing_pays(episodes: Episodes) -> RewardVerdict | None:
     )
 
 
-RULES: dict[str, Callable[[Episodes], RewardVerdict | None]] = {
+RULES: dict[str, Callable[[PlannedEpisodes], RewardVerdict | None]] = {
     "reward-exploited": exploited,
     "reward-flat": flat,
     "reward-stuck": stuck,
@@ -248,7 +248,7 @@ def _ended_early(episode: PlannedEpisode) -> bool:
     return episode.failed_at > 0 or episode.cut_off
 
 
-def _earns_like_success(episodes: Episodes, episode: PlannedEpisode) -> bool:
+def _earns_like_success(episodes: PlannedEpisodes, episode: PlannedEpisode) -> bool:
     paid = episodes.at_success
     return paid is not None and not _ended_early(episode) and float(_end(episode).mean()) >= paid
 
@@ -263,15 +263,15 @@ def _gain_a_step(episode: PlannedEpisode) -> NDArray[Any]:
     return episode.best / episode.horizon - np.maximum(episode.hold / episode.horizon, before)
 
 
-def _least(episodes: Episodes, episode: PlannedEpisode) -> float:
+def _least(episodes: PlannedEpisodes, episode: PlannedEpisode) -> float:
     return episodes.same * episode.horizon
 
 
-def _is_flat(episodes: Episodes, episode: PlannedEpisode) -> bool:
+def _is_flat(episodes: PlannedEpisodes, episode: PlannedEpisode) -> bool:
     return bool((_end(episode, _spread_a_step(episode)) <= episodes.same).all())
 
 
-def _is_stuck(episodes: Episodes, episode: PlannedEpisode) -> bool:
+def _is_stuck(episodes: PlannedEpisodes, episode: PlannedEpisode) -> bool:
     return bool((_end(episode, _gain_a_step(episode)) <= episodes.same).all())
 
 

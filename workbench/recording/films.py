@@ -405,7 +405,7 @@ FROM_THE_FRONT = np.array([1.0, 0.55, 0.75])
 
 
 @dataclass(frozen=True)
-class Eye:
+class FilmEye:
     """A fixed camera; metres in the env's frame."""
 
     position: tuple[float, float, float]
@@ -424,23 +424,23 @@ class Eye:
         return np.concatenate([self.position, quaternion]).astype(np.float32)
 
 
-def default_eye(episode: Episode) -> Eye:
+def default_eye(episode: Episode) -> FilmEye:
     """The recorded human-render camera's, or else one that sees all movable bodies."""
     for camera in episode.cameras:
         if camera.info.kind == "human" and len(camera.pose):
             position, forward = camera.pose[0, :3], quat2mat(camera.pose[0, 3:])[:, 0]
             look_at = position + forward
-            return Eye(triple(position), triple(look_at), fovy=float(camera.info.fovy))
+            return FilmEye(triple(position), triple(look_at), fovy=float(camera.info.fovy))
     assert episode.poses is not None and episode.geometry is not None
     low, high = movable_bounds(episode.poses, episode.geometry.body_kinds)
     middle = (low + high) / 2
     # The box holds origins of bodies, not their outlines: leave a margin.
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.25) * 1.1
     direction = FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
-    return Eye(triple(middle + direction * radius / np.sin(FOVY / 2)), triple(middle))
+    return FilmEye(triple(middle + direction * radius / np.sin(FOVY / 2)), triple(middle))
 
 
-def scene_frames(episode: Episode, eye: Eye | None = None) -> Iterator[NDArray[np.uint8]]:
+def scene_frames(episode: Episode, eye: FilmEye | None = None) -> Iterator[NDArray[np.uint8]]:
     """One picture (H, W, 3) per state, rendered by SAPIEN from the recorded meshes and poses.
 
     Call it in a job process: the server imports no renderer.

@@ -40,7 +40,7 @@ from workbench.core.rules import Degree, Finding, silence_of
 
 
 @dataclass(frozen=True)
-class Group:
+class RuleGroup:
     """Rules that look at the same evidence, checked by one process."""
 
     name: str
@@ -48,17 +48,17 @@ class Group:
     checks: Mapping[str, Check]
 
 
-GROUPS: tuple[Group, ...] = (
-    Group("source", {**source.CHECKS, **files.CHECKS}),
-    Group("resets", placement.CHECKS),
-    Group("success", {**evaluate.CHECKS, **placement.RUN_CHECKS}),
-    Group("rewards", reward.CHECKS),
-    Group("tensors", devices.CHECKS),
-    Group("the same again", reproduce.CHECKS),
-    Group("observations", observation.CHECKS),
-    Group("the scene", scene.CHECKS),
-    Group("pictures", {**observation.PICTURE_CHECKS, **cameras.CHECKS}),
-    Group("planned episodes", solved.CHECKS),
+GROUPS: tuple[RuleGroup, ...] = (
+    RuleGroup("source", {**source.CHECKS, **files.CHECKS}),
+    RuleGroup("resets", placement.CHECKS),
+    RuleGroup("success", {**evaluate.CHECKS, **placement.RUN_CHECKS}),
+    RuleGroup("rewards", reward.CHECKS),
+    RuleGroup("tensors", devices.CHECKS),
+    RuleGroup("the same again", reproduce.CHECKS),
+    RuleGroup("observations", observation.CHECKS),
+    RuleGroup("the scene", scene.CHECKS),
+    RuleGroup("pictures", {**observation.PICTURE_CHECKS, **cameras.CHECKS}),
+    RuleGroup("planned episodes", solved.CHECKS),
 )
 """In the order in which they run: what people meet most first."""
 RULES_OVER_SEEDS: Mapping[str, OverSeeds] = {
@@ -72,7 +72,7 @@ CORE_RESETS = 6
 """Resets of random envs, with steps between them."""
 
 
-def run_group(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
+def run_group(group: RuleGroup, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
     """The result of each rule of the group that is not off, as soon as it is known. Raises what `keep_going` raises."""
     told: set[object] = set()
     for rule, check in group.checks.items():
@@ -158,7 +158,7 @@ def _is_known(error: TaskError, checkup: Checkup, degrees: Mapping[str, Degree])
     return error.problem.stage == "returns" and any(degrees[rule] != "off" for rule in returned)
 
 
-def run_core(group: Group, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
+def run_core(group: RuleGroup, checkup: Checkup, degrees: Mapping[str, Degree]) -> Iterator[RuleResult]:
     """Steps, and resets of random envs among them, while the rules of GPU simulation look. Gives results only where the task
     raises; what was found is in `Checkup.findings`, see `core_results`."""
     rng = np.random.default_rng(0)

@@ -13,7 +13,7 @@ from workbench.planning.episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
 from workbench.planning.report import few_seeds_text
 from workbench.planning.rollouts import NotAlike, control_mode_to_plan
-from workbench.planning.verdicts import ENOUGH_SEEDS, Episodes
+from workbench.planning.verdicts import ENOUGH_SEEDS, PlannedEpisodes
 from workbench.planning.verdicts import RULES as VERDICTS
 
 SEEDS = ENOUGH_SEEDS
@@ -26,7 +26,7 @@ HOOK = {"success-lost": "evaluate"}
 """At which a rule is told; the others at the dense reward."""
 
 
-def solved_episodes(checkup: Checkup) -> Episodes:
+def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
     """The first seeds, each to its success, its fail or the end of its time.
 
     Raises:
@@ -48,7 +48,7 @@ def solved_episodes(checkup: Checkup) -> Episodes:
                 found.append(_solved(checkup, live, planner, seed))
         finally:
             planner.close()
-    return Episodes(tuple(found))
+    return PlannedEpisodes(tuple(found))
 
 
 def _solved(checkup: Checkup, live: TaskEnv, planner: Planner, seed: int) -> PlannedEpisode:

@@ -62,7 +62,7 @@ class Merged:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PoseSet:
     """One pose that was set on an actor or an articulation."""
 
     name: str
@@ -107,13 +107,13 @@ def noting_builds(built: list[Built], merged: list[Merged], files: Collection[st
 
 
 @contextmanager
-def noting_poses(placed: list[Placed], files: Collection[str]) -> Iterator[None]:
+def noting_poses(placed: list[PoseSet], files: Collection[str]) -> Iterator[None]:
     """Within this, add to `placed` each pose that is set on an actor or a root link."""
 
     def note(stock: Any) -> Any:
         def set_pose(struct: Any, pose: Any) -> None:
             name = struct.name if isinstance(struct, Actor) else struct.articulation.name
-            placed.append(Placed(str(name), _quaternions(pose), author_place(files)))
+            placed.append(PoseSet(str(name), _quaternions(pose), author_place(files)))
             stock.fset(struct, pose)
 
         return property(stock.fget, set_pose)

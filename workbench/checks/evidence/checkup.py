@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from workbench.authoring.loading.blamed import blamed, returns_check
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import TaskError
-from workbench.checks.evidence.builds import Built, Merged, Placed, noting_builds, noting_poses, shapes_of_env
+from workbench.checks.evidence.builds import (
+    Built,
+    Merged,
+    PoseSet,
+    noting_builds,
+    noting_poses,
+    shapes_of_env,
+)
 from workbench.checks.evidence.episodes import Actor, Episodes, SeenOutliers, joined, stacked
 from workbench.checks.evidence.places import Places
 from workbench.checks.evidence.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
@@ -404,9 +411,9 @@ class Checkup:
             return Alone(shapes, rebuilds, overlaps_of(task, 0))
 
     @evidence
-    def placed(self) -> list[Placed]:
+    def placed(self) -> list[PoseSet]:
         """The poses that are set in a reset of the first seeds."""
-        placed: list[Placed] = []
+        placed: list[PoseSet] = []
         task = self.task
         with noting_poses(placed, self.files):
             self.reset(task, next(self.batches()))

@@ -59,7 +59,7 @@ from workbench.recording.reader.reading import find_all_sources
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.recordings import (
-    Group,
+    RescoreGroup,
     group_episodes,
     hidden_modules_text,
     with_renderer,
@@ -165,7 +165,7 @@ def rescore_all(
 def _setup_of(
     what: RescoreOptions,
     files: Sequence[Source],
-    groups: Sequence[Group],
+    groups: Sequence[RescoreGroup],
     cleared: Sequence[TaskName | NotCleared],
     unreadable: Sequence[Verdict[Source]],
 ) -> RescoreSetup:
@@ -197,7 +197,7 @@ def _setup_of(
 def _request_of(
     what: RescoreOptions,
     files: Sequence[Source],
-    groups: Sequence[Group],
+    groups: Sequence[RescoreGroup],
     cleared: Sequence[TaskName | NotCleared],
 ) -> RescoreRequest:
     recorded = [(file.name, file.path.stat().st_size) for file in files]
@@ -227,7 +227,7 @@ def _sum(value: Any) -> str:
 
 
 def _require_success(
-    groups: Sequence[Group], place: Mapping[str, int], results: Sequence[RescoredRecording]
+    groups: Sequence[RescoreGroup], place: Mapping[str, int], results: Sequence[RescoredRecording]
 ) -> None:
     """Raise the error of the first group, if all failed: a folder holds recordings of many tasks, and one may be gone."""
     by_place = {result.place: result for result in results}
@@ -244,7 +244,7 @@ def _require_success(
         raise CannotEnterRecording(first.verdict.why_not)
 
 
-def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | NotCleared]:
+def _cleared(groups: list[RescoreGroup], clearances: Clearances) -> list[TaskName | NotCleared]:
     """The task to open for each group, decided before any of them runs: all or nothing if no one can be asked."""
     cleared = clearances.clear_all([group.code for group in groups])
     not_cleared = [one for one in cleared if isinstance(one, NotCleared)]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask, undo_load
 from workbench.authoring.problem import Problem, TaskError
-from workbench.checks.by_hook.run import CORE_GROUP, RULES_OVER_SEEDS, Group, run_core, run_group
+from workbench.checks.by_hook.run import CORE_GROUP, RULES_OVER_SEEDS, RuleGroup, run_core, run_group
 from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.results import RuleResult
 from workbench.checks.rules import degree_of_each
@@ -127,7 +127,7 @@ class _Worker:
         )
         return self._checkup
 
-    def _checked(self, group: Group, checkup: Checkup, task: CheckedTask | None) -> GroupOutcome:
+    def _checked(self, group: RuleGroup, checkup: Checkup, task: CheckedTask | None) -> GroupOutcome:
         known, silenced = len(checkup.findings), len(checkup.silenced)
         if self._part > 0:
             checks = {rule: check for rule, check in group.checks.items() if rule in RULES_OVER_SEEDS}

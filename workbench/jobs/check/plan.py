@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from workbench.checks.by_hook.run import CORE_GROUP, GROUPS, RULES_OVER_SEEDS, Group
+from workbench.checks.by_hook.run import CORE_GROUP, GROUPS, RULES_OVER_SEEDS, RuleGroup
 from workbench.checks.results import RuleResult, Silenced
 from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
 from workbench.core.rules import Degree, Finding
@@ -76,12 +76,12 @@ class GroupOutcome:
     """With the first group of each chunk."""
 
 
-def groups_of(degrees: Mapping[str, Degree]) -> list[Group]:
+def groups_of(degrees: Mapping[str, Degree]) -> list[RuleGroup]:
     """The groups with a rule that is not off; the last one lets the rules of GPU simulation look, and checks none itself."""
     groups = [group for group in GROUPS if any(degrees[rule] != "off" for rule in group.checks)]
     core = any(degrees[rule] != "off" for rule in RULES if rule not in CHECK_RULES)
     # Whether the task runs is known from there too.
-    return [*groups, Group(CORE_GROUP, {})] if core or degrees["runs"] != "off" else groups
+    return [*groups, RuleGroup(CORE_GROUP, {})] if core or degrees["runs"] != "off" else groups
 
 
 def count_rules(degrees: Mapping[str, Degree]) -> int:
@@ -109,7 +109,7 @@ class CheckPlan:
     """The items of a check: groups of rules on parts of the seeds. Those that do not depend on the seeds are looked at in the
     first part alone."""
 
-    groups: list[Group]
+    groups: list[RuleGroup]
     over_seeds: frozenset[str]
     """Rules that are checked in every part."""
     part: int
@@ -132,7 +132,7 @@ class CheckPlan:
     def chunks(self) -> int:
         return len(self.groups) if self.parts == 1 else self.parts
 
-    def of(self, number: int) -> tuple[int, Group]:
+    def of(self, number: int) -> tuple[int, RuleGroup]:
         """Part and group of an item."""
         part, group = divmod(number, len(self.groups))
         return part, self.groups[group]

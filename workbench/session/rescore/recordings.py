@@ -38,7 +38,7 @@ from workbench.session.rescore.background import RescoreView, Rescoring
 
 
 @dataclass(frozen=True)
-class Group:
+class RescoreGroup:
     """Episodes that are rescored in one env."""
 
     reference: TaskName
@@ -66,7 +66,7 @@ def group_episodes(
     task: str | None = None,
     file: Path | None = None,
     recorded_source: bool = False,
-) -> tuple[list[Group], list[Verdict[Source]]]:
+) -> tuple[list[RescoreGroup], list[Verdict[Source]]]:
     """Group episodes by env, and return those that cannot be read with the reason.
 
     Args:
@@ -75,7 +75,7 @@ def group_episodes(
         file: opened for those whose task is in it.
         recorded_source: rescore each with the text that it was recorded with.
     """
-    groups: dict[str, Group] = {}
+    groups: dict[str, RescoreGroup] = {}
     broken_files: list[Verdict[Source]] = []
     for episode in files:
         try:
@@ -95,7 +95,7 @@ def group_episodes(
         # Recordings that were made here are trusted: they must not share a group with others.
         about = [str(reference), info.task, options.env_kwargs, text, made_here(info).value]
         key = json.dumps(about, sort_keys=True, default=str)
-        group = groups.get(key) or Group(reference, options, info, (), note, recorded_source)
+        group = groups.get(key) or RescoreGroup(reference, options, info, (), note, recorded_source)
         groups[key] = replace(group, files=(*group.files, episode))
     return [
         replace(g, options=replace(g.options, num_envs=max(1, min(num_envs, len(g.files)))))
@@ -114,9 +114,9 @@ def hidden_modules_text(reference: TaskName) -> list[str]:
 
 
 def rescore_each(
-    groups: Sequence[Group],
+    groups: Sequence[RescoreGroup],
     cleared: Sequence[TaskName | NotCleared],
-    rescore: Callable[[Group, TaskName], None],
+    rescore: Callable[[RescoreGroup, TaskName], None],
     known: Callable[[], Iterable[Verdict[Source]]],
     not_rescored: Callable[[list[Verdict[Source]]], None],
 ) -> None:
@@ -228,7 +228,7 @@ class Rescorer:
 
     # --- on the lane ---------------------------------------------------------------------------------
 
-    def _rescore_all(self, job: Job, groups: list[Group], use_env_states: bool) -> None:
+    def _rescore_all(self, job: Job, groups: list[RescoreGroup], use_env_states: bool) -> None:
         cleared = self._clearances.clear_all([group.code for group in groups], lambda: job.stopped)
         job.check()
 
@@ -240,7 +240,7 @@ class Rescorer:
             lambda verdicts: self._update(job, verdicts),
         )
 
-    def _rescore(self, job: Job, group: Group, reference: TaskName, use_env_states: bool) -> None:
+    def _rescore(self, job: Job, group: RescoreGroup, reference: TaskName, use_env_states: bool) -> None:
         process = self._process
         warnings = tuple(dict.fromkeys((*self.rescoring.view.warnings, *hidden_modules_text(reference))))
         self._update(job, state="loading", task=_code_text(group), warnings=warnings)
@@ -274,7 +274,7 @@ class Rescorer:
         self.rescoring.update(job, verdicts=known, done=len(known), **values)
 
 
-def _code_text(group: Group) -> str:
+def _code_text(group: RescoreGroup) -> str:
     """The code that rescores a group, as text."""
     if group.recorded_source:
         return f"{group.info.task} as it was recorded"

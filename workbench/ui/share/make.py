@@ -27,7 +27,7 @@ from workbench.machine.software_vulkan import ensure_render_device
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import Source
 from workbench.recording.films import (
-    Eye,
+    FilmEye,
     camera_of,
     cameras_by_name,
     contact_sheet,
@@ -59,7 +59,7 @@ class MakeRequest:
     """Of the files; for a dataset the folder that it becomes, for ManiSkill's demonstrations their ``.h5``."""
     camera: str = EVERY_CAMERA
     """Of a film."""
-    eye: Eye | None = None
+    eye: FilmEye | None = None
     """The viewpoint of a scene; None: a usual one."""
     export: ExportOptions = ExportOptions()
     """Of a dataset."""

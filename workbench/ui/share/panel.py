@@ -14,7 +14,7 @@ import viser
 
 from workbench.core.cameras.conventions import triple
 from workbench.recording.episode.row import LibraryRow, Source
-from workbench.recording.films import Eye, cameras_by_name
+from workbench.recording.films import FilmEye, cameras_by_name
 from workbench.recording.lerobot.export import ExportOptions
 from workbench.recording.library.library import Library
 from workbench.session.review.view import ReviewView
@@ -240,12 +240,12 @@ def _names(cameras: tuple[str, ...]) -> tuple[str, ...]:
     return (ALL_CAMERAS, *cameras)
 
 
-def _eye_of(client: viser.ClientHandle | None) -> Eye | None:
+def _eye_of(client: viser.ClientHandle | None) -> FilmEye | None:
     """The page's viewpoint."""
     if client is None or client.camera.image_width == 0:
         return None
     camera = client.camera
-    return Eye(
+    return FilmEye(
         triple(camera.position), triple(camera.look_at), triple(camera.up_direction), float(camera.fov)
     )
 

@@ -12,7 +12,7 @@ import viser
 
 from workbench.machine.files import new_file
 from workbench.recording.episode.episode import Episode
-from workbench.recording.films import Eye, default_eye
+from workbench.recording.films import FilmEye, default_eye
 from workbench.session.review.view import outcome_text
 from workbench.ui.scene.bodies import Looks, SceneView
 from workbench.ui.scene.env_grid import lay_out
@@ -29,7 +29,7 @@ PAUSE = 1.0
 def write_scene_html(
     path: Path,
     episode: Episode,
-    eye: Eye | None = None,
+    eye: FilmEye | None = None,
     on_progress: Callable[[float], None] = lambda done: None,
 ) -> None:
     """Write the moving scene to a new file at `path`.
@@ -79,7 +79,7 @@ def _caption(episode: Episode) -> str:
 
 
 def _recorded(
-    server: viser.ViserServer, episode: Episode, eye: Eye, on_progress: Callable[[float], None]
+    server: viser.ViserServer, episode: Episode, eye: FilmEye, on_progress: Callable[[float], None]
 ) -> str:
     geometry, poses = episode.geometry, episode.poses
     assert geometry is not None and poses is not None
