@@ -177,7 +177,7 @@ class FastShapes:
         """In metres, by the name of the body: the same in all envs, where equal states are to look alike."""
         finest: dict[str, float] = {}
         for env, (component, of_env) in enumerate(zip(camera, self._heavy, strict=True)):
-            position = component.get_global_pose().p
+            position = np.asarray(component.get_global_pose().p, np.float32)
             for (entity, _), points in zip(of_env, self._corner_points[env], strict=True):
                 name = _shared_name(entity, env)
                 # SAPIEN's `get_global_aabb_fast` goes through all vertices each time: a millisecond a link.
@@ -342,7 +342,7 @@ def _parts_of(body: Any) -> Iterator[_Part]:
             yield _Part(shape, part, exact, scale, frame @ np.diag([*scale, 1.0]))
 
 
-def _moved(points: NDArray[np.floating], by: NDArray[np.float64]) -> NDArray[np.float64]:
+def _moved(points: NDArray[np.floating], by: NDArray[np.floating]) -> NDArray[np.float64]:
     return points @ by[:3, :3].T + by[:3, 3]
 
 
