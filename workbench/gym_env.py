@@ -117,7 +117,8 @@ def make(
 
 _FAST_PICTURES = (
     'pictures="fast" draws simplified meshes: a policy that is trained on these pictures sees others on a GPU, with stock '
-    "ManiSkill and with the default, exact. How much they differ is in `workbench help benchmarks`."
+    "ManiSkill and with the default, exact. In ManiSkill's tabletop tasks they differ by 0.3 of 255 on average, and by more "
+    "than 10 in 0.4 % of the pixels (128 x 128; more in `workbench help benchmarks`)."
 )
 
 

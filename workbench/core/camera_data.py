@@ -184,7 +184,8 @@ class Picture:
     """(H, W, 3) of unit length, in the same frame; 0 where the ray met nothing."""
     albedo: NDArray[np.uint8] | None = None
     """(H, W, 3) colour without light."""
-    degree: PictureDegree = "exact"
+    degree: PictureDegree | None = "exact"
+    """None for a recorded one that is not known to be fast: it may be from elsewhere."""
 
     @property
     def nbytes(self) -> int:

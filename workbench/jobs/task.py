@@ -224,7 +224,7 @@ class RecordArguments:
         use_env_states: put every env state of a demonstration back after its step.
         pictures: record what every camera sees (--no-pictures is much faster).
         fast_pictures: draw simplified meshes: several times as many pictures a second without a GPU, which differ a little
-            from a GPU's. The recordings say so.
+            from a GPU's. The recordings say so, in their .json and in the review.
         max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
         seconds_per_seed: wall time after which an episode ends at its next step, solved or not. Which ones that cuts off
             depends on the machine and on what else it does, so a second run may record others.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -326,6 +326,9 @@ def test_real_files_come_back_with_scene_pictures_and_numbers(child_process: Non
     assert abs(int(seen.rgb.mean()) - 40) <= 2 and np.allclose(seen.depth, 0.2) and seen.segmentation is None
     again = reader.pictures(one.episode, 2, wanted, env=0)["sensor", "base_camera"]
     assert again is seen, "the same state is not decoded again"
+    assert seen.degree is None, "of any recording that does not say that they are fast"
+    of_fast = replace(one.episode, info=replace(one.episode.info, pictures="fast"))
+    assert reader.pictures(of_fast, 2, wanted, env=0)["sensor", "base_camera"].degree == "fast"
     library.close()
 
 

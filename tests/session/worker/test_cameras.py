@@ -152,6 +152,20 @@ def test_after_a_round_there_is_a_pause_in_proportion(desk: Desk) -> None:
     assert desk.wait() == 0.0, "somebody waits for these"
 
 
+def test_how_long_a_picture_took_is_not_told_where_steps_took_part_of_the_time(desk: Desk) -> None:
+    """*Fast, rendered in 450 ms* stood below a picture that had taken 4."""
+    desk.cameras.watch(0, (SENSOR,))
+    desk.makes()
+    desk.held.steps.number += 1
+    (pictures,) = desk.makes()
+    assert pictures.milliseconds is None
+    desk.cameras.scene_changed()
+    desk.clock.now += 1.0
+    desk.makes()
+    (pictures,) = desk.makes()
+    assert pictures.milliseconds is not None
+
+
 def test_a_picture_is_fetched_when_it_should_be_ready_by_what_the_last_ones_took(desk: Desk) -> None:
     desk.cameras.watch(0, (SENSOR,))
     desk.makes()
@@ -180,6 +194,9 @@ def test_pictures_are_fast_while_something_moves_and_exact_when_it_stands_still(
     desk.cameras.watch(0, (SENSOR,))
     exact = next_picture("exact")
     desk.cameras.watch(0, (SENSOR,), "auto")
+    assert desk.wait() is None, "nothing moved, and what is shown is exact"
+    desk.cameras.scene_changed()
+    desk.clock.now += 1.0
     next_picture()  # the meshes may have to be made first
     for thread in threading.enumerate():
         if thread.name == under_test.SIMPLIFYING:

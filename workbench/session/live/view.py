@@ -43,7 +43,7 @@ class ShownCameras:
     """Names of the ids in a segmentation."""
     env: int = 0
     milliseconds: float | None = None
-    """Render time of the newest picture; None for a recorded one."""
+    """Render time of the newest picture; None for a recorded one, and for one that was drawn while steps were made."""
     can_render: bool = True
     placed: CameraKey | None = None
     """The camera that is placed by hand."""
@@ -94,7 +94,7 @@ class SessionView:
     """Serial of the shown moment."""
     pictures: dict[tuple[CameraKind, str], Picture] = field(default_factory=dict)
     pictures_serial: int = 0
-    picture_milliseconds: float = 0.0
+    picture_milliseconds: float | None = None
     problem: Problem | None = None
     problem_serial: int = 0
     refused: Problem | None = None

@@ -357,7 +357,8 @@ class Pictures:
     """The newest pictures of the watched cameras of one kind."""
 
     pictures: tuple[Picture, ...]
-    milliseconds: float
+    milliseconds: float | None
+    """None where steps were made meanwhile, which took part of the time."""
     number: int
     """`Stepped.number` of the moment that they show."""
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import CameraInfo, CameraKey, Picture
+from workbench.core.camera_data import CameraInfo, CameraKey, Picture, PictureDegree
 from workbench.recording.episode.episode import CameraTrack, Episode
 from workbench.recording.reader.processes import ReaderBusy
 from workbench.session.history.curves import PREFIX
@@ -276,7 +276,8 @@ class PictureReader:
             kept = self._cache.get(track.info.key)
             if kept is None or kept[:2] != (index, modalities) or kept[2].env != env:
                 try:
-                    picture = decode_picture(track, index, modalities, env)
+                    degree = "fast" if episode.info.pictures == "fast" else None
+                    picture = decode_picture(track, index, modalities, env, degree)
                 except ReaderBusy:
                     # Another recording is being opened by the reader: the last picture stays until it is done.
                     if kept is not None:
@@ -291,9 +292,11 @@ class PictureReader:
         return found
 
 
-def decode_picture(track: CameraTrack, index: int, modalities: tuple[str, ...], env: int) -> Picture:
+def decode_picture(
+    track: CameraTrack, index: int, modalities: tuple[str, ...], env: int, degree: PictureDegree | None
+) -> Picture:
     """Picture `index` of a camera."""
     planes: dict[str, Any] = {
         m: np.asarray(encoded[index]) for m, encoded in track.pictures.items() if m in modalities
     }
-    return Picture(track.info.name, track.info.kind, env, track.pose[index], **planes)
+    return Picture(track.info.name, track.info.kind, env, track.pose[index], **planes, degree=degree)

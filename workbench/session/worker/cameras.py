@@ -144,8 +144,11 @@ class WorkerCameras:
 
     def watch(self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "exact") -> None:
         # Every `Settings` has it, changed or not.
-        if ((env, cameras), degree) != (self._watched, self._degree):
-            self._watched, self._degree = (env, cameras), degree
+        before, now = (self._watched, self._degree), ((env, cameras), degree)
+        self._watched, self._degree = now
+        # From exact to auto those that are there, or under way, stay right: drawn anew they would be fast for a moment.
+        stay = degree == "auto" and before == ((env, cameras), "exact")
+        if before != now and not stay:
             self.update_watched()
 
     def place(self, request: PlaceCamera) -> None:
@@ -342,7 +345,8 @@ class WorkerCameras:
                 self._exact_at = done + _STILL
             pause = _PAUSE_SHARE * (done - self._round_began)
             self._next_round = max(self._round_began + _PERIOD, done + pause)
-        return Pictures(made, 1000 * took, begun.number)
+        stood_still = begun.number == self._task.steps.number
+        return Pictures(made, 1000 * took if stood_still else None, begun.number)
 
     def _begin(self, env: TaskEnv) -> None:
         """Begin the next group of the round, if there is one."""

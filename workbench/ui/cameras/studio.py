@@ -414,9 +414,10 @@ def _placed(camera: StudioCamera) -> CameraSettings:
 def _took(camera: StudioCamera, view: SessionView) -> str:
     """Of the camera's picture: how it is drawn, and how long that took; empty for one of another size than the camera's."""
     picture = view.pictures.get(camera.key)
-    if picture is None or not view.picture_milliseconds or view.studio.preview_scale != 1.0:
+    if picture is None or picture.degree is None or view.studio.preview_scale != 1.0:
         return ""
-    return f"{picture.degree}, {view.picture_milliseconds:.0f} ms"
+    took = view.picture_milliseconds
+    return picture.degree if took is None else f"{picture.degree}, {took:.0f} ms"
 
 
 def _preview_text(camera: StudioCamera, scale: float) -> str:
