@@ -111,6 +111,38 @@ def test_where_it_pays_a_process_makes_the_files(
     env.close()
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        True,
+        pytest.param(("render_camera",), marks=pytest.mark.slow),
+        pytest.param(False, marks=pytest.mark.slow),
+    ],
+)
+def test_the_pictures_that_were_asked_for_are_there_and_are_those_of_the_env(
+    renderer: None, tmp_path: Path, asked: bool | tuple[str, ...]
+) -> None:
+    with pytest.warns(UserWarning, match="draws simplified meshes"):
+        made = workbench.make("PushCube-v1", 2, obs_mode="rgb", pictures="fast", backend="cpu")
+    env = workbench.Recorder(made, tmp_path, pictures=asked)
+    observed = [env.reset(seed=0)[0]]
+    observed += [env.step(env.action_space.sample())[0] for _ in range(2)]
+    env.close()
+    seen = np.array([obs["sensor_data"]["base_camera"]["rgb"].numpy() for obs in observed], np.int16)
+    names = {True: {"base_camera", "render_camera"}, False: set[str]()}
+    for number, episode in enumerate(episodes_in(tmp_path)):
+        tracks = {track.info.name: track for track in episode.cameras}
+        assert tracks.keys() == names.get(asked, {"render_camera"}) and episode.info.pictures == "fast"  # type: ignore[call-overload]
+        for track in tracks.values():
+            assert track.frame.tolist() == [0, 1, 2]
+        if asked is True:
+            kept = np.array([tracks["base_camera"].pictures["rgb"][step] for step in range(3)], np.int16)
+            # With the loss of a JPEG; each is nearest to the one of its env and step.
+            off = np.abs(kept[:, None, None] - seen).mean(axis=(-3, -2, -1))
+            assert off.reshape(3, -1).argmin(axis=1).tolist() == [2 * step + number for step in range(3)]
+            assert off.min(axis=(1, 2)).max() < 6
+
+
 def test_a_full_disk_warns_once_and_the_run_goes_on(tmp_path: Path) -> None:
     in_the_way = tmp_path / "recordings"
     in_the_way.write_text("no folder")

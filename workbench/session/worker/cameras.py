@@ -144,11 +144,11 @@ class WorkerCameras:
 
     def watch(self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "exact") -> None:
         # Every `Settings` has it, changed or not.
-        before, now = (self._watched, self._degree), ((env, cameras), degree)
-        self._watched, self._degree = now
+        before, of_degree = self._watched, self._degree
+        self._watched, self._degree = (env, cameras), degree
         # From exact to auto those that are there, or under way, stay right: drawn anew they would be fast for a moment.
-        stay = degree == "auto" and before == ((env, cameras), "exact")
-        if before != now and not stay:
+        stay = degree == of_degree or (of_degree == "exact" and degree == "auto")
+        if before != (env, cameras) or not stay:
             self.update_watched()
 
     def place(self, request: PlaceCamera) -> None:
