@@ -22,6 +22,7 @@ os.environ["XDG_STATE_HOME"] = os.path.join(os.environ["XDG_CONFIG_HOME"], "stat
 
 import psutil
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.drive.waiting import until
 
@@ -33,6 +34,10 @@ MANY_MODULES = 50
 gc.disable()
 
 pytest_plugins = ["tests.drive.tiers"]
+
+# By itself hypothesis fails an example that takes 0.2 s, which a busy machine makes of any.
+settings.register_profile("unhurried", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("unhurried")
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

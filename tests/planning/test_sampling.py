@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from workbench.planning.options import Method, PlanOptions
@@ -29,7 +29,6 @@ def improved(sampler: Sampler, rounds: int, target: torch.Tensor) -> torch.Tenso
     return sampler.plan
 
 
-@settings(deadline=None)
 @given(
     knots=st.integers(2, 9),
     steps=st.integers(2, 40),
@@ -50,7 +49,6 @@ def test_candidates_stay_within_their_bounds_at_any_time_of_an_episode(
         sampler.shift(shift)
 
 
-@settings(deadline=None)
 @given(knots=st.integers(2, 9), steps=st.integers(2, 40), value=st.floats(-1, 1), shift=st.integers(0, 50))
 def test_knots_of_one_value_are_a_plan_of_that_value_before_and_after_a_shift(
     knots: int, steps: int, value: float, shift: int
@@ -62,7 +60,6 @@ def test_knots_of_one_value_are_a_plan_of_that_value_before_and_after_a_shift(
     torch.testing.assert_close(sampler.sequences(sampler.plan[None]), torch.full((1, steps, 3), value))
 
 
-@settings(deadline=None)
 @given(knots=st.integers(2, 9), steps=st.integers(2, 40), seed=st.integers(0, 100))
 def test_a_shift_by_no_step_changes_nothing(knots: int, steps: int, seed: int) -> None:
     sampler = sampler_of(PlanOptions(rollouts=8, knots=knots), steps, seed)

@@ -130,7 +130,6 @@ def test_no_random_claim_disturbs_another_page(served, listener, monkeypatch, ca
     served.show(which)
 
     @settings(
-        deadline=None,
         max_examples=200,
         suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
     )

@@ -21,7 +21,7 @@ parts = st.floats(-1, 1)
 quaternions = st.tuples(parts, parts, parts, parts).filter(lambda q: math.hypot(*q) > 0.1)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(quaternions, quaternions)
 def test_the_angle_between_two_orientations_is_that_of_the_rotation_from_one_to_the_other(
     a: tuple[float, ...], b: tuple[float, ...]
@@ -31,7 +31,7 @@ def test_the_angle_between_two_orientations_is_that_of_the_rotation_from_one_to_
     assert angle_between(a, [-part for part in a]) < 1e-7
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(turns, turns, turns, st.tuples(turns, turns, turns))
 def test_angles_of_a_quaternion_are_its_own_and_near_the_old_ones(
     roll: float, pitch: float, yaw: float, near: tuple[float, float, float]
@@ -46,7 +46,7 @@ def test_angles_of_a_quaternion_are_its_own_and_near_the_old_ones(
     assert not level or apart <= given_apart + 1e-6
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(turns, st.sampled_from((-1, 1)), turns, turns)
 def test_straight_up_or_down_the_yaw_stays_and_the_roll_has_the_turn(
     roll: float, side: int, yaw: float, old_yaw: float
@@ -61,7 +61,7 @@ def test_straight_up_or_down_the_yaw_stays_and_the_roll_has_the_turn(
 points = st.tuples(*[st.floats(-4, 4)] * 3)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(points, points, st.sampled_from(((0, 0, 1), (0, 0, -2), (0, 1, 0), (0.5, 0.5, 0.5))))
 def test_look_at_is_maniskills(
     eye: tuple[float, ...], target: tuple[float, ...], up: tuple[float, ...]

@@ -68,7 +68,7 @@ def poses(draw: st.DrawFn) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 @pytest.mark.parametrize("form", FORMS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(pose=poses(), fov=st.none() | st.floats(0.05, 3.0))
 # Nearly straight down: an eye and a target of 32 bits each are 1e-7 m off, and that turns the picture.
 @example(

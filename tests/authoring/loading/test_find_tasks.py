@@ -84,7 +84,7 @@ def test_a_file_that_does_not_parse_is_listed_if_it_is_a_task_that_somebody_is_w
     assert names(tmp_path / "gone") == []
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.binary(max_size=300) | st.text(max_size=200).map(lambda text: text.encode("utf-8", "replace")))
 def test_no_text_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, raw: bytes) -> None:
     file = tmp_path_factory.getbasetemp() / "any.py"
@@ -95,7 +95,7 @@ def test_no_text_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, raw
     read_task_file(file)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.integers(1, 4000))
 def test_no_depth_of_nesting_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, depth: int) -> None:
     file = tmp_path_factory.getbasetemp() / "deep.py"

@@ -90,7 +90,7 @@ def test_a_seed_for_one_env_starts_the_episode_of_a_stock_single_env(push: TaskE
     single.close()
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     subset=st.sets(st.integers(0, N - 1), min_size=1, max_size=N),
     seed=st.integers(0, 2**31 - N - 1),

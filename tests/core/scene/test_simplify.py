@@ -93,7 +93,7 @@ def test_texture_coordinates_survive_reduction_and_the_seam_stays_closed() -> No
     assert np.ptp(reduced.uvs[reduced.faces, 0], axis=1).max() < 0.5
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     arrays(np.float32, (30, 3), elements=st.floats(-10, 10, width=32)),
     arrays(np.uint32, (60, 3), elements=st.integers(0, 29)),

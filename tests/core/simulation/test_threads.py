@@ -15,7 +15,7 @@ from workbench.core.simulation.stepping import EnvThreads, env_threads, usable_c
 shared = EnvThreads()
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(count=st.integers(0, 40), threads=st.integers(1, 6))
 def test_every_env_is_done_once(count: int, threads: int) -> None:
     done: list[int] = []

@@ -76,9 +76,7 @@ def stack() -> Iterator[BaseEnv]:
     env.close()
 
 
-PROPERTY = settings(
-    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+PROPERTY = settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @PROPERTY

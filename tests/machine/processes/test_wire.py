@@ -130,9 +130,7 @@ def _has_extension(value: Any) -> bool:
 
 
 @pytest.mark.parametrize("kind", [*EVENTS, *QUESTIONS], ids=lambda kind: kind.__name__)
-@settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
-)
+@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(st.data())
 def test_whatever_is_made_of_the_schema_is_that_message_and_what_is_not_is_unreadable(
     kind: type, data: st.DataObject

@@ -74,7 +74,7 @@ VALUE = st.sampled_from([np.bool_, np.int64, np.float32, np.float64]).flatmap(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.dictionaries(st.text(max_size=3), VALUE, max_size=3), min_size=1, max_size=8))
 def test_any_rows_come_back(entries: list[dict[str, np.ndarray]]) -> None:
     columns = through(

@@ -17,7 +17,7 @@ from workbench.recording.episode.encoded_pictures import EncodedPictures, encode
 SHAPE = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(SHAPE.flatmap(lambda shape: hnp.arrays(np.int32, shape)))
 def test_ids_come_back_whatever_they_are(ids: np.ndarray) -> None:
     (found,) = EncodedPictures("segmentation", [encode("segmentation", ids)])
@@ -25,7 +25,7 @@ def test_ids_come_back_whatever_they_are(ids: np.ndarray) -> None:
     np.testing.assert_array_equal(found, ids)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(SHAPE.flatmap(lambda shape: hnp.arrays(np.uint16, shape)))
 def test_whole_millimetres_come_back(millimetres: np.ndarray) -> None:
     depth = (millimetres / 1000).astype(np.float32)

@@ -142,7 +142,7 @@ def test_the_json_that_a_library_reads_stays_small(make_episode: Maker, tmp_path
     assert files is not None and files.json.stat().st_size < 3 * MOST_BYTES
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(states=st.lists(ENTRIES, min_size=3, max_size=3), num_envs=st.integers(1, 3))
 def test_whatever_evaluate_returns_is_recorded(
     make_episode: Maker, states: list[dict[Any, Any]], num_envs: int

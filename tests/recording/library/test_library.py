@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 import pytest
 import rerun as rr
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mani_skill.utils.wrappers.record import RecordEpisode
 from PIL import Image
@@ -251,7 +251,7 @@ def is_wrong(name: str, value: Any) -> bool:
     return type(value) is int and name != "return" and not -(2**63) <= value < 2**63
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=60)
 @given(st.fixed_dictionaries({}, optional=dict.fromkeys(_TYPES, _anything)))
 def test_whatever_a_description_says_there_is_one_row_that_the_index_can_hold(fields: dict) -> None:
     with tempfile.TemporaryDirectory() as name:

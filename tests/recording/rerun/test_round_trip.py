@@ -365,7 +365,7 @@ EVALUATE = st.dictionaries(
 )
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), steps=st.integers(0, 6), entries=EVALUATE, lost=st.integers(0, 9))
 def test_any_episode_comes_back(
     make_episode: Callable[..., Made], data: st.DataObject, steps: int, entries: Any, lost: int

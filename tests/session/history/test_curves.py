@@ -75,7 +75,7 @@ NUMBERS = arrays(
 
 
 @given(NUMBERS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
     rewards: NDArray[np.float32],
 ) -> None:

@@ -91,7 +91,7 @@ event = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(event, max_size=40))
 def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(events: list[tuple]) -> None:
     history = past()

@@ -68,7 +68,7 @@ def drawn(seed: int, rows: int, envs: int) -> tuple[list[StepResult], list[StepR
     return old, new, jumped
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 10**6), st.integers(2, 30), st.integers(1, 4), st.floats(0, 1))
 def test_differences_are_those_that_plain_loops_find(seed: int, rows: int, envs: int, part: float) -> None:
     old, new, jumped = drawn(seed, rows, envs)

@@ -90,7 +90,7 @@ def test_a_broken_file_is_survived_and_written_anew(folder: Path, text: str) -> 
     assert [task.reference for task in recents(folder).list()] == ["PickCube-v1"]
 
 
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary(max_size=200))
 def test_no_bytes_break_it(folder: Path, raw: bytes) -> None:
     folder.mkdir(mode=0o700, exist_ok=True)

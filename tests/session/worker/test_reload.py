@@ -400,7 +400,6 @@ def test_a_reload_as_random_as_can_be_equals_a_fresh_env_step_for_step(
 
     @settings(
         max_examples=edits_tried,
-        deadline=None,
         derandomize=True,
         suppress_health_check=[HealthCheck.too_slow],
     )

@@ -26,9 +26,7 @@ from workbench.ui.server.control_values import LONGEST_LINE
 from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.server.viser_private import element_id
 
-unhurried = settings(
-    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+with_fixtures = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 NUMBERS = st.integers(-(2**63), 2**64 - 1) | st.floats() | st.sampled_from([1e30, -1e30, 2**53 + 1, 1e308])
 ANYTHING = st.recursive(
     st.none() | st.booleans() | NUMBERS | st.text(max_size=8) | st.binary(max_size=8),
@@ -133,7 +131,7 @@ def attacker(gated_server: GatedServer) -> Iterator[Connection]:
         yield connection
 
 
-@unhurried
+@with_fixtures
 @given(st.sampled_from(sorted(CONTROLS)), ANYTHING | st.lists(NUMBERS, min_size=2, max_size=4))
 def test_whatever_is_claimed_a_control_holds_what_it_can_hold(gated_server, controls, attacker, name, value):
     control = controls[name]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -135,7 +135,6 @@ def test_the_table_is_bounded() -> None:
     assert len(rows) == MOST_ROWS + 3 and rows[2].name == "success" and rows[-1].name == "… and 301 more"
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])  # a busy machine is no failure
 @given(ENTRIES, st.integers(1, 4), st.integers(0, 5))
 def test_any_dict_of_evaluate_is_shown(entries: dict[Any, Any], num_envs: int, env: int) -> None:
     columns, others = split_entries(entries, num_envs)

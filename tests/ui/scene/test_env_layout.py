@@ -31,7 +31,7 @@ def test_box_of_an_env_holds_what_stands_in_it_and_not_its_floor() -> None:
     depth=st.floats(0.3, 12.0),
     width=st.floats(0.3, 12.0),
 )
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_no_two_envs_of_a_grid_touch(num_envs: int, depth: float, width: float) -> None:
     offsets = grid_offsets(num_envs, np.array([depth, width]))
     assert offsets.shape == (num_envs, 3)

@@ -19,7 +19,7 @@ from workbench.ui.scene.viewpoint import FOV, Framing, Viewpoint, frame_all, fra
     aspect=st.floats(0.35, 3.5),
     covered=st.floats(0, 0.45),
 )
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 def test_whole_box_is_in_the_picture_above_what_is_covered(
     size: tuple[float, float, float], aspect: float, covered: float
 ) -> None:

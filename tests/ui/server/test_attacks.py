@@ -53,7 +53,7 @@ from workbench.ui.server.strangers import RareLog
 from workbench.ui.server.viser_private import element_id
 
 # A busy machine is no failure, and one door is for all that is tried on it.
-unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+with_fixtures = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 LOADED_BY = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"}
 
@@ -273,7 +273,7 @@ def test_garbage_instead_of_http_harms_nobody(gated_server, bystander, raw, capf
 hosts = st.from_regex(r"[A-Za-z0-9.:@\[\]/\\_-]{0,30}", fullmatch=True)
 
 
-@unhurried
+@with_fixtures
 @given(host=st.one_of(hosts, st.text(max_size=30)), path=st.text(max_size=40), cookie=st.text(max_size=40))
 def test_the_gate_lets_nobody_in_without_the_token_and_never_fails(host, path, cookie):
     rules = AccessRules(token="x" * 43, any_address=True)
@@ -284,7 +284,7 @@ def test_the_gate_lets_nobody_in_without_the_token_and_never_fails(host, path, c
         assert isinstance(decide(rules, asked), RefusedRequest)
 
 
-@unhurried
+@with_fixtures
 @given(hosts)
 def test_without_a_token_only_loopback_hosts_are_let_in(host):
     decision = decide(AccessRules(token=None), RequestParts(path="/", host=[host]))
@@ -293,7 +293,7 @@ def test_without_a_token_only_loopback_hosts_are_let_in(host):
     assert isinstance(decision, RefusedRequest) or loopback
 
 
-@unhurried
+@with_fixtures
 @given(st.text(max_size=60))
 def test_what_follows_the_right_token_is_always_a_path_of_ours(path):
     rules = AccessRules(token="right")
@@ -305,7 +305,7 @@ def test_what_follows_the_right_token_is_always_a_path_of_ours(path):
         assert "token=right" not in decision.location
 
 
-@unhurried
+@with_fixtures
 @given(
     st.text(st.characters(codec="ascii", categories=("Ll", "Nd")), min_size=1, max_size=12).filter(
         lambda name: not name.isdigit()
@@ -500,7 +500,7 @@ def test_a_malformed_frame_closes_its_own_connection_only(gated_server, bystande
     assert "Traceback" not in capfd.readouterr().err
 
 
-@unhurried
+@with_fixtures
 @given(
     st.recursive(
         st.none()
@@ -524,7 +524,7 @@ def test_any_message_is_admitted_dropped_or_called_malformed(gated_server, value
     rescored(gated_server, msgspec.msgpack.encode(message))
 
 
-@unhurried
+@with_fixtures
 @given(st.binary(max_size=200))
 def test_any_bytes_are_admitted_dropped_or_called_malformed(gated_server, raw):
     rescored(gated_server, raw)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import viser
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from workbench.ui.server.control_values import (
@@ -20,7 +20,6 @@ from workbench.ui.server.control_values import (
     name_control,
 )
 
-unhurried = settings(deadline=None)  # a busy machine is no failure
 anything = st.one_of(
     st.none(),
     st.booleans(),
@@ -48,7 +47,6 @@ def outcome(check: Callable[[], object]) -> object:
         return error
 
 
-@unhurried
 @given(anything, bounds)
 def test_a_number_is_within_its_bounds_or_refused(value, limits):
     low, high = limits
@@ -60,7 +58,6 @@ def test_a_number_is_within_its_bounds_or_refused(value, limits):
         assert low <= got <= high
 
 
-@unhurried
 @given(bounds, st.floats(0, 1))
 def test_a_number_within_its_bounds_is_kept(limits, part):
     low, high = limits
@@ -68,7 +65,6 @@ def test_a_number_within_its_bounds_is_kept(limits, part):
     assert checked_number(value, low, high, "speed") == value
 
 
-@unhurried
 @given(bounds.filter(lambda limits: limits[1] - limits[0] > 1e-3), st.sampled_from((-1, 1)))
 def test_a_number_beyond_a_bound_is_refused_and_rounding_at_a_bound_is_not(limits, side):
     low, high = limits
@@ -86,7 +82,6 @@ def test_what_is_no_number_is_refused(value):
         checked_number(value, 0.0, 10.0, "speed")
 
 
-@unhurried
 @given(anything, st.tuples(st.integers(-100, 100), st.integers(-100, 100)).map(sorted))
 def test_an_int_is_within_its_bounds_or_refused(value, limits):
     low, high = limits
@@ -110,7 +105,6 @@ def test_an_int_of_an_empty_range_does_not_exist():
         checked_int(0, 0, -1, "env")
 
 
-@unhurried
 @given(anything, st.lists(st.text(), max_size=4))
 def test_a_choice_is_one_of_the_options_or_refused(value, options):
     got = outcome(lambda: checked_choice(value, options, "camera"))
@@ -136,7 +130,6 @@ def texts() -> Iterator[dict[bool, viser.GuiTextHandle]]:
     server.stop()
 
 
-@unhurried
 @given(anything)
 def test_a_limited_text_is_short_and_can_be_read_or_is_refused(texts, value):
     for several, text in texts.items():

@@ -166,17 +166,17 @@ def fuzzed(gated_server: GatedServer, capfd: pytest.CaptureFixture[str]) -> Iter
     assert "Traceback" not in capfd.readouterr().err
 
 
-unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+with_fixtures = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
-@settings(unhurried, max_examples=60)
+@settings(with_fixtures, max_examples=60)
 @given(REQUESTS)
 def test_whatever_a_stranger_sends_is_refused(fuzzed, raw):
     fuzz(fuzzed, raw)
 
 
 @pytest.mark.slow
-@settings(unhurried, max_examples=3000)
+@settings(with_fixtures, max_examples=3000)
 @given(REQUESTS | st.binary(max_size=3000))
 def test_whatever_a_stranger_sends_for_long_is_refused(fuzzed, raw):
     fuzz(fuzzed, raw)
