@@ -20,8 +20,7 @@ from tests.drive.studio import press
 from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
-SLOW = pytest.mark.slow
-SIZES = [(1280, 720), pytest.param((1440, 900), marks=SLOW), pytest.param((1920, 1080), marks=SLOW)]
+SIZES = [(1280, 720), (1440, 900), (1920, 1080)]
 DEFECTS = {
     "buttons touch": ".mantine-Flex-root { gap: 0 !important }",
     "cut": "label { display: block; width: 12px; overflow: hidden; white-space: nowrap }",
@@ -91,6 +90,7 @@ def choose_camera(desk: Desk) -> None:
         desk.page.get_by_role("option", name=re.compile("^base_camera")).first.click()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
 def test_every_tab_of_the_live_page_in_both_themes(desk: Desk, size: tuple[int, int]) -> None:
     choose_camera(desk)
@@ -214,7 +214,7 @@ def test_the_light_theme_has_a_light_view(desk: Desk) -> None:
     desk.press("d")
 
 
-@SLOW
+@pytest.mark.slow
 def test_every_tab_of_the_review_in_all_sizes_and_both_themes(tmp_path: Path, browser: Browser) -> None:
     shutil.copytree(GOLDEN / "v1", tmp_path / "v1")
     with (
