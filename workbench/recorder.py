@@ -93,8 +93,8 @@ class Recorder(gym.Wrapper):
             env: as `workbench.make` gives it.
             folder: created if it is missing. Half-written files of an earlier recording in it are recovered.
             env_idx: which envs; None for all.
-            pictures: record every camera at every step, or the cameras of these names; False for none. Sensors that the env observes are
-                rendered already; any other picture takes 25 to 50 ms without a GPU.
+            pictures: record every camera at every step, or the cameras of these names; False for none. Sensors that the
+                env observes are rendered already; any other picture takes 25 to 50 ms without a GPU.
             acted_by: what chooses the actions, such as the name of a policy; for readers of the recordings.
 
         Raises:
