@@ -1,9 +1,8 @@
-"""Which part of the workbench may import which, and how large its folders are."""
+"""Which part of the workbench may import which."""
 
 from __future__ import annotations
 
 import ast
-import re
 import subprocess
 import sys
 from collections import defaultdict
@@ -19,18 +18,9 @@ from packaging.utils import canonicalize_name
 
 PACKAGE = Path(__file__).parents[1] / "workbench"
 TESTS = Path(__file__).parent
-ARCHITECTURE = PACKAGE.parent / "web_assets" / "docs" / "developers" / "architecture.md"
 LAYERS = ("cli", "ui", "session", "jobs", "checks", "planning", "recording", "authoring", "core", "machine")
 """From the top to the bottom: a layer imports those behind it. Recording and authoring do not import each other."""
 APART = {("recording", "authoring")}
-MOST_ENTRIES = 12
-FEWEST_LINES = 60
-SHORT_FOR_A_REASON = {
-    "core/env_numbers": "snapshots, cameras and resets read the numbers of envs by it, and none of them may import another",
-    "machine/parse_python": "core, authoring, checks, jobs and session parse by it, under one lock",
-    "machine/processes/own_path": "it is imported before anything else, so that nothing else is imported from the wrong place",
-}
-"""Modules below `FEWEST_LINES` lines, each with why it stays apart."""
 
 
 def modules() -> dict[str, Path]:
@@ -112,51 +102,6 @@ def test_no_folder_imports_one_that_imports_it() -> None:
     for folder in sorted(below):
         reach(folder, ())
     assert "core" in reached["ui/app"]
-
-
-def test_no_folder_is_a_hall_of_doors() -> None:
-    entries: dict[str, set[str]] = defaultdict(set)
-    for module in MODULES:
-        parts = module.split("/")
-        for depth in range(len(parts)):
-            entries["/".join(parts[:depth])].add(parts[depth])
-    assert {folder: len(names) for folder, names in entries.items() if len(names) > MOST_ENTRIES} == {}
-
-
-def test_a_short_module_has_a_reason() -> None:
-    lines = {module: len(file.read_text().splitlines()) for module, file in MODULES.items()}
-    assert {module for module, count in lines.items() if count < FEWEST_LINES} == set(SHORT_FOR_A_REASON)
-
-
-def test_the_architecture_page_tells_of_each_folder_what_it_holds_and_what_it_imports() -> None:
-    """A row each of its table: the folder, the sentence of its ``__init__``, and the folders of its layer that it imports."""
-    rows = re.findall(r"^\| `([a-z_/]+)` \| (.+?) \| (.*?) ?\|$", ARCHITECTURE.read_text(), re.M)
-    told = {folder: (holds, set(re.findall(r"[a-z_/]+", imports))) for folder, holds, imports in rows}
-    folders = {folder_of(module) for module in MODULES} - {""}
-    folders |= {folder.split("/")[0] for folder in folders}
-    for folder in sorted(folders):
-        (holds, *_) = (
-            ast.get_docstring(ast.parse((PACKAGE / folder / "__init__.py").read_text())) or ""
-        ).split("\n\n")
-        names = {
-            folder_of(name)
-            for module in MODULES
-            if folder_of(module) == folder
-            for _, name in imports()[module]
-        }
-        same_layer = {name for name in names - {folder} if layer_of(f"{name}/") == layer_of(f"{folder}/")}
-        assert told.get(folder) == (" ".join(holds.split()), same_layer), folder
-    assert set(told) == folders
-
-
-def test_each_line_whose_slips_may_live_is_still_in_its_module() -> None:
-    listed = tomllib.loads((TESTS / "mutants_that_live.toml").read_text())["lives"]
-    gone = [
-        (one["module"], one["line"])
-        for one in listed
-        if one["line"] not in map(str.strip, (PACKAGE / f"{one['module']}.py").read_text().splitlines())
-    ]
-    assert gone == []
 
 
 def test_the_page_is_the_only_part_that_knows_viser() -> None:

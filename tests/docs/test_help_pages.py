@@ -4,33 +4,18 @@ from __future__ import annotations
 
 import re
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 
-from tests.docs.pages import DOCS, PAGES, ROOT, without_fences
+from tests.docs.pages import PAGES, ROOT
 from workbench.cli.help import show_help
 from workbench.machine.folders import web_assets_folder
 from workbench.ui.app import help_pages
-from workbench.ui.app.help_pages import ADDRESS, RULE_PAGES, Topic, find_topic, html_of, reply, topics
+from workbench.ui.app.help_pages import ADDRESS, Topic, find_topic, html_of, reply, topics
 from workbench.ui.widgets.templates import render
 
-MOST_LINES_OF_README = 150
-MOST_ENTRIES = 12
 ELSEWHERE = {"github.com"}
 """Hosts that pages link to."""
-
-
-SOURCES = [
-    file.read_text()
-    for folder in (ROOT / "workbench", ROOT / "web_assets")
-    for file in folder.rglob("*")
-    if file.suffix in (".py", ".html", ".js") and "docs" not in file.parts
-]
-OF_OTHER_WORDS = {"checked_tasks", "core_benchmarks", "task_ids", "versions"}
-"""Pages of figures, whose words in italics are columns."""
-NOT_LABELS = {"your", "with", "stop", "warn"}
-"""Set in italics for another reason."""
 
 
 class Seen(HTMLParser):
@@ -148,15 +133,6 @@ def test_a_topic_is_found_as_people_write_it(named: str) -> None:
     assert found is not None and found.name == "batched_env"
 
 
-def test_readme_is_short_and_folders_are_no_heaps() -> None:
-    assert len((ROOT / "README.md").read_text().splitlines()) <= MOST_LINES_OF_README
-    # Pages of rules are found by the name of the rule.
-    folders = [DOCS, *(path for path in DOCS.iterdir() if path.is_dir() and path.name != RULE_PAGES)]
-    assert {
-        folder.name: n for folder in folders if (n := len(list(folder.glob("*.md")))) > MOST_ENTRIES
-    } == {}
-
-
 def test_the_page_of_a_rule_is_found_by_its_name_and_in_no_list(capsys: pytest.CaptureFixture[str]) -> None:
     for named in ("reward-rows", "reward_rows", "Reward rows"):
         found = find_topic(named)
@@ -166,16 +142,3 @@ def test_the_page_of_a_rule_is_found_by_its_name_and_in_no_list(capsys: pytest.C
     assert show_help("reward-rows") == 0 and show_help("") == 0
     page, listed = capsys.readouterr().out.split("Use it\n")
     assert "Mend" in page and "reward-rows" not in listed and "rules" in listed
-
-
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if page.stem not in OF_OTHER_WORDS], ids=lambda page: page.stem
-)
-def test_a_label_in_italics_is_one_of_the_page(page: Path) -> None:
-    """Whoever renames a button finds here the pages that name it."""
-    text = re.sub(r"`[^`\n]*`|\*\*", "", without_fences(page))
-    named = {
-        " ".join(one.split()) for one in re.findall(r"(?<![\w*])\*([^*\n]+(?:\n[^*\n]+)?)\*(?![\w*])", text)
-    }
-    gone = [one for one in named - NOT_LABELS if not any(one in source for source in SOURCES)]
-    assert gone == []
