@@ -205,15 +205,6 @@ class BrokenRules:
             self._rows = kept
             self.serial += 1
 
-    def copy(self) -> tuple[Any, ...]:
-        """The present rows, for `put_back`."""
-        return dict(self._rows), dict(self._silenced), self.more
-
-    def put_back(self, kept: tuple[Any, ...]) -> None:
-        """Restore rows: another version was tried and not taken."""
-        self._rows, self._silenced, self.more = kept
-        self.serial += 1
-
     def edited(self, place_now: Callable[[Finding], tuple[str, int] | None]) -> None:
         """Continue with another version of the file: drop rows whose function changed, mark the others unconfirmed.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,11 +23,12 @@ from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.policy import NoPolicy, find_policy
 from workbench.jobs.task import Stepped, TaskDescription, TaskOptions, changed_options
+from workbench.machine.processes.wire import pack
 from workbench.session.history.env_table import EnvTable
 from workbench.session.live.timeline import Timeline
 from workbench.session.live.view import PastLoad, SessionView
 from workbench.session.process.heartbeat import death_problem, own_files_of
-from workbench.session.process.supervisor import Death
+from workbench.session.process.supervisor import Death, End
 from workbench.session.protocol.messages import (
     SCENE_KEPT,
     Event,
@@ -104,7 +105,9 @@ class LiveState:
         task, report, before = event.task, event.reload, self.now.task
         self._take_options(event.options)
         kept = scene_kept(event)
-        if kept and before is not None:
+        same = restored and before is not None and before.source_hash == task.source_hash
+        drawn = kept or (same and before is not None and pack(before.geometry) == pack(task.geometry))
+        if drawn and before is not None:
             # The same object, so that the page sees that it need not build the scene again.
             task = replace(task, geometry=before.geometry)
         self.set(
@@ -122,8 +125,7 @@ class LiveState:
         if not kept:
             # Broken rules of the new scene are reported after it.
             self.set(rules=None, rules_serial=self.now.rules_serial + 1)
-            same = restored and before is not None and before.source_hash == task.source_hash
-            self._new_scene(task, event.first, its_past_stays=same)
+            self._new_scene(task, event.first, its_past_stays=same, drawn=drawn)
         elif self.timeline is not None:
             self.set(step=self.timeline.history.replace_last(event.first))
             if before is None or before.source_hash != task.source_hash:
@@ -145,11 +147,11 @@ class LiveState:
             self.set_problem(None)
         self._set_running()
 
-    def _new_scene(self, task: TaskDescription, first: StepResult, its_past_stays: bool) -> None:
+    def _new_scene(self, task: TaskDescription, first: StepResult, its_past_stays: bool, drawn: bool) -> None:
         settings = self.now.settings
         selected = min(settings.selected_env, task.num_envs - 1)
         self.set(
-            scene_serial=self.now.scene_serial + 1,
+            scene_serial=self.now.scene_serial + (not drawn),
             settings=replace(settings, sliders=(), selected_env=selected),
             inspection=None,
         )
@@ -229,12 +231,15 @@ class LiveState:
         if self.timeline is not None:
             self.timeline.camera_moved(*event.key)
 
-    def died(self, death: Death, while_loading: bool, printed: str) -> Problem | None:
+    def died(
+        self, death: Death, while_loading: bool, printed: str, texts: Mapping[str, str] | None = None
+    ) -> Problem | None:
         """The worker is gone.
 
         Args:
             while_loading: a version was being loaded, so the running one is not to blame.
             printed: the last lines.
+            texts: source by path of what ran; None for that of the running version.
 
         Returns:
             The problem to show; None if the end was requested.
@@ -242,13 +247,14 @@ class LiveState:
         if while_loading:
             self._refuse_options(self.tried_options)
         problem = None
-        if not death.asked or death.stack:
-            task = self.now.task
-            source = {} if task is None or while_loading else task.source
-            problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, source)
+        asked = death.end is End.ASKED and not death.stack
+        if not asked and death.end is not End.HANDED_OVER:
+            if texts is None:
+                texts = {} if self.now.task is None else self.now.task.source
+            problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, texts)
             self.set_problem(problem)
             self.problem_at_run = not while_loading
-        if not death.file_waits:
+        if death.end not in (End.FILE_WAITS, End.HANDED_OVER):
             self.wants_play = False
         self.set(
             playing=False,
@@ -343,7 +349,12 @@ class LiveState:
             self.reference = str(self.reference)
 
     def load_request(
-        self, source: dict[str, str] | None, snapshot: bytes | None = None, level: LoadLevel = "auto"
+        self,
+        source: dict[str, str] | None,
+        snapshot: bytes | None = None,
+        number: int = 0,
+        level: LoadLevel = "auto",
+        because: str = "",
     ) -> Load:
         """See `Load`."""
         tried = self.tried_options if source is None else None
@@ -351,7 +362,7 @@ class LiveState:
         # The version that ran is brought back even if another class of the file was chosen since.
         reference = self.reference if source is None else self.running_reference
         any_task = self.now.task is None and isinstance(reference, str)
-        return Load(reference, options, source, level, snapshot, any_task)
+        return Load(reference, options, source, level, snapshot, any_task, number, because)
 
     def settings(self) -> Settings:
         """Settings for the worker: without cameras if no page is open."""

@@ -30,7 +30,7 @@ from workbench.session.live.view import SessionView
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.captured_output import PrintedLine, PrintedLog
 from workbench.session.process.heartbeat import Busy
-from workbench.session.process.supervisor import Death, Supervisor, WorkerOptions
+from workbench.session.process.supervisor import Death, End, Supervisor, WorkerOptions
 from workbench.session.protocol.messages import (
     Answer,
     EnterRecording,
@@ -38,6 +38,8 @@ from workbench.session.protocol.messages import (
     Inspect,
     Loaded,
     LoadFailed,
+    Loading,
+    NewProcessNeeded,
     Placed,
     PlanDropped,
     PlanWanted,
@@ -406,7 +408,8 @@ class Session:
     # --- events of the worker, on the session's thread -------------------------------------------
 
     def _on_death(self, death: Death) -> None:
-        self._recorder.stop()
+        if death.end is not End.HANDED_OVER:
+            self._recorder.stop()
         self.solver.stop()
         self.studio.interrupted()
         problem, kept = self.versions.died(death, self._printed.tail(20))
@@ -423,6 +426,7 @@ class Session:
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, LoadFailed) and self._worker.load_pending and event.problem.interrupted:
+            self.versions.failed(event)
             return  # interrupted because a newer version waits: no failure to report
         if isinstance(event, Loaded):
             self._on_loaded(event)
@@ -437,6 +441,10 @@ class Session:
         else:
             with self._lock:
                 self._state.take(event)
+                if isinstance(event, Loading):
+                    self.versions.began(event)
+                if isinstance(event, NewProcessNeeded):
+                    self.versions.new_process_needed(event)
             if isinstance(event, Placed):
                 self.studio.placed(event, self._state.now.task)
             if isinstance(event, LoadFailed):

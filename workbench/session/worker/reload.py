@@ -10,10 +10,16 @@ import numpy as np
 from workbench.authoring.loading.blamed import blamed, returns_check
 from workbench.authoring.loading.load import LoadedTask, RefusedClass, load_task, undo_load, with_late_imports
 from workbench.authoring.loading.modules import read_source
-from workbench.authoring.loading.reference import reference_to_class
+from workbench.authoring.loading.reference import named_file, reference_to_class
 from workbench.authoring.problem import Interrupted, TaskError
 from workbench.authoring.reload.call_graph import line_in
-from workbench.authoring.reload.level import RESET_HOOKS, Change, find_change, inherited_names
+from workbench.authoring.reload.level import (
+    RESET_HOOKS,
+    Change,
+    find_change,
+    inherited_names,
+    removed_effects,
+)
 from workbench.checks.evidence.places import rules_of_outliers
 from workbench.core.broken_rule import BrokenRules
 from workbench.core.cameras.render import list_cameras
@@ -27,7 +33,6 @@ from workbench.core.env.hot_swap import (
 )
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
-from workbench.core.maniskill_private import task_class
 from workbench.core.rules import Finding
 from workbench.core.snapshots.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.jobs.open_task import (
@@ -40,7 +45,14 @@ from workbench.jobs.open_task import (
     with_advice,
 )
 from workbench.jobs.task import changed_options
+from workbench.machine.parse_python import parse_python
 from workbench.session.protocol.messages import Load, ReloadReport
+from workbench.session.worker.process_state import (
+    ProcessState,
+    changed_settings,
+    read_process_state,
+    threads_of,
+)
 
 
 @dataclass(frozen=True)
@@ -72,7 +84,7 @@ def load_version(
     changed. No picture may be under way.
 
     Raises:
-        TaskError: the version does not work; `running` is unchanged.
+        TaskError: the version does not work. If its code ran, nothing that it did is undone: the process has to end.
     """
     opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
@@ -146,6 +158,54 @@ def _bring_in(
         raise
 
 
+# --- which process ---------------------------------------------------------------------------------
+
+
+def why_new_process(
+    request: Load, running: Running, at_start: ProcessState, when_loaded: ProcessState
+) -> str:
+    """What the running version left in this process that no reload takes back; empty if nothing, or if the new version
+    leaves it too.
+
+    Args:
+        at_start: settings of the process before any version was loaded.
+        when_loaded: after the running version was loaded.
+    """
+    before = with_late_imports(running.opened.loaded)
+    same_file = named_file(request.task) in (None, before.file)
+    texts = _earlier_modules(before, request) if same_file else {}
+    if same_file and before.file is not None and not _is_python(texts.get(str(before.file), "")):
+        return ""  # it is refused before any of it runs
+    left = changed_settings(when_loaded, read_process_state()) + threads_of(before.source)
+    if left:
+        return f"the version before has changed {_some(left)}"
+    if not before.followed:
+        return ""
+    if same_file:
+        inherited = inherited_names(before.cls, {*before.source})
+        change = find_change(before.source, texts, str(before.file), before.class_name, inherited)
+        if change.level != "rebuilt":
+            return ""  # what was imported and built is as it was
+    left = changed_settings(at_start, when_loaded)
+    if left:
+        return f"the version before has changed {_some(left)}"
+    gone = removed_effects(before.source, texts)
+    return f"what {gone} did when it was imported cannot be taken back" if gone else ""
+
+
+def _is_python(text: str) -> bool:
+    try:
+        parse_python(text)
+    except (SyntaxError, ValueError, RecursionError):
+        return False
+    return True
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - 2} more" if len(names) > 2 else ""
+    return ", ".join(names[:2]) + more
+
+
 # --- which level -----------------------------------------------------------------------------------
 
 
@@ -211,37 +271,29 @@ def _exchange(
     opened, env = running.opened, running.opened.env.env
     if change.level == "cameras" and not can_exchange_cameras(env):
         raise _MustRebuild(f"{change.reason}, and cameras cannot be exchanged here")
-    before = task_class(env)
     rules = opened.env.broken_rules or BrokenRules({})
-    kept_rules = rules.copy()
+    # Nothing of this is undone if it fails: the process ends then.
     put_class(env, loaded.cls)
     left: dict[str, str] = {}
-    try:
-        if change.level != "same":
-            rules.edited(lambda row: _find_place(row, opened.loaded, loaded))
-        task = TaskEnv(
-            env,
-            loaded.max_episode_steps,
-            check=returns_check(loaded, opened.env.num_envs),
-            obs=opened.env.obs,
-        )
-        if change.level == "cameras":
-            with blamed("build", loaded, task):
-                exchange_cameras(env)
-        if change.tried_hooks:
-            resets = "_initialize_episode" in change.tried_hooks
-            with blamed("reset", loaded, task), rules.during("reset", confirms=resets):
-                left = rehearse_hooks(env, change.tried_hooks)
-        clock.lap("rehearse")
-        first = running.last if change.level == "same" else _rescore(task, loaded, running.last, change)
-        if change.level != "same":
-            keep_observation_space(env, task.obs)
-    except BaseException:
-        put_class(env, before)
-        rules.put_back(kept_rules)
-        if change.level == "cameras":
+    if change.level != "same":
+        rules.edited(lambda row: _find_place(row, opened.loaded, loaded))
+    task = TaskEnv(
+        env,
+        loaded.max_episode_steps,
+        check=returns_check(loaded, opened.env.num_envs),
+        obs=opened.env.obs,
+    )
+    if change.level == "cameras":
+        with blamed("build", loaded, task):
             exchange_cameras(env)
-        raise
+    if change.tried_hooks:
+        resets = "_initialize_episode" in change.tried_hooks
+        with blamed("reset", loaded, task), rules.during("reset", confirms=resets):
+            left = rehearse_hooks(env, change.tried_hooks)
+    clock.lap("rehearse")
+    first = running.last if change.level == "same" else _rescore(task, loaded, running.last, change)
+    if change.level != "same":
+        keep_observation_space(env, task.obs)
     clock.lap("rescore")
     loaded = with_late_imports(loaded)
     description = replace(
@@ -312,7 +364,7 @@ def _build(
         raise
     opening.clock.lap("restore")
     level = "restarted" if running is None else "rebuilt"
-    reason = change.reason if running is not None else "the worker was restarted"
+    reason = change.reason if running is not None else request.because or "the worker was restarted"
     report = ReloadReport(level, reason, restored.carried, dict(restored.not_carried))
     return replace(opened, first=first, milliseconds=opening.clock.laps), report
 
