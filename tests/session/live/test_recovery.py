@@ -98,21 +98,25 @@ def test_of_a_restart_the_file_is_loaded_as_it_is_now() -> None:
     assert load is not None and (load.source, load.snapshot) == (None, b"newest")
 
 
-def test_a_version_that_crashes_soon_gives_way_to_the_one_before() -> None:
+def test_a_version_that_crashes_soon_and_again_gives_way_to_the_one_before() -> None:
     clock = Clock()
     recovery = ran(GOOD, NEW, clock=clock)
-    clock.now += 600
-    recovery.died(crashed=True)
-    assert recovery.next_load() == LoadInputs(NEW, b"newest", 0), "it ran for ten minutes"
-    recovery.loaded(replace(TASK, source=NEW))
+    for seconds in (3, 600, 3):
+        clock.now += seconds
+        recovery.died(crashed=True)
+        assert recovery.next_load() == LoadInputs(NEW, b"newest", 0), "once, and once more after ten minutes"
+        recovery.loaded(replace(TASK, source=NEW))
     clock.now += 3
     recovery.died(crashed=True)
     assert recovery.next_load() == LoadInputs(GOOD, b"newest", 0)
+    for _ in range(9):
+        recovery.loaded(replace(TASK, source=GOOD))
+        recovery.died(crashed=True)
+        assert recovery.next_load() == LoadInputs(GOOD, b"newest", 0), (
+            "there is no other, and a person asked for it"
+        )
     recovery.loaded(replace(TASK, source=GOOD))
-    recovery.died(crashed=True)
-    assert recovery.next_load() == LoadInputs(GOOD, b"newest", 0), "there is no other"
-    recovery.loaded(replace(TASK, source=GOOD))
-    recovery.died(crashed=True)
+    recovery.died(crashed=True, idle=True)
     assert recovery.next_load() is None
 
 
@@ -139,7 +143,7 @@ def test_workers_do_not_die_for_ever(events: list[str]) -> None:
         elif event == "failed":
             recovery.failed(kept=False)
         elif event in ("died", "handed over"):
-            recovery.died(crashed=event == "died")
+            recovery.died(crashed=event == "died", idle=True)
             loads += event == "died" and recovery.next_load() is not None
         assert loads <= 8
     recovery.began(10**6)

@@ -346,12 +346,13 @@ def removed_effects(old: Mapping[str, str], new: Mapping[str, str]) -> str:
     """A statement that the old version ran when it was imported, for what it does (a call, an assignment to something of
     another module), and that the new version does not have: ``push.py:7 (torch.set_num_threads(8))``. Empty if there is none.
     """
-    kept = {dump for path, text in new.items() for dump, _ in _effects(path, text)}
-    for path, text in old.items():
-        for dump, statement in _effects(path, text):
-            if dump not in kept:
-                code = ast.unparse(statement).partition("\n")[0]
-                return f"{PurePath(path).name}:{statement.lineno} ({code})"
+    changed = [path for path in old if old[path] != new.get(path)]
+    ran = [(path, *effect) for path in changed for effect in _effects(path, old[path])]
+    kept = {dump for path, text in new.items() if ran for dump, _ in _effects(path, text)}
+    for path, dump, statement in ran:
+        if dump not in kept:
+            code = ast.unparse(statement).partition("\n")[0]
+            return f"{PurePath(path).name}:{statement.lineno} ({code})"
     return ""
 
 

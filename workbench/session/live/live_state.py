@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from workbench.authoring.loading.reference import (
     RecordedTask,
@@ -104,9 +104,10 @@ class LiveState:
         """
         task, report, before = event.task, event.reload, self.now.task
         self._take_options(event.options)
-        kept = scene_kept(event)
-        same = restored and before is not None and before.source_hash == task.source_hash
-        drawn = kept or (same and before is not None and pack(before.geometry) == pack(task.geometry))
+        kept, past = scene_kept(event), past_after(before, event)
+        drawn = kept or (
+            past != "gone" and before is not None and pack(before.geometry) == pack(task.geometry)
+        )
         if drawn and before is not None:
             # The same object, so that the page sees that it need not build the scene again.
             task = replace(task, geometry=before.geometry)
@@ -125,9 +126,10 @@ class LiveState:
         if not kept:
             # Broken rules of the new scene are reported after it.
             self.set(rules=None, rules_serial=self.now.rules_serial + 1)
-            self._new_scene(task, event.first, its_past_stays=same, drawn=drawn)
+            self._new_scene(task, event.first, its_past_stays=past != "gone", drawn=drawn)
         elif self.timeline is not None:
             self.set(step=self.timeline.history.replace_last(event.first))
+        if past != "gone" and self.timeline is not None:
             if before is None or before.source_hash != task.source_hash:
                 self.timeline.history.begin_version(task.outlier_rules)
                 self.versions.append((self.timeline.history.last + 1, task))
@@ -355,6 +357,7 @@ class LiveState:
         number: int = 0,
         level: LoadLevel = "auto",
         because: str = "",
+        same_scene: bool = False,
     ) -> Load:
         """See `Load`."""
         tried = self.tried_options if source is None else None
@@ -362,7 +365,7 @@ class LiveState:
         # The version that ran is brought back even if another class of the file was chosen since.
         reference = self.reference if source is None else self.running_reference
         any_task = self.now.task is None and isinstance(reference, str)
-        return Load(reference, options, source, level, snapshot, any_task, number, because)
+        return Load(reference, options, source, level, snapshot, any_task, number, because, same_scene)
 
     def settings(self) -> Settings:
         """Settings for the worker: without cameras if no page is open."""
@@ -462,6 +465,24 @@ class LiveState:
         if moment is None:
             return view
         return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))
+
+
+def past_after(before: TaskDescription | None, event: Loaded) -> Literal["same", "patched", "gone"]:
+    """What a load means for the history: it goes on and means the same, it goes on with other code, or another begins.
+
+    Args:
+        before: the version that ran before.
+    """
+    report = event.reload
+    if before is None or report is None:
+        return "gone"
+    if report.level in SCENE_KEPT:
+        return "patched" if report.level == "patched" else "same"
+    same_source = before.source_hash == event.task.source_hash
+    same_task = before.chosen == event.task.chosen and before.num_envs == event.task.num_envs
+    if report.level != "restarted" or not same_task or not (same_source or report.same_scene):
+        return "gone"
+    return "same" if same_source else "patched"
 
 
 def scene_kept(event: Loaded) -> bool:

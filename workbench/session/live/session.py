@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 from workbench.authoring.loading.reference import TaskName
 from workbench.core.capture.inspection import Section
@@ -22,7 +22,7 @@ from workbench.session.checks.checks import Checks
 from workbench.session.checks.profile import StepProfiler
 from workbench.session.checks.solve_seeds import SeedsSolver
 from workbench.session.history.env_table import EnvRows
-from workbench.session.live.live_state import LiveState, SharedState, scene_kept
+from workbench.session.live.live_state import LiveState, SharedState, past_after
 from workbench.session.live.solver import Solver
 from workbench.session.live.timeline import TimeTravel
 from workbench.session.live.versions import Versions
@@ -457,14 +457,15 @@ class Session:
     def _on_loaded(self, event: Loaded) -> None:
         self._worker.reset_deaths()
         recording, one_each = self._recorder.recording, self._recorder.one_each
-        if not scene_kept(event) or (event.reload is not None and event.reload.level != "same"):
-            # An episode must not mix steps of two versions.
+        if event.reload is None or event.reload.level != "same":
+            # An episode must not mix steps of two versions, nor of two processes.
             self._recorder.stop()
         with self._lock:
             s = self._state
             restored, stale = self.versions.version_loaded(event.task)
             before = s.now.task
-            what_to_do = rescore_after_load(s.now.task, event, self.rescorer.rescoring.view)
+            past = past_after(before, event)
+            what_to_do = rescore_after_load(past, self.rescorer.rescoring.view)
             rescored = None
             if what_to_do == "rescore" and s.timeline is not None:
                 rescored = RescoredPast(s.timeline.history)
@@ -485,15 +486,17 @@ class Session:
         self._send_settings()
         self.studio.send_placements(placed)
         if recording:
-            self._continue_recording(event, recording, one_each)
+            self._continue_recording(past, recording, one_each)
         with self._lock:
             to_enter, self._to_enter = self._to_enter, None
         if to_enter is not None:
             self._send_enter(*to_enter)
 
-    def _continue_recording(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
+    def _continue_recording(
+        self, past: Literal["same", "patched", "gone"], env_idx: tuple[int, ...], one_each: bool
+    ) -> None:
         """Continue recording these envs after a version came in."""
-        if not scene_kept(event):
+        if past == "gone":
             self.start_recording(env_idx, next_episode=one_each)
         elif not self._recorder.recording:
             # No reset, which would lose the present moment: recording continues with each env's next episode.
@@ -501,6 +504,7 @@ class Session:
                 task = self._state.now.task
             if task is not None:
                 self._recorder.start(task, env_idx, one_each)
+                self._send(SetCapture(env_idx, from_reset=True))
 
     def _on_stepped(self, event: Stepped) -> None:
         with self._lock:

@@ -27,7 +27,7 @@ from workbench.session.protocol.messages import (
 Attempt = Literal["file", "moment", "version", "nothing"]
 _GOOD_VERSIONS = 2
 _PROVEN_SECONDS = 30.0
-"""A version that crashes its process sooner after it was loaded is not brought back again."""
+"""A version that crashes its process later than this after it was loaded had worked."""
 
 
 class LoadInputs(NamedTuple):
@@ -61,7 +61,7 @@ class _GoodVersion:
     since: float
     """When it was loaded last."""
     crashes: int = 0
-    """Of the process, each soon after it was loaded."""
+    """Of its process, one after the other, each soon after it was loaded."""
 
 
 class Recovery:
@@ -70,8 +70,9 @@ class Recovery:
     Loading may end the worker again: the version is refused, the moment cannot be restored, importing the file crashes,
     memory runs out. So the attempts are, in order: the file on disk if no worker has tried it yet, the last good version at
     its newest moment, the same from its start, and at last nothing, until the file changes. None is tried twice, so that
-    no file can end workers one after the other. A version that crashes soon after it was loaded is no good one: the version
-    before it comes back; without one it gets a second process, and no third. Used under the session's lock.
+    no file can end workers one after the other. A version that crashes twice, each time soon after it was loaded, is no good
+    one: the version before it comes back. Without one it comes back itself, unless it crashed while nothing was asked of it.
+    Used under the session's lock.
     """
 
     def __init__(
@@ -146,14 +147,19 @@ class Recovery:
         self._step_down()
         return self._attempt != "nothing"
 
-    def died(self, crashed: bool) -> None:
-        """The worker is gone; `crashed`: by itself, and not because it was ended or handed over."""
+    def died(self, crashed: bool, idle: bool = False) -> None:
+        """The worker is gone.
+
+        Args:
+            crashed: by itself, and not because it was ended or handed over.
+            idle: nothing was asked of it at the time.
+        """
         if self.file_waits:
             self._attempt = "file"
         elif self.loading:
             self._step_down()
         elif self._attempt != "nothing":
-            self._after_running(crashed)
+            self._after_running(crashed, idle)
         self.loading = self._has_env = False
 
     def restart_requested(self) -> None:
@@ -166,17 +172,18 @@ class Recovery:
         self._attempt, self.loading, self._has_env = "file", False, False
         self._asked += 1
 
-    def _after_running(self, crashed: bool) -> None:
+    def _after_running(self, crashed: bool, idle: bool) -> None:
         if not self._good:
             self._attempt = "nothing"
             return
         self._attempt, version = "moment", self._good[-1]
-        if not crashed or self._clock() - version.since > _PROVEN_SECONDS:
+        if not crashed:
             return
-        version.crashes += 1
-        if len(self._good) > 1:
+        proven = self._clock() - version.since > _PROVEN_SECONDS
+        version.crashes = 0 if proven else version.crashes + 1
+        if version.crashes > 1 and len(self._good) > 1:
             self._good.pop()
-        elif version.crashes > 1:
+        elif version.crashes > 1 and idle:
             self._attempt = "nothing"
 
     def _step_down(self) -> None:
@@ -211,8 +218,8 @@ class Versions:
         self._on_save = on_save
         self._recovery = Recovery(shared.state.newest_moment)
         self._watcher = SourceWatcher(self._on_files_changed)
-        self._because = ""
-        """Why the next worker is a new process."""
+        self._needed = NewProcessNeeded("", False)
+        """Why the next worker is a new process, where the last one said so."""
 
     def start(self) -> None:
         """Watch the task's own file from now on."""
@@ -276,8 +283,10 @@ class Versions:
             requests: list[Request] = [state.settings()]
             next_load = self._recovery.next_load()
             if next_load is not None:
-                because, self._because = self._because, ""
-                requests.append(state.load_request(*next_load, because=because))
+                needed, self._needed = self._needed, NewProcessNeeded("", False)
+                requests.append(
+                    state.load_request(*next_load, because=needed.reason, same_scene=needed.same_scene)
+                )
             else:
                 state.wait_for_file()
             if state.wants_play:
@@ -306,7 +315,7 @@ class Versions:
 
     def new_process_needed(self, needed: NewProcessNeeded) -> None:
         """The worker ends and leaves the load to the next one. Under the lock."""
-        self._because = needed.reason
+        self._needed = needed
 
     # --- results -------------------------------------------------------------------------------------
 
@@ -328,7 +337,7 @@ class Versions:
         """A load failed; a worker without a version gets the next attempt of `Recovery`, unless it is spoiled and ends."""
         with self._shared.lock:
             if failed.spoiled:
-                self._because = "a refused version had run in the process"
+                self._needed = NewProcessNeeded("a refused version had run in the process", False)
                 next_load = None
             else:
                 next_load = self._recovery.next_load() if self._recovery.failed(failed.kept) else None
@@ -352,7 +361,7 @@ class Versions:
         with self._shared.lock:
             while_loading = self._recovery.loading
             texts = self._loading_texts() if while_loading else None
-            self._recovery.died(death.end is End.DIED)
+            self._recovery.died(death.end is End.DIED, idle=death.doing is None)
             problem = self._shared.state.died(death, while_loading, printed, texts)
             return problem, self._shared.state.now.task is not None
 

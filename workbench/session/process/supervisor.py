@@ -17,12 +17,16 @@ from workbench.session.process.memory_limit import format_size
 from workbench.session.process.worker_process import Output, WorkerProcess
 from workbench.session.protocol.messages import (
     Answer,
+    EnterRecording,
     Event,
     ListenForDebugger,
     Load,
     Loaded,
     Loading,
     Request,
+    Reset,
+    Restore,
+    SingleStep,
     WarmUp,
     hands_over,
 )
@@ -216,6 +220,9 @@ class Supervisor:
         self._load_sent: float | None = None
         self._replace_asked = False
         self._closing = False
+        self._hands_over = False
+        self._pressed: list[Request] = []
+        """Waits for the next worker."""
         self._deaths = 0
         self._interrupted: tuple[int, float] | None = None
         self._lives = 0
@@ -243,11 +250,16 @@ class Supervisor:
         return self._load_sent is not None
 
     def send(self, request: Request) -> None:
-        """Send to the current worker. Between two workers the request is lost; `first_requests` must include its effect."""
+        """Send to the current worker. While one hands over to the next, what a person pressed waits. Everything else that is
+        sent between two workers is lost; `first_requests` must include its effect."""
         with self._condition:
             worker = self._worker
             if isinstance(request, Load) and self._load_sent is None:
                 self._load_sent = time.monotonic()
+            if self._hands_over:
+                if isinstance(request, SingleStep | Reset | Restore | EnterRecording):
+                    self._pressed.append(request)
+                return
         if worker is not None:
             worker.send(request)
 
@@ -330,8 +342,11 @@ class Supervisor:
         if not any(isinstance(request, Load) for request in requests):
             # No version to bring back: the mended file, which comes next, finds shaders and imports ready.
             requests.append(Call(0, self._warm_up))
-        for request in requests:
-            worker.send(request)
+        with self._condition:
+            requests += self._pressed
+            self._pressed, self._hands_over = [], False
+            for request in requests:
+                worker.send(request)
         state = _WorkerState()
         try:
             self._serve(worker, state)
@@ -380,6 +395,9 @@ class Supervisor:
                 self._load_sent = None
             if isinstance(event, Loaded) and self._spare is not None:
                 self._spare.begin_soon()
+            if hands_over(event):
+                with self._condition:
+                    self._hands_over = True
             if event is not None:
                 self._on_event(event)
             if hands_over(event):

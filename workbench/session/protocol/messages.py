@@ -57,6 +57,8 @@ class Load(Question["Loaded"]):
     """Counts the loads of the file on disk; 0 for a version that is brought back."""
     because: str = ""
     """Why a new process loads it, for the `ReloadReport`."""
+    same_scene: bool = False
+    """A new process loads it, and the scene is built by the same code as before."""
 
 
 @dataclass(frozen=True)
@@ -307,6 +309,8 @@ class NewProcessNeeded:
     reload takes back. The worker ends; the next one loads the file at the newest moment."""
 
     reason: str
+    same_scene: bool
+    """Only code that runs at resets and steps differs, if any does."""
 
 
 @dataclass(frozen=True)
@@ -320,6 +324,8 @@ class ReloadReport:
     """After a build: names of actors, articulations and attributes that kept their state."""
     not_carried: dict[str, str] = field(default_factory=dict)
     """Names of those that did not, each with the reason."""
+    same_scene: bool = False
+    """As `Load.same_scene`."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,6 @@ from workbench.session.protocol.messages import (
     Loaded,
     LoadFailed,
     Loading,
-    NewProcessNeeded,
     PlaceCamera,
     Play,
     Progress,
@@ -258,10 +257,13 @@ class Worker:
         return min(waits)
 
     def _load(self, request: Load) -> None:
-        if reason := self._why_new_process(request):
-            self._line.send(NewProcessNeeded(reason))
-            self._quit = True
-            return
+        running, when_loaded = self._running, self._state_when_loaded
+        if running is not None and when_loaded is not None:
+            needed = why_new_process(request, running, self._task.failed, self._state_at_start, when_loaded)
+            if needed is not None:
+                self._line.send(needed)
+                self._quit = True
+                return
         self._line.send(Loading("loading", request.number))
         executed = executed_modules()
         try:
@@ -271,15 +273,6 @@ class Worker:
             kept = self._task.opened is not None
             spoiled = executed_modules() > executed
             self._task.refuse(LoadFailed(error.problem, kept, error.classes, request.options, spoiled))
-
-    def _why_new_process(self, request: Load) -> str:
-        """Why another process has to load it; empty if this one can."""
-        running = self._running
-        if running is None or self._state_when_loaded is None:
-            return ""
-        if self._task.failed:
-            return "the version before failed while it ran"
-        return why_new_process(request, running, self._state_at_start, self._state_when_loaded)
 
     @property
     def _running(self) -> Running | None:

@@ -46,7 +46,7 @@ from workbench.jobs.open_task import (
 )
 from workbench.jobs.task import changed_options
 from workbench.machine.parse_python import parse_python
-from workbench.session.protocol.messages import Load, ReloadReport
+from workbench.session.protocol.messages import Load, NewProcessNeeded, ReloadReport
 from workbench.session.worker.process_state import (
     ProcessState,
     changed_settings,
@@ -162,12 +162,13 @@ def _bring_in(
 
 
 def why_new_process(
-    request: Load, running: Running, at_start: ProcessState, when_loaded: ProcessState
-) -> str:
-    """What the running version left in this process that no reload takes back; empty if nothing, or if the new version
+    request: Load, running: Running, failed: bool, at_start: ProcessState, when_loaded: ProcessState
+) -> NewProcessNeeded | None:
+    """What the running version left in this process that no reload takes back; None if nothing, or if the new version
     leaves it too.
 
     Args:
+        failed: it raised while it ran.
         at_start: settings of the process before any version was loaded.
         when_loaded: after the running version was loaded.
     """
@@ -175,22 +176,26 @@ def why_new_process(
     same_file = named_file(request.task) in (None, before.file)
     texts = _earlier_modules(before, request) if same_file else {}
     if same_file and before.file is not None and not _is_python(texts.get(str(before.file), "")):
-        return ""  # it is refused before any of it runs
-    left = changed_settings(when_loaded, read_process_state()) + threads_of(before.source)
-    if left:
-        return f"the version before has changed {_some(left)}"
-    if not before.followed:
-        return ""
-    if same_file:
-        inherited = inherited_names(before.cls, {*before.source})
-        change = find_change(before.source, texts, str(before.file), before.class_name, inherited)
-        if change.level != "rebuilt":
-            return ""  # what was imported and built is as it was
-    left = changed_settings(at_start, when_loaded)
-    if left:
-        return f"the version before has changed {_some(left)}"
-    gone = removed_effects(before.source, texts)
-    return f"what {gone} did when it was imported cannot be taken back" if gone else ""
+        return None  # it is refused before any of it runs
+    while_running = changed_settings(when_loaded, read_process_state()) + threads_of(before.source)
+    at_load = changed_settings(at_start, when_loaded)
+    gone = removed_effects(before.source, texts) if before.followed else ""
+    if not (failed or while_running or at_load or gone):
+        return None
+    inherited = inherited_names(before.cls, {*before.source})
+    change = find_change(before.source, texts, str(before.file), before.class_name, inherited)
+    same_scene = same_file and before.followed and change.level != "rebuilt"
+    if failed:
+        reason = "the version before failed while it ran"
+    elif while_running:
+        reason = f"the version before has changed {_some(while_running)}"
+    elif same_scene or not before.followed:
+        return None  # what was imported and built stays as it is
+    elif at_load:
+        reason = f"the version before has changed {_some(at_load)}"
+    else:
+        reason = f"what {gone} did when it was imported cannot be taken back"
+    return NewProcessNeeded(reason, same_scene)
 
 
 def _is_python(text: str) -> bool:
@@ -365,7 +370,8 @@ def _build(
     opening.clock.lap("restore")
     level = "restarted" if running is None else "rebuilt"
     reason = change.reason if running is not None else request.because or "the worker was restarted"
-    report = ReloadReport(level, reason, restored.carried, dict(restored.not_carried))
+    same_scene = request.same_scene and bool(restored.carried)
+    report = ReloadReport(level, reason, restored.carried, dict(restored.not_carried), same_scene)
     return replace(opened, first=first, milliseconds=opening.clock.laps), report
 
 

@@ -114,7 +114,7 @@ class Banner(PagePart[SessionView]):
                 self._panel.visible = False
             self._drawn = None
             return
-        stopped = view.state == "stopped"
+        stopped = _stopped(view)
         self._restart.visible = stopped
         self._rebuild.visible = view.task is not None and not stopped and problem.stage in _MAY_BE_OLD
         # Written once for each problem: a new text would close an open traceback.
@@ -152,10 +152,16 @@ def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) ->
     return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view), link=link)
 
 
+def _stopped(view: SessionView) -> bool:
+    """Whether no worker has a version, and none will be started unasked."""
+    lost = view.problem is not None and view.problem.stage == "worker"
+    return view.state == "stopped" or (lost and view.state == "error")
+
+
 def _kept(view: SessionView) -> str:
     """Which version still runs, in a sentence."""
-    if view.state == "stopped":
-        return "The worker process is gone. Restart the worker to load the file as it is now."
+    if _stopped(view):
+        return "No process runs the task. Restart the worker to load the file as it is now."
     if view.task is None and not (view.problem is not None and view.problem.file):
         return "There is nothing to show yet. Open another task (Ctrl O) or change how the envs are made (Run tab)."
     if view.task is None:
