@@ -104,7 +104,7 @@ class LiveState:
         """
         task, report, before = event.task, event.reload, self.now.task
         self._take_options(event.options)
-        kept, past = scene_kept(event), past_after(before, event)
+        kept, past = scene_kept(event), past_after(before, event, restored)
         drawn = kept or (
             past != "gone" and before is not None and pack(before.geometry) == pack(task.geometry)
         )
@@ -467,18 +467,22 @@ class LiveState:
         return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))
 
 
-def past_after(before: TaskDescription | None, event: Loaded) -> Literal["same", "patched", "gone"]:
+def past_after(
+    before: TaskDescription | None, event: Loaded, restored: bool
+) -> Literal["same", "patched", "gone"]:
     """What a load means for the history: it goes on and means the same, it goes on with other code, or another begins.
 
     Args:
         before: the version that ran before.
+        restored: it was brought back.
     """
-    report = event.reload
-    if before is None or report is None:
+    if before is None:
         return "gone"
+    report, same_source = event.reload, before.source_hash == event.task.source_hash
+    if report is None:
+        return "same" if restored and same_source else "gone"
     if report.level in SCENE_KEPT:
         return "patched" if report.level == "patched" else "same"
-    same_source = before.source_hash == event.task.source_hash
     same_task = before.chosen == event.task.chosen and before.num_envs == event.task.num_envs
     if report.level != "restarted" or not same_task or not (same_source or report.same_scene):
         return "gone"

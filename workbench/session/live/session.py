@@ -464,7 +464,7 @@ class Session:
             s = self._state
             restored, stale = self.versions.version_loaded(event.task)
             before = s.now.task
-            past = past_after(before, event)
+            past = past_after(before, event, restored)
             what_to_do = rescore_after_load(past, self.rescorer.rescoring.view)
             rescored = None
             if what_to_do == "rescore" and s.timeline is not None:
@@ -509,6 +509,7 @@ class Session:
     def _on_stepped(self, event: Stepped) -> None:
         with self._lock:
             self._state.stepped(event)
+            self.versions.stepped(event)
             planned = self._state.now.settings.action_source == "solve"
         self.solver.stepped(event, planned)
         self._recorder.take(event)

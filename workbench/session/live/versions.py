@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 from workbench.authoring.loading.modules import read_source
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem
-from workbench.jobs.task import TaskDescription, TaskOptions
+from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
 from workbench.session.live.live_state import SharedState
 from workbench.session.process.supervisor import Death, End
 from workbench.session.protocol.messages import (
@@ -62,6 +62,8 @@ class _GoodVersion:
     """When it was loaded last."""
     crashes: int = 0
     """Of its process, one after the other, each soon after it was loaded."""
+    idle_crashes: int = 0
+    """Of these, those since its last step while nothing was asked of it."""
 
 
 class Recovery:
@@ -71,7 +73,7 @@ class Recovery:
     memory runs out. So the attempts are, in order: the file on disk if no worker has tried it yet, the last good version at
     its newest moment, the same from its start, and at last nothing, until the file changes. None is tried twice, so that
     no file can end workers one after the other. A version that crashes twice, each time soon after it was loaded, is no good
-    one: the version before it comes back. Without one it comes back itself, unless it crashed while nothing was asked of it.
+    one: the version before it comes back. Without one it comes back itself, unless it crashed twice without making a step.
     Used under the session's lock.
     """
 
@@ -139,6 +141,11 @@ class Recovery:
         self._has_env = True
         self._attempt, self.loading = "file", self.file_waits
 
+    def stepped(self) -> None:
+        """A step was made, which somebody had asked for."""
+        if self._good:
+            self._good[-1].idle_crashes = 0
+
     def failed(self, kept: bool) -> bool:
         """A load failed in a worker that goes on. True if it has no version now, and `next_load` has one to try."""
         was_loading, self.loading = self.loading, self.file_waits
@@ -166,7 +173,7 @@ class Recovery:
         """A person restarts the worker, to load the file as it is now; if that is just being loaded (it may loop there), to
         have the last good version back."""
         for version in self._good:
-            version.crashes = 0
+            version.crashes = version.idle_crashes = 0
         if self.loading and not self.restoring and not self.file_waits and self._good:
             return  # `died` goes on from there
         self._attempt, self.loading, self._has_env = "file", False, False
@@ -181,9 +188,10 @@ class Recovery:
             return
         proven = self._clock() - version.since > _PROVEN_SECONDS
         version.crashes = 0 if proven else version.crashes + 1
+        version.idle_crashes = 0 if proven else version.idle_crashes + idle
         if version.crashes > 1 and len(self._good) > 1:
             self._good.pop()
-        elif version.crashes > 1 and idle:
+        elif version.idle_crashes > 1:
             self._attempt = "nothing"
 
     def _step_down(self) -> None:
@@ -312,6 +320,11 @@ class Versions:
     def began(self, loading: Loading) -> None:
         """The worker has begun a load. Under the lock."""
         self._recovery.began(loading.number)
+
+    def stepped(self, event: Stepped) -> None:
+        """The worker has made a step. Under the lock."""
+        if event.step.action is not None:
+            self._recovery.stepped()
 
     def new_process_needed(self, needed: NewProcessNeeded) -> None:
         """The worker ends and leaves the load to the next one. Under the lock."""

@@ -175,7 +175,7 @@ def why_new_process(
     before = with_late_imports(running.opened.loaded)
     same_file = named_file(request.task) in (None, before.file)
     texts = _earlier_modules(before, request) if same_file else {}
-    if same_file and before.file is not None and not _is_python(texts.get(str(before.file), "")):
+    if same_file and before.file is not None and not _is_python(texts.get(str(before.file))):
         return None  # it is refused before any of it runs
     while_running = changed_settings(when_loaded, read_process_state()) + threads_of(before.source)
     at_load = changed_settings(at_start, when_loaded)
@@ -198,7 +198,10 @@ def why_new_process(
     return NewProcessNeeded(reason, same_scene)
 
 
-def _is_python(text: str) -> bool:
+def _is_python(text: str | None) -> bool:
+    """Whether a file's text can be executed; None if the file cannot be read."""
+    if text is None:
+        return False
     try:
         parse_python(text)
     except (SyntaxError, ValueError, RecursionError):
