@@ -69,7 +69,12 @@ def refused(session: Session, task_file: Path, text: str) -> SessionView:
         return view.problem is not None and view.problem_serial > before.problem_serial
 
     wait_until(session, reached, "the refusal")
-    return wait_until(session, lambda v: v.state == "paused", "the last good version")
+    # Its first moment comes after it.
+    return wait_until(
+        session,
+        lambda v: v.state == "paused" and v.timeline.last > before.timeline.last,
+        "the last good version",
+    )
 
 
 def in_evaluate(good: str, *lines: str) -> str:

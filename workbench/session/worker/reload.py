@@ -173,7 +173,7 @@ def why_new_process(
         when_loaded: after the running version was loaded.
     """
     before = with_late_imports(running.opened.loaded)
-    same_file = named_file(request.task) in (None, before.file)
+    same_file = named_file(request.task) == named_file(running.request.task)
     texts = _earlier_modules(before, request) if same_file else {}
     if same_file and before.file is not None and not _is_python(texts.get(str(before.file))):
         return None  # it is refused before any of it runs
