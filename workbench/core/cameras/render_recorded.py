@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import sapien
 import sapien.render
+from mani_skill.render import PREBUILT_SHADER_CONFIGS
 from numpy.typing import NDArray
 
 from workbench.core.backends import find_renderer, give_brdf_table, keep_render_device
+from workbench.core.camera_shader import selected
 from workbench.core.scene.normals import with_normals
 from workbench.core.scene.shapes import Material, SceneGeometry, Visual
 
@@ -50,12 +52,12 @@ class RecordedScene:
             entity.add_component(shapes)
             self._scene.add_entity(entity)
         self._eye = sapien.Entity()
-        sapien.render.set_camera_shader_dir("default")
         camera: Any = sapien.render.RenderCameraComponent(width, height)
         camera.set_fovy(fovy)
         camera.near, camera.far = NEAR, FAR
         self._eye.add_component(camera)
-        self._scene.add_entity(self._eye)
+        with selected(PREBUILT_SHADER_CONFIGS["default"]):
+            self._scene.add_entity(self._eye)
         give_brdf_table(camera)
         self._camera = camera
 

@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 import sapien
 import sapien.render
-from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from numpy.typing import ArrayLike, NDArray
 
 from workbench.core.backends import give_brdf_table
 from workbench.core.camera_data import CameraKind, CameraSettings
+from workbench.core.camera_shader import MINIMAL, selected
 from workbench.core.cameras.conventions import intrinsic_of, scaled_intrinsic
-from workbench.core.cameras.render import cameras_of, depth_in_metres, places_to_draw, show_hidden_objects
+from workbench.core.cameras.render import depth_in_metres, places_to_draw, show_hidden_objects
 from workbench.core.env_numbers import require_env
 from workbench.core.simulation.drawn_poses import drawn_at, temporarily
 
-_SHADER = PREBUILT_SHADER_CONFIGS["minimal"]
 _TEXTURE = "PositionSegmentation"
 
 
@@ -94,7 +93,7 @@ def temporary_camera(
         move_bodies = after.enter_context(drawn_at(places))
         second_scene = sapien.Scene([render_system])
         entity = sapien.Entity()
-        with _minimal_shader(env):
+        with selected(MINIMAL):
             component = sapien.render.RenderCameraComponent(size[0], size[1])
             entity.add_component(component)
             second_scene.add_entity(entity)
@@ -104,18 +103,6 @@ def temporary_camera(
         component.set_focal_lengths(k[0, 0], k[1, 1])
         component.set_principal_point(k[0, 2], k[1, 2])
         yield TemporaryCamera(sub_scene, component, move_bodies)
-
-
-@contextmanager
-def _minimal_shader(env: Any) -> Iterator[None]:
-    """Select the minimal shader: SAPIEN makes every camera with the shader selected last in the process."""
-    last = [*cameras_of(env).values()][-1:]
-    set_shader_pack(_SHADER)
-    try:
-        yield
-    finally:
-        for camera in last:
-            set_shader_pack(camera.config.shader_config)
 
 
 @contextmanager

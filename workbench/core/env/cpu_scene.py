@@ -30,6 +30,7 @@ from workbench.core.broken_rule import (
     warn_of,
 )
 from workbench.core.camera_data import CameraKey, CameraKind, PictureDegree
+from workbench.core.camera_shader import note_shader
 from workbench.core.env.partial_reset import (
     KeptControllers,
     explain_reset_errors,
@@ -194,6 +195,7 @@ class BatchedCpuScene(ManiSkillScene):
         finally:
             self.gpu_sim_enabled = True
         for component in camera._render_cameras:
+            note_shader(component)
             give_brdf_table(component)
         return camera
 

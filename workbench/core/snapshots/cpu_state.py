@@ -14,6 +14,7 @@ import sapien.physx as physx
 from numpy.typing import NDArray
 
 from workbench.core.backends import give_brdf_table
+from workbench.core.camera_shader import made_again
 from workbench.core.scene.scene_index import hidden_poses, once_a_scene, scene_index
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
 from workbench.core.simulation.state_layout import BODY
@@ -471,14 +472,20 @@ def _moved(old: sapien.Scene, physics: physx.PhysxCpuSystem) -> sapien.Scene:
     """A scene over `physics` that has all entities of `old`, in their order, and its render system."""
     entities = old.entities
     systems = _render_systems(old)
+    cameras = [camera for system in systems for camera in system.cameras]
     new = sapien.Scene([physics, *systems])
     for entity in entities:
         entity.remove_from_scene()
+    carriers = [camera.entity for camera in cameras]
+    for entity, camera in zip(carriers, cameras, strict=True):
+        entity.remove_component(camera)
     for entity in entities:
         new.add_entity(entity)
-    for system in systems:
-        for camera in system.cameras:
-            give_brdf_table(camera)  # it has a new renderer, which would compute one for seconds
+    for entity, camera in zip(carriers, cameras, strict=True):
+        # One by one, since two cameras of an entity may have different shaders.
+        with made_again(camera):
+            entity.add_component(camera)
+        give_brdf_table(camera)  # it has a new renderer, which would compute one for seconds
     return new
 
 
