@@ -421,6 +421,13 @@ _TABLE = (
         "Thousands of envs do not fit the GPU's memory.",
         "_default_sensor_configs",
     ),
+    Rule(
+        "ray-traced",
+        "warn",
+        "No camera is ray traced: shader_pack is minimal or default.",
+        'render() of several envs raises "ray tracing shaders do not work with parallel rendering".',
+        "_default_human_render_camera_configs",
+    ),
     # --- solved by planning (--solve) ------------------------------------------------------------------------
     Rule(
         "reward-exploited",

@@ -171,7 +171,9 @@ class ManyShaders(PICK_CUBE):
 
 
 def test_each_camera_keeps_its_shader(renderer: None) -> None:
-    env: Any = batched(ManyShaders, 2, render=True, obs_mode="rgb+depth+segmentation", render_mode="rgb_array")
+    env: Any = batched(
+        ManyShaders, 2, render=True, obs_mode="rgb+depth+segmentation", render_mode="rgb_array"
+    )
     env.reset(seed=[0, 1])
     restore_snapshot(env, take_snapshot(env))
 

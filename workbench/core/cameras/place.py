@@ -17,7 +17,7 @@ from mani_skill.utils.structs.pose import Pose
 from workbench.core import maniskill_private
 from workbench.core.backends import give_brdf_table
 from workbench.core.camera_data import NOT_ON_THE_GPU, CameraKey, CameraSettings, why_no_camera
-from workbench.core.camera_shader import note_shader, selected
+from workbench.core.camera_shader import drawable, note_shader, selected
 from workbench.core.cameras.conventions import matrix3, triple
 from workbench.core.simulation.cpu_system import batched_system
 
@@ -128,7 +128,7 @@ def _config(config: Any, settings: CameraSettings) -> Any:
     placed.width, placed.height = settings.width, settings.height
     if settings.shader_pack != config.shader_pack:
         placed.shader_pack, placed.shader_config = settings.shader_pack, shaders[settings.shader_pack]
-    return placed
+    return drawable(placed)
 
 
 def _set(env: Any, key: CameraKey, camera: Any, config: Any, poses: list[sapien.Pose]) -> bool:

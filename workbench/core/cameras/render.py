@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import linecache
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,11 +15,14 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import maniskill_private
+from workbench.core.backends import why_no_ray_tracing
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture, PictureDegree
+from workbench.core.camera_shader import replaced_shader
 from workbench.core.cameras.place import rows_of_pose, settings_of
 from workbench.core.env.cpu_scene import BatchedCpuScene
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.env_numbers import require_env
+from workbench.core.rules import Finding
 from workbench.core.scene.scene_index import hidden_poses, scene_index
 from workbench.core.simulation.cpu_system import batched_system
 from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, camera_pose, drawn_at, temporarily
@@ -57,9 +61,36 @@ def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
                 settings=settings_of(camera.config),
                 varies=_varies(camera.config, components),
                 site=maniskill_private.camera_site(camera.config),
+                replaced_shader=replaced_shader(camera.config),
             )
         )
     return tuple(infos)
+
+
+def findings_of_shaders(cameras: Iterable[CameraInfo]) -> list[Finding]:
+    """For each camera whose shader is replaced, where its config is made."""
+    found = []
+    for camera in cameras:
+        if not camera.replaced_shader:
+            continue
+        message = f"camera {camera.name!r} is ray traced (shader_pack {camera.replaced_shader!r}). {here_without_ray_tracing()}"
+        site = camera.site
+        at = (None, None, "", "")
+        if site is not None:
+            code = linecache.getline(site.file, site.line).strip()
+            at = (site.file, site.line, code, site.function.rpartition(".")[2])
+        found.append(Finding("ray-traced", "warn", message, *at, 1, 0))
+    return found
+
+
+def here_without_ray_tracing() -> str:
+    """What this machine does with ray traced cameras, as a sentence; empty where it traces rays."""
+    why = why_no_ray_tracing()
+    if why is None:
+        return ""
+    return (
+        f"That needs a GPU driver with ray tracing, and {why}: here its pictures have shader_pack 'default'."
+    )
 
 
 def segmentation_names(env: Any) -> dict[int, str]:

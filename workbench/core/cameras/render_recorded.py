@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import sapien
 import sapien.render
-from mani_skill.render import PREBUILT_SHADER_CONFIGS
 from numpy.typing import NDArray
 
 from workbench.core.backends import find_renderer, give_brdf_table, keep_render_device
-from workbench.core.camera_shader import selected
+from workbench.core.camera_shader import DEFAULT, selected
 from workbench.core.scene.normals import with_normals
 from workbench.core.scene.shapes import Material, SceneGeometry, Visual
 
@@ -56,7 +55,7 @@ class RecordedScene:
         camera.set_fovy(fovy)
         camera.near, camera.far = NEAR, FAR
         self._eye.add_component(camera)
-        with selected(PREBUILT_SHADER_CONFIGS["default"]):
+        with selected(DEFAULT):
             self._scene.add_entity(self._eye)
         give_brdf_table(camera)
         self._camera = camera

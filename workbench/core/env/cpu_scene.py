@@ -30,7 +30,7 @@ from workbench.core.broken_rule import (
     warn_of,
 )
 from workbench.core.camera_data import CameraKey, CameraKind, PictureDegree
-from workbench.core.camera_shader import note_shader
+from workbench.core.camera_shader import install_drawable_cameras, note_shader
 from workbench.core.env.partial_reset import (
     KeptControllers,
     explain_reset_errors,
@@ -43,6 +43,7 @@ from workbench.core.maniskill_private import (
     asks_for_a_gpu,
     camera_components,
     install_row_lookups,
+    mark_camera_configs,
     scene_of,
     substeps_are_unwatched,
 )
@@ -226,6 +227,17 @@ class BatchedCpuScene(ManiSkillScene):
                 sub_scene.update_render()
                 move_bodies()
 
+    def get_human_render_camera_images(self, camera_name: str | None = None) -> dict[str, torch.Tensor]:
+        # ManiSkill refuses ray tracing where one group draws the cameras of all envs. Here each is drawn alone.
+        images = {}
+        for name, camera in self.human_render_cameras.items():
+            if camera_name in (None, name):
+                camera.capture()
+                images[name] = camera.get_obs(rgb=True, depth=False, segmentation=False, position=False)[
+                    "rgb"
+                ]
+        return images
+
     def _gpu_apply_all(self) -> None:
         if self._needs_fetch:
             raise RuntimeError(
@@ -390,6 +402,10 @@ class BatchedCpuMixin:
         self.scene.px.timestep = 1.0 / self._sim_freq
 
 
+def _is_batched(scene: Any) -> bool:
+    return isinstance(scene, BatchedCpuScene)
+
+
 def batched_class(
     task: type[BaseEnv],
     threads: int | None = None,
@@ -406,6 +422,8 @@ def batched_class(
     """
     install_row_lookups(batched_system)
     install_struct_access()
+    install_drawable_cameras(_is_batched)
+    mark_camera_configs()
     namespace = {
         "__module__": task.__module__,
         "__doc__": task.__doc__,
