@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from weakref import WeakKeyDictionary
 
 import sapien.render
@@ -27,7 +27,7 @@ class _Selection:
     folder: str
     samples_per_pixel: int
     path_depth: int
-    denoiser: str
+    denoiser: Literal["none", "oidn", "optix"]
 
     @staticmethod
     def now() -> _Selection:

@@ -410,19 +410,20 @@ def joints_of(struct: Any) -> int:
 
 
 def hidden_objects(env: Any) -> list[Any]:
-    """Actors (merged ones too) that the task hides from its sensors: ``_hidden_objects``; none if `why_not` of `HIDDEN`."""
-    return [] if why_not(HIDDEN) else env._hidden_objects
+    """Actors that the task hides from its sensors, of ``_hidden_objects``; none if `why_not` of `HIDDEN`.
+
+    ManiSkill cannot hide an Articulation, which has no ``hide_visual``.
+    """
+    return [] if why_not(HIDDEN) else [each for each in env._hidden_objects if isinstance(each, Actor)]
 
 
 def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
-    """True pose of an actor that is hidden now, (M, 7) or (7,); None if it is not hidden.
+    """(M, 7) true pose of an actor that was moved away to hide it; None if it was not.
 
-    ``Actor.hide_visual`` cannot switch off drawing in GPU simulation: it keeps the pose in
-    ``before_hide_pose`` and moves the actor 99999 m away. On a stock CPU env nothing moves.
+    In GPU simulation ``Actor.hide_visual`` keeps the pose in ``before_hide_pose`` and moves the actor 99999 m away. On the
+    CPU, stock or batched (`simulation.hiding`), nothing moves.
     """
-    if not actor.hidden or not actor.scene.gpu_sim_enabled:
-        return None
-    return actor.before_hide_pose  # type: ignore[attr-defined]
+    return getattr(actor, "before_hide_pose", None) if actor.hidden else None
 
 
 def unflattened_state(env: BaseEnv, info: dict[str, Any]) -> dict[str, Any]:

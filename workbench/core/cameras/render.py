@@ -26,6 +26,7 @@ from workbench.core.rules import Finding
 from workbench.core.scene.scene_index import hidden_poses, scene_index
 from workbench.core.simulation.cpu_system import batched_system
 from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, camera_pose, drawn_at, temporarily
+from workbench.core.simulation.hiding import shown_visibility
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
 _INT16_END = 32.767
@@ -283,24 +284,29 @@ def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[Camera
 def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
     """Within this, draw the task's hidden objects in this env, or do not.
 
-    ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on a stock CPU env by visibility,
-    in batched simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away
-    is put back while human cameras look. Both are undone, so a picture leaves no trace in the simulation.
+    ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by visibility, in GPU
+    simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back
+    while human cameras look. One that something else has moved back meanwhile stays in sight of sensors, as for the policy.
+    Both are undone, so a picture leaves no trace in the simulation.
     """
     slot_of = scene_index(env).slot_of
     true = (
         {slot: pose for rows in hidden_poses(env) for slot, pose in zip(*rows, strict=True)} if shown else {}
     )
     changes: list[tuple[Any, str, Any]] = []
-    for actor in maniskill_private.hidden_objects(env):
+    actors = maniskill_private.hidden_objects(env)
+    for actor in actors:
+        moved_away = maniskill_private.pose_before_hiding(actor) is not None
         for entity, env_of in zip(
             maniskill_private.objects_of(actor), maniskill_private.envs_of(actor), strict=True
         ):
             body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
             if env_of != env_index or body is None:
                 continue
-            # A ghost of visibility 0.3 stays one; only what is switched off is switched on.
-            changes.append((body, "visibility", (body.visibility or 1.0) if shown else 0.0))
+            if shown:
+                changes.append((body, "visibility", shown_visibility(actors, body)))
+            elif not moved_away:
+                changes.append((body, "visibility", 0.0))
             pose = true.get(slot_of[id(entity)]) if id(entity) in slot_of else None
             if pose is not None:
                 changes.append((entity, "pose", sapien.Pose(pose[:3], pose[3:])))

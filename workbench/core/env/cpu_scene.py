@@ -54,6 +54,7 @@ from workbench.core.simulation.accessors import install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
 from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, drawn_at
+from workbench.core.simulation.hiding import install_hiding
 from workbench.core.snapshots.snapshot import begin_anew
 from workbench.core.snapshots.task_state import note_constructed, note_scene
 
@@ -422,6 +423,7 @@ def batched_class(
     """
     install_row_lookups(batched_system)
     install_struct_access()
+    install_hiding()
     install_drawable_cameras(_is_batched)
     mark_camera_configs()
     namespace = {
