@@ -159,6 +159,13 @@ _TABLE = (
         "_load_scene",
     ),
     Rule(
+        "hidden-objects",
+        "warn",
+        "_hidden_objects has actors without collision shapes, and the merged actor in place of its parts.",
+        "Poses are wrong and sensors see what is hidden; or every picture fails.",
+        "_load_scene",
+    ),
+    Rule(
         "reconfigures",
         "warn",
         "A scene that is built at random is rebuilt now and then (reconfiguration_freq), at one env at each reset.",

@@ -409,12 +409,14 @@ def joints_of(struct: Any) -> int:
     return int(getattr(struct, "max_dof", 0))
 
 
-def hidden_objects(env: Any) -> list[Any]:
-    """Actors that the task hides from its sensors, of ``_hidden_objects``; none if `why_not` of `HIDDEN`.
+def named_to_hide(env: Any) -> list[Any]:
+    """``_hidden_objects``; none if `why_not` of `HIDDEN`."""
+    return [] if why_not(HIDDEN) else env._hidden_objects
 
-    ManiSkill cannot hide an Articulation, which has no ``hide_visual``.
-    """
-    return [] if why_not(HIDDEN) else [each for each in env._hidden_objects if isinstance(each, Actor)]
+
+def hidden_objects(env: Any) -> list[Any]:
+    """The actors that the task hides from its sensors. ManiSkill cannot hide an Articulation, which has no ``hide_visual``."""
+    return [each for each in named_to_hide(env) if isinstance(each, Actor)]
 
 
 def pose_before_hiding(actor: Actor) -> torch.Tensor | None:

@@ -37,11 +37,28 @@ def _in_batched_scenes(ours: Callable[[Any], None], stock: Callable[[Any], None]
     def act(self: Any) -> None:
         if batched_system(self.scene) is None:
             stock(self)
+        elif why := why_not_hidden(self):
+            raise RuntimeError(f"ManiSkill cannot hide {self.name!r} from cameras: {why}.")
         else:
-            assert not self.has_collision_shapes
             ours(self)
 
     return act
+
+
+def why_not_hidden(thing: Any) -> str:
+    """Why ManiSkill cannot hide a member of ``_hidden_objects``, as a clause; empty if it can. `RuntimeError` in a batched CPU
+    scene, an assertion or an AttributeError in others."""
+    if not isinstance(thing, Actor):
+        return f"it is no actor but a {type(thing).__name__}, and only actors can be hidden"
+    if thing.merged and "has_collision_shapes" not in vars(thing):
+        return "it is merged, and may collide. If it does not, set its has_collision_shapes to False first"
+    if thing.px_body_type == "static":
+        return "it is static. Build it with build_kinematic()"
+    return (
+        "it has collision shapes. Hide an actor that is made of visuals alone"
+        if thing.has_collision_shapes
+        else ""
+    )
 
 
 def _where_it_is(stock: Any) -> Callable[..., Any]:
