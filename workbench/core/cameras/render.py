@@ -19,6 +19,7 @@ from workbench.core.backends import why_no_ray_tracing
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture, PictureDegree
 from workbench.core.camera_shader import replaced_shader
 from workbench.core.cameras.place import rows_of_pose, settings_of
+from workbench.core.drawing import drawing, read_texture
 from workbench.core.env.cpu_scene import BatchedCpuScene
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.env_numbers import require_env
@@ -132,7 +133,7 @@ def take_pictures(
     Raises:
         IndexError: there is no such env.
         ValueError: there is no such camera, or it cannot give the requested modalities.
-        RuntimeError: the renderer failed.
+        CannotDraw: the renderer failed, a RuntimeError.
     """
     pictures: dict[int, Picture] = {}
     for kind in KINDS:
@@ -207,15 +208,16 @@ def begin_pictures(
         sub_scene.update_render()
         move_bodies()
         for (name, kind, modalities), component, textures in zip(requests, components, needed, strict=True):
-            drawing = component
-            if batched is None:
-                component.take_picture()
-            else:
-                drawing = batched.take_picture(env_index, (kind, name), component, textures, degree)
+            drawn_by = component
+            with drawing((kind, name), maniskill_private.camera_site(cameras[kind, name].config)):
+                if batched is None:
+                    component.take_picture()
+                else:
+                    drawn_by = batched.take_picture(env_index, (kind, name), component, textures, degree)
             pose = component.get_global_pose()
             where = np.array([*pose.p, *pose.q], dtype=np.float32)
             taken.append(
-                (cameras[kind, name], drawing, name, kind, env_index, tuple(modalities), where, drawn)
+                (cameras[kind, name], drawn_by, name, kind, env_index, tuple(modalities), where, drawn)
             )
     return PendingPictures(tuple(taken))
 
@@ -330,7 +332,7 @@ def _read(
     for texture, gives in config.texture_names.items():
         if not set(gives) & set(modalities):
             continue
-        data = component.get_picture(texture)
+        data = read_texture(component, texture, (kind, name), maniskill_private.camera_site(camera.config))
         transformed = config.texture_transforms[texture](torch.from_numpy(data)[None])
         made.update({m: image[0] for m, image in transformed.items() if m in modalities})
         if "depth" in gives and "depth" in modalities:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from workbench.core.backends import find_renderer, give_brdf_table, keep_render_device
 from workbench.core.camera_shader import DEFAULT, selected
+from workbench.core.drawing import drawing
 from workbench.core.scene.normals import with_normals
 from workbench.core.scene.shapes import Material, SceneGeometry, Visual
 
@@ -74,9 +75,10 @@ class RecordedScene:
                 sapien.Pose(pose[:3].tolist(), pose[3:].tolist()) if there else sapien.Pose([0, 0, -1000])
             )
         self._eye.pose = sapien.Pose(eye[:3].tolist(), eye[3:].tolist())
-        self._scene.update_render()
-        self._camera.take_picture()
-        colour = np.asarray(self._camera.get_picture("Color"))[..., :3]
+        with drawing(("human", "film")):
+            self._scene.update_render()
+            self._camera.take_picture()
+            colour = np.asarray(self._camera.get_picture("Color"))[..., :3]
         if colour.dtype != np.uint8:
             colour = np.rint(np.clip(colour, 0.0, 1.0) * 255).astype(np.uint8)
         return np.ascontiguousarray(colour)

@@ -13,10 +13,11 @@ import sapien.render
 from numpy.typing import ArrayLike, NDArray
 
 from workbench.core.backends import give_brdf_table
-from workbench.core.camera_data import CameraKind, CameraSettings
+from workbench.core.camera_data import CameraKey, CameraKind, CameraSettings
 from workbench.core.camera_shader import MINIMAL, selected
 from workbench.core.cameras.conventions import intrinsic_of, scaled_intrinsic
 from workbench.core.cameras.render import depth_in_metres, places_to_draw, show_hidden_objects
+from workbench.core.drawing import drawing
 from workbench.core.env_numbers import require_env
 from workbench.core.simulation.drawn_poses import drawn_at, temporarily
 
@@ -27,6 +28,7 @@ _TEXTURE = "PositionSegmentation"
 class TemporaryCamera:
     """A camera that gives depth and segmentation, of what its kind of camera sees."""
 
+    _key: CameraKey
     _sub_scene: Any
     _component: Any
     _move_bodies: Any
@@ -38,14 +40,16 @@ class TemporaryCamera:
         # A camera renders from where its entity was at the last update.
         self._sub_scene.update_render()
         self._move_bodies()
-        self._component.take_picture()
-        data = self._component.get_picture(_TEXTURE)
+        with drawing(self._key):
+            self._component.take_picture()
+            data = self._component.get_picture(_TEXTURE)
         depth = depth_in_metres(_TEXTURE, data, -data[..., 2], self._component)
         return data[..., 3].astype(np.int32), depth
 
     def colours(self) -> NDArray[np.uint8]:
         """(H, W, 3) RGB of the last picture."""
-        return np.ascontiguousarray(self._component.get_picture("Color")[..., :3])
+        with drawing(self._key):
+            return np.ascontiguousarray(self._component.get_picture("Color")[..., :3])
 
 
 @contextmanager
@@ -102,7 +106,7 @@ def temporary_camera(
         component.near, component.far = near, far
         component.set_focal_lengths(k[0, 0], k[1, 1])
         component.set_principal_point(k[0, 2], k[1, 2])
-        yield TemporaryCamera(sub_scene, component, move_bodies)
+        yield TemporaryCamera((kind, "temporary"), sub_scene, component, move_bodies)
 
 
 @contextmanager

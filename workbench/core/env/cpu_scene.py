@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from collections.abc import Callable, Collection
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -31,6 +31,7 @@ from workbench.core.broken_rule import (
 )
 from workbench.core.camera_data import CameraKey, CameraKind, PictureDegree
 from workbench.core.camera_shader import install_drawable_cameras, note_shader
+from workbench.core.drawing import drawing, read_texture
 from workbench.core.env.partial_reset import (
     KeptControllers,
     explain_reset_errors,
@@ -42,6 +43,7 @@ from workbench.core.env.strict import StrictMixin
 from workbench.core.maniskill_private import (
     asks_for_a_gpu,
     camera_components,
+    camera_site,
     install_row_lookups,
     mark_camera_configs,
     scene_of,
@@ -98,21 +100,27 @@ class CpuCameraGroup:
 
     def take_picture(self) -> None:
         self._has = {*self.textures}
-        self._drawn = [
-            self._scene.take_picture(env, self._key, camera, self._has)
-            for env, camera in enumerate(self._cameras)
-        ]
+        with self._drawing():
+            self._drawn = [
+                self._scene.take_picture(env, self._key, camera, self._has)
+                for env, camera in enumerate(self._cameras)
+            ]
 
     def get_picture_cuda(self, name: str) -> CpuArray:
         """(N, H, W, C) texture `name` of every env, on the CPU."""
         self.textures.add(name)
         if name not in self._has and self._drawn != self._cameras:
             # For this once by the exact cameras, which the last `update_render` has moved too.
-            for env, camera in enumerate(self._cameras):
-                self._scene.take_picture(env, self._key, camera, None)
+            with self._drawing():
+                for env, camera in enumerate(self._cameras):
+                    self._scene.take_picture(env, self._key, camera, None)
             self._drawn = self._cameras
-        pictures = [torch.from_numpy(camera.get_picture(name)) for camera in self._drawn]
-        return CpuArray(torch.stack(pictures))
+        site = camera_site(self._scene.camera(self._key).config)
+        pictures = [read_texture(camera, name, self._key, site) for camera in self._drawn]
+        return CpuArray(torch.stack([torch.from_numpy(picture) for picture in pictures]))
+
+    def _drawing(self) -> AbstractContextManager[None]:
+        return drawing(self._key, camera_site(self._scene.camera(self._key).config))
 
 
 class BatchedCpuScene(ManiSkillScene):
@@ -163,7 +171,7 @@ class BatchedCpuScene(ManiSkillScene):
         Args:
             places: where bodies of the env are drawn instead.
         """
-        sensor = self._sensor(key)
+        sensor = self.camera(key)
         components = camera_components(sensor)
         shapes, cameras = self._fast_parts()
         shapes.prepare(env, key, components, places)
@@ -180,7 +188,8 @@ class BatchedCpuScene(ManiSkillScene):
             self._fast = FastShapes(self.sub_scenes), FastCameras(self.sub_scenes)
         return self._fast
 
-    def _sensor(self, key: CameraKey) -> Any:
+    def camera(self, key: CameraKey) -> Any:
+        """ManiSkill's sensor or human camera of this key."""
         kind, name = key
         return (self.sensors if kind == "sensor" else self.human_render_cameras)[name]
 

@@ -490,7 +490,8 @@ class _Episodes:
 
     def _stepped(self, step: StepResult, reset_mask: np.ndarray, pictured: list[int]) -> Stepped:
         task = self._opened.env
-        pictures = tuple(step_pictures(task, pictured, self._wanted))
+        with blamed("pictures", self._opened.loaded, task):
+            pictures = tuple(step_pictures(task, pictured, self._wanted))
         with blamed("step", self._opened.loaded, task):
             columns = read_state_columns(task)
         return Stepped(step, reset_mask, pictures, task.episode_seeds, columns=columns)
