@@ -25,7 +25,7 @@ from workbench.cli.terminal.arguments import (
 )
 from workbench.cli.terminal.output import Exit, end_quietly, interrupted, lacks_maniskill, refuse
 from workbench.jobs.task import ShownPictures
-from workbench.machine.processes.time_limit import end_after
+from workbench.machine.processes.time_limit import end_after, end_limit
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.machine.text import guard_terminal
 
@@ -355,6 +355,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )
         finally:
+            end_limit()
             if sys.stdout is not None:
                 sys.stdout.flush()
     except KeyboardInterrupt:  # during the imports of a command: torch takes seconds

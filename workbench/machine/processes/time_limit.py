@@ -36,7 +36,17 @@ _watcher: _Watcher | None = None
 def end_after(seconds: float = PICTURE_SECONDS) -> None:
     """End this process where what is done within `limited` takes longer. Without this call `limited` does nothing."""
     global _watcher
+    end_limit()
     _watcher = _Watcher(os.getpid(), seconds)
+
+
+def end_limit() -> None:
+    """Take back `end_after`."""
+    global _watcher
+    watcher, _watcher = _watcher, None
+    if watcher is not None and watcher.process is not None and watcher.pid == os.getpid():
+        os.close(watcher.pipe)
+        watcher.process.wait()
 
 
 @contextmanager
