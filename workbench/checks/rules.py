@@ -411,7 +411,7 @@ _TABLE = (
         "camera-pose",
         "warn",
         "A camera's quaternion has length 1.",
-        "Extrinsics come out scaled: look_at straight down or up does this (tilt the view a little).",
+        "The picture is turned and zoomed, and extrinsics are scaled: look_at straight down or up does this (tilt the view a little).",
         "_default_sensor_configs",
     ),
     Rule(

@@ -48,11 +48,11 @@ sapien.render.RenderCameraComponent.get_picture = get_picture
 """
 
 
-def task(folder: Path, code: str, *edit: str) -> Path:
-    assert CLASS in EXAMPLE and (not edit or edit[0] in EXAMPLE)
+def task(folder: Path, code: str, old: str = "", new: str = "") -> Path:
+    assert CLASS in EXAMPLE and old in EXAMPLE
     text = EXAMPLE.replace(CLASS, code.lstrip() + CLASS)
     file = folder / "task.py"
-    file.write_text(text.replace(*edit) if edit else text)
+    file.write_text(text.replace(old, new) if old else text)
     return file
 
 

@@ -12,7 +12,7 @@ from workbench.authoring.loading.blamed import blamed
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
-from workbench.core.camera_data import CameraKey
+from workbench.core.camera_data import CameraKey, CameraKind
 from workbench.core.camera_shader import is_ray_traced
 from workbench.core.cameras.place import rows_of_pose
 from workbench.core.cameras.render import cameras_of, here_without_ray_tracing, mount_of
@@ -39,6 +39,10 @@ MISSED_SHARE = 0.25
 """Of the pictures in which an object may be out of view."""
 BACKGROUND_SHARE = 0.5
 MOST_PIXELS = 512 * 512
+HOOKS: Mapping[CameraKind, str] = {
+    "sensor": "_default_sensor_configs",
+    "human": "_default_human_render_camera_configs",
+}
 UNIT = 1e-3
 """Largest difference of a quaternion's length from 1."""
 
@@ -98,14 +102,20 @@ def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
-    """The poses that the hooks return."""
-    for config in _own_configs(checkup):
+    """The poses that the hooks return, for sensors of the task and for people."""
+    configs = checkup.look(hook_configs)
+    robots = {config.uid for config in checkup.look(sensor_configs)[1]}
+    own = {key: config for key, config in configs.items() if key[0] == "human" or key[1] not in robots}
+    if not own:
+        raise CannotCheck("it has no camera of its own")
+    for (kind, _), config in own.items():
         lengths = np.linalg.norm(rows_of_pose(config)[:, 3:], axis=1)
         if np.abs(lengths - 1).max() > UNIT:
             yield Found(
-                f"the quaternion of camera {config.uid!r} has length {lengths[0]:.3g}: its extrinsics are scaled. Give a "
-                "unit quaternion; if look_at() looks straight up or down, move the eye aside by 0.001 m.",
-                _site(checkup, config),
+                f"the quaternion of camera {config.uid!r} has length {lengths[0]:.3g}: its picture is turned and zoomed, and "
+                "its extrinsics are scaled. Give a unit quaternion; if look_at() looks straight up or down, move the eye "
+                "aside by 0.001 m.",
+                _site(checkup, config, HOOKS[kind]),
             )
 
 
@@ -137,14 +147,13 @@ def camera_size(checkup: Checkup) -> Iterator[Found | Note]:
 
 def ray_traced(checkup: Checkup) -> Iterator[Found | Note]:
     """The configs that the hooks return, for sensors and for people."""
-    hooks = {"sensor": "_default_sensor_configs", "human": "_default_human_render_camera_configs"}
     for (kind, name), config in checkup.look(hook_configs).items():
         if is_ray_traced(str(config.shader_pack)):
             yield Found(
                 f"camera {name!r} is ray traced (shader_pack {config.shader_pack!r}), which ManiSkill refuses for several "
                 f"envs on a GPU. {here_without_ray_tracing()} For films, give shader_pack to gym.make of one env in "
                 "human_render_camera_configs.".replace("  ", " "),
-                _site(checkup, config, hooks[kind]),
+                _site(checkup, config, HOOKS[kind]),
             )
 
 

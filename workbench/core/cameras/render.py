@@ -201,13 +201,14 @@ def begin_pictures(
     ):
         batched = scene if isinstance(scene, BatchedCpuScene) else None
         needed = [_textures(cameras[kind, name], modalities) for name, kind, modalities in requests]
-        drawn = _degree_of(scene, degree)
-        if batched is not None and drawn == "fast":
-            for (name, kind, _), textures in zip(requests, needed, strict=True):
+        degrees = [_degree_of(scene, component, degree) for component in components]
+        for (name, kind, _), textures, drawn in zip(requests, needed, degrees, strict=True):
+            if batched is not None and drawn == "fast":
                 batched.prepare_fast(env_index, (kind, name), textures, places)
         sub_scene.update_render()
         move_bodies()
-        for (name, kind, modalities), component, textures in zip(requests, components, needed, strict=True):
+        each = zip(requests, components, needed, degrees, strict=True)
+        for (name, kind, modalities), component, textures, drawn in each:
             drawn_by = component
             with drawing((kind, name), maniskill_private.camera_site(cameras[kind, name].config)):
                 if batched is None:
@@ -222,9 +223,9 @@ def begin_pictures(
     return PendingPictures(tuple(taken))
 
 
-def _degree_of(scene: Any, asked: PictureDegree | None = None) -> PictureDegree:
-    """What a picture of the scene is, if this is asked for: only a batch on the CPU has fast ones."""
-    return (asked or scene.pictures) if isinstance(scene, BatchedCpuScene) else "exact"
+def _degree_of(scene: Any, component: Any, asked: PictureDegree | None = None) -> PictureDegree:
+    """What a picture of a camera is, if this is asked for: only a batch on the CPU has fast ones."""
+    return scene.degree_of(component, asked) if isinstance(scene, BatchedCpuScene) else "exact"
 
 
 def _textures(camera: Any, modalities: Sequence[str]) -> set[str]:
@@ -441,7 +442,7 @@ def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[P
                 rgb=None if "rgb" not in rows else rows["rgb"][at],
                 depth=None if depth is None else depth[at, ..., 0],
                 segmentation=None if segmentation is None else segmentation[at, ..., 0],
-                degree=_degree_of(scene),
+                degree=_degree_of(scene, components[env]),
             )
         )
     return found

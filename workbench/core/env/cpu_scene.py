@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import sapien
 import sapien.physx as physx
 import sapien.render
@@ -60,6 +61,8 @@ from workbench.core.simulation.hiding import install_hiding
 from workbench.core.snapshots.snapshot import begin_anew
 from workbench.core.snapshots.task_state import note_constructed, note_scene
 
+_UNIT = 1e-3
+"""Largest difference of a quaternion's length from 1."""
 SIM_BACKEND = "physx_cpu_batched"
 """Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
 
@@ -154,7 +157,7 @@ class BatchedCpuScene(ManiSkillScene):
             textures: those that a fast picture needs; None for all of `camera`'s own, by `camera` itself.
             degree: None for the scene's own. A fast one needs `prepare_fast` before ``update_render``.
         """
-        if (degree or self.pictures) == "exact":
+        if self.degree_of(camera, degree) == "exact":
             camera.take_picture()
             return camera
         shapes, cameras = self._fast_parts()
@@ -162,6 +165,18 @@ class BatchedCpuScene(ManiSkillScene):
         with shown(shapes.bodies(key, env)):
             drawing.take_picture()
         return drawing
+
+    def degree_of(
+        self, camera: sapien.render.RenderCameraComponent, asked: PictureDegree | None = None
+    ) -> PictureDegree:
+        """The degree of a picture for which this degree is asked, or the scene's own.
+
+        Always exact where the camera's quaternion is not of unit length (``look_at`` straight down): SAPIEN turns and zooms
+        its picture, and what is out of its view is not known.
+        """
+        if (asked or self.pictures) == "exact" or abs(float(np.linalg.norm(camera.local_pose.q)) - 1) > _UNIT:
+            return "exact"
+        return "fast"
 
     def prepare_fast(
         self, env: int, key: CameraKey, textures: Collection[str], places: Places = NOWHERE_ELSE
@@ -173,6 +188,8 @@ class BatchedCpuScene(ManiSkillScene):
         """
         sensor = self.camera(key)
         components = camera_components(sensor)
+        if self.degree_of(components[env], "fast") == "exact":
+            return
         shapes, cameras = self._fast_parts()
         shapes.prepare(env, key, components, places)
         cameras.follow(env, sensor.config, components[env], textures)

@@ -456,7 +456,7 @@ def answer_question(
     )
 
 
-def _draw_temporary(opened: OpenedTask, question: DrawCamera) -> Picture:
+def _draw_temporary(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Picture:
     """A picture in another size than the camera's, or by a camera that the env does not have."""
     settings, scale = question.settings, question.scale
     if settings is None or not 0 < scale <= LARGEST_SCALE:
@@ -464,6 +464,14 @@ def _draw_temporary(opened: OpenedTask, question: DrawCamera) -> Picture:
     size = (max(1, round(settings.width * scale)), max(1, round(settings.height * scale)))
     info = opened.description.camera(question.key)
     placement = Placement(settings, question.key[0], None if info is None else info.mount)
+    if (
+        info is not None
+        and placed.settings(info.key) is None
+        and settings == info.settings
+        and not info.varies
+    ):
+        # Where it is, to the last bit: its own quaternion may not be of unit length.
+        placement = placement_of(opened.env.env, info.key, question.env)
     picture = picture_of(opened.env.env, question.env, placement, question.poses, size)
     wanted = question.modalities
     return replace(
@@ -477,7 +485,7 @@ def _draw_temporary(opened: OpenedTask, question: DrawCamera) -> Picture:
 def _draw(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Picture:
     env, key = opened.env.env, question.key
     if question.scale != 1.0 or opened.description.camera(key) is None:
-        return _draw_temporary(opened, question)
+        return _draw_temporary(opened, placed, question)
     before = placed.settings(key)
     if question.settings is not None:
         placed.place(env, key, question.settings)
