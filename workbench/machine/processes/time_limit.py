@@ -77,11 +77,13 @@ def _tell(watcher: _Watcher, line: bytes) -> None:
 
 
 def _start(watcher: _Watcher) -> None:
+    # Here, since this file also runs as a script that has the standard library alone.
+    from workbench.machine.processes.child_python import script_command
+
     read, watcher.pipe = os.pipe()
     try:
-        # -I and -S: the standard library alone, which starts in some milliseconds.
         watcher.process = subprocess.Popen(
-            [sys.executable, "-I", "-S", __file__, str(read), str(watcher.pid), str(watcher.seconds)],
+            script_command(__file__, str(read), str(watcher.pid), str(watcher.seconds)),
             pass_fds=[read],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
