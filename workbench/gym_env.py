@@ -21,8 +21,10 @@ from workbench.authoring.loading.load import LoadedTask, class_of_module, load_t
 from workbench.authoring.loading.reference import split_reference
 from workbench.authoring.problem import definition_line
 from workbench.core.backends import BackendUnavailable, find_renderer
-from workbench.core.broken_rule import class_is_installed, is_installed
+from workbench.core.broken_rule import class_is_installed, is_installed, warn_of
 from workbench.core.camera_data import PictureDegree
+from workbench.core.cameras.render import findings_of_shaders, list_cameras
+from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.task_env import Backend, EnvOptions, build_env, default_reward_mode
 from workbench.core.rules import Degree
 
@@ -159,7 +161,11 @@ def _built(
                 "`workbench doctor` says which one to install."
             )
     # gym.make(env.spec, num_envs=2) may change the number.
-    return build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
+    env = build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
+    if isinstance(env, BatchedCpuMixin):
+        for finding in findings_of_shaders(list_cameras(env)):
+            warn_of(finding)
+    return env
 
 
 def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:

@@ -409,20 +409,23 @@ def joints_of(struct: Any) -> int:
     return int(getattr(struct, "max_dof", 0))
 
 
-def hidden_objects(env: Any) -> list[Any]:
-    """Actors (merged ones too) that the task hides from its sensors: ``_hidden_objects``; none if `why_not` of `HIDDEN`."""
+def named_to_hide(env: Any) -> list[Any]:
+    """``_hidden_objects``; none if `why_not` of `HIDDEN`."""
     return [] if why_not(HIDDEN) else env._hidden_objects
 
 
-def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
-    """True pose of an actor that is hidden now, (M, 7) or (7,); None if it is not hidden.
+def hidden_objects(env: Any) -> list[Any]:
+    """The actors that the task hides from its sensors. ManiSkill cannot hide an Articulation, which has no ``hide_visual``."""
+    return [each for each in named_to_hide(env) if isinstance(each, Actor)]
 
-    ``Actor.hide_visual`` cannot switch off drawing in GPU simulation: it keeps the pose in
-    ``before_hide_pose`` and moves the actor 99999 m away. On a stock CPU env nothing moves.
+
+def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
+    """(M, 7) true pose of an actor that was moved away to hide it; None if it was not.
+
+    In GPU simulation ``Actor.hide_visual`` keeps the pose in ``before_hide_pose`` and moves the actor 99999 m away. On the
+    CPU, stock or batched (`simulation.hiding`), nothing moves.
     """
-    if not actor.hidden or not actor.scene.gpu_sim_enabled:
-        return None
-    return actor.before_hide_pose  # type: ignore[attr-defined]
+    return getattr(actor, "before_hide_pose", None) if actor.hidden else None
 
 
 def unflattened_state(env: BaseEnv, info: dict[str, Any]) -> dict[str, Any]:

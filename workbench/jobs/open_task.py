@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,7 +27,14 @@ from workbench.authoring.problem import (
 from workbench.checks.evidence.places import rules_of_outliers
 from workbench.core.backends import BackendUnavailable, find_renderer, unused_gpu_text
 from workbench.core.broken_rule import BrokenRule, class_is_installed, warn_of
-from workbench.core.cameras.render import list_cameras, recorded_pictures, segmentation_names, take_pictures
+from workbench.core.camera_data import CameraInfo
+from workbench.core.cameras.render import (
+    findings_of_shaders,
+    list_cameras,
+    recorded_pictures,
+    segmentation_names,
+    take_pictures,
+)
 from workbench.core.cameras.visibility import objects_to_see
 from workbench.core.capture.recorded_run import env_kwargs
 from workbench.core.env import actions
@@ -217,7 +224,7 @@ def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Op
         description = describe(loaded, task, options.env_kwargs, loaded.max_episode_steps)
         description = replace(
             description,
-            notices=notices_of(loaded, options),
+            notices=notices_of(loaded, options, description.cameras),
             outlier_rules=rules_of_outliers(loaded, options.rules),
         )
         clock.lap("geometry")
@@ -289,11 +296,12 @@ def describe(
     )
 
 
-def notices_of(loaded: LoadedTask, options: TaskOptions) -> tuple[str, ...]:
+def notices_of(loaded: LoadedTask, options: TaskOptions, cameras: Iterable[CameraInfo]) -> tuple[str, ...]:
     """Notices about a task that works, as sentences."""
     own = loaded.notices if loaded.followed else ()
+    of_cameras = [f"{each.file}:{each.line}: {each.message}" for each in findings_of_shaders(cameras)]
     of_machine = (unused_gpu_text(options.backend), version_notice(), _rerun_notice())
-    return (*own, *(text for text in of_machine if text))
+    return (*own, *of_cameras, *(text for text in of_machine if text))
 
 
 def _rerun_notice() -> str:

@@ -222,7 +222,8 @@ def placement_pose(
 ) -> NDArray[np.float64]:
     """(7,) of a placement in the env's frame, with bodies at `bodies` (B, 7)."""
     if placement.mount is None:
-        return pose_of(placement.settings)
+        # As it is: a quaternion that is not of unit length gives another picture.
+        return np.array([*placement.settings.position, *placement.settings.quaternion])
     mount = bodies[mount_column(index, placement.mount)]
     if not np.isfinite(mount).all():
         raise ValueError(f"this env has no body {placement.mount!r} to mount a camera on")

@@ -5,10 +5,11 @@ from __future__ import annotations
 import ctypes
 import sys
 from collections.abc import Callable, Collection
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import sapien
 import sapien.physx as physx
 import sapien.render
@@ -30,6 +31,8 @@ from workbench.core.broken_rule import (
     warn_of,
 )
 from workbench.core.camera_data import CameraKey, CameraKind, PictureDegree
+from workbench.core.camera_shader import install_drawable_cameras, note_shader
+from workbench.core.drawing import drawing, read_texture
 from workbench.core.env.partial_reset import (
     KeptControllers,
     explain_reset_errors,
@@ -41,7 +44,9 @@ from workbench.core.env.strict import StrictMixin
 from workbench.core.maniskill_private import (
     asks_for_a_gpu,
     camera_components,
+    camera_site,
     install_row_lookups,
+    mark_camera_configs,
     scene_of,
     substeps_are_unwatched,
 )
@@ -52,9 +57,12 @@ from workbench.core.simulation.accessors import install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
 from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, drawn_at
+from workbench.core.simulation.hiding import install_hiding
 from workbench.core.snapshots.snapshot import begin_anew
 from workbench.core.snapshots.task_state import note_constructed, note_scene
 
+_UNIT = 1e-3
+"""Largest difference of a quaternion's length from 1."""
 SIM_BACKEND = "physx_cpu_batched"
 """Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
 
@@ -95,21 +103,27 @@ class CpuCameraGroup:
 
     def take_picture(self) -> None:
         self._has = {*self.textures}
-        self._drawn = [
-            self._scene.take_picture(env, self._key, camera, self._has)
-            for env, camera in enumerate(self._cameras)
-        ]
+        with self._drawing():
+            self._drawn = [
+                self._scene.take_picture(env, self._key, camera, self._has)
+                for env, camera in enumerate(self._cameras)
+            ]
 
     def get_picture_cuda(self, name: str) -> CpuArray:
         """(N, H, W, C) texture `name` of every env, on the CPU."""
         self.textures.add(name)
         if name not in self._has and self._drawn != self._cameras:
             # For this once by the exact cameras, which the last `update_render` has moved too.
-            for env, camera in enumerate(self._cameras):
-                self._scene.take_picture(env, self._key, camera, None)
+            with self._drawing():
+                for env, camera in enumerate(self._cameras):
+                    self._scene.take_picture(env, self._key, camera, None)
             self._drawn = self._cameras
-        pictures = [torch.from_numpy(camera.get_picture(name)) for camera in self._drawn]
-        return CpuArray(torch.stack(pictures))
+        site = camera_site(self._scene.camera(self._key).config)
+        pictures = [read_texture(camera, name, self._key, site) for camera in self._drawn]
+        return CpuArray(torch.stack([torch.from_numpy(picture) for picture in pictures]))
+
+    def _drawing(self) -> AbstractContextManager[None]:
+        return drawing(self._key, camera_site(self._scene.camera(self._key).config))
 
 
 class BatchedCpuScene(ManiSkillScene):
@@ -143,7 +157,7 @@ class BatchedCpuScene(ManiSkillScene):
             textures: those that a fast picture needs; None for all of `camera`'s own, by `camera` itself.
             degree: None for the scene's own. A fast one needs `prepare_fast` before ``update_render``.
         """
-        if (degree or self.pictures) == "exact":
+        if self.degree_of(camera, degree) == "exact":
             camera.take_picture()
             return camera
         shapes, cameras = self._fast_parts()
@@ -151,6 +165,18 @@ class BatchedCpuScene(ManiSkillScene):
         with shown(shapes.bodies(key, env)):
             drawing.take_picture()
         return drawing
+
+    def degree_of(
+        self, camera: sapien.render.RenderCameraComponent, asked: PictureDegree | None = None
+    ) -> PictureDegree:
+        """The degree of a picture for which this degree is asked, or the scene's own.
+
+        Always exact where the camera's quaternion is not of unit length (``look_at`` straight down): SAPIEN turns and zooms
+        its picture, and what is out of its view is not known.
+        """
+        if (asked or self.pictures) == "exact" or abs(float(np.linalg.norm(camera.local_pose.q)) - 1) > _UNIT:
+            return "exact"
+        return "fast"
 
     def prepare_fast(
         self, env: int, key: CameraKey, textures: Collection[str], places: Places = NOWHERE_ELSE
@@ -160,8 +186,10 @@ class BatchedCpuScene(ManiSkillScene):
         Args:
             places: where bodies of the env are drawn instead.
         """
-        sensor = self._sensor(key)
+        sensor = self.camera(key)
         components = camera_components(sensor)
+        if self.degree_of(components[env], "fast") == "exact":
+            return
         shapes, cameras = self._fast_parts()
         shapes.prepare(env, key, components, places)
         cameras.follow(env, sensor.config, components[env], textures)
@@ -177,7 +205,8 @@ class BatchedCpuScene(ManiSkillScene):
             self._fast = FastShapes(self.sub_scenes), FastCameras(self.sub_scenes)
         return self._fast
 
-    def _sensor(self, key: CameraKey) -> Any:
+    def camera(self, key: CameraKey) -> Any:
+        """ManiSkill's sensor or human camera of this key."""
         kind, name = key
         return (self.sensors if kind == "sensor" else self.human_render_cameras)[name]
 
@@ -194,6 +223,7 @@ class BatchedCpuScene(ManiSkillScene):
         finally:
             self.gpu_sim_enabled = True
         for component in camera._render_cameras:
+            note_shader(component)
             give_brdf_table(component)
         return camera
 
@@ -223,6 +253,17 @@ class BatchedCpuScene(ManiSkillScene):
                             self.prepare_fast(env, (kind, name), group.textures, places)
                 sub_scene.update_render()
                 move_bodies()
+
+    def get_human_render_camera_images(self, camera_name: str | None = None) -> dict[str, torch.Tensor]:
+        # ManiSkill refuses ray tracing where one group draws the cameras of all envs. Here each is drawn alone.
+        images = {}
+        for name, camera in self.human_render_cameras.items():
+            if camera_name in (None, name):
+                camera.capture()
+                images[name] = camera.get_obs(rgb=True, depth=False, segmentation=False, position=False)[
+                    "rgb"
+                ]
+        return images
 
     def _gpu_apply_all(self) -> None:
         if self._needs_fetch:
@@ -388,6 +429,10 @@ class BatchedCpuMixin:
         self.scene.px.timestep = 1.0 / self._sim_freq
 
 
+def _is_batched(scene: Any) -> bool:
+    return isinstance(scene, BatchedCpuScene)
+
+
 def batched_class(
     task: type[BaseEnv],
     threads: int | None = None,
@@ -404,6 +449,9 @@ def batched_class(
     """
     install_row_lookups(batched_system)
     install_struct_access()
+    install_hiding()
+    install_drawable_cameras(_is_batched)
+    mark_camera_configs()
     namespace = {
         "__module__": task.__module__,
         "__doc__": task.__doc__,

@@ -16,6 +16,8 @@ from workbench.core import maniskill_private
 from workbench.core.scene.shapes import BodyKind
 
 _T = TypeVar("_T")
+_AWAY = 5e4
+"""Metres along each axis from where an actor was hidden, if it is still hidden; ``Actor.hide_visual`` moves it by 99999."""
 
 
 def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
@@ -38,8 +40,8 @@ class SceneIndex:
 
     Asked one by one a body's pose costs 2 us, so 64 envs of 16 bodies cost 2 ms a frame. Here it is found once which row of
     ``px.cuda_rigid_body_data`` belongs to which (env, body), and a frame is one gather. Static bodies are not in that
-    tensor: `fixed` has their poses. A hidden body was moved 99999 m away; `hidden_poses` has its true pose. Objects that
-    differ from env to env (`Actor.merge`) are one body by the merged name.
+    tensor: `fixed` has their poses. In GPU simulation a hidden body was moved 99999 m away; `hidden_poses` has its true pose.
+    Objects that differ from env to env (`Actor.merge`) are one body by the merged name.
     """
 
     names: tuple[str, ...]
@@ -202,13 +204,15 @@ def read_joints(env: Any) -> NDArray[np.float32] | None:
 
 
 def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-    """For each hidden Actor: the slots (M,) of its entities and their true poses (M, 7).
-
-    On the CPU the poses are ManiSkill's own array, which callers write to.
-    """
+    """For each Actor that GPU simulation has moved away to hide it: slots (M,) and true poses (M, 7) of its entities, without
+    those that something else has moved since."""
     for actor, slots in scene_index(env).actors:
-        if actor.hidden and (kept := maniskill_private.pose_before_hiding(actor)) is not None:
-            yield slots, kept.cpu().numpy()
+        if (kept := maniskill_private.pose_before_hiding(actor)) is not None:
+            now = rows_of(env.scene.px.cuda_rigid_body_data, maniskill_private.data_rows_of(actor).long())[
+                :, :3
+            ]
+            away = ((now - kept[:, :3]).abs() > _AWAY).all(dim=1).cpu().numpy()
+            yield slots[away], kept.cpu().numpy()[away]
 
 
 def present_states(env: Any) -> dict[str, Any]:
@@ -255,7 +259,7 @@ def state_rows(env: Any) -> StateRows:
     asked = {
         name: in_every_env(env, struct, struct.get_state())
         for name, (struct, column, joints, _) in places.items()
-        if column is None or (joints is None and struct.hidden)
+        if column is None or (joints is None and maniskill_private.pose_before_hiding(struct) is not None)
     }
     qpos, qvel = px.cuda_articulation_qpos.torch(), px.cuda_articulation_qvel.torch()
     qpos, qvel = (q.numpy().copy() if q.is_cpu else q.clone() for q in (qpos, qvel))

@@ -79,9 +79,9 @@ def _checked_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Call
         system = self.scene.px
         if velocity and group == "bodies" and self.px_body_type == "static" and batched_system(self.scene):
             raise RuntimeError(f"'{self.name}' is static: it has no velocity on the GPU, nor here.")
-        # Poses of hidden and static actors are not in the tensors.
+        # Poses of static actors are not in the tensors.
         if type(system) is StrictCpuSystem and group != "targets" and system.laid_out:
-            if not (group == "bodies" and (self.px_body_type == "static" or self.hidden)):
+            if not (group == "bodies" and self.px_body_type == "static"):
                 system.about_to_read(self, group, _rows(self, group))
         return stock(self)
 
@@ -106,7 +106,7 @@ def _checked_writes(stock: Callable[..., None], name: str, group: Group) -> Call
                 "_after_reconfigure(self, options), and one of each episode in _initialize_episode, with "
                 "articulation.set_joint_drive_targets(targets, joints=[...])."
             )
-        if type(system) is StrictCpuSystem and system.laid_out and not (group == "bodies" and self.hidden):
+        if type(system) is StrictCpuSystem and system.laid_out:
             system.about_to_write(self, group, _rows(self, group)[_mask(self)])
         try:
             stock(self, targets, *args, **kwargs)

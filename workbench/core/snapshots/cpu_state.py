@@ -14,7 +14,8 @@ import sapien.physx as physx
 from numpy.typing import NDArray
 
 from workbench.core.backends import give_brdf_table
-from workbench.core.scene.scene_index import hidden_poses, once_a_scene, scene_index
+from workbench.core.camera_shader import made_again
+from workbench.core.scene.scene_index import once_a_scene, scene_index
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
 from workbench.core.simulation.state_layout import BODY
 
@@ -24,8 +25,6 @@ _EXACT_POINT_ATTEMPTS = 40
 """Attempts to find a state that reads back as written; all but some humanoids need one."""
 _LAST_BIT = np.float32(2**-24)
 """Of the numbers of a quaternion, and of a metre."""
-_FAR = np.float32(99999)
-"""By how much ``Actor.hide_visual`` moves an actor along each axis, metres."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +61,12 @@ class CpuState:
     * *Forces* of ``set_qf``, and which drives were ever set (`BatchedCpuSystem.drive_flags`).
     * *Contacts*: after a restore PhysX's list is that of another moment, and ``is_grasping`` would answer for it. The counted
       impulses are kept, and answer queries until the next substep.
-    * *Hidden objects* are 99999 m away; their true pose is kept.
     """
 
     contents: tuple[Contents, ...]
     """(n,)"""
     packed: tuple[bytes, ...]
-    """(n,) as ``PhysxCpuSystem.pack()`` gives it; hidden actors where they really are."""
+    """(n,) as ``PhysxCpuSystem.pack()`` gives it."""
     asleep: tuple[tuple[bool, ...], ...]
     """(n,) one for each of its `contents`."""
     qf: NDArray[np.float32]
@@ -112,8 +110,6 @@ class CpuStatePlan:
     """Of each env: the ``id`` of the component, by name."""
     held: list[Any]
     """Objects whose ids are used, kept alive: ids are reused once an object is gone."""
-    offsets: dict[int, tuple[int, int]]
-    """Env and offset in its packed floats of an actor, by the slot of its entity (`SceneIndex`)."""
     settled: list[dict[int, tuple[bytes, bytes]]]
     """Of each env, by offset in its packed bytes: a root pose, and the pose to set so that it reads back as that."""
 
@@ -129,7 +125,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         return scene.name_of(component) or component.entity.name
 
     alike: dict[Contents, Contents] = {}
-    plan = CpuStatePlan([], [], [], {}, [], [], {}, [{} for _ in px.systems])
+    plan = CpuStatePlan([], [], [], {}, [], [], [{} for _ in px.systems])
     first_articulation = 0
     for index, system in enumerate(px.systems):
         bodies, links = system.rigid_dynamic_components, system.articulation_link_components
@@ -140,8 +136,6 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         plan.names.update({component: (index, name) for name, component in by_name.items()})
         parts, sleepers = [], []
         for body in bodies:
-            if id(body.entity) in scene.slot_of:
-                plan.offsets[scene.slot_of[id(body.entity)]] = index, sum(part.size for part in parts)
             if not body.kinematic:
                 sleepers.append((len(parts), _getter(body, "is_sleeping"), body))
             parts.append(PackedPart(name_of(body), None))
@@ -171,12 +165,7 @@ def read_cpu_state(env: Any, env_idx: list[int]) -> CpuState:
     """The simulation state of the envs in `env_idx`."""
     px: BatchedCpuSystem = env.scene.px
     plan = plan_cpu_state(env)
-    packs = [*px.packs()]
-    for i, hidden in _hidden(env, plan).items():
-        numbers = np.frombuffer(packs[i], dtype=np.float32).copy()
-        for offset, pose in hidden:
-            numbers[offset : offset + 7] = pose[[3, 4, 5, 6, 0, 1, 2]]
-        packs[i] = numbers.tobytes()
+    packs = px.packs()
     awake = {len(contents): (False,) * len(contents) for contents in plan.contents}
     asleep = []
     for i in env_idx:
@@ -217,7 +206,6 @@ def write_cpu_state(
     if fresh_physics:
         for i in renew_physics(env.scene, env_idx):
             missed[f"fresh physics of env {i}"] = "entities were removed from its scene since it was built"
-    hidden = _hidden(env, plan)
     packed: dict[int, bytes] = {}
     matches: dict[int, Sequence[int | None]] = {}
     alike: dict[int, Contents] = {}
@@ -227,8 +215,6 @@ def write_cpu_state(
             alike[id(contents)], matches[i] = contents, range(len(contents))
         else:
             packed[i], matches[i] = _joined(contents, own[i], state, k, carried, missed)
-        if i in hidden:
-            packed[i] = _hide(packed[i], hidden[i])
     _unpack(px, plan, packed)
     _write_joint_forces(px, plan, dict(zip(env_idx, positions, strict=True)), state, matches, fresh_physics)
     touches: dict[int, list[tuple[str, str, Any]]] = {}
@@ -403,26 +389,6 @@ def _touching(
     return found
 
 
-def _hidden(env: Any, plan: CpuStatePlan) -> dict[int, list[tuple[int, NDArray[np.float32]]]]:
-    """For each env with hidden actors: their offsets in its packed floats, and their true poses [p, q]."""
-    found: dict[int, list[tuple[int, NDArray[np.float32]]]] = {}
-    for slots, poses in hidden_poses(env):
-        for slot, pose in zip(slots.tolist(), poses, strict=True):
-            if slot in plan.offsets:
-                index, offset = plan.offsets[slot]
-                found.setdefault(index, []).append((offset, pose))
-    return found
-
-
-def _hide(packed: bytes, hidden: list[tuple[int, NDArray[np.float32]]]) -> bytes:
-    numbers = np.frombuffer(packed, dtype=np.float32).copy()
-    for offset, kept in hidden:
-        pose = numbers[offset : offset + 7]
-        kept[:] = pose[[4, 5, 6, 0, 1, 2, 3]]
-        pose[4:] += _FAR
-    return numbers.tobytes()
-
-
 # --- physics without a past --------------------------------------------------------------------------
 
 
@@ -471,14 +437,20 @@ def _moved(old: sapien.Scene, physics: physx.PhysxCpuSystem) -> sapien.Scene:
     """A scene over `physics` that has all entities of `old`, in their order, and its render system."""
     entities = old.entities
     systems = _render_systems(old)
+    cameras = [camera for system in systems for camera in system.cameras]
     new = sapien.Scene([physics, *systems])
     for entity in entities:
         entity.remove_from_scene()
+    carriers = [camera.entity for camera in cameras]
+    for entity, camera in zip(carriers, cameras, strict=True):
+        entity.remove_component(camera)
     for entity in entities:
         new.add_entity(entity)
-    for system in systems:
-        for camera in system.cameras:
-            give_brdf_table(camera)  # it has a new renderer, which would compute one for seconds
+    for entity, camera in zip(carriers, cameras, strict=True):
+        # One by one, since two cameras of an entity may have different shaders.
+        with made_again(camera):
+            entity.add_component(camera)
+        give_brdf_table(camera)  # it has a new renderer, which would compute one for seconds
     return new
 
 

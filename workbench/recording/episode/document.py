@@ -60,18 +60,22 @@ class CameraJson(Struct, frozen=True):
     intrinsic: tuple[Vector, Vector, Vector]
     mount: str | None
     modalities: tuple[str, ...]
+    replaced_shader: str = ""
+    """As `CameraInfo.replaced_shader`."""
 
     @classmethod
     def of(cls, camera: CameraInfo) -> CameraJson:
         rows = np.asarray(camera.intrinsic, dtype=np.float64).tolist()
         numbers = float(camera.fovy), float(camera.near), float(camera.far)
         size = camera.width, camera.height
-        return cls(camera.name, camera.kind, *size, *numbers, rows, camera.mount, camera.modalities)
+        of = camera.mount, camera.modalities, camera.replaced_shader
+        return cls(camera.name, camera.kind, *size, *numbers, rows, *of)
 
     def info(self) -> CameraInfo:
         intrinsic = np.array(self.intrinsic, dtype=np.float32)
         size, numbers = (self.width, self.height), (self.fovy, self.near, self.far)
-        return CameraInfo(self.name, self.kind, *size, *numbers, intrinsic, self.mount, self.modalities)
+        of = {"mount": self.mount, "modalities": self.modalities, "replaced_shader": self.replaced_shader}
+        return CameraInfo(self.name, self.kind, *size, *numbers, intrinsic, **of)
 
 
 class SceneJson(Struct, frozen=True):

@@ -19,6 +19,7 @@ from workbench.authoring.loading.reference import (
     reference_to_class,
 )
 from workbench.authoring.problem import Problem
+from workbench.core.camera_data import CameraKey
 from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.policy import NoPolicy, find_policy
@@ -31,6 +32,7 @@ from workbench.session.process.heartbeat import death_problem, own_files_of
 from workbench.session.process.supervisor import Death, End
 from workbench.session.protocol.messages import (
     SCENE_KEPT,
+    CameraFailed,
     Event,
     Load,
     Loaded,
@@ -119,6 +121,7 @@ class LiveState:
             reload=report,
             activity="",
             stale=stale,
+            failed_cameras=self.now.failed_cameras if restored else {},
         )
         level, reason = (None, "the first version") if report is None else (report.level, report.reason)
         self._remember(PastLoad(time.time(), level, reason, self.now.load_milliseconds))
@@ -207,6 +210,8 @@ class LiveState:
                 made = {picture.key: picture for picture in event.pictures}
                 shown = {key: p for key, p in {**now.pictures, **made}.items() if key in watched}
                 self.new_pictures(pictures=shown, picture_milliseconds=event.milliseconds)
+        elif isinstance(event, CameraFailed):
+            self._cameras_failed({event.key: event.why})
         elif isinstance(event, Placed):
             self._placed(event)
         elif isinstance(event, Inspection):
@@ -222,6 +227,9 @@ class LiveState:
             elif now.state in ("running", "paused", "loading"):
                 self.set(activity="")
                 self._set_running()
+
+    def _cameras_failed(self, failed: dict[CameraKey, str]) -> None:
+        self.set(failed_cameras={**self.now.failed_cameras, **failed})
 
     def _placed(self, event: Placed) -> None:
         if event.info is None or self.now.task is None:
@@ -256,6 +264,12 @@ class LiveState:
             problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, texts)
             self.set_problem(problem)
             self.problem_at_run = not while_loading
+        if death.doing == "drawing" and death.end is not End.ASKED:
+            # The next worker would die of the same picture.
+            why = (
+                f"The worker process {death.why} while it drew. Untick it and tick it again to try once more."
+            )
+            self._cameras_failed({(camera.kind, camera.name): why for camera in self.now.settings.cameras})
         if death.end not in (End.FILE_WAITS, End.HANDED_OVER):
             self.wants_play = False
         self.set(
@@ -324,6 +338,10 @@ class LiveState:
         if new == before:
             return False
         self.set(settings=new)
+        if new.cameras != before.cameras:
+            # One that is asked for again is tried again.
+            kept = {camera.key for camera in before.cameras} & {camera.key for camera in new.cameras}
+            self.set(failed_cameras={key: why for key, why in self.now.failed_cameras.items() if key in kept})
         if new.selected_env != before.selected_env:
             # Without this the other env's picture would stay until a new one comes.
             self.new_pictures(pictures={})
@@ -370,10 +388,11 @@ class LiveState:
     def settings(self) -> Settings:
         """Settings for the worker: without cameras if no page is open."""
         chosen = self.now.settings
+        cameras = tuple(camera for camera in chosen.cameras if camera.key not in self.now.failed_cameras)
         return replace(
             chosen,
             policy_folder=None if self.folder is None else str(self.folder),
-            cameras=chosen.cameras if self.clients > 0 else (),
+            cameras=cameras if self.clients > 0 else (),
         )
 
     @property

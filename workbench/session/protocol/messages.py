@@ -392,6 +392,14 @@ class Pictures:
 
 
 @dataclass(frozen=True)
+class CameraFailed:
+    """A camera that cannot be drawn, and is left out until other cameras are watched or another version is loaded."""
+
+    key: CameraKey
+    why: str
+
+
+@dataclass(frozen=True)
 class Placed:
     """The result of `PlaceCamera`. Later pictures of that camera show it as placed."""
 
@@ -475,6 +483,7 @@ Event = (
     | PlanWanted
     | PlanDropped
     | Pictures
+    | CameraFailed
     | Placed
     | PastPictures
     | Inspection

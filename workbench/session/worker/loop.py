@@ -32,6 +32,7 @@ from workbench.machine.processes.debugger import (
     listening_text,
     wait_for_debugger,
 )
+from workbench.machine.processes.time_limit import end_after
 from workbench.machine.processes.wire import Call, Question, pack
 from workbench.session.process.heartbeat import Doing, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
@@ -553,7 +554,9 @@ class Worker:
         if self._steps.pictures_due(step, reset_mask):
             self._cameras.settle()  # the same scene is about to be drawn
         acted_by = "" if restored else self._chooser.name
-        event = self._steps.event(self._task.opened, step, reset_mask, seeds, restored, acted_by, resumed)
+        event = self._steps.event(
+            self._task.opened, step, reset_mask, seeds, restored, acted_by, resumed, self._cameras.failed
+        )
         self._cameras.scene_changed()
         self._line.send(event)
 
@@ -627,4 +630,5 @@ def work(connection: int, heartbeat: HeartbeatWriter) -> None:
     torch.set_num_threads(1)
     mark_camera_configs()
     treat_ctrl_c_as_error()
+    end_after()
     Worker(connection, heartbeat).run()

@@ -313,11 +313,11 @@ def _exchange(
         chosen=loaded.chosen,
         others=loaded.others,
         in_place_of=None,
-        notices=notices_of(loaded, running.request.options),
+        cameras=list_cameras(env) if change.level == "cameras" else opened.description.cameras,
         outlier_rules=rules_of_outliers(loaded, running.request.options.rules),
     )
-    if change.level == "cameras":
-        description = replace(description, cameras=list_cameras(env))
+    notices = notices_of(loaded, running.request.options, description.cameras)
+    description = replace(description, notices=notices)
     report = ReloadReport(change.level, change.reason, not_carried=left)
     return OpenedTask(loaded, task, description, first, clock.laps), report
 
