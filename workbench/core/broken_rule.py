@@ -12,15 +12,14 @@ import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Literal
 
-import mani_skill
 from mani_skill.envs.sapien_env import BaseEnv
 
+from workbench.core.error_notes import CoreRefusal, Place
 from workbench.core.rules import Degree, Finding, Silence, silence_of
+from workbench.machine.library_files import is_installed
 from workbench.machine.parse_python import parse_python
 
 MOST_ROWS = 64
@@ -36,11 +35,9 @@ Frame = tuple[FrameType, int, int]
 Occasion = Literal["step", "reset"]
 _Key = tuple[str, Hashable]
 """A rule, and the line or thing at which it was broken."""
-Place = tuple[str, int, str]
-"""File, line, and the name of the function."""
 
 
-class BrokenRule(RuntimeError):
+class BrokenRule(CoreRefusal, RuntimeError):
     """The task broke a rule of GPU simulation that stops."""
 
     def __init__(self, message: str, rule: str, place: Place | None = None) -> None:
@@ -288,20 +285,6 @@ def class_is_installed(cls: type) -> bool:
         return is_installed(inspect.getfile(cls))
     except (TypeError, OSError):  # made in a notebook, or by type()
         return False
-
-
-@cache
-def is_installed(file: str) -> bool:
-    """Whether a source file belongs to Python, to an installed package or to the workbench."""
-    if file.startswith(("<", *_OWN_FOLDERS)):
-        return True
-    return not {"site-packages", "dist-packages"}.isdisjoint(Path(file).parts)
-
-
-_OWN_FOLDERS = tuple(
-    f"{Path(file).parent}/" for file in (inspect.__file__, mani_skill.__file__, str(Path(__file__).parent))
-)
-"""Of Python, ManiSkill and the workbench."""
 
 
 # --- the line that assigns ---------------------------------------------------------------------------

@@ -1,0 +1,203 @@
+"""Notes to errors of loading a robot: its file, the line and link there, and the line of its class that names them."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import inspect
+import textwrap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from traceback import walk_tb
+from types import FrameType
+from typing import Any
+from xml.parsers.expat import ExpatError, ParserCreate
+
+import mani_skill
+import sapien
+from mani_skill.agents import base_agent
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers.base_controller import BaseController
+
+from workbench.core.error_notes import CoreRefusal, Note, Place, chain_of
+from workbench.machine.parse_python import parse_python
+
+_LOADERS = tuple(
+    f"{Path(module.__path__[0]) / folder}/"
+    for module, folder in ((sapien, "wrapper"), (mani_skill, "utils/building"))
+)
+_FILE_ARGUMENTS = ("urdf_file", "mjcf_file", "asset_path")
+"""Names of the robot's file in the loaders and in ``BaseAgent._load_articulation``."""
+_ELEMENTS = ("origin_node", "node", "geom", "mesh", "texture", "material", "body")
+"""Names of an element of the file in the functions that read one."""
+_OF_A_LOOP = ("mimic", "joint", "x", "link")
+"""Names that may be of an earlier turn where a function called others."""
+
+
+@contextmanager
+def note_robot_errors() -> Iterator[None]:
+    """Within this, an exception of a robot's loader or controller gets a note with the place."""
+    try:
+        yield
+    except CoreRefusal:
+        raise
+    except Exception as error:
+        for link in chain_of(error):
+            note = _note(link)
+            if note is not None:
+                error.add_note(note)
+                break
+        raise
+
+
+def place_of_robot_file(cls: type) -> Place | None:
+    """The line that gives a robot's class its ``urdf_path`` or ``mjcf_path``."""
+    name = "urdf_path" if getattr(cls, "urdf_path", None) is not None else "mjcf_path"
+    return _find_line(cls, lambda node: _gives(node, name))
+
+
+def _note(error: BaseException) -> Note | None:
+    frames = [frame for frame, _ in walk_tb(error.__traceback__)][::-1]
+    robot = next((agent for frame in frames if (agent := _self(frame, BaseAgent)) is not None), None)
+    controller = next(
+        (found for frame in frames if (found := _self(frame, BaseController)) is not None), None
+    )
+    if controller is not None and robot is not None:
+        return _controller_note(controller, robot)
+    path = next((Path(str(found)) for frame in frames if (found := _file_argument(frame)) is not None), None)
+    if path is None:
+        return None
+    part = _part_at_fault([frame for frame in frames if frame.f_code.co_filename.startswith(_LOADERS)])
+    line = _line_of(error, part, path)
+    text = f"Robot file {path}" + ("" if line is None else f":{line}")
+    if part is not None:
+        text += f", {part[0]} {part[1]!r}" if part[1] else f", <{part[0]}>"
+    text += "".join(_missing_mesh(frames, path))
+    place = None if robot is None else place_of_robot_file(type(robot))
+    if robot is not None:
+        at = "" if place is None else f" at {place[0]}:{place[1]}"
+        text += f". {type(robot).__name__} names it{at}"
+    return Note(f"{text}.", place)
+
+
+def _file_argument(frame: FrameType) -> Any:
+    file = frame.f_code.co_filename
+    if not (file.startswith(_LOADERS) or file == base_agent.__file__):
+        return None
+    return next((frame.f_locals[name] for name in _FILE_ARGUMENTS if name in frame.f_locals), None)
+
+
+def _self(frame: FrameType, kind: type) -> Any:
+    found = frame.f_locals.get("self")
+    return found if isinstance(found, kind) else None
+
+
+_Part = tuple[str, str, int | None]
+"""An element of a robot's file: tag, name (may be empty), and line."""
+
+
+def _part_at_fault(frames: list[FrameType]) -> _Part | None:
+    """
+    Args:
+        frames: of the loaders, innermost first.
+    """
+    for frame in frames:
+        values = frame.f_locals
+        names = (*_ELEMENTS, *_OF_A_LOOP) if frame is frames[0] else _ELEMENTS
+        if frame.f_code.co_name == "_build_link":
+            names = (*names, "link")
+        for value in (values[name] for name in names if values.get(name) is not None):
+            if (part := _part_of(value)) is not None:
+                return part
+        builder = values.get("self")
+        if hasattr(builder, "joint_record"):
+            return "link", str(getattr(builder, "name", "")), None
+    return None
+
+
+def _part_of(value: Any) -> _Part | None:
+    if hasattr(value, "sourceline") and hasattr(value, "iterancestors"):  # lxml's
+        if value.tag in ("robot", "mujoco"):
+            return None
+        named = next((one for one in (value, *value.iterancestors()) if one.get("name")), value)
+        return str(named.tag), str(named.get("name") or ""), value.sourceline
+    if hasattr(value, "mimic") and hasattr(value, "multiplier"):
+        return "joint", str(value.joint), None
+    name = getattr(value, "name", None)
+    return (type(value).__name__.lower(), name, None) if isinstance(name, str) else None
+
+
+def _line_of(error: BaseException, part: _Part | None, path: Path) -> int | None:
+    """1-based line in the robot's file."""
+    if isinstance(error, SyntaxError) and not Path(error.filename or "").is_file():
+        return error.lineno  # of XML
+    if part is None or part[2] is not None:
+        return None if part is None else part[2]
+    lines: list[int] = []
+    parser = ParserCreate()
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        if (tag, attributes.get("name")) == part[:2]:
+            lines.append(parser.CurrentLineNumber)
+
+    parser.StartElementHandler = begin
+    try:
+        parser.Parse(path.read_bytes(), True)
+    except (OSError, ExpatError):
+        return None
+    # Of two with one name the last is the one too many.
+    return lines[-1] if lines else None
+
+
+def _missing_mesh(frames: list[FrameType], path: Path) -> Iterator[str]:
+    for frame in frames:
+        record = frame.f_locals.get("r")
+        if isinstance(name := getattr(record, "filename", None), str) and name:
+            exists = Path(path.parent, name).exists()
+            yield f", mesh {name}" + ("" if exists else f" (there is no {Path(path.parent, name)})")
+            return
+
+
+def _controller_note(controller: Any, robot: Any) -> Note | None:
+    names = getattr(getattr(controller, "config", None), "joint_names", None)
+    articulation = getattr(controller, "articulation", None)
+    if articulation is None:
+        return None
+    known = [joint.name for joint in articulation.active_joints]
+    unknown = [str(name) for name in names or () if name not in known]
+    place = _find_line(type(robot), lambda node: isinstance(node, ast.Constant) and node.value in unknown)
+    place = place or _find_line(
+        type(robot), lambda node: isinstance(node, ast.FunctionDef) and node.name == "_controller_configs"
+    )
+    at = "" if place is None else f" ({place[0]}:{place[1]})"
+    text = f"{type(controller).__name__} of {type(robot).__name__}{at}"
+    for name in unknown:
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
+        text += f": the robot has no active joint {name!r}; {hint}"
+    return Note(text, place)
+
+
+def _gives(node: ast.AST, name: str) -> bool:
+    if isinstance(node, ast.FunctionDef):
+        return node.name == name  # a property
+    targets = node.targets if isinstance(node, ast.Assign) else ()
+    targets = [node.target] if isinstance(node, ast.AnnAssign) and node.value is not None else targets
+    return any(name in (getattr(target, "id", None), getattr(target, "attr", None)) for target in targets)
+
+
+def _find_line(cls: type, fits: Callable[[ast.AST], bool]) -> Place | None:
+    """The first fitting node in the text of a class or of one that it inherits."""
+    for owner in cls.__mro__:
+        if owner is BaseAgent or not issubclass(owner, BaseAgent):
+            continue
+        try:
+            file, (lines, first) = inspect.getfile(owner), inspect.getsourcelines(owner)
+            tree = parse_python(textwrap.dedent("".join(lines)))
+        except (OSError, TypeError, SyntaxError):  # made without a text
+            continue
+        found = [node for node in ast.walk(tree) if fits(node)]
+        if found:
+            return file, first + found[0].lineno - 1, owner.__name__  # type: ignore[attr-defined]
+    return None
