@@ -262,6 +262,14 @@ def place_of_hook(task: type, hook: str) -> Place | None:
     return None if code is None else (code.co_filename, code.co_firstlineno, hook)
 
 
+def place_of_class(cls: type) -> Place | None:
+    """Where a class is defined; None for one without a file."""
+    try:
+        return inspect.getfile(cls), inspect.getsourcelines(cls)[1], cls.__name__
+    except (TypeError, OSError):
+        return None
+
+
 def place_of(frames: Sequence[Frame]) -> Place | None:
     """The first line outside installed packages; else the first outside ManiSkill's general code."""
     general = None

@@ -31,11 +31,13 @@ from workbench.core.broken_rule import (
 )
 from workbench.core.camera_data import CameraKey, CameraKind, PictureDegree
 from workbench.core.env.partial_reset import (
+    TARGET_FLAGS,
     KeptControllers,
     in_ascending_order,
     note_what_was_reset,
     seeded,
     untouched_envs,
+    without_target_flags,
 )
 from workbench.core.env.robot_notes import note_robot_errors
 from workbench.core.env.strict import StrictMixin
@@ -358,6 +360,10 @@ class BatchedCpuMixin:
         # Substeps may be merged only if no code of the author's runs between them.
         px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
         unwatched = substeps_are_unwatched(self, self._workbench_task)
+        for controller in without_target_flags(self):
+            for flag in TARGET_FLAGS:
+                # Only what was changed is applied, so a controller that sets none loses nothing.
+                setattr(controller, flag, getattr(controller, flag, True))
         try:
             with px.merging(self._sim_steps_per_control if unwatched else 1):
                 return super()._step_action(action)  # type: ignore[misc]

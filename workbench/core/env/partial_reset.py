@@ -51,6 +51,16 @@ def active_controllers(env: Any) -> list[BaseController]:
     return single
 
 
+TARGET_FLAGS = ("sets_target_qpos", "sets_target_qvel")
+"""What ManiSkill asks a controller in each step, on the GPU alone: which drive targets it sets."""
+
+
+def without_target_flags(env: Any) -> list[BaseController]:
+    """The controllers of robots that do not say what `TARGET_FLAGS` asks, as ``BaseController`` does not."""
+    controllers = [agent.controller for agent in agents(env)]
+    return [one for one in controllers if not all(hasattr(one, flag) for flag in TARGET_FLAGS)]
+
+
 def untouched_envs(env: Any, options: dict[str, Any] | None) -> list[int]:
     """The envs that a reset with these options does not touch; empty for a reset of all."""
     chosen = _chosen(env, options or {})

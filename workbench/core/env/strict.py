@@ -13,12 +13,13 @@ from workbench.core.broken_rule import (
     BrokenRule,
     BrokenRules,
     WrongReturn,
+    place_of_class,
     place_of_hook,
     warn_of,
 )
 from workbench.core.env.evaluate_entries import wrong_evaluate, wrong_observation, wrong_reward
 from workbench.core.env.kept_rows import ResetWatch
-from workbench.core.env.partial_reset import untouched_envs
+from workbench.core.env.partial_reset import TARGET_FLAGS, untouched_envs, without_target_flags
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.simulation.accessors import guard_scenes
 from workbench.core.simulation.strict_system import StrictCpuSystem
@@ -77,6 +78,18 @@ class StrictMixin:
             stepped = super().step(action)  # type: ignore[misc]
         self.broken_rules.step += 1
         return stepped
+
+    def _step_action(self, action: Any) -> Any:
+        for controller in without_target_flags(self):
+            cls = type(controller)
+            self.broken_rules.report_breach(
+                "controller-targets",
+                f"{cls.__name__} lacks {' and '.join(flag for flag in TARGET_FLAGS if not hasattr(controller, flag))}.",
+                frames=None,
+                place=place_of_class(cls),
+                subject=cls,
+            )
+        return super()._step_action(action)  # type: ignore[misc]
 
     # --- partial resets ------------------------------------------------------------------------------
 
