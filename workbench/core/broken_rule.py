@@ -41,8 +41,10 @@ class BrokenRule(CoreRefusal, RuntimeError):
     """The task broke a rule of GPU simulation that stops."""
 
     def __init__(self, message: str, rule: str, place: Place | None = None) -> None:
-        super().__init__(f"{message} (Rule {rule}; with --rules warn, or rules='warn', the task continues.)")
-        self.rule, self.place = rule, place
+        super().__init__(
+            f"{message} (Rule {rule}; with --rules warn, or rules='warn', the task continues.)", place=place
+        )
+        self.rule = rule
 
 
 class WrongReturn(BrokenRule):
@@ -320,6 +322,16 @@ def find_assignment(task: type, path: str) -> Place | None:
     return min(found, default=(0, None))[1]
 
 
+def find_entry(task: type, hook: str, name: str) -> Place | None:
+    """The line where a hook makes the entry `name` of what it returns, as a key or a keyword; else its ``def``."""
+    function = inspect.unwrap(getattr(task, hook))
+    for node, line in _nodes(function):
+        key = getattr(node, "value", None) if isinstance(node, ast.Constant) else getattr(node, "arg", None)
+        if key == name and isinstance(node, ast.Constant | ast.keyword):
+            return function.__code__.co_filename, line, hook
+    return place_of_hook(task, hook)
+
+
 def files_of_task(task: type) -> set[str]:
     """Source files of its methods, and of those that it inherits from classes below BaseEnv."""
     return {function.__code__.co_filename for _, function in _methods(task)}
@@ -337,12 +349,7 @@ def _methods(task: type) -> Iterator[tuple[str, Any]]:
 
 
 def _lines_that_assign(function: Any, wanted: str) -> Iterator[int]:
-    try:
-        lines, first = inspect.getsourcelines(function)
-        tree = parse_python(textwrap.dedent("".join(lines)))
-    except (OSError, SyntaxError):  # made without a text, or a lambda in the middle of a line
-        return
-    for node in ast.walk(tree):
+    for node, line in _nodes(function):
         if isinstance(node, ast.Assign):
             targets = node.targets
         elif isinstance(node, (ast.AugAssign, ast.AnnAssign)):
@@ -350,7 +357,19 @@ def _lines_that_assign(function: Any, wanted: str) -> Iterator[int]:
         else:
             continue
         if any(_names(target, wanted) for target in targets):
-            yield first + node.lineno - 1
+            yield line
+
+
+def _nodes(function: Any) -> Iterator[tuple[ast.AST, int]]:
+    """The nodes of a function's text that have a line, with it."""
+    try:
+        lines, first = inspect.getsourcelines(function)
+        tree = parse_python(textwrap.dedent("".join(lines)))
+    except (OSError, SyntaxError):  # made without a text, or a lambda in the middle of a line
+        return
+    for node in ast.walk(tree):
+        if (line := getattr(node, "lineno", None)) is not None:
+            yield node, first + line - 1
 
 
 def _names(target: ast.expr, wanted: str) -> bool:

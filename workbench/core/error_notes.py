@@ -39,13 +39,14 @@ def notes_of(error: BaseException) -> list[str]:
 
 class CoreRefusal(Exception):
     """The batched core refuses what a task asks for. The running `AuthorCall` remembers it: the task may catch it, and fail
-    later for want of what was refused."""
+    later for want of what was refused.
 
-    place: Place | None = None
-    """The line at fault, where it is known better than from the traceback."""
+    `place` is the line at fault, where it is known better than from the traceback.
+    """
 
-    def __init__(self, *args: object) -> None:
+    def __init__(self, *args: object, place: Place | None = None) -> None:
         super().__init__(*args)
+        self.place = place
         _running.remember(self)
 
 

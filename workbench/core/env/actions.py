@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from mani_skill.agents.controllers.base_controller import CombinedController
 from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
+from workbench.core.broken_rule import place_of_class
+from workbench.core.error_notes import RefusedCall
 from workbench.core.scene.scene_index import once_a_scene
 
 _EE_AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -31,11 +34,17 @@ class ActionPart:
     names: tuple[str, ...]
     low: NDArray[np.float32]
     high: NDArray[np.float32]
+    shape: tuple[int, ...]
+    """Of the controller's action of one env, which has a row of the flat one."""
 
 
 @once_a_scene
 def action_parts(env: BaseEnv) -> tuple[ActionPart, ...]:
-    """Parts in the order of the flat action; empty without a robot."""
+    """Parts in the order of the flat action; empty without a robot.
+
+    Raises:
+        RefusedCall: a controller's action is not an array of numbers.
+    """
     if env.agent is None:
         return ()
     controllers: Any = env.agent.controller
@@ -46,10 +55,15 @@ def action_parts(env: BaseEnv) -> tuple[ActionPart, ...]:
         named = controller.controllers.items() if combined else [(None, controller)]
         for name, part in named:
             space: Any = part.single_action_space
+            if not isinstance(space, spaces.Box):
+                raise RefusedCall(
+                    f"The action space of {type(part).__name__} is {space}: the workbench acts in a Box only.",
+                    place=place_of_class(type(part)),
+                )
             prefix = "/".join(str(p) for p in (robot, name) if p is not None)
             dimensions = [f"{prefix}/{d}" if prefix else d for d in _dimension_names(part)]
-            low, high = np.asarray(space.low, np.float32), np.asarray(space.high, np.float32)
-            parts.append(ActionPart(robot, part, tuple(dimensions), low, high))
+            low, high = (np.asarray(bound, np.float32).ravel() for bound in (space.low, space.high))
+            parts.append(ActionPart(robot, part, tuple(dimensions), low, high, space.shape))
     return tuple(parts)
 
 
@@ -108,11 +122,13 @@ def by_robot(parts: tuple[ActionPart, ...], action: torch.Tensor) -> Any:
     """The argument of ``env.step`` of a flat action (N, A): itself, a dict of parts for several robots, None without a robot."""
     if not parts:
         return None
-    if parts[0].robot is None:
-        return action
     split = torch.split(action, [len(p.names) for p in parts], dim=1)
-    robots = dict.fromkeys(p.robot for p in parts)
-    return {r: torch.cat([s for p, s in zip(parts, split, strict=True) if p.robot == r], 1) for r in robots}
+    of_robots: dict[str | None, list[torch.Tensor]] = {}
+    for part, columns in zip(parts, split, strict=True):
+        # Several controllers of one robot share a flat action.
+        of_robots.setdefault(part.robot, []).append(columns.reshape(len(columns), *part.shape))
+    made = {robot: each[0] if len(each) == 1 else torch.cat(each, 1) for robot, each in of_robots.items()}
+    return made[None] if None in made else made
 
 
 def to_flat_action(
@@ -159,11 +175,11 @@ def _numpy(values: Any) -> NDArray[np.float32]:
 
 
 def _dimension_names(controller: Any) -> list[str]:
-    count = controller.single_action_space.shape[0]
+    count = math.prod(controller.single_action_space.shape)
     if isinstance(controller, PDEEPosController):
         names: list[str] = list(_EE_AXES)
     else:
-        names = [joint.name for joint in controller.joints]
+        names = [joint.name for joint in getattr(controller, "joints", ())]
         controlled = getattr(controller, "control_joint_indices", None)
         if controlled is not None:
             names = [names[i] for i in controlled.tolist()]

@@ -20,7 +20,7 @@ from mani_skill.utils.assets import data
 
 from workbench.core.broken_rule import in_brackets
 from workbench.core.env.robot_notes import place_of_robot_file
-from workbench.core.error_notes import CoreRefusal
+from workbench.core.error_notes import CoreRefusal, Place
 
 _COMMAND = "python -m mani_skill.utils.download_asset"
 _A_PATH = re.compile(r"(?:/|[A-Za-z]:\\)[^\s'\"]+")
@@ -29,8 +29,8 @@ _A_PATH = re.compile(r"(?:/|[A-Za-z]:\\)[^\s'\"]+")
 class MissingAssets(CoreRefusal, RuntimeError):
     """The task needs assets that are not downloaded."""
 
-    def __init__(self, message: str, names: Sequence[str] = ()) -> None:
-        super().__init__(message)
+    def __init__(self, message: str, names: Sequence[str] = (), place: Place | None = None) -> None:
+        super().__init__(message, place=place)
         self.names = tuple(names)
         """Arguments of ``python -m mani_skill.utils.download_asset``, one for each missing asset."""
 
@@ -155,12 +155,11 @@ def _robot_without_file(task: str, robot: Any) -> MissingAssets:
 
 def _no_robot_file(task: str, robot: type, path: Path | None) -> MissingAssets:
     place = place_of_robot_file(robot)
-    refusal = MissingAssets(
+    return MissingAssets(
         f"{task}: the file of the robot {robot.__name__}, {path}, does not exist{in_brackets(place)}, and ManiSkill has no "
-        "download for it."
+        "download for it.",
+        place=place,
     )
-    refusal.place = place
-    return refusal
 
 
 def _named_by(error: Exception) -> list[str]:

@@ -477,10 +477,6 @@ def free_thread_keys() -> int | None:
 class ForgottenInit(CoreRefusal, RuntimeError):
     """A constructor did not call its parent's; the first use would fail far away ("weak reference to 'NoneType'")."""
 
-    def __init__(self, message: str, place: Place | None) -> None:
-        super().__init__(message)
-        self.place = place
-
 
 def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None:
     """After the constructor of `task`.
@@ -493,14 +489,14 @@ def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None
         raise ForgottenInit(
             f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so nothing was built"
             f"{in_brackets(place)}. Call it there, after setting what the hooks need: ManiSkill builds the scene and resets in it.",
-            place,
+            place=place,
         )
     if env.num_envs != num_envs:
         cls, place = _culprit(task, BaseEnv, silent=False)
         raise ForgottenInit(
             f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not hand num_envs on"
             f"{in_brackets(place)}. Give its keyword arguments to super().__init__(*args, **kwargs).",
-            place,
+            place=place,
         )
 
 
@@ -516,7 +512,7 @@ def refuse_unbuilt_agent(agent: Any) -> None:
             raise ForgottenInit(
                 f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so the robot was not loaded"
                 f"{in_brackets(place)}. Call it there.",
-                place,
+                place=place,
             )
 
 

@@ -289,6 +289,14 @@ def wrong_observation(obs: object, num_envs: int) -> str | None:
     return None
 
 
+def without_rows(value: object, num_envs: int) -> Iterator[tuple[str, str]]:
+    """Name and description of each tensor or array in nested dicts that has no row for each env."""
+    for name, held in flat_entries(value):
+        if isinstance(held, torch.Tensor | np.ndarray) and held.shape[:1] != (num_envs,):
+            if num_envs > 1 or held.ndim:  # ManiSkill takes shape () for a single env
+                yield name, type_text(held)
+
+
 def _describe(value: object) -> str:
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"a {type_text(value)}"

@@ -20,6 +20,7 @@ from mani_skill.agents import base_agent
 from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.controllers.base_controller import BaseController
 
+from workbench.core.broken_rule import in_brackets, place_of_class
 from workbench.core.error_notes import CoreRefusal, Note, Place, chain_of
 from workbench.machine.parse_python import parse_python
 
@@ -66,19 +67,23 @@ def _note(error: BaseException) -> Note | None:
     if controller is not None and robot is not None:
         return _controller_note(controller, robot)
     path = next((Path(str(found)) for frame in frames if (found := _file_argument(frame)) is not None), None)
+    named = None if robot is None else place_of_class(type(robot))
     if path is None:
-        return None
+        return (
+            None
+            if robot is None
+            else Note(f"The robot is {type(robot).__name__}{in_brackets(named)}.", named)
+        )
     part = _part_at_fault([frame for frame in frames if frame.f_code.co_filename.startswith(_LOADERS)])
     line = _line_of(error, part, path)
     text = f"Robot file {path}" + ("" if line is None else f":{line}")
     if part is not None:
         text += f", {part[0]} {part[1]!r}" if part[1] else f", <{part[0]}>"
     text += "".join(_missing_mesh(frames, path))
-    place = None if robot is None else place_of_robot_file(type(robot))
     if robot is not None:
-        at = "" if place is None else f" at {place[0]}:{place[1]}"
-        text += f". {type(robot).__name__} names it{at}"
-    return Note(f"{text}.", place)
+        named = place_of_robot_file(type(robot)) or named
+        text += f". {type(robot).__name__} names it{in_brackets(named)}"
+    return Note(f"{text}.", named)
 
 
 def _file_argument(frame: FrameType) -> Any:
@@ -170,8 +175,7 @@ def _controller_note(controller: Any, robot: Any) -> Note | None:
     place = place or _find_line(
         type(robot), lambda node: isinstance(node, ast.FunctionDef) and node.name == "_controller_configs"
     )
-    at = "" if place is None else f" ({place[0]}:{place[1]})"
-    text = f"{type(controller).__name__} of {type(robot).__name__}{at}"
+    text = f"{type(controller).__name__} of {type(robot).__name__}{in_brackets(place)}"
     for name in unknown:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"

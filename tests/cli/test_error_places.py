@@ -1,0 +1,160 @@
+"""Where an error of a task is, as ``workbench check`` and ``record`` say it: file, line, and what came before."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.drive.session import TASKS
+from workbench.cli.main import main
+
+FEW = ("--envs-per-worker", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
+Check = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Check:
+    """Checks ``runs`` of a task below `tmp_path`; its error, or else its finding. Paths are relative."""
+    (tmp_path / ".git").mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    def run(task: str, *more: str) -> dict[str, Any]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit):
+            main(["check", task, "--select", "runs", "--json", *FEW, *more])
+        told = json.loads(capsys.readouterr().out)
+        return told["error"] or (told["findings"] or [{}])[0]
+
+    return run
+
+
+def line_of(file: Path, words: str) -> int:
+    text = file.read_text()
+    return text[: text.index(words)].count("\n") + 1
+
+
+def edited(folder: Path, *edits: tuple[str, str]) -> Path:
+    """The smallest example, with other texts in place of some of its."""
+    text = (TASKS / "minimal.py").read_text()
+    for old, new in edits:
+        assert old in text, old
+        text = text.replace(old, new)
+    file = folder / "task.py"
+    file.write_text(text)
+    return file
+
+
+RESET, EVALUATED = "        self.cube.set_pose(Pose.create_from_pq(p=p))\n", 'return {"success":'
+
+
+def test_a_refusal_of_the_core_that_the_task_caught_is_told_before_the_error_that_it_led_to(
+    tmp_path: Path, check: Check
+) -> None:
+    caught = """
+        self.places = [1]
+        try:
+            self.moved()
+        except ValueError:
+            self.cube.set_pose(Pose.create_from_pq(p=p))
+            self.places = []
+        self.places[0]
+
+    def moved(self):
+        self.cube.set_pose(Pose.create_from_pq(torch.full((1, 3), torch.nan)))
+        self.scene._gpu_apply_all()
+"""
+    file = edited(tmp_path, (RESET, caught))
+    told = check("task.py")
+    assert told["line"] == line_of(file, "self.places[0]") and told["file"] == "task.py"
+    said = told["message"]
+    refused, swallowed = (
+        f"task.py:{line_of(file, words)}" for words in ("self.scene._gpu_apply_all()", "self.moved()")
+    )
+    assert said.index(refused) < said.index(swallowed) < said.index("IndexError"), said
+    assert "NaN" in said
+    # What is refused while no error follows is not told, and of the next call it is no part.
+    file.write_text(file.read_text().replace("        self.places[0]\n", ""))
+    assert check("task.py") == {}
+    file.write_text(
+        file.read_text().replace(
+            "    def moved", "    def _before_control_step(self):\n        {}[9]\n\n    def moved"
+        )
+    )
+    assert "NaN" not in check("task.py")["message"]
+
+
+def test_the_first_exception_of_a_chain_is_told_with_its_line(tmp_path: Path, check: Check) -> None:
+    chain = """
+        try:
+            {}["table"]
+        except KeyError as error:
+            raise ValueError("no such place") from error
+"""
+    file = edited(tmp_path, (RESET, chain))
+    told = check("task.py")
+    assert told["line"] == line_of(file, "raise ValueError")
+    assert told["message"].index(f"task.py:{line_of(file, '{}[')}") < told["message"].index("ValueError")
+
+
+def test_what_evaluate_returned_without_rows_is_named_where_another_hook_fails_with_it(
+    tmp_path: Path, check: Check
+) -> None:
+    hooks = """apart = self.cube.pose.p[:1, 0].repeat(3)
+        return {
+            "apart": apart,
+            "success": torch.zeros(self.num_envs, dtype=torch.bool),
+        }
+
+    def compute_dense_reward(self, obs, action, info):
+        return info["apart"] + self.cube.pose.p[:, 0]
+
+    def compute_normalized_dense_reward(self, obs, action, info):
+        return self.compute_dense_reward(obs, action, info)
+
+    def old(self):
+        return {"success":"""
+    file = edited(tmp_path, (EVALUATED, hooks), ('("sparse", "none")', '("normalized_dense", "dense")'))
+    told = check("task.py")
+    assert told["line"] == line_of(file, 'return info["apart"]')
+    entry = line_of(file, '"apart": apart')
+    assert "(3,)" in told["message"] and f"task.py:{entry}" in told["message"]
+
+
+BROKEN = {
+    "a name": ("from typing import nothing_like_it\n", "from typing"),
+    "a module": ("import os\nimport nothing_of_this_name\n", "import nothing"),
+    "a syntax": ("x = 1\ny = = 2\n", "y ="),
+    "at run time": ("SIZES = {}\nprint(SIZES['cube'])\n", "print"),
+    "a circle": ("from LAB.tasks.reach import LabEnv\n", "tasks.reach"),
+    "a relative one": ("from .nowhere import THING\n", "from .nowhere"),
+    "a name of a package": ("from . import nothing_there\n", "from . import"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+@pytest.mark.parametrize("where", ["robots/dual.py", "__init__.py", "robots/__init__.py"])
+def test_a_module_of_another_folder_that_cannot_be_imported_is_named_with_its_line(
+    kind: str, where: str, tmp_path: Path, check: Check
+) -> None:
+    text, words = BROKEN[kind]
+    # Python keeps a package that another test of this process has imported.
+    lab = f"lab_{kind.replace(' ', '_')}_{where.replace('/', '_').removesuffix('.py')}"
+    names = ("__init__.py", "robots/__init__.py", "robots/dual.py", "tasks/__init__.py")
+    files = dict.fromkeys(names, "") | {where: text.replace("LAB", lab)}
+    files["tasks/reach.py"] = f"import {lab}.robots.dual\n" + (TASKS / "minimal.py").read_text()
+    for name, held in files.items():
+        file = tmp_path / lab / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(held)
+    told = check(f"{lab}/tasks/reach.py")
+    assert (told["file"], told["line"]) == (f"{lab}/{where}", line_of(tmp_path / lab / where, words)), told
+
+
+def test_an_error_without_a_line_of_the_authors_has_none(tmp_path: Path, check: Check) -> None:
+    (tmp_path / "task.py").write_bytes(b"x = 1" * 10_000_000)
+    told = check("task.py")
+    assert (told["file"], told["line"]) == ("task.py", None), told
