@@ -25,7 +25,7 @@ def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     def run(task: str, *more: str) -> dict[str, Any]:
         capsys.readouterr()
         with pytest.raises(SystemExit):
-            main(["check", task, "--select", "runs", "--json", *FEW, *more])
+            main(["check", task, "--select", "runs", "--json", *(more or FEW)])
         told = json.loads(capsys.readouterr().out)
         return told["error"] or (told["findings"] or [{}])[0]
 
@@ -158,3 +158,136 @@ def test_an_error_without_a_line_of_the_authors_has_none(tmp_path: Path, check: 
     (tmp_path / "task.py").write_bytes(b"x = 1" * 10_000_000)
     told = check("task.py")
     assert (told["file"], told["line"]) == ("task.py", None), told
+
+
+ROBOT = """
+from pathlib import Path
+import numpy as np
+import sapien
+from mani_skill.agents.base_agent import BaseAgent, Keyframe
+from mani_skill.agents.controllers import PDJointPosControllerConfig
+from mani_skill.agents.registration import register_agent
+
+@register_agent()
+class Stick(BaseAgent):
+    uid = "stick_of_NAME"
+    KIND_path = str(Path(__file__).with_name("stick.xml"))
+    keyframes = {"rest": Keyframe(pose=sapien.Pose(p=[0, 0, 0.05]), qpos=np.array([0.3]))}
+
+    @property
+    def _controller_configs(self):
+        return {"pd": {"arm": PDJointPosControllerConfig(["hinge"], -0.1, 0.1, 1000, 100, use_delta=True)}}
+"""
+URDF = """<?xml version="1.0"?>
+<robot name="stick">
+  <link name="base">
+    <inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>
+    <collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>
+  </link>
+  <link name="arm">
+    <inertial><mass value="0.5"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial>
+    <collision><origin xyz="0 0 0.15"/><geometry><box size="0.03 0.03 0.3"/></geometry></collision>
+  </link>
+  <joint name="hinge" type="revolute">
+    <parent link="base"/><child link="arm"/><origin xyz="0 0 0.06"/><axis xyz="0 1 0"/>
+    <limit lower="-1.5" upper="1.5" effort="10" velocity="3"/>
+  </joint>
+</robot>
+"""
+MJCF = """<mujoco model="stick">
+  <worldbody>
+    <body name="base" pos="0 0 0.05">
+      <geom type="box" size="0.05 0.05 0.05"/>
+      <body name="arm" pos="0 0 0.06">
+        <joint name="hinge" type="hinge" axis="0 1 0" range="-1.5 1.5"/>
+        <geom type="box" size="0.015 0.015 0.15" pos="0 0 0.15"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+MISTAKES = {
+    "an inertia": (URDF, 'ixx="0.001"', 'ixx="-0.001"', '<link name="arm"', "arm"),
+    "no number": (URDF, "0.03 0.03 0.3", "0.03 wide 0.3", "0.03 wide 0.3", "arm"),
+    "a link twice": (
+        URDF,
+        '<link name="arm"',
+        '<link name="base"',
+        '<link name="base">\n    <inertial><mass value="0.5"',
+        "base",
+    ),
+    "no parent": (URDF, '<parent link="base"/>', '<parent link="bse"/>', '<joint name="hinge"', "hinge"),
+    "no limit": (
+        URDF,
+        '    <limit lower="-1.5" upper="1.5" effort="10" velocity="3"/>\n',
+        "",
+        '<joint name="hinge"',
+        "hinge",
+    ),
+    "a joint's type": (URDF, "revolute", "hinge", '<joint name="hinge"', "hinge"),
+    "not closed": (URDF, "</robot>\n", "", None, ""),
+    "an element of MJCF": (
+        MJCF,
+        'type="box" size="0.015 0.015 0.15"',
+        'type="box" size="0.015 thin 0.15"',
+        "thin",
+        "arm",
+    ),
+    "MJCF not closed": (MJCF, "</worldbody>", "", "</mujoco>", ""),
+}
+
+
+@pytest.mark.parametrize("kind", MISTAKES)
+def test_a_mistake_in_a_robots_file_is_told_with_its_line_and_the_line_that_names_the_file(
+    kind: str, tmp_path: Path, check: Check
+) -> None:
+    text, old, new, words, named = MISTAKES[kind]
+    name = "mjcf" if text is MJCF else "urdf"
+    robot = tmp_path / "stick.py"
+    robot.write_text(ROBOT.replace("KIND", name).replace("NAME", kind.replace(" ", "_").replace("'", "")))
+    described = tmp_path / "stick.xml"
+    described.write_text(text.replace(old, new))
+    told = check("stick.py")
+    line = text.replace(old, new).count("\n") + 1 if words is None else line_of(described, words)
+    assert (told["file"], told["line"]) == ("stick.py", line_of(robot, f"{name}_path")), told
+    assert f"{described}:{line}" in told["message"] and named in told["message"], told
+
+
+def test_what_a_robot_names_and_is_not_there_is_told_with_the_line(tmp_path: Path, check: Check) -> None:
+    robot = tmp_path / "stick.py"
+    text = ROBOT.replace("KIND", "urdf")
+    robot.write_text(text.replace("NAME", "no_file"))
+    told = check("stick.py")
+    assert told["line"] == line_of(robot, "urdf_path") and str(tmp_path / "stick.xml") in told["message"]
+    (tmp_path / "stick.xml").write_text(URDF)
+    robot.write_text(text.replace("NAME", "no_joint").replace('["hinge"]', '["hing"]'))
+    told = check("stick.py")
+    assert told["line"] == line_of(robot, '["hing"]') and "'hinge'" in told["message"], told
+
+
+def test_a_mesh_that_is_not_there_is_told_with_the_link_that_names_it(
+    renderer: None, tmp_path: Path, check: Check
+) -> None:
+    robot, described = tmp_path / "stick.py", tmp_path / "stick.xml"
+    robot.write_text(ROBOT.replace("KIND", "urdf").replace("NAME", "no_mesh"))
+    visual = '<visual><geometry><mesh filename="meshes/arm.stl"/></geometry></visual>'
+    described.write_text(URDF.replace('<link name="arm">', f'<link name="arm">{visual}'))
+    told = check("stick.py", *FEW[:-2])
+    assert told["line"] == line_of(robot, "urdf_path"), told
+    assert f"{described}:{line_of(described, visual)}" in told["message"] and "'arm'" in told["message"]
+    assert str(tmp_path / "meshes" / "arm.stl") in told["message"]
+
+
+def test_a_file_that_the_task_loads_itself_is_told_with_the_line_that_loads_it(
+    tmp_path: Path, check: Check
+) -> None:
+    described = tmp_path / "door.xml"
+    described.write_text(URDF.replace('ixx="0.001"', 'ixx="-0.001"'))
+    loads = f"loader = self.scene.create_urdf_loader()\n        loader.parse({str(described)!r})\n        "
+    file = edited(
+        tmp_path, ("build_ground(self.scene)\n", f"build_ground(self.scene)\n        {loads}pass\n")
+    )
+    told = check("task.py")
+    assert told["line"] == line_of(file, "loader.parse")
+    link = line_of(described, '<link name="arm"')
+    assert f"{described}:{link}" in told["message"]

@@ -6,8 +6,9 @@ import ast
 import difflib
 import inspect
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from traceback import walk_tb
 from types import FrameType
@@ -78,7 +79,7 @@ def _note(error: BaseException) -> Note | None:
     line = _line_of(error, part, path)
     text = f"Robot file {path}" + ("" if line is None else f":{line}")
     if part is not None:
-        text += f", {part[0]} {part[1]!r}" if part[1] else f", <{part[0]}>"
+        text += f", {part.tag} {part.name!r}" if part.name else f", <{part.tag}>"
     text += "".join(_missing_mesh(frames, path))
     if robot is not None:
         named = place_of_robot_file(type(robot)) or named
@@ -98,8 +99,16 @@ def _self(frame: FrameType, kind: type) -> Any:
     return found if isinstance(found, kind) else None
 
 
-_Part = tuple[str, str, int | None]
-"""An element of a robot's file: tag, name (may be empty), and line."""
+@dataclass(frozen=True)
+class _Part:
+    """An element of a robot's file."""
+
+    tag: str
+    name: str
+    """Its own, or that of one around it; empty if none has one."""
+    line: int | None = None
+    attributes: Mapping[str, str] | None = None
+    """All of its own, where the line is not known."""
 
 
 def _part_at_fault(frames: list[FrameType]) -> _Part | None:
@@ -107,43 +116,58 @@ def _part_at_fault(frames: list[FrameType]) -> _Part | None:
     Args:
         frames: of the loaders, innermost first.
     """
+    found: _Part | None = None
     for frame in frames:
         values = frame.f_locals
         names = (*_ELEMENTS, *_OF_A_LOOP) if frame is frames[0] else _ELEMENTS
         if frame.f_code.co_name == "_build_link":
             names = (*names, "link")
-        for value in (values[name] for name in names if values.get(name) is not None):
-            if (part := _part_of(value)) is not None:
-                return part
+        parts = [_part_of(values[name]) for name in names if values.get(name) is not None]
         builder = values.get("self")
         if hasattr(builder, "joint_record"):
-            return "link", str(getattr(builder, "name", "")), None
-    return None
+            parts.append(_Part("link", str(getattr(builder, "name", ""))))
+        for part in filter(None, parts):
+            # An element of MJCF need not have a name: that of the body around it is in a frame further out.
+            found = part if found is None else replace(found, name=part.name)
+            if found.name:
+                return found
+    return found
 
 
 def _part_of(value: Any) -> _Part | None:
-    if hasattr(value, "sourceline") and hasattr(value, "iterancestors"):  # lxml's
-        if value.tag in ("robot", "mujoco"):
+    tag = getattr(value, "tag", None)
+    if isinstance(tag, str):
+        if tag in ("robot", "mujoco"):
             return None
-        named = next((one for one in (value, *value.iterancestors()) if one.get("name")), value)
-        return str(named.tag), str(named.get("name") or ""), value.sourceline
+        around = (
+            value.iterancestors() if hasattr(value, "iterancestors") else ()
+        )  # lxml's know more than Python's own
+        named = next((one for one in (value, *around) if one.get("name")), value)
+        line = getattr(value, "sourceline", None)
+        return _Part(named.tag, named.get("name") or "", line, None if line else dict(value.attrib))
     if hasattr(value, "mimic") and hasattr(value, "multiplier"):
-        return "joint", str(value.joint), None
+        return _Part("joint", str(value.joint))
     name = getattr(value, "name", None)
-    return (type(value).__name__.lower(), name, None) if isinstance(name, str) else None
+    return _Part(type(value).__name__.lower(), name) if isinstance(name, str) else None
 
 
 def _line_of(error: BaseException, part: _Part | None, path: Path) -> int | None:
     """1-based line in the robot's file."""
-    if isinstance(error, SyntaxError) and not Path(error.filename or "").is_file():
-        return error.lineno  # of XML
-    if part is None or part[2] is not None:
-        return None if part is None else part[2]
+    if isinstance(error, SyntaxError | ExpatError):  # of XML
+        position = getattr(error, "position", None)
+        return position[0] if position else error.lineno
+    if part is None or part.line is not None:
+        return None if part is None else part.line
     lines: list[int] = []
     parser = ParserCreate()
 
     def begin(tag: str, attributes: dict[str, str]) -> None:
-        if (tag, attributes.get("name")) == part[:2]:
+        wanted = (
+            attributes == part.attributes
+            if part.attributes is not None
+            else attributes.get("name") == part.name
+        )
+        if tag == part.tag and wanted:
             lines.append(parser.CurrentLineNumber)
 
     parser.StartElementHandler = begin
