@@ -25,7 +25,7 @@ def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captur
     def run(task: str, *more: str) -> dict[str, Any]:
         capsys.readouterr()
         with pytest.raises(SystemExit):
-            main(["check", task, "--select", "runs", "--json", *(more or FEW)])
+            main(["check", task, "--select", "runs", "--json", *FEW, *more])
         told = json.loads(capsys.readouterr().out)
         return told["error"] or (told["findings"] or [{}])[0]
 
@@ -266,16 +266,20 @@ def test_what_a_robot_names_and_is_not_there_is_told_with_the_line(tmp_path: Pat
 
 
 def test_a_mesh_that_is_not_there_is_told_with_the_link_that_names_it(
-    renderer: None, tmp_path: Path, check: Check
+    renderer: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot, described = tmp_path / "stick.py", tmp_path / "stick.xml"
     robot.write_text(ROBOT.replace("KIND", "urdf").replace("NAME", "no_mesh"))
     visual = '<visual><geometry><mesh filename="meshes/arm.stl"/></geometry></visual>'
     described.write_text(URDF.replace('<link name="arm">', f'<link name="arm">{visual}'))
-    told = check("stick.py", *FEW[:-2])
-    assert told["line"] == line_of(robot, "urdf_path"), told
-    assert f"{described}:{line_of(described, visual)}" in told["message"] and "'arm'" in told["message"]
-    assert str(tmp_path / "meshes" / "arm.stl") in told["message"]
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["record", "stick.py", "--episodes", "1", "--envs-per-worker", "1"])
+    said = capsys.readouterr().err
+    assert ended.value.code == 1
+    assert f"{robot}:{line_of(robot, 'urdf_path')}" in said, said
+    assert f"{described}:{line_of(described, visual)}" in said and "'arm'" in said
+    assert str(tmp_path / "meshes" / "arm.stl") in said
 
 
 def test_a_file_that_the_task_loads_itself_is_told_with_the_line_that_loads_it(
