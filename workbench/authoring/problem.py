@@ -130,14 +130,18 @@ def task_error(message: str, file: Path | None = None) -> TaskError:
 
 
 def problem_from_exception(
-    exc: BaseException, stage: str, own_files: Collection[Path], cls: type | None = None
+    exc: BaseException,
+    stage: str,
+    own_files: Collection[Path],
+    cls: type | None = None,
+    otherwise: tuple[str, int] | None = None,
 ) -> Problem:
     """The problem that `exc` is for the author of `own_files`.
 
     Its line is the innermost frame in `own_files`, or in a file called from there that no package has installed; of `exc`,
     or else of the exceptions that caused it. A hook of `HOOK_STAGES` on the traceback replaces `stage`, except while
     importing. If no frame is the author's but a note names a place, it is that; else, if a hook is known and `cls` (the
-    task's class) is given, that hook's ``def``. The message begins with the first exception of the chain, and with what the
+    task's class) is given, that hook's ``def``; else the file and line `otherwise`. The message begins with the first exception of the chain, and with what the
     core's notes say came before.
     """
     own = {str(path) for path in own_files}
@@ -155,7 +159,7 @@ def problem_from_exception(
     if place is None:
         hooks = () if stage_found in ("build", "step") else hooks_of(stage_found)
         found = None if cls is None else hook_definition(cls, hooks, own_files)
-        place = None if found is None else found[1]
+        place = otherwise if found is None else found[1]
     file, line = place if place is not None else (None, None)
     code = None
     if file is not None and line is not None:

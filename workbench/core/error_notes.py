@@ -62,6 +62,14 @@ class RefusedMember(CoreRefusal, NotImplementedError):
     """Refused because the batched simulation does not have it."""
 
 
+class WrongAction(ValueError):
+    """An action that does not fit the task. `problem` goes on from the name of what gave it."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(f"the action {problem}")
+        self.problem = problem
+
+
 class AuthorCall:
     """A context around a call of the author's code: an error that leaves it is given a note for each refusal of the core
     that was caught before. Nests."""
