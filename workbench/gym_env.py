@@ -21,12 +21,13 @@ from workbench.authoring.loading.load import LoadedTask, class_of_module, load_t
 from workbench.authoring.loading.reference import split_reference
 from workbench.authoring.problem import definition_line
 from workbench.core.backends import BackendUnavailable, find_renderer
-from workbench.core.broken_rule import class_is_installed, is_installed, warn_of
+from workbench.core.broken_rule import class_is_installed, warn_of
 from workbench.core.camera_data import PictureDegree
 from workbench.core.cameras.render import findings_of_shaders, list_cameras
 from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.task_env import Backend, EnvOptions, build_env, default_reward_mode
 from workbench.core.rules import Degree
+from workbench.machine.library_files import is_installed
 
 _STATE_MODES = {"state", "state_dict", "none"}
 """The parts of an ``obs_mode`` for which nothing is drawn."""

@@ -8,17 +8,17 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from workbench.core.broken_rule import Place
 from workbench.core.camera_data import CallSite, CameraKey
+from workbench.core.error_notes import CoreRefusal, Place
 from workbench.machine.processes.time_limit import PICTURE_SECONDS, limited
 
 
-class CannotDraw(RuntimeError):
+class CannotDraw(CoreRefusal, RuntimeError):
     """The renderer failed to draw a camera."""
 
     def __init__(self, message: str, key: CameraKey, place: Place | None) -> None:
-        super().__init__(message)
-        self.key, self.place = key, place
+        super().__init__(message, place=place)
+        self.key = key
 
 
 @contextmanager

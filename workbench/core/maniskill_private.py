@@ -399,6 +399,15 @@ def agents(env: Any) -> list[Any]:
     return agent.agents if isinstance(agent, MultiAgent) else [] if agent is None else [agent]
 
 
+def tool_of(agent: Any) -> Link | None:
+    """The link of a robot's tool centre point, ``tcp``; None if its class has none, or one that is no link."""
+    try:
+        tool = getattr(agent, "tcp", None)
+    except Exception:  # a property of the author's, which nothing of ManiSkill's reads
+        return None
+    return tool if isinstance(tool, Link) else None
+
+
 def data_rows_of_articulation(articulation: Any) -> torch.Tensor:
     """Its row of each env in the joint tensors, such as ``px.cuda_articulation_qpos``: ``_data_index``."""
     return articulation._data_index

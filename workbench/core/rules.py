@@ -119,6 +119,13 @@ _TABLE = (
         "step",
     ),
     Rule(
+        "controller-targets",
+        "warn",
+        "A controller says in sets_target_qpos and sets_target_qvel which drive targets it sets.",
+        "Each step raises AttributeError.",
+        "step",
+    ),
+    Rule(
         "evaluate-rows",
         "stop",
         "evaluate() returns a row for each env.",

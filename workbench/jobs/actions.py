@@ -96,8 +96,7 @@ class ActionChooser:
         if self._source == "policy":
             # Never another action instead: the page says that the policy acts.
             with self._imported() as policy:
-                whose = f"what {self._policy_name} returned"
-                return actions.to_flat_action(task.env, task.parts, policy(task.obs), whose)
+                return actions.to_flat_action(task.env, task.parts, policy(task.obs))
         low, high = actions.bounds(task.parts)
         if self._source == "zero":
             return _same_for_all(np.clip(0.0, low, high), task)

@@ -9,7 +9,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -21,6 +20,7 @@ from workbench.authoring.loading.task_content import CannotRead, read_text, sour
 from workbench.authoring.reload.call_graph import TwoVersions
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN, RecordedRun
 from workbench.jobs.task import TaskDescription, TaskOptions
+from workbench.machine.library_files import is_installed
 from workbench.machine.parse_python import parse_python
 from workbench.recording.episode.episode import Episode, EpisodeInfo
 from workbench.recording.episode.side_files import folder_of, side_file_path
@@ -189,7 +189,7 @@ def reference_of(info: EpisodeInfo) -> RecordedTask:
         or not file.is_absolute()
         or file.suffix != ".py"
         or not file.is_file()
-        or _is_installed(file)
+        or is_installed(str(file))
     ):
         return RecordedTask(info.task)
     try:
@@ -285,12 +285,3 @@ def _class_of(text: str, env_id: str) -> str | None:
     return (
         env_id if any(isinstance(node, ast.ClassDef) and node.name == env_id for node in tree.body) else None
     )
-
-
-def _is_installed(file: Path) -> bool:
-    """Whether it is a file of ManiSkill or another installed package, which is opened by its id."""
-    if {"site-packages", "dist-packages"} & set(file.parts):
-        return True
-    spec = find_spec("mani_skill")  # does not import it
-    folders = [] if spec is None else list(spec.submodule_search_locations or [])
-    return any(file.is_relative_to(folder) for folder in folders)

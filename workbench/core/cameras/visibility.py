@@ -104,11 +104,8 @@ def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
     """
     names, entities = scene_index(env).names, scene_index(env).entities[0]
     drawn = [body for body in reversed(robot.bodies) if is_drawn(entities[body])]
-    tools = [
-        getattr(agent, "tcp", None)
-        for agent in maniskill_private.agents(env)
-        if agent.robot.name == robot.name
-    ]
+    agents = [agent for agent in maniskill_private.agents(env) if agent.robot.name == robot.name]
+    tools = [maniskill_private.tool_of(agent) for agent in agents]
     name = f"{robot.name}/{getattr(tools[0], 'name', '')}" if tools else ""
     if name in names:
         places = read_poses(env)[0, :, :3]

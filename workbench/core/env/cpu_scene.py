@@ -34,13 +34,17 @@ from workbench.core.camera_data import CameraKey, CameraKind, PictureDegree
 from workbench.core.camera_shader import install_drawable_cameras, note_shader
 from workbench.core.drawing import drawing, read_texture
 from workbench.core.env.partial_reset import (
+    TARGET_FLAGS,
     KeptControllers,
-    explain_reset_errors,
     in_ascending_order,
+    note_what_was_reset,
     seeded,
     untouched_envs,
+    without_target_flags,
 )
+from workbench.core.env.robot_notes import note_robot_errors
 from workbench.core.env.strict import StrictMixin
+from workbench.core.error_notes import AuthorCall, CoreRefusal, RefusedCall, RefusedValue
 from workbench.core.maniskill_private import (
     asks_for_a_gpu,
     camera_components,
@@ -267,7 +271,7 @@ class BatchedCpuScene(ManiSkillScene):
 
     def _gpu_apply_all(self) -> None:
         if self._needs_fetch:
-            raise RuntimeError(
+            raise RefusedCall(
                 "self.scene._gpu_apply_all() was called twice without self.scene._gpu_fetch_all() between: "
                 "on the GPU that is an error too. Fetch after every apply, and once before the end of "
                 f"_initialize_episode, after which ManiSkill applies. The first call{self._applied_at}."
@@ -310,14 +314,15 @@ class BatchedCpuMixin:
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("parallel_in_single_scene"):
-            raise ValueError(
+            raise RefusedValue(
                 "parallel_in_single_scene is not possible with the batched CPU core: the page "
                 "shows all envs side by side without it."
             )
         if kwargs.get("render_mode") == "human":
-            raise ValueError(_NO_WINDOW)
+            raise RefusedValue(_NO_WINDOW)
         kwargs["sim_backend"] = "physx_cpu"
-        super().__init__(*args, **kwargs)
+        with AuthorCall():
+            super().__init__(*args, **kwargs)
         refuse_unbuilt_env(self, self._workbench_task, kwargs.get("num_envs", 1))  # type: ignore[arg-type]
         note_constructed(self)  # type: ignore[arg-type]
 
@@ -327,7 +332,7 @@ class BatchedCpuMixin:
         return self.scene.gpu_sim_enabled and not asks_for_a_gpu(sys._getframe(1))
 
     def render_human(self) -> Any:
-        raise RuntimeError(_NO_WINDOW)
+        raise RefusedCall(_NO_WINDOW)
 
     @property
     def backend(self) -> BackendInfo:
@@ -357,13 +362,17 @@ class BatchedCpuMixin:
         self._kept_controllers = KeptControllers(self, untouched) if untouched else None
         self._to_begin = [] if self.begins_anew else None
         try:
-            with explain_reset_errors(self, untouched), given:
+            with AuthorCall(), note_robot_errors(), note_what_was_reset(self, untouched), given:
                 return super().reset(seed=seed, options=options)  # type: ignore[misc]
         except BaseException:
             self.drop_writes()
             raise
         finally:
             self._kept_controllers = self._to_begin = None
+
+    def step(self, action: Any) -> Any:
+        with AuthorCall():
+            return super().step(action)  # type: ignore[misc]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
         super()._initialize_episode(env_idx, options)  # type: ignore[misc]
@@ -392,6 +401,10 @@ class BatchedCpuMixin:
         # Substeps may be merged only if no code of the author's runs between them.
         px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
         unwatched = substeps_are_unwatched(self, self._workbench_task)
+        for controller in without_target_flags(self):
+            for flag in TARGET_FLAGS:
+                # Only what was changed is applied, so a controller that sets none loses nothing.
+                setattr(controller, flag, getattr(controller, flag, True))
         try:
             with px.merging(self._sim_steps_per_control if unwatched else 1):
                 return super()._step_action(action)  # type: ignore[misc]
@@ -481,7 +494,7 @@ def require_scenes(count: int) -> None:
     """
     free = free_thread_keys()
     if free is not None and count > free - _SPARE:
-        raise ValueError(
+        raise RefusedValue(
             f"num_envs={count} is more than this process has room for: PhysX takes one of Linux's 1024 thread-local "
             f"keys for each env, and {max(free - _SPARE, 0)} are left here. Use fewer envs, close envs that "
             "are not needed, or divide the envs among processes."
@@ -509,12 +522,8 @@ def free_thread_keys() -> int | None:
 # --- constructors ------------------------------------------------------------------------------------
 
 
-class ForgottenInit(RuntimeError):
+class ForgottenInit(CoreRefusal, RuntimeError):
     """A constructor did not call its parent's; the first use would fail far away ("weak reference to 'NoneType'")."""
-
-    def __init__(self, message: str, place: Place | None) -> None:
-        super().__init__(message)
-        self.place = place
 
 
 def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None:
@@ -528,14 +537,14 @@ def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None
         raise ForgottenInit(
             f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so nothing was built"
             f"{in_brackets(place)}. Call it there, after setting what the hooks need: ManiSkill builds the scene and resets in it.",
-            place,
+            place=place,
         )
     if env.num_envs != num_envs:
         cls, place = _culprit(task, BaseEnv, silent=False)
         raise ForgottenInit(
             f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not hand num_envs on"
             f"{in_brackets(place)}. Give its keyword arguments to super().__init__(*args, **kwargs).",
-            place,
+            place=place,
         )
 
 
@@ -551,7 +560,7 @@ def refuse_unbuilt_agent(agent: Any) -> None:
             raise ForgottenInit(
                 f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so the robot was not loaded"
                 f"{in_brackets(place)}. Call it there.",
-                place,
+                place=place,
             )
 
 

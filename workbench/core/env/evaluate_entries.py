@@ -237,13 +237,13 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
     Other entries may be anything, as in ManiSkill (`split_entries`).
     """
     if not isinstance(evaluate, Mapping):
-        return f"returned {_describe(evaluate)}; it must return a dict ({{}} where there is nothing to say)"
+        return f"returned {describe(evaluate)}; it must return a dict ({{}} where there is nothing to say)"
     for name in FLAGS:
         value = evaluate.get(name)
         if name in evaluate and not (
             isinstance(value, torch.Tensor) and value.dtype == torch.bool and _a_row_each(value, num_envs)
         ):
-            return f"returned {name!r} as {_describe(value)}; expected a bool tensor of shape ({num_envs},)"
+            return f"returned {name!r} as {describe(value)}; expected a bool tensor of shape ({num_envs},)"
     return None
 
 
@@ -256,13 +256,13 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
     success = evaluate.get("success")
     if isinstance(success, torch.Tensor) and reward.dtype == torch.bool and torch.equal(reward, success):
         return None
-    return f"returned {_describe(reward)}; {_floating(num_envs)}: append .float()"
+    return f"returned {describe(reward)}; {_floating(num_envs)}: append .float()"
 
 
 def no_reward(reward: object, num_envs: int) -> str | None:
     """What is wrong with a reward that is no real number (or bool) for each env: it cannot be drawn or recorded."""
     if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs) or reward.dtype.is_complex:
-        return f"returned {_describe(reward)}; {_floating(num_envs)}"
+        return f"returned {describe(reward)}; {_floating(num_envs)}"
     return None
 
 
@@ -278,18 +278,27 @@ def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:
 def wrong_observation(obs: object, num_envs: int) -> str | None:
     """What is wrong with an observation hook's return value, or None: a dict of arrays (N, ...)."""
     if not isinstance(obs, Mapping):
-        return f"returned {_describe(obs)}; it must return a dict ({{}} where there is nothing to observe)"
+        return f"returned {describe(obs)}; it must return a dict ({{}} where there is nothing to observe)"
     for name, value in flat_entries(obs):
         shape = getattr(value, "shape", None)
         if shape is None or len(shape) == 0 or shape[0] != num_envs:
             return (
-                f"returned {name!r} as {_describe(value)}; "
+                f"returned {name!r} as {describe(value)}; "
                 f"expected shape ({num_envs}, ...), a row for each env"
             )
     return None
 
 
-def _describe(value: object) -> str:
+def without_rows(value: object, num_envs: int) -> Iterator[tuple[str, str]]:
+    """Name and description of each tensor or array in nested dicts that has no row for each env."""
+    for name, held in flat_entries(value):
+        if isinstance(held, torch.Tensor | np.ndarray) and held.shape[:1] != (num_envs,):
+            if num_envs > 1 or held.ndim:  # ManiSkill takes shape () for a single env
+                yield name, type_text(held)
+
+
+def describe(value: object) -> str:
+    """A value in a message: its type, with the shape of an array, or its text."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"a {type_text(value)}"
     if value is None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -13,12 +14,21 @@ from workbench.core.broken_rule import (
     BrokenRule,
     BrokenRules,
     WrongReturn,
+    find_entry,
+    in_brackets,
+    place_of_class,
     place_of_hook,
     warn_of,
 )
-from workbench.core.env.evaluate_entries import wrong_evaluate, wrong_observation, wrong_reward
+from workbench.core.env.evaluate_entries import (
+    without_rows,
+    wrong_evaluate,
+    wrong_observation,
+    wrong_reward,
+)
 from workbench.core.env.kept_rows import ResetWatch
-from workbench.core.env.partial_reset import untouched_envs
+from workbench.core.env.partial_reset import TARGET_FLAGS, untouched_envs, without_target_flags
+from workbench.core.error_notes import CoreRefusal, Note
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.simulation.accessors import guard_scenes
 from workbench.core.simulation.strict_system import StrictCpuSystem
@@ -78,6 +88,18 @@ class StrictMixin:
         self.broken_rules.step += 1
         return stepped
 
+    def _step_action(self, action: Any) -> Any:
+        for controller in without_target_flags(self):
+            cls = type(controller)
+            self.broken_rules.report_breach(
+                "controller-targets",
+                f"{cls.__name__} lacks {' and '.join(flag for flag in TARGET_FLAGS if not hasattr(controller, flag))}.",
+                frames=None,
+                place=place_of_class(cls),
+                subject=cls,
+            )
+        return super()._step_action(action)  # type: ignore[misc]
+
     # --- partial resets ------------------------------------------------------------------------------
 
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
@@ -134,7 +156,8 @@ class StrictMixin:
         return evaluated
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
-        reward = super().get_reward(obs=obs, action=action, info=info)  # type: ignore[misc]
+        with self._noting_rows(info, obs):
+            reward = super().get_reward(obs=obs, action=action, info=info)  # type: ignore[misc]
         hook = _REWARD_HOOK.get(self.reward_mode)  # type: ignore[attr-defined]
         if hook is not None:
             self._returned("reward-rows", hook, wrong_reward(reward, self.num_envs, info))
@@ -150,10 +173,11 @@ class StrictMixin:
         self._observed("_get_obs_agent", obs)
         return obs
 
-    def get_obs(self, *args: Any, **kwargs: Any) -> Any:
+    def get_obs(self, info: Any = None, *args: Any, **kwargs: Any) -> Any:
         self._wrong_obs = None
         try:
-            obs = super().get_obs(*args, **kwargs)  # type: ignore[misc]
+            with self._noting_rows(info):
+                obs = super().get_obs(info, *args, **kwargs)  # type: ignore[misc]
         except Exception as error:
             if self._wrong_obs is None or isinstance(error, BrokenRule):
                 raise
@@ -167,6 +191,32 @@ class StrictMixin:
             # `evaluate` may store values of all envs, which is not the reset's fault: compare from here.
             self._watch.go_on(self)  # type: ignore[arg-type]
         return obs
+
+    @contextmanager
+    def _noting_rows(self, info: Any, obs: Any = None) -> Iterator[None]:
+        """Note what has no row for each env in what ``evaluate`` and ``_get_obs_extra`` returned to a hook that fails with it."""
+        try:
+            yield
+        except CoreRefusal:
+            raise
+        except (
+            RuntimeError,
+            ValueError,
+            TypeError,
+            IndexError,
+        ) as error:  # what torch and numpy raise for shapes
+            extra = obs.get("extra") if isinstance(obs, Mapping) else None
+            for hook, returned in (("evaluate", info), ("_get_obs_extra", extra)):
+                for name, what in (
+                    without_rows(returned, self.num_envs) if isinstance(returned, Mapping) else ()
+                ):
+                    place = find_entry(self._workbench_task, hook, name.rpartition("/")[2])
+                    error.add_note(
+                        Note(
+                            f"{hook}() returned {name!r} as a {what}, for {self.num_envs} envs{in_brackets(place)}."
+                        )
+                    )
+            raise
 
     def _observed(self, hook: str, obs: Any) -> None:
         problem = wrong_observation(obs, self.num_envs)

@@ -19,6 +19,7 @@ from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct, PhysxRi
 from mani_skill.utils.structs.link import Link
 from mani_skill.utils.structs.pose import vectorize_pose
 
+from workbench.core.error_notes import CoreRefusal, RefusedCall, RefusedValue
 from workbench.core.simulation.cpu_system import batched_system
 from workbench.core.simulation.mirrors import Group
 from workbench.core.simulation.strict_system import StrictCpuSystem
@@ -78,7 +79,7 @@ def _checked_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Call
     def get(self: Any) -> Any:
         system = self.scene.px
         if velocity and group == "bodies" and self.px_body_type == "static" and batched_system(self.scene):
-            raise RuntimeError(f"'{self.name}' is static: it has no velocity on the GPU, nor here.")
+            raise RefusedCall(f"'{self.name}' is static: it has no velocity on the GPU, nor here.")
         # Poses of static actors are not in the tensors.
         if type(system) is StrictCpuSystem and group != "targets" and system.laid_out:
             if not (group == "bodies" and self.px_body_type == "static"):
@@ -95,12 +96,12 @@ def _checked_writes(stock: Callable[..., None], name: str, group: Group) -> Call
         if system is None:
             return stock(self, targets, *args, **kwargs)
         if group == "bodies" and self.px_body_type == "static":
-            raise RuntimeError(
+            raise RefusedCall(
                 f"'{self.name}' is static: on the GPU, and here, a static actor cannot be moved once the scene "
                 "is built. Give it its initial_pose before build_static(), or build it with build_kinematic()."
             )
         if group == "targets" and not system.laid_out:
-            raise RuntimeError(
+            raise RefusedCall(
                 f"A drive target of '{getattr(self, 'articulation', self).name}' was set before the simulation is "
                 "initialised: in _load_agent and _load_scene it has none yet, on the GPU or here. Set one that stays in "
                 "_after_reconfigure(self, options), and one of each episode in _initialize_episode, with "
@@ -110,10 +111,12 @@ def _checked_writes(stock: Callable[..., None], name: str, group: Group) -> Call
             system.about_to_write(self, group, _rows(self, group)[_mask(self)])
         try:
             stock(self, targets, *args, **kwargs)
+        except CoreRefusal:
+            raise
         except (RuntimeError, IndexError) as error:
+            _explain(self, targets, name, error)
             if group == "targets" and isinstance(self, ArticulationJoint):
                 _explain_single_joint(self, name, error)
-            _explain(self, targets, name, error)
             raise
 
     return put
@@ -125,15 +128,18 @@ def _mask(struct: Any) -> torch.Tensor:
 
 
 def _explain_single_joint(joint: ArticulationJoint, name: str, error: Exception) -> None:
-    """Raise a clear error if `error` comes from ManiSkill's own index of a joint."""
+    """Raise a clear error if `error` comes from ManiSkill's own index of a joint.
+
+    ManiSkill 3.0.1 puts the rows of the envs that are reset together with the joints of all: no value fits.
+    """
     wanted, every = int(_mask(joint).sum()), len(joint._objs)
     if not 1 < wanted < every:
         return
     setter = "set_joint_drive_targets" if name == "drive_target" else "set_joint_drive_velocity_targets"
-    raise RuntimeError(
-        f"ManiSkill's own fault, not yours: joint.set_{name}() of '{joint.name}' fails where {wanted} of {every} envs are "
-        f"reset, on the GPU as here (it puts the rows of {wanted} envs together with the joints of {every}). Set it through "
-        f"the articulation instead: joint.articulation.{setter}(targets, joints=[joint]) with targets of shape ({wanted}, 1)."
+    raise RefusedCall(
+        f"joint.set_{name}() of '{joint.name}' takes no value where {wanted} of {every} envs are reset, on the GPU as here: "
+        f"ManiSkill puts the rows of {wanted} envs together with the joints of {every}. Set it through the articulation "
+        f"instead: joint.articulation.{setter}(targets, joints=[joint]) with targets of shape ({wanted}, 1)."
     ) from error
 
 
@@ -148,7 +154,7 @@ def _explain(struct: Any, value: Any, name: str, error: Exception) -> None:
         if wanted != len(struct._objs)
         else "one for each env that has it"
     )
-    raise ValueError(
+    raise RefusedValue(
         f"The {name.replace('_', ' ')} of '{struct.name}' was set with a batch of {len(value)} (shape "
         f"{tuple(value.shape)}), but {wanted} {'row is' if wanted == 1 else 'rows are'} wanted: {reset}."
     ) from error

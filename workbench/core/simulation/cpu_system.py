@@ -12,6 +12,7 @@ import sapien.physx as physx
 import torch
 from numpy.typing import NDArray
 
+from workbench.core.error_notes import RefusedCall, RefusedMember
 from workbench.core.simulation.contact_queries import ContactReader, CpuArray, ImpulseQuery
 from workbench.core.simulation.drawn_poses import Places, bodies_elsewhere
 from workbench.core.simulation.mirrors import Group, Mirror, Mirrors, refuse_nan
@@ -32,7 +33,7 @@ def _uncommon_member(name: str) -> Any:
         AttributeError: SAPIEN's does not have it either.
     """
     if hasattr(physx.PhysxGpuSystem, name):
-        raise NotImplementedError(
+        raise RefusedMember(
             f"{name} is a member of SAPIEN's GPU system that the batched CPU simulation does not have: here every env has "
             "its own physics, at its own origin. For what all of them share, use self.scene.px.systems[0]."
         )
@@ -44,7 +45,7 @@ def _applies(mirror: Callable[[Mirrors], Mirror], keep_awake: bool = False) -> C
 
     def apply(self: BatchedCpuSystem, index_buffer: Any = None) -> None:
         if index_buffer is not None:
-            raise NotImplementedError(
+            raise RefusedMember(
                 "gpu_apply_... takes no index buffer in the batched CPU simulation: call it without, it applies the "
                 "rows that were changed."
             )
@@ -117,7 +118,7 @@ class BatchedCpuSystem:
         return np.zeros(3, dtype=np.float32)
 
     def get_contacts(self) -> list[physx.PhysxContact]:
-        raise NotImplementedError(
+        raise RefusedMember(
             "scene.get_contacts() does not exist in batched simulation (nor on the GPU). Use "
             "scene.get_pairwise_contact_impulses(a, b) or actor.get_net_contact_impulses()."
         )
@@ -213,19 +214,19 @@ class BatchedCpuSystem:
     def _laid_out(self) -> StateLayout:
         self._catch_up()
         if self._layout is None:
-            raise RuntimeError(_TOO_EARLY)
+            raise RefusedCall(_TOO_EARLY)
         return self._layout
 
     @property
     def _mirrors(self) -> Mirrors:
         if self._found is None:
-            raise RuntimeError(_TOO_EARLY)
+            raise RefusedCall(_TOO_EARLY)
         return self._found
 
     def __getattr__(self, name: str) -> Any:
         # The tensors exist from `gpu_init` on: explain an earlier access.
         if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
-            raise RuntimeError(_TOO_EARLY)
+            raise RefusedCall(_TOO_EARLY)
         return _uncommon_member(name)
 
     def _setter(self, joint: Any, method: str) -> Callable[[float], None]:

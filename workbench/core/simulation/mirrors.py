@@ -9,6 +9,7 @@ import numpy as np
 import sapien
 from numpy.typing import NDArray
 
+from workbench.core.error_notes import RefusedValue
 from workbench.core.simulation.state_layout import BODY, StateLayout
 
 Group = Literal["bodies", "links", "joints", "targets", "forces"]
@@ -245,4 +246,4 @@ def _pose(row: Floats) -> sapien.Pose:
 def refuse_nan(values: Floats, name: str, env: int) -> None:
     # PhysX does not check: a NaN pose spreads to everything it touches and may crash the process.
     if not np.isfinite(values).all():
-        raise ValueError(f"{name} of env {env}: the state to be set holds NaN or infinity: {values}")
+        raise RefusedValue(f"{name} of env {env}: the state to be set holds NaN or infinity: {values}")

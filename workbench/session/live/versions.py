@@ -359,8 +359,9 @@ class Versions:
         if request is not None:
             self._send(request)
         if failed.problem.file is not None:
-            # It may be a module that the task has never imported without an error, so it is in no `source_files`.
-            self._follow((*(() if task is None else task.source_files), failed.problem.file), {})
+            # It may be a module that the task has never imported without an error, so it is in no `source_files`; or one of
+            # another folder, and a person mends it there.
+            self._follow(() if task is None else task.source_files, {}, Path(failed.problem.file))
 
     def died(self, death: Death, printed: str) -> tuple[Problem | None, bool]:
         """The worker is gone.
@@ -392,10 +393,10 @@ class Versions:
         """Stop watching."""
         self._watcher.stop()
 
-    def _follow(self, paths: Iterable[str], texts: Mapping[str, str]) -> None:
-        """Watch the task's own file, and those of `paths` in its folder."""
+    def _follow(self, paths: Iterable[str], texts: Mapping[str, str], at_fault: Path | None = None) -> None:
+        """Watch the task's own file, those of `paths` in its folder, and the one that `at_fault` names, wherever it is."""
         own_file, folder = self._shared.state.own_file, self._shared.state.own_folder
         if own_file is None or folder is None:
             return
         modules = [Path(p) for p in paths if Path(p).is_relative_to(folder)]
-        self._watcher.follow({own_file, *modules}, texts)
+        self._watcher.follow({own_file, *modules, *([] if at_fault is None else [at_fault])}, texts)

@@ -20,7 +20,7 @@ from workbench.authoring.loading.load import LoadedTask, load_task, undo_load
 from workbench.authoring.loading.reference import reference_to_class
 from workbench.authoring.problem import problem_from_exception
 from workbench.authoring.source.names import Project
-from workbench.authoring.source.read_values import module_of
+from workbench.authoring.source.read_values import classes_of, module_of
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core import maniskill_private
 from workbench.core.camera_data import CameraKey, Picture, PictureDegree
@@ -567,7 +567,7 @@ def _changed_attributes(before: Mapping[str, str], after: Mapping[str, str], own
     named = {n.attr for path in edited for n in new.file(path).nodes if isinstance(n, ast.Attribute)}
     found: dict[str, Any] = {}
     for name in named & vars(owner).keys():
-        was, stores = old.attribute_stores(name), new.attribute_stores(name)
+        was, stores = (project.attribute_stores(name, classes_of(type(owner))) for project in (old, new))
         if len(was) != 1 or len(stores) != 1 or was[0].value is None or stores[0].value is None:
             continue
         if ast.dump(was[0].value) != ast.dump(stores[0].value):

@@ -99,10 +99,7 @@ def load_version(
             if found is not None:
                 return found, None
         else:
-            same = running.opened.loaded.chosen == loaded.chosen
-            knows_others = same or not loaded.alternatives
-            if same and not isinstance(error.__cause__, _MAY_BE_OF_THE_BATCH):
-                raise  # a misspelt name cannot depend on the batch: report it without trying one env
+            knows_others = running.opened.loaded.chosen == loaded.chosen or not loaded.alternatives
         raise with_advice(
             error,
             loaded,
@@ -110,10 +107,6 @@ def load_version(
             lambda: load_task(request.task, source=request.source),
             knows_others,
         ) from error.__cause__
-
-
-_MAY_BE_OF_THE_BATCH = (RuntimeError, ValueError, TypeError, IndexError)
-"""What torch and numpy raise for shapes, which may be right with one env."""
 
 
 def _open_another(request: Load, tried: LoadedTask, error: TaskError, opening: Opening) -> OpenedTask | None:
