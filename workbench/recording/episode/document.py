@@ -380,7 +380,9 @@ def check(path: Path, checksums: Mapping[str, Checksum]) -> None:
     Raises:
         OSError: it differs, or cannot be read.
     """
-    if (why := wrong_size(checksums, path.suffix, path.stat().st_size)) is not None:
+    with open_regular_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+    if (why := wrong_size(checksums, path.suffix, size)) is not None:
         raise OSError(why)
     written = checksums.get(path.suffix)
     if written is not None and written.xxh3_128 is not None and checksum(path) != written:

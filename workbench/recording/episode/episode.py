@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,7 @@ from workbench.core.env.step_result import OtherEntry
 from workbench.core.scene.shapes import BodyKind, SceneGeometry
 from workbench.recording.episode.columns import TextTrack, entry_at
 from workbench.recording.episode.encoded_pictures import EncodedPictures, Modality
+from workbench.recording.episode.row import UnreadableRecording
 
 
 def _now() -> str:
@@ -215,6 +216,24 @@ class Episode:
             if entry is not None and (number is None or _is_nan(number.numbers)):
                 found[name] = OtherEntry(entry.what, (entry.text,), None, entry.per_env, entry.whole)
         return found
+
+
+def read_whole(name: str, read: Callable[[], Episode]) -> Episode:
+    """The episode that `read` returns, for a dataset: of files none of which is damaged or missing.
+
+    Args:
+        name: of the recording, for messages.
+
+    Raises:
+        UnreadableRecording: it cannot be read, or not all of it; the message names the recording.
+    """
+    try:
+        episode = read()
+    except (OSError, UnreadableRecording) as error:
+        raise UnreadableRecording(str(error) if name in str(error) else f"{name}: {error}") from error
+    if episode.broken_files:
+        raise UnreadableRecording(" ".join(broken.sentence for broken in episode.broken_files))
+    return episode
 
 
 def _is_nan(value: NDArray | None) -> bool:
