@@ -29,7 +29,8 @@ from workbench.recording.episode.columns import TextTrack
 from workbench.recording.episode.episode import NO_SEED, ActedBy, EpisodeInfo, Seal
 from workbench.recording.episode.row import clean_note, clean_tags
 
-FORMAT = 1
+FORMAT = 2
+"""Since 2 the ``.json`` ends with a checksum of itself (`with_checksum`)."""
 MOST_BYTES = 64 << 20
 """ManiSkill's ``.json`` of 100,000 episodes has 40 MB."""
 _BLOCK = 1 << 20
@@ -247,9 +248,16 @@ class Document:
 
 
 def read_document(path: Path) -> Document:
-    """Raises OSError, WrongDocument."""
-    data = read_json(path)
-    return Document(data if isinstance(data, dict) else {})
+    """
+    Raises:
+        OSError: it cannot be read.
+        WrongDocument: as `read_json`, or it was changed since the workbench wrote it.
+    """
+    content = _read_content(path, MOST_BYTES)
+    data = parse_json(content)
+    document = Document(data if isinstance(data, dict) else {})
+    _require_unchanged(content, document)
+    return document
 
 
 def description_in(text: str, source: Mapping[str, str]) -> Description:
@@ -265,13 +273,17 @@ def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
         OSError: it cannot be read.
         WrongDocument: not JSON, not a regular file, or longer than `most_bytes`.
     """
+    return parse_json(_read_content(path, most_bytes))
+
+
+def _read_content(path: Path, most_bytes: int) -> bytes:
+    """Raises as `read_json`."""
     try:
-        content = read_regular_file(path, most_bytes)
+        return read_regular_file(path, most_bytes)
     except FileTooLarge as error:
         raise WrongDocument(f"is longer than {most_bytes >> 20} MB") from error
     except NotARegularFile as error:
         raise WrongDocument(str(error.strerror)) from error
-    return parse_json(content)
 
 
 def parse_json(content: bytes | str) -> Any:
@@ -358,9 +370,30 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
 # Neither format detects a changed byte: HDF5 has checksums for chunks only, and most columns of an episode are too small
 # to be chunked; rerun has none. Rescoring such a file would be silently wrong. So the `.json` holds size and hash of the
 # other two. Both are in the page cache when just written: hashing takes a hundredth of the time of writing (measured).
+# The `.json` itself ends with a hash of all that is before it.
 #
 # This detects damage, not forgery. After an intended change (`rerun rrd optimize`), remove the file's entry from
-# `workbench.files` in the `.json`.
+# `workbench.files` in the `.json`; after one of the `.json`, set its hash to null.
+
+_OWN = "workbench_checksum"
+
+
+def with_checksum(text: bytes) -> bytes:
+    """The JSON object `text`, with a hash of all of it as its last member."""
+    body = text.rstrip().removesuffix(b"}").rstrip()
+    return b'%s,\n  "%s": "%s"\n}' % (body, _OWN.encode(), xxhash.xxh3_128_hexdigest(body).encode())
+
+
+def _require_unchanged(content: bytes, document: Document) -> None:
+    """Raises WrongDocument if it was changed since that got its checksum."""
+    if _OWN not in document.data:
+        # A changed byte in the name of the hash must not pass for an old recording, which has none.
+        if document.is_ours and document.data["workbench"].get("format", 1) != 1:
+            raise WrongDocument("was changed since it was written: it has lost its checksum")
+    elif document.data[_OWN] is not None:
+        before, comma, _ = content.rpartition(b',\n  "%s"' % _OWN.encode())
+        if not comma or with_checksum(before + b"}") != content.rstrip():
+            raise WrongDocument("was changed since it was written: its checksum differs")
 
 
 def checksum(path: Path) -> Checksum:
@@ -454,13 +487,17 @@ def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None
 
     Raises:
         OSError: it cannot be read or written.
-        ValueError: it is not a workbench recording. The message ends a sentence.
+        ValueError: it is not a workbench recording, or was changed: sealing that would hide it. The message ends a sentence.
     """
-    described = read_json(path, MOST_NOTES_BYTES)
+    content = _read_content(path, MOST_NOTES_BYTES)
+    described = parse_json(content)
     if not isinstance(described, dict) or not Document(described).is_ours:
         raise ValueError("is not a recording of the workbench")
+    _require_unchanged(content, Document(described))
+    is_sealed = described.get(_OWN) is not None
+    if is_sealed:
+        del described[_OWN]
     described["workbench"] |= {"tags": list(tags), "note": note}
     # Keep the indentation: people read these files.
-    with open_regular_file(path) as file:
-        indent = 2 if b"\n" in file.read(4) else None
-    replace_file(path, json.dumps(described, indent=indent).encode())
+    text = json.dumps(described, indent=2 if b"\n" in content[:4] else None).encode()
+    replace_file(path, with_checksum(text) if is_sealed else text)
