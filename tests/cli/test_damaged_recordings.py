@@ -1,10 +1,12 @@
-"""Every command that takes recordings names the damaged ones, gives the exit code 1, and does its work with the others."""
+"""Every command that takes recordings names the damaged ones, gives the exit code 1, and does its work with the others,
+whatever they are called."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +16,8 @@ from tests.drive.episodes import made, write
 from tests.recording.foreign_h5 import write as write_foreign
 from workbench.cli.main import main
 from workbench.recording.library.library import Library
+from workbench.recording.reader.reading import find_all_sources
+from workbench.ui.share.make import MakeRequest, make
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -141,3 +145,36 @@ def test_the_whole_ones_beside_it_are_used(tmp_path: Path, capsys: pytest.Captur
         assert run("export", folder, option, made_of, "--only-fitting") == 0 and made_of.exists()
         said = capsys.readouterr()
         assert "half.h5" in said.err and "theirs.h5" in said.err and "1 episode" in said.out
+
+
+def test_a_name_that_is_not_utf_8_is_one_like_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = tmp_path / "recordings", tmp_path / "out"
+    odd = os.fsdecode(b"od\xffd")
+    made_first = ours(folder, "ours")
+    for suffix in (".json", ".rrd", ".h5"):
+        made_first.with_suffix(suffix).rename(folder / f"{odd}{suffix}")
+    theirs = write_foreign(folder)
+    for suffix in (".h5", ".json"):
+        shutil.copy(theirs.with_suffix(suffix), folder / f"by {odd}{suffix}")
+    assert run("share", folder / f"{odd}.json", "--sheet", "--html", "--out", out) == 0
+    assert {path.name for path in out.iterdir()} == {f"{odd}.sheet.png", f"{odd}.html"}
+    assert run("export", folder / f"{odd}.h5", "--lerobot", out / "set") == 0
+    for option, made_of in (("--lerobot", out / "sets"), ("--maniskill", out / "demos.h5")):
+        capsys.readouterr()
+        assert run("export", folder, option, made_of, "--only-fitting") == 0
+        said = capsys.readouterr()
+        assert "2 episodes" in said.out and "od\\udcffd" in said.err and "theirs" not in said.err
+    made_of = [source for source in find_all_sources([folder]) if source.part is None]
+    (archive,) = make(MakeRequest("zip", tuple(made_of), out)).paths
+    with zipfile.ZipFile(archive) as opened:
+        assert sorted(opened.namelist()) == [f"od\\udcffd{suffix}" for suffix in (".h5", ".json", ".rrd")]
+    table = tmp_path / "table"
+    arguments = "--trust", "--workers", 2, "--envs-per-worker", 1
+    assert run("rescore", folder, "--csv-file", table, "--json-file", f"{table}.json", *arguments) == 0
+    names = [row["episode"] for row in json.loads(Path(f"{table}.json").read_text())]
+    assert names == [f"by {odd}#traj_0", odd, "theirs#traj_0"]
+    assert all(name in table.read_text() for name in ("by od\\udcffd#traj_0", "theirs#traj_0"))
+    assert run("record", "PickCube-v1", "--episodes", 1, "--out", tmp_path / odd) == 2
+    assert not (tmp_path / odd).exists() and "UTF-8" in capsys.readouterr().err

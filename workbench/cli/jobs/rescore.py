@@ -325,7 +325,8 @@ def write_tables(verdicts: list[Verdict[Source]], output: RescoreOutput) -> None
     """Write the files that are asked for. Raises OSError."""
     for path, text in ((output.csv_file, verdict_text.as_csv), (output.json_file, verdict_text.as_json)):
         if path is not None:
-            replace_file(path, text(verdicts).encode())
+            # Names of files may not be UTF-8.
+            replace_file(path, text(verdicts).encode(errors="backslashreplace"))
 
 
 def warn_of_verdicts(verdicts: list[Verdict[Source]], notes: Iterable[str]) -> None:

@@ -24,6 +24,7 @@ from workbench.jobs.pool.deal import Deal, ItemQueue, PoolError, Work
 from workbench.jobs.pool.processes import Processes
 from workbench.machine.files import new_file
 from workbench.machine.software_vulkan import ensure_render_device
+from workbench.machine.text import plain_text
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.films import (
@@ -237,7 +238,8 @@ def _zip(wanted: MakeRequest, on_progress: OnProgress) -> Made:
         for number, file in enumerate(files):
             on_progress(number / len(files), file.name)
             # What takes space in it, meshes and pictures, is compressed already.
-            archive.write(file, file.relative_to(root), zipfile.ZIP_STORED)
+            # An archive holds no name that is not UTF-8.
+            archive.write(file, plain_text(str(file.relative_to(root))), zipfile.ZIP_STORED)
     on_progress(1.0, "done")
     return Made((path,), f"{counted(len(files), 'file')} of {counted(len(wanted.sources), 'recording')}")
 
