@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,16 @@ def test_what_takes_too_long_is_given_up_and_the_others_are_read(
     assert not psutil.pid_exists(first)
     (tmp_path / "b.json").unlink()
     assert sorted(rows(tmp_path)) == ["a", "c", "d"]
+
+
+def test_reading_that_is_not_needed_any_more_is_given_up(tmp_path: Path) -> None:
+    whole = describe(tmp_path, "a")
+    slow_json(tmp_path / "b.json")
+    began = time.monotonic()
+    with pytest.raises(UnreadableRecording, match="b"):
+        reading.read_recording(Source(tmp_path / "b.json"), stopped=lambda: time.monotonic() - began > 0.3)
+    assert time.monotonic() - began < reading.OPEN_SECONDS / 2
+    assert rows(tmp_path)["a"].problem is None and whole.exists()
 
 
 def test_a_reader_that_crashes_is_a_row_and_another_one_reads_on(tmp_path: Path) -> None:

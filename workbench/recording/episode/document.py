@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -26,7 +27,20 @@ from workbench.machine.files import (
     replace_file,
 )
 from workbench.recording.episode.columns import TextTrack
-from workbench.recording.episode.episode import NO_SEED, ActedBy, EpisodeInfo, Seal
+from workbench.recording.episode.episode import (
+    DEEPEST,
+    MOST_BODIES,
+    NO_SEED,
+    ActedBy,
+    Entries,
+    EpisodeInfo,
+    Name,
+    PathText,
+    Seal,
+    Seconds,
+    SmallInt,
+    is_shallow,
+)
 from workbench.recording.episode.row import clean_note, clean_tags
 
 FORMAT = 2
@@ -34,14 +48,17 @@ FORMAT = 2
 MOST_BYTES = 64 << 20
 """ManiSkill's ``.json`` of 100,000 episodes has 40 MB."""
 _BLOCK = 1 << 20
+_ESCAPED_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 MOST_PARTS = 40
 """Parts of a recorded path that are tried: the path comes from an untrusted file."""
 
 T = TypeVar("T")
-Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Vector = tuple[float, float, float]
-ColumnType = tuple[str, tuple[int, ...]]
+ColumnType = tuple[Name, Annotated[tuple[SmallInt, ...], Meta(max_length=32)]]
 """numpy dtype, and shape of one row."""
+Columns = Annotated[dict[Name, ColumnType], Entries]
+Side = Annotated[int, Meta(ge=1, le=100_000)]
+"""Pixels."""
 
 
 class WrongDocument(ValueError):
@@ -51,16 +68,16 @@ class WrongDocument(ValueError):
 class CameraJson(Struct, frozen=True):
     """A camera's parameters, without its position in the task's source."""
 
-    name: str
+    name: Name
     kind: CameraKind
-    width: int
-    height: int
+    width: Side
+    height: Side
     fovy: float
     near: float
     far: float
     intrinsic: tuple[Vector, Vector, Vector]
-    mount: str | None
-    modalities: tuple[str, ...]
+    mount: Name | None
+    modalities: Annotated[tuple[Name, ...], Entries]
 
     @classmethod
     def of(cls, camera: CameraInfo) -> CameraJson:
@@ -75,12 +92,15 @@ class CameraJson(Struct, frozen=True):
         return CameraInfo(self.name, self.kind, *size, *numbers, intrinsic, self.mount, self.modalities)
 
 
+Bodies = Meta(max_length=MOST_BODIES)
+
+
 class SceneJson(Struct, frozen=True):
     """Every body of the scene."""
 
-    body_names: tuple[str, ...]
-    body_kinds: tuple[BodyKind, ...]
-    body_hidden: tuple[bool, ...]
+    body_names: Annotated[tuple[Name, ...], Bodies]
+    body_kinds: Annotated[tuple[BodyKind, ...], Bodies]
+    body_hidden: Annotated[tuple[bool, ...], Bodies]
 
 
 class Checksum(Struct, frozen=True):
@@ -97,6 +117,10 @@ class SealJson(Struct, frozen=True):
     place: str
 
 
+MOST_SEGMENTS = 1_000_000
+"""Ids of a segmentation."""
+
+
 class Description(Struct, frozen=True, kw_only=True):
     """Metadata of a recording, in the ``.json`` and in the ``.rrd``; fields with a default may be missing.
 
@@ -106,50 +130,50 @@ class Description(Struct, frozen=True, kw_only=True):
 
     format: int = FORMAT
     # Up to `source_hash` as in `EpisodeInfo`.
-    id: str
-    task: str
-    env_index: Whole
-    seed: Whole | None
+    id: Name
+    task: Name
+    env_index: SmallInt
+    seed: SmallInt | None
     """None if unknown."""
-    control_dt: float
-    control_mode: str | None
-    backend: str
-    versions: dict[str, str]
-    env_kwargs: dict[str, Any]
-    reset_options: dict[str, Any]
-    max_episode_steps: int | None
-    written_at: str
+    control_dt: Seconds
+    control_mode: PathText | None
+    backend: Name
+    versions: Annotated[dict[Name, Name], Entries]
+    env_kwargs: Annotated[dict[Name, Any], Entries]
+    reset_options: Annotated[dict[Name, Any], Entries]
+    max_episode_steps: SmallInt | None
+    written_at: Name
     recovered: bool
-    source_hash: str
-    source_file: str | None
+    source_hash: Name
+    source_file: PathText | None
     """The name of the task's file."""
-    source: dict[str, str] | None
+    source: Annotated[dict[PathText, str], Entries] | None
     """Path relative to the task's folder, to text. None in the ``.rrd``, which holds the texts separately."""
-    side_files: dict[str, str] = {}
+    side_files: Annotated[dict[PathText, Name], Entries] = {}
     """Other files that the task reads, not included: path relative to the task's folder, to hash."""
     acted_by: ActedBy = ()
     pictures: PictureDegree = "exact"
-    length: Whole
+    length: SmallInt
     total_reward: float = msgspec.field(name="return")
     success: bool | None
     """In the last state (`success_once`: in any). None if the task has no such entry."""
     success_once: bool | None
     fail: bool | None
     fail_once: bool | None
-    action_names: tuple[str, ...]
-    cameras: list[CameraJson]
-    segmentation: dict[int, str]
+    action_names: Annotated[tuple[Name, ...], Entries]
+    cameras: Annotated[list[CameraJson], Entries]
+    segmentation: Annotated[dict[SmallInt, Name], Meta(max_length=MOST_SEGMENTS)]
     scene: SceneJson
-    evaluate: dict[str, ColumnType]
-    batch: dict[str, ColumnType] = {}
+    evaluate: Columns
+    batch: Columns = {}
     """Numbers that ``evaluate()`` returned without a row for each env."""
-    texts: dict[str, TextTrack] = {}
+    texts: Annotated[dict[Name, TextTrack], Entries] = {}
     """Entries of ``evaluate()`` that are not numbers."""
-    obs: dict[str, ColumnType]
+    obs: Columns
     # Only in the .json:
     files: dict[str, Checksum] | UnsetType = UNSET
     """Suffix of the other two files to checksum."""
-    source_path: str | None | UnsetType = UNSET
+    source_path: PathText | None | UnsetType = UNSET
     """Path of the task's file relative to the recording's folder."""
     thumbnail: str | None | UnsetType = UNSET
     """Base64 of a JPEG; None without cameras."""
@@ -183,17 +207,17 @@ SHARED = (
 class ResetJson(Struct, frozen=True):
     """Arguments of the reset, as ManiSkill records them."""
 
-    seed: Whole | list[Whole] | None = None
-    options: dict[str, Any] | None = None
+    seed: SmallInt | list[SmallInt] | None = None
+    options: Annotated[dict[Name, Any], Entries] | None = None
 
 
 class EpisodeJson(Struct, frozen=True):
     """An episode as ManiSkill records it; batched envs write a list of one instead of a number."""
 
-    episode_id: int
-    episode_seed: Whole | list[Whole] | None = None
-    control_mode: str | dict[str, Any] | None = None
-    elapsed_steps: Whole | list[Whole] | None = None
+    episode_id: SmallInt
+    episode_seed: SmallInt | list[SmallInt] | None = None
+    control_mode: PathText | dict[str, Any] | None = None
+    elapsed_steps: SmallInt | list[SmallInt] | None = None
     reset_kwargs: ResetJson | None = None
     success: bool | list[bool] | None = None
     fail: bool | list[bool] | None = None
@@ -209,9 +233,9 @@ class EpisodeJson(Struct, frozen=True):
 class EnvJson(Struct, frozen=True):
     """Arguments of ``gym.make``, as ManiSkill records them."""
 
-    env_id: str | None = None
-    env_kwargs: dict[str, Any] | None = None
-    max_episode_steps: int | None = None
+    env_id: Name | None = None
+    env_kwargs: Annotated[dict[Name, Any], Entries] | None = None
+    max_episode_steps: SmallInt | None = None
 
 
 @dataclass(frozen=True)
@@ -290,7 +314,10 @@ def parse_json(content: bytes | str) -> Any:
     """Raises WrongDocument."""
     try:
         # msgspec's parser refuses NaN, which a sum of rewards may be.
-        return json.loads(content)
+        data = json.loads(content)
+        if _ESCAPED_SURROGATE.search(content if isinstance(content, bytes) else content.encode()):
+            json.dumps(data, ensure_ascii=False).encode()  # half of a pair can be neither sent nor printed
+        return data
     except (ValueError, RecursionError) as error:
         raise WrongDocument("is not JSON, or was cut short") from error
 
@@ -331,6 +358,10 @@ def _plain(value: object) -> Any:
 
 
 def _typed(data: object, kind: type[T], place: str) -> T:
+    if not is_shallow(data):
+        raise WrongDocument(
+            f"is not as a recording is described: lists and objects nested deeper than {DEEPEST} at $.{place}"
+        )
     try:
         return msgspec.convert(data, kind, str_keys=True)
     except (msgspec.ValidationError, OverflowError) as error:
@@ -349,7 +380,8 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     """
     if not source_path:
         return None
-    if (there := folder / source_path).is_file():
+    # Not `Path.is_file`, which raises for a name that no file can have.
+    if os.path.isfile(there := folder / source_path):
         return os.fspath(there.resolve())
     parts = [part for part in Path(source_path).parts if part not in ("..", os.sep)]
     if not source_path.endswith(".py") or len(parts) > MOST_PARTS:
@@ -360,7 +392,7 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
             try:
                 if task.encode(errors="surrogatepass") in read_regular_file(candidate, MOST_SOURCE_BYTES):
                     return os.fspath(candidate.resolve())
-            except OSError:
+            except (OSError, ValueError):  # a null byte
                 continue
     return None
 

@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from workbench.machine.text import short_line
 from workbench.recording.episode.document import json_text
 from workbench.recording.episode.episode import Episode, read_whole
 from workbench.recording.episode.row import UnreadableRecording
@@ -152,7 +153,8 @@ def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
     """In what an episode differs from the first one, as a sentence; empty if in nothing."""
     for what, wanted in first.items():
         if other[what] != wanted:
-            return f"its {what} is {other[what]!r}, and that of the first recording {wanted!r}"
+            found, expected = short_line(repr(other[what]), 300), short_line(repr(wanted), 300)
+            return f"its {what}: {found}, and of the first recording: {expected}"
     return ""
 
 

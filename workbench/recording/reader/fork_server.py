@@ -10,10 +10,12 @@ import sys
 from collections import OrderedDict
 from typing import Literal, get_args
 
+import msgspec
+
 from workbench.machine.processes.confinement import confine
 from workbench.machine.processes.family import end_with_parent
 from workbench.machine.processes.wire import MessageSocket, Unpacker, pack, pack_message
-from workbench.recording.episode.episode import CameraTrack
+from workbench.recording.episode.episode import CameraTrack, EpisodeInfo
 from workbench.recording.episode.row import UnreadableRecording, clean_text
 from workbench.recording.reader.episode_wire import SentShapes, pack_episode
 from workbench.recording.reader.read_rows import read_found
@@ -172,6 +174,12 @@ class _Reader:
             episode = read_maniskill(request.path, request.part)
         else:
             episode, source_path = read_without_task(request.path, shapes.shapes)
+        try:
+            msgspec.convert(msgspec.to_builtins(episode.info), EpisodeInfo)
+        except msgspec.ValidationError as error:
+            raise UnreadableRecording(
+                f"{request.path.name} is a recording, but a broken one: {error}."
+            ) from error
         self._number += 1
         self._opened[self._number] = episode.cameras
         return pack_episode(episode, source_path, self._number, shapes)

@@ -6,7 +6,7 @@ import os
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -103,7 +103,12 @@ def read_rows(
             yield found, _entries(found, answer)
 
 
-def read_recording(source: Source, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
+def read_recording(
+    source: Source,
+    shapes: SharedShapes | None = None,
+    folder: Path | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Episode:
     """An episode; its pictures are read on access.
 
     Recordings may come from anybody, and HDF5, Arrow, rerun, ffmpeg and Pillow parse them in millions of lines of C, C++
@@ -113,6 +118,7 @@ def read_recording(source: Source, shapes: SharedShapes | None = None, folder: P
     Args:
         shapes: shapes to share with other recordings.
         folder: what the process may read; by default the file's folder.
+        stopped: asked a few times a second; once it is true, reading is given up.
 
     Raises:
         UnreadableRecording: it cannot be read; the message says what is wrong.
@@ -128,7 +134,7 @@ def read_recording(source: Source, shapes: SharedShapes | None = None, folder: P
     shapes = SharedShapes() if shapes is None else shapes
     sharing, known = _shapes.of(shapes)
     request = OpenEpisode(kind, path, source.part or "", sharing)
-    read, process = _request(reader, request, EpisodeRead, path.name)
+    read, process = _request(reader, request, EpisodeRead, path.name, stopped)
     opened = _OpenEpisode(reader, request, process, read.opened, path.name)
     try:
         episode = unpack_episode(read, opened.picture, process, shapes, known)
@@ -250,18 +256,24 @@ def _thumbnail(jpeg: bytes | None) -> bytes | None:
 
 
 def _request(
-    reader: Reader, request: OpenEpisode | ReadRerunInfo | ReadSweep, kind: type[T], name: str
+    reader: Reader,
+    request: OpenEpisode | ReadRerunInfo | ReadSweep,
+    kind: type[T],
+    name: str,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> tuple[T, int]:
     """The answer, and the number of the process that answered."""
     try:
-        answered = reader.ask(request, OPEN_SECONDS)
+        answered = reader.ask(request, OPEN_SECONDS, stopped=stopped)
     except ReaderEnded as error:
         raise UnreadableRecording(f"{name} {error}.") from error
     answer = answered.answer
     if isinstance(answer, ReadFailed):
         if answer.why == "system":
             raise OSError(answer.message)
-        raise UnreadableRecording(answer.message)
+        raise UnreadableRecording(
+            answer.message if Path(name).stem in answer.message else f"{name}: {answer.message}"
+        )
     if not isinstance(answer, kind):
         raise UnreadableRecording(f"{name} gave {type(answer).__name__}.")
     return answer, answered.process

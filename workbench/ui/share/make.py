@@ -25,7 +25,7 @@ from workbench.jobs.pool.processes import Processes
 from workbench.machine.files import new_file
 from workbench.machine.software_vulkan import ensure_render_device
 from workbench.machine.text import plain_text
-from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.episode import Episode, file_part
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.films import (
     FilmEye,
@@ -144,7 +144,7 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
 
 def file_name(what: What, source: str, camera: str = "") -> str:
     """File name of what is made from the recording `source`, and from its `camera` for a film."""
-    suffix = {"film": f".{camera.replace('/', '_')}.mp4", "scene": ".scene.mp4", "page": ".html"}
+    suffix = {"film": f".{file_part(camera)}.mp4", "scene": ".scene.mp4", "page": ".html"}
     return source + suffix.get(what, ".sheet.png")
 
 
