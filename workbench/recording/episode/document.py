@@ -57,8 +57,6 @@ Vector = tuple[float, float, float]
 ColumnType = tuple[Name, Annotated[tuple[SmallInt, ...], Meta(max_length=32)]]
 """numpy dtype, and shape of one row."""
 Columns = Annotated[dict[Name, ColumnType], Entries]
-Side = Annotated[int, Meta(ge=1, le=100_000)]
-"""Pixels."""
 
 
 class WrongDocument(ValueError):
@@ -70,8 +68,8 @@ class CameraJson(Struct, frozen=True):
 
     name: Name
     kind: CameraKind
-    width: Side
-    height: Side
+    width: SmallInt
+    height: SmallInt
     fovy: float
     near: float
     far: float

@@ -27,7 +27,7 @@ def observed_pictures(episode: Episode) -> dict[str, tuple[Modality, ...]]:
     _, wanted = _wanted(episode)
     found: dict[str, tuple[Modality, ...]] = {}
     for track in _sensors(episode):
-        kept = tuple(modality for modality in wanted if track.pictures.get(modality) is not None)
+        kept: tuple[Modality, ...] = tuple(m for m in wanted if track.pictures.get(m) is not None)
         if kept and _is_whole(track, episode):
             found[track.info.name] = kept
     return found
