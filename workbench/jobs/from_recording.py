@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import shutil
 import tempfile
 import time
@@ -101,7 +102,7 @@ def changed_since(
 def changed_on_disk(info: EpisodeInfo) -> str:
     """`changed_since` for the recording's file and modules as they are on disk now."""
     file = None if info.source_file is None else Path(info.source_file)
-    if file is None or not file.is_absolute() or not file.is_file():
+    if file is None or not file.is_absolute() or not os.path.isfile(file):
         return ""
     try:
         _, then = relative_sources(info.source_file or "", info.source)
@@ -110,7 +111,8 @@ def changed_on_disk(info: EpisodeInfo) -> str:
     now = {}
     for name in then:
         path = file.parent / name
-        if path.is_file():
+        # Not `Path.is_file`, which raises for a name that no file can have.
+        if os.path.isfile(path):
             try:
                 now[str(path)] = read_source(path)
             except (OSError, SyntaxError):
@@ -188,7 +190,7 @@ def reference_of(info: EpisodeInfo) -> RecordedTask:
         file is None
         or not file.is_absolute()
         or file.suffix != ".py"
-        or not file.is_file()
+        or not os.path.isfile(file)
         or is_installed(str(file))
     ):
         return RecordedTask(info.task)
@@ -255,7 +257,7 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
         _link_side_files(info, folder)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # a null byte in a name
         shutil.rmtree(folder, ignore_errors=True)
         raise CannotEnterRecording(f"the recorded text cannot be written: {error}") from error
     name = _class_of(texts[main], info.task)
@@ -268,7 +270,7 @@ def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
         if name.endswith(_IMPORTED):
             continue  # importable, and none of the texts that the person has trusted
         there, here = side_file_path(folder_of(info.source_file), name), side_file_path(folder, name)
-        if there is not None and here is not None and there.is_file() and not here.exists():
+        if there is not None and here is not None and os.path.isfile(there) and not os.path.lexists(here):
             here.parent.mkdir(parents=True, exist_ok=True)
             here.symlink_to(there)
 
