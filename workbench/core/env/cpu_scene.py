@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
-from collections.abc import Callable, Collection
-from contextlib import nullcontext
+import threading
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -19,9 +22,11 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.render.utils import can_render
+from mani_skill.utils.structs import Articulation
 
 from workbench.core.backends import give_brdf_table
 from workbench.core.broken_rule import (
+    NeedsOneEnv,
     Place,
     frames_of_the_task,
     in_brackets,
@@ -39,19 +44,26 @@ from workbench.core.env.partial_reset import (
 )
 from workbench.core.env.strict import StrictMixin
 from workbench.core.maniskill_private import (
+    allowed_on_the_cpu,
     asks_for_a_gpu,
+    base_arguments,
     camera_components,
+    clears_scene,
+    envs_of,
+    hook_of_base_env,
+    install_base_env_hooks,
     install_row_lookups,
+    objects_of,
     scene_of,
     substeps_are_unwatched,
 )
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.scene.fast_shader import FastCameras
 from workbench.core.scene.fast_shapes import FastShapes, shown
-from workbench.core.simulation.accessors import install_struct_access
+from workbench.core.simulation.accessors import guard_scenes, install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
-from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, drawn_at
+from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places
 from workbench.core.snapshots.snapshot import begin_anew
 from workbench.core.snapshots.task_state import note_constructed, note_scene
 
@@ -60,10 +72,12 @@ SIM_BACKEND = "physx_cpu_batched"
 
 
 _NO_WINDOW = (
-    'render_mode="human" and render_human() open SAPIEN\'s viewer on one scene; batched on the CPU there are many, '
-    "and none is needed: `workbench open` with this task's file or id shows all envs in the browser. For pictures "
+    'render_mode="human" and render_human() open a window, and this process has no display (DISPLAY is not set). '
+    "`workbench open` with this task's file or id shows all envs in the browser. For pictures "
     'use render_mode="rgb_array", "sensors" or "all" and render().'
 )
+_MOST_NESTED = 16
+"""Calls of `step` or `reset` within each other; a hook that steps in each step would do so without end."""
 
 
 class BatchedSimDevice:
@@ -207,33 +221,60 @@ class BatchedCpuScene(ManiSkillScene):
             chosen.append(("human", self.human_render_cameras))
         for kind, cameras in chosen:
             for name, sensor in cameras.items():
-                if sensor.camera.camera_group is None:
-                    group = CpuCameraGroup(sensor.camera._render_cameras, self, (kind, name))
+                components = camera_components(sensor)  # none of a sensor that is no camera
+                if components and sensor.camera.camera_group is None:
+                    group = CpuCameraGroup(components, self, (kind, name))
                     sensor.camera.camera_group = self.camera_groups[name] = group  # type: ignore
-        px: BatchedCpuSystem = self.px  # type: ignore[assignment]
-        every = [*self.sensors.values(), *self.human_render_cameras.values()]
-        elsewhere = px.elsewhere(range(len(self.sub_scenes)))
+        self._system.catch_up()
         for env, sub_scene in enumerate(self.sub_scenes):
-            components = (sensor.camera._render_cameras[env] for sensor in every)
-            places = elsewhere.get(env, NOWHERE_ELSE)
-            with drawn_at(places, components) as move_bodies:
-                for kind, cameras in chosen if self.pictures == "fast" else ():
-                    for name, sensor in cameras.items():
-                        if isinstance(group := sensor.camera.camera_group, CpuCameraGroup):
-                            self.prepare_fast(env, (kind, name), group.textures, places)
-                sub_scene.update_render()
-                move_bodies()
+            for kind, cameras in chosen if self.pictures == "fast" else ():
+                for name, sensor in cameras.items():
+                    if camera_components(sensor) and isinstance(
+                        group := sensor.camera.camera_group, CpuCameraGroup
+                    ):
+                        self.prepare_fast(env, (kind, name), group.textures)
+            sub_scene.update_render()
+
+    @property
+    def _system(self) -> BatchedCpuSystem:
+        return self.px  # type: ignore[return-value]
+
+    @property
+    def _gpu_sim_initialized(self) -> bool:
+        """For ManiSkill's own code: what it allows before a GPU simulation runs is allowed here, see `allowed_on_the_cpu`."""
+        return not allowed_on_the_cpu(sys._getframe(1), self._system.laid_out)
+
+    @_gpu_sim_initialized.setter
+    def _gpu_sim_initialized(self, value: bool) -> None:
+        """ManiSkill's constructor sets it."""
+
+    def _setup(self, enable_gpu: bool) -> None:
+        # As on a stock CPU env, what was set while the scene was built stays, but for the poses.
+        self._system.gpu_init()
+        super()._setup(enable_gpu=False)
+        self._gpu_apply_all()
+        self._gpu_fetch_all()
 
     def _gpu_apply_all(self) -> None:
         if self._needs_fetch:
-            raise RuntimeError(
-                "self.scene._gpu_apply_all() was called twice without self.scene._gpu_fetch_all() between: "
-                "on the GPU that is an error too. Fetch after every apply, and once before the end of "
-                f"_initialize_episode, after which ManiSkill applies. The first call{self._applied_at}."
+            self._system.refused_by_gpu(
+                "self.scene._gpu_apply_all() is called twice without self.scene._gpu_fetch_all() between: on the GPU this fails. "
+                "Fetch after every apply, and once before the end of _initialize_episode, after which ManiSkill applies. The "
+                f"first call{self._applied_at}."
             )
         self._applied_at = in_brackets(place_of(frames_of_the_task())) or " was ManiSkill's own"
-        self.px.apply_changes()  # type: ignore[union-attr]
+        self._system.apply_changes()
         self._needs_fetch = True
+
+    def remove_articulation(self, articulation: Articulation) -> None:
+        self._system.refused_by_gpu(
+            f"'{articulation.name}' is removed from the scene: on the GPU this fails. Move it out of sight."
+        )
+        for env, each in zip(envs_of(articulation).tolist(), objects_of(articulation), strict=True):
+            for entity in [link.entity for link in each.links]:
+                self.sub_scenes[env].remove_entity(entity)
+        self.articulations.pop(articulation.name)
+        self._system.note_structure()
 
     def step(self) -> None:
         self.px.step()
@@ -264,8 +305,12 @@ class BatchedCpuMixin:
     _sim_steps_per_control: int
     _set_scene_config: Any
     sim_config: Any
+    _elapsed_steps: torch.Tensor
     agent: Any
     device: torch.device
+    _is_closed = False
+    _nested = 0
+    """Steps and resets that are under way."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("parallel_in_single_scene"):
@@ -274,11 +319,40 @@ class BatchedCpuMixin:
                 "shows all envs side by side without it."
             )
         if kwargs.get("render_mode") == "human":
-            raise ValueError(_NO_WINDOW)
-        kwargs["sim_backend"] = "physx_cpu"
-        super().__init__(*args, **kwargs)
-        refuse_unbuilt_env(self, self._workbench_task, kwargs.get("num_envs", 1))  # type: ignore[arg-type]
+            _require_display()
+        _refuse_frequencies(kwargs.get("sim_config"))
+        wanted = kwargs.get("num_envs", 1)
+        # Before ManiSkill makes generators for each.
+        require_scenes(wanted)
+        with base_arguments(self, self._workbench_task, kwargs) as passed_on:
+            super().__init__(*args, **passed_on)
+        refuse_unbuilt_env(self, self._workbench_task, wanted)  # type: ignore[arg-type]
         note_constructed(self)  # type: ignore[arg-type]
+
+    @property
+    def scene(self) -> Any:
+        """
+        Raises:
+            EnvClosed: the env is closed.
+        """
+        made = self.__dict__.get("scene")
+        if made is None and self._is_closed:
+            raise EnvClosed("this env is closed: make another one")
+        return made
+
+    @scene.setter
+    def scene(self, value: Any) -> None:
+        if value is None and not clears_scene(sys._getframe(1)):
+            raise RuntimeError("self.scene is set to None: the env cannot go on without its scene.")
+        self.__dict__["scene"] = value
+
+    def close(self) -> None:
+        if hook := hook_of_base_env(self, sys._getframe(1)):
+            raise RuntimeError(
+                f"self.close() is called within {hook}(): the env cannot go on once it is closed."
+            )
+        super().close()  # type: ignore[misc]
+        self._is_closed = True
 
     @property
     def gpu_sim_enabled(self) -> bool:
@@ -286,7 +360,8 @@ class BatchedCpuMixin:
         return self.scene.gpu_sim_enabled and not asks_for_a_gpu(sys._getframe(1))
 
     def render_human(self) -> Any:
-        raise RuntimeError(_NO_WINDOW)
+        _require_display()
+        return super().render_human()  # type: ignore[misc]
 
     @property
     def backend(self) -> BackendInfo:
@@ -305,7 +380,34 @@ class BatchedCpuMixin:
     def _sim_device(self, value: sapien.Device) -> None:
         """BaseEnv sets the device that it parsed from the backend: the CPU, as asked in __init__."""
 
+    def step(self, action: Any) -> Any:
+        elapsed, among = self._elapsed_steps, self.scene.px.resetting
+        with self._in_turn("step"):
+            before = None if among is None else elapsed.clone()
+            result = super().step(action)  # type: ignore[misc]
+        if before is not None:  # a hook of a reset steps the envs that are being reset
+            self._elapsed_steps[~among] = before[~among]
+        return result
+
+    @contextmanager
+    def _in_turn(self, what: str) -> Iterator[None]:
+        """Within this the env is stepped or reset."""
+        if self._nested >= _MOST_NESTED:
+            raise RuntimeError(
+                f"{what}() is called by a hook that it calls itself, {_MOST_NESTED} times within each other."
+            )
+        self._nested += 1
+        try:
+            with drawing_alone():
+                yield
+        finally:
+            self._nested -= 1
+
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        with self._in_turn("reset"):
+            return self._reset_in_turn(seed, options)
+
+    def _reset_in_turn(self, seed: Any, options: dict[str, Any] | None) -> Any:
         untouched = untouched_envs(self, options)
         options, seeds = in_ascending_order(options or {}, seed, self)
         # ManiSkill takes a list of seeds for those of the whole batch.
@@ -315,6 +417,10 @@ class BatchedCpuMixin:
             given, seed = seeded(self, options["env_idx"].tolist(), seeds), None
         self._kept_controllers = KeptControllers(self, untouched) if untouched else None
         self._to_begin = [] if self.begins_anew else None
+        if untouched:
+            chosen = torch.ones(self.num_envs, dtype=torch.bool)
+            chosen[untouched] = False
+            self.scene.px.resetting = chosen
         try:
             with explain_reset_errors(self, untouched), given:
                 return super().reset(seed=seed, options=options)  # type: ignore[misc]
@@ -323,6 +429,8 @@ class BatchedCpuMixin:
             raise
         finally:
             self._kept_controllers = self._to_begin = None
+            if untouched and scene_of(self) is not None:
+                self.scene.px.resetting = None
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
         super()._initialize_episode(env_idx, options)  # type: ignore[misc]
@@ -362,12 +470,12 @@ class BatchedCpuMixin:
         """Discard writes to the simulation's tensors that were not applied."""
         # Else every later reset would apply what a hook that raised had written (a NaN, say), and what it had applied
         # and not fetched would make the next reset raise.
-        if scene_of(self) is not None and self.scene._gpu_sim_initialized:
-            px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
-            px.drop_writes()
+        if scene_of(self) is not None and self.scene.px.laid_out:
+            self.scene.px.drop_writes()
             self.scene._gpu_fetch_all()
 
-    def _setup_scene(self) -> None:
+    def _make_scene(self) -> None:
+        """What ``BaseEnv._setup_scene`` does for this env; a task may have its own, which calls that."""
         require_scenes(self.num_envs)
         self._set_scene_config()
         sub_scenes = []
@@ -386,6 +494,7 @@ class BatchedCpuMixin:
         )
         self.scene.pictures = self._workbench_pictures
         self.scene.px.timestep = 1.0 / self._sim_freq
+        guard_scenes(self.scene.px)
 
 
 def batched_class(
@@ -404,6 +513,7 @@ def batched_class(
     """
     install_row_lookups(batched_system)
     install_struct_access()
+    install_base_env_hooks()
     namespace = {
         "__module__": task.__module__,
         "__doc__": task.__doc__,
@@ -458,6 +568,53 @@ def free_thread_keys() -> int | None:
     return len(taken)
 
 
+# --- what cannot go on -------------------------------------------------------------------------------
+
+
+class EnvClosed(AttributeError):
+    """The env was closed: it has no scene."""
+
+
+def _require_display() -> None:
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise ValueError(_NO_WINDOW)
+
+
+def _refuse_frequencies(config: Any) -> None:
+    given = config if isinstance(config, Mapping) else vars(config) if config is not None else {}
+    for name in ("sim_freq", "control_freq"):
+        value = given.get(name, 1)
+        if not isinstance(value, (int, float)) or value <= 0:
+            raise ValueError(f"sim_config: {name} is a number of Hz above 0, not {value!r}")
+
+
+_drawing: dict[int, str] = {}
+"""Threads that step or reset an env now."""
+
+
+@contextmanager
+def drawing_alone() -> Iterator[None]:
+    """Within this, warn if another thread steps or resets an env at the same time."""
+    me, outermost = threading.get_ident(), threading.get_ident() not in _drawing
+    if _drawing.keys() - {me}:
+        warnings.warn(_SHARED_GENERATOR, RuntimeWarning, stacklevel=5)
+    if outermost:
+        _drawing[me] = threading.current_thread().name
+    try:
+        yield
+    finally:
+        if outermost:
+            del _drawing[me]
+
+
+_SHARED_GENERATOR = (
+    "Two threads step or reset envs at the same time: torch has one random generator for all of them, so the same seed does "
+    "not give the same episode twice. Use a process for each env, or one env with more envs in its batch."
+)
+
+
 # --- constructors ------------------------------------------------------------------------------------
 
 
@@ -473,7 +630,8 @@ def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None
     """After the constructor of `task`.
 
     Raises:
-        ForgottenInit: ``BaseEnv.__init__`` was not called, or not with the number of envs.
+        ForgottenInit: ``BaseEnv.__init__`` was not called.
+        NeedsOneEnv: it was not called with the number of envs.
     """
     if scene_of(env) is None:
         cls, place = _culprit(task, BaseEnv, silent=True)
@@ -484,9 +642,9 @@ def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None
         )
     if env.num_envs != num_envs:
         cls, place = _culprit(task, BaseEnv, silent=False)
-        raise ForgottenInit(
-            f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not hand num_envs on"
-            f"{in_brackets(place)}. Give its keyword arguments to super().__init__(*args, **kwargs).",
+        raise NeedsOneEnv(
+            f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not hand num_envs on",
+            " Or give its keyword arguments to super().__init__(*args, **kwargs).",
             place,
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -41,10 +42,7 @@ def can_exchange_cameras(env: BaseEnv) -> bool:
     ManiSkill has no name for it any more."""
     if maniskill_private.why_not(maniskill_private.EXCHANGING):
         return False
-    plain = all(
-        maniskill_private.camera_components(camera) for camera in maniskill_private.cameras(env).values()
-    )
-    return plain and batched_system(env.scene) is not None
+    return batched_system(env.scene) is not None
 
 
 def exchange_cameras(env: BaseEnv) -> None:
@@ -99,8 +97,12 @@ def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
     """Call `do`, and undo what it did to the env; returns and raises as `rehearse_hooks`."""
     every = list(range(env.num_envs))
     kept, had = take_snapshot(env), set(vars(env))
+    px = batched_system(env.scene)
     try:
-        with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+        with (
+            torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []),
+            nullcontext() if px is None else px.holding_back(),
+        ):
             do()
     except BaseException:
         # Else a buffer with a row for the one env of the rehearsal is what the mended hook finds.

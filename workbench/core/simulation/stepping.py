@@ -254,18 +254,22 @@ class EnvThreads:
             for index in todo:
                 job(index)
             return
+        working: list[_Helper] = []
         with self._busy:
-            while len(self._helpers) < helpers:
-                self._helpers.append(_Helper())
-            working = self._helpers[:helpers]
-            for helper in working:
-                helper.begin(job, todo)
+            # A run that is torn (by too deep a recursion, or an interrupt) leaves none: nobody knows what they wait for.
+            every, self._helpers = self._helpers, []
             try:
+                while len(every) < helpers:
+                    every.append(_Helper())
+                for helper in every[:helpers]:
+                    helper.begin(job, todo)
+                    working.append(helper)
                 for index in todo:
                     job(index)
             finally:
                 # Also after an exception here: the others still use what the caller will release.
                 errors = [helper.end() for helper in working]
+            self._helpers = every
         for error in errors:
             if error is not None:
                 raise error
