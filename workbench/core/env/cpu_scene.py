@@ -254,6 +254,7 @@ class BatchedCpuScene(ManiSkillScene):
         super()._setup(enable_gpu=False)
         self._gpu_apply_all()
         self._gpu_fetch_all()
+        self._system.keep_beginning()
 
     def _gpu_apply_all(self) -> None:
         if self._needs_fetch:
@@ -436,6 +437,10 @@ class BatchedCpuMixin:
         super()._initialize_episode(env_idx, options)  # type: ignore[misc]
         if self._to_begin is not None:
             self._to_begin = env_idx.tolist()
+
+    def _clear_sim_state(self) -> None:
+        self.scene.px.heal(torch.nonzero(self.scene._reset_mask)[:, 0].tolist())
+        super()._clear_sim_state()  # type: ignore[misc]
 
     def _load_agent(self, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(*args, **kwargs)  # type: ignore[misc]

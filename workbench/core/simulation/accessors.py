@@ -157,7 +157,6 @@ def _setter(stock: Callable[..., None], each: StateProperty) -> Callable[..., No
         mirror, at = system.mirror(each.mirror), each.at(self, rows, chosen)
         if isinstance(self, ArticulationJoint):
             # ManiSkill's puts the rows of the envs that are reset together with the joints of all.
-            system.refresh(each.group)
             mirror.now[at] = np.ravel(_rows(self, value, each.name, chosen))
         else:
             _stock_write(stock, self, value, each.name, chosen)
@@ -165,8 +164,8 @@ def _setter(stock: Callable[..., None], each: StateProperty) -> Callable[..., No
             return system.wrote_targets(mirror, rows)
         values = mirror.now[at]
 
-        def write_through() -> None:
-            for i, row in zip(chosen.tolist(), values, strict=True):
+        def write_through(whole: NDArray[np.bool_]) -> None:
+            for i, row in zip(chosen[whole].tolist(), values[whole], strict=True):
                 write(self, i, row)
 
         system.wrote(mirror, at, values, write_through)
@@ -229,6 +228,8 @@ def _target_setter(stock: Callable[..., None], name: str) -> Callable[..., None]
 def _stock_write(
     stock: Callable[[Any, Any], None], struct: Any, value: Any, name: str, chosen: NDArray[np.int64]
 ) -> None:
+    system: Any = batched_system(struct.scene)
+    system.is_writing = True
     try:
         stock(struct, value)
     except (RuntimeError, IndexError) as error:
@@ -239,7 +240,9 @@ def _stock_write(
             rows = _rows(struct, value, name, chosen)
         except ValueError as refused:
             raise refused from error
-        stock(struct, torch.from_numpy(rows))
+        stock(struct, torch.from_numpy(np.array(rows)))
+    finally:
+        system.is_writing = False
 
 
 def _rows(struct: Any, value: Any, name: str, chosen: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -474,7 +477,7 @@ def _guarded(stock: Any, called: str, instead: str) -> Callable[..., Any]:
             return stock(self, *args, **kwargs)
         if not _may_write(system, env, self, called, instead) or system.held_back:
             return None
-        system.note_direct_write()
+        system.note_direct_write(env)
         return stock(self, *args, **kwargs)
 
     call.__doc__, call.__wrapped__ = stock.__doc__, stock  # type: ignore[attr-defined]

@@ -89,6 +89,8 @@ class BatchedCpuSystem:
         self._link_pose_at = np.zeros((0, 7), dtype=np.int64)
         self._behind: set[Group] = set()
         """Groups whose tensors are older than the simulation."""
+        self.is_writing = False
+        """Whether a setter of ManiSkill's runs."""
         self.held_back = False
         """Whether setters write to the tensors alone, see `holding_back`."""
         self.resetting: torch.Tensor | None = None
@@ -97,6 +99,8 @@ class BatchedCpuSystem:
         """Poses that static actors were given."""
         self._version = 0
         """Grows when the simulation may differ from what was fetched."""
+        self._beginning: list[bytes] = []
+        """Of each env the packed state that it was built with."""
         self.layout_version = 0
         """Grows when rows belong to other bodies."""
         self._read_at: dict[str, int] = {}
@@ -270,6 +274,34 @@ class BatchedCpuSystem:
         self._apply_targets()
         self._moved(MOVING)
         self.gpu_init()
+        self.keep_beginning()
+
+    def keep_beginning(self) -> None:
+        """Keep the present state as the one that `heal` puts back."""
+        self._beginning = [*self.packs()]
+
+    def heal(self, envs: Sequence[int]) -> None:
+        """Put back what is NaN or infinite in these envs: each such body or articulation to where it was built.
+
+        PhysX carries a NaN on for ever, and a reset puts right only what the task sets.
+        """
+        numbers = self._pack()
+        if np.isfinite(numbers).all():
+            return
+        starts = np.cumsum([0, *map(len, self._beginning)]) // numbers.itemsize
+        for env in envs:
+            now = numbers[starts[env] : starts[env + 1]].copy()
+            built = np.frombuffer(self._beginning[env], np.float32)
+            if np.isfinite(now).all() or not np.isfinite(built).all():
+                continue
+            for part in self._laid_out.parts[env]:
+                if not np.isfinite(now[part]).all():
+                    now[part] = built[part]
+            self.systems[env].unpack(now.tobytes())
+        held: tuple[Group, ...] = (*MOVING, "targets")
+        self._moved(held)
+        for group in held:
+            self.refresh(group)
 
     def note_structure(self) -> None:
         """Entities were removed from a scene."""
@@ -380,8 +412,8 @@ class BatchedCpuSystem:
                 mirror.refresh()
 
     def tensor(self, name: str) -> CpuArray:
-        """One of `TENSORS`, as the simulation is now."""
-        for group in TENSORS[name]:
+        """One of `TENSORS`, as the simulation is now (within a setter: as it was read last)."""
+        for group in () if self.is_writing else TENSORS[name]:
             self.refresh(group)
         return self._tensors[name]
 
@@ -471,18 +503,18 @@ class BatchedCpuSystem:
         """The state was changed by a call on one of `systems` or of their objects."""
         self._moved(MOVING)
 
-    def note_direct_write(self) -> None:
-        """The task writes to one of SAPIEN's objects."""
-        self._moved(MOVING)
+    def note_direct_write(self, env: int) -> None:
+        """The task writes to one of SAPIEN's objects in this env."""
+        self._moved(MOVING, {env})
 
     def _stepped(self) -> None:
         self.contacts.stepped(self.stepper.frozen)
         self._forget_packs(MOVING)
 
-    def _moved(self, behind: Iterable[Group]) -> None:
-        """After a write to the simulation: drop packed state, and note the groups that are behind."""
+    def _moved(self, behind: Iterable[Group], envs: Iterable[int] | None = None) -> None:
+        """At a write to the simulation of these envs (None: of all): drop packed state, and note which groups are behind."""
         self.catch_up()
-        self.stepper.forget()
+        self.stepper.forget(envs)
         self._forget_packs(behind)
 
     def _forget_packs(self, behind: Iterable[Group]) -> None:
@@ -511,27 +543,35 @@ class BatchedCpuSystem:
 
     # --- writing: ManiSkill's setters, and gpu_apply_* ------------------------------------------------
 
-    def wrote(self, mirror: Mirror, at: Any, values: NDArray[np.float32], write: Callable[[], None]) -> None:
-        """A setter wrote `values` to the numbers `at` of a mirror's tensor: write them to the simulation too.
+    def wrote(
+        self,
+        mirror: Mirror,
+        at: tuple[NDArray[np.int64], Any],
+        values: NDArray[np.float32],
+        write: Callable[[NDArray[np.bool_]], None],
+    ) -> None:
+        """A setter wrote `values` to the rows and columns `at` of a mirror's tensor: write them to the simulation too.
 
         Args:
-            write: does so, through SAPIEN's objects.
+            write: does so, through SAPIEN's objects; called with which of the rows to write.
 
         Raises:
-            ValueError: a value is NaN or infinite; the tensor is as before.
+            ValueError: as `Mirror.may_write`; the tensor is as before.
         """
         if self.held_back:
             return
+        whole = np.ones(len(values), dtype=bool)
         if not np.isfinite(values).all():
             mirror.now[at] = mirror.seen[at]
-            rows = np.broadcast_to(at[0], values.shape[:1])
-            for row, value in zip(rows.tolist(), values, strict=True):
-                mirror.refuse_nan(value, row)
+            each = zip(at[0].tolist(), values, strict=True)
+            whole = np.array([mirror.may_write(value, row) for row, value in each], dtype=bool)
         own = self._mirrors
         # Links follow: their poses and, as PhysX rounds it, the root's.
-        self._moved(("links",) if mirror in (own.qpos, own.links) else ())
-        write()
-        mirror.seen[at] = values
+        follow: tuple[Group, ...] = ("links",) if mirror in (own.qpos, own.links) else ()
+        self._moved(follow, {*mirror.envs[at[0]].tolist()})
+        write(whole)
+        at = tuple(part[whole] if isinstance(part, np.ndarray) else part for part in at)
+        mirror.now[at] = mirror.seen[at] = values[whole]
 
     def wrote_targets(self, mirror: DriveTargets, rows: NDArray[np.int64]) -> None:
         """A setter wrote drive targets of these articulations: they are applied before the next step."""
@@ -555,7 +595,8 @@ class BatchedCpuSystem:
     def _put(self, mirror: Mirror) -> None:
         if mirror.differs().any():
             own = self._mirrors
-            self._moved(("links",) if mirror in (own.qpos, own.roots) else ())
+            follow: tuple[Group, ...] = ("links",) if mirror in (own.qpos, own.roots) else ()
+            self._moved(follow, {*mirror.envs[mirror.rows[mirror.changed()]].tolist()})
             mirror.apply()
         elif isinstance(mirror, DriveTargets) and mirror.pending:
             mirror.apply()
@@ -599,7 +640,8 @@ class BatchedCpuSystem:
         rows = np.concatenate([layout.body_rows, layout.link_rows]).tolist()
         for row, body in zip(rows, [*layout.bodies, *layout.links], strict=True):
             if values[row].any():
-                self._mirrors.bodies.refuse_nan(values[row], row)
+                if not self._mirrors.bodies.may_write(values[row], row):
+                    continue
                 if kind == "force":
                     body.add_force_torque(values[row], zero)
                 else:

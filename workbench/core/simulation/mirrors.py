@@ -54,6 +54,8 @@ class Mirror:
         self.rows = np.arange(len(self.now)) if rows is None else rows
         self.at: Any = columns if rows is None else (rows, columns)
         self.sources, self._owners, self._put = sources, owners, put
+        self.sound: Callable[[int], bool] = lambda env: True
+        """Whether all that is known of the state of an env is finite."""
 
     def differs(self) -> NDArray[np.bool_]:
         """(K, W) what was written and neither applied nor overwritten by a fetch."""
@@ -88,26 +90,35 @@ class Mirror:
         """Write what differs to the simulation.
 
         Raises:
-            ValueError: a number that was written is NaN or infinite.
+            ValueError: as `may_write`.
         """
-        now, differs = self.now[self.at], self.differs()
-        changed = np.flatnonzero(differs.any(axis=1)).tolist()
-        for i in changed:
-            self.refuse_nan(now[i][differs[i]], int(self.rows[i]))
-        for i in changed:
-            self._put(self._owners[i], now[i], differs[i])
-        self.seen[self.at] = now
+        now, seen, differs = self.now[self.at], self.seen[self.at], self.differs()
+        for i in np.flatnonzero(differs.any(axis=1)).tolist():
+            if self.may_write(now[i][differs[i]], int(self.rows[i])):
+                self._put(self._owners[i], now[i], differs[i])
+            else:
+                now[i] = seen[i]
+        self.seen[self.at] = self.now[self.at] = now
 
-    def refuse_nan(self, values: Floats, row: int) -> None:
-        """Refuse numbers that were written to a row of the tensor, and discard what was written, or every later apply would
-        refuse them again."""
-        # PhysX does not check: a NaN pose spreads to everything it touches and may crash the process.
-        if not np.isfinite(values).all():
+    def may_write(self, values: Floats, row: int) -> bool:
+        """Whether to write these numbers of a row to the simulation.
+
+        PhysX does not check: a NaN pose spreads to everything that it touches and may crash the process. In an env that holds
+        NaN already, whatever is computed of it is NaN: there it is left out, until a reset puts the env right.
+
+        Raises:
+            ValueError: one is NaN or infinite, and the env is sound. What was written and not applied is discarded, or every
+                later apply would raise again.
+        """
+        if np.isfinite(values).all():
+            return True
+        env = int(self.envs[row])
+        if self.sound(env):
             self.drop()
-            env = int(self.envs[row])
             raise ValueError(
                 f"{self.names[row]} of env {env}: the state to be set holds NaN or infinity: {values}"
             )
+        return False
 
 
 def differ(a: Floats, b: Floats) -> NDArray[np.bool_]:
@@ -159,12 +170,13 @@ class DriveTargets(Mirror):
         """Schedule what was set.
 
         Raises:
-            ValueError: one of them is NaN or infinite.
+            ValueError: as `may_write`.
         """
         chosen = np.flatnonzero(self._set | self.differs().any(axis=1)).tolist()
         if not np.isfinite(self.now).all():
-            for i in chosen:
-                self.refuse_nan(self.now[i], i)
+            kept = [i for i in chosen if self.may_write(self.now[i], i)]
+            left = sorted(set(chosen).difference(kept))
+            self.now[left], chosen = self.seen[left], kept
         self._set[:] = self.pending = False
         if not chosen:
             return
@@ -244,6 +256,12 @@ class Mirrors:
         """Each number once; `roots` and `root_velocities` are part of `links`."""
         self.of = {group: [mirror for mirror in self.all if mirror.group == group] for group in GROUPS}
         """Mirrors that are fetched together."""
+        for mirror in (*self.all, self.roots, self.root_velocities):
+            mirror.sound = self._is_sound
+
+    def _is_sound(self, env: int) -> bool:
+        held = ((each.seen, each.envs) for each in (self.bodies, self.qpos, self.qvel))
+        return all(np.isfinite(seen[envs == env]).all() for seen, envs in held)
 
 
 def _twin(shape: tuple[int, ...]) -> tuple[Floats, Floats]:

@@ -58,6 +58,8 @@ class StateLayout:
     index_of: dict[int, int]
     size: int
     """Numbers in the packs of all envs."""
+    parts: list[list[slice]]
+    """Of each env: the numbers of each body and articulation in its pack."""
 
 
 def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:
@@ -65,6 +67,7 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:
     env_of_row, body_at, joints_at = [], [], []
     roots: dict[int, tuple[int, Any]] = {}  # row and articulation of the first link of each
     packed = 0
+    parts: list[list[slice]] = []
     for env, system in enumerate(systems):
         bodies, links = system.rigid_dynamic_components, system.articulation_link_components
         body_at += [packed + BODY * i for i in range(len(bodies))]
@@ -72,9 +75,13 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:
         before = len(roots)
         for row, link in enumerate(links, len(rows) + len(bodies)):
             roots.setdefault(id(link.articulation), (row, link.articulation))
+        own = [slice(BODY * i, BODY * (i + 1)) for i in range(len(bodies))]
         for _, articulation in [*roots.values()][before:]:
             joints_at.append(packed + BODY)
             packed += BODY + 4 * articulation.dof
+            start = own[-1].stop if own else 0
+            own.append(slice(start, start + BODY + 4 * articulation.dof))
+        parts.append(own)
         rows += [*bodies, *links]
         env_of_row += [env] * (len(bodies) + len(links))
     is_link = np.array([isinstance(c, physx.PhysxArticulationLinkComponent) for c in rows], dtype=bool)
@@ -107,6 +114,7 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:
         row_of={id(component): row for row, component in enumerate(rows)},
         index_of={id(a): i for i, a in enumerate(articulations)},
         size=packed,
+        parts=parts,
     )
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import sapien
+import sapien.physx as physx
 import torch
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
@@ -64,22 +66,36 @@ def _numbers(pose: Any) -> list[float]:
     return [*pose.p, *pose.q]
 
 
-def _set(owner: Any, name: str, value: Any) -> None:
-    setattr(owner, name, value)
+def _setter(owner: type, name: str) -> Callable[[Any, Any], None]:
+    """SAPIEN's own, without the guard of `accessors`, which replaces it later."""
+    return vars(owner)[name].fset
 
 
-def _set_velocity(body: Any, name: str, row: Floats) -> None:
-    if (
-        not body.kinematic
-    ):  # ManiSkill's `set_state` gives one to every actor, on a stock CPU env to dynamic ones
-        setattr(body, name, row)
+_ENTITY_POSE, _LINK_POSE = _setter(sapien.Entity, "pose"), _setter(sapien.Component, "pose")
+_VELOCITY = {
+    name: _setter(physx.PhysxRigidDynamicComponent, name) for name in ("linear_velocity", "angular_velocity")
+}
+_ROOT_VELOCITY = {
+    name: _setter(physx.PhysxArticulation, name) for name in ("root_linear_velocity", "root_angular_velocity")
+}
+_JOINTS = {name: _setter(physx.PhysxArticulation, name) for name in ("qpos", "qvel", "qf")}
+_TARGETS = {
+    name: _setter(physx.PhysxArticulationJoint, name) for name in ("drive_target", "drive_velocity_target")
+}
+
+
+def _write_velocity(struct: Any, i: int, row: Floats, name: str) -> None:
+    body = struct._bodies[i]
+    # ManiSkill's `set_state` gives a velocity to every actor, on a stock CPU env to dynamic ones.
+    if not body.kinematic:
+        _VELOCITY[name](body, row)
 
 
 def _write_joint(struct: Any, i: int, row: Floats, name: str) -> None:
     articulation = struct._physx_articulations[i]
     every = getattr(articulation, name)
     every[int(struct.active_index[i])] = row
-    setattr(articulation, name, every)
+    _JOINTS[name](articulation, every)
 
 
 def _read_joint(struct: Any, i: int, name: str) -> Any:
@@ -94,7 +110,7 @@ def _of_articulation(name: Literal["qpos", "qvel", "qf"], group: Group) -> State
         name,
         slice(None),
         lambda s, i: getattr(s._objs[i], name),
-        lambda s, i, row: _set(s._objs[i], name, row[: s._objs[i].dof]),
+        lambda s, i, row: _JOINTS[name](s._objs[i], row[: s._objs[i].dof]),
     )
 
 
@@ -118,7 +134,7 @@ def _target(name: str, mirror: MirrorName) -> StateProperty:
         mirror,
         slice(None),
         lambda s, i: float(np.ravel(getattr(s._objs[i], name))[0]),
-        lambda s, i, row: _set(s._objs[i], name, np.ravel(row)),
+        lambda s, i, row: _TARGETS[name](s._objs[i], np.ravel(row)),
     )
 
 
@@ -130,7 +146,7 @@ STATE_PROPERTIES = (
         "bodies",
         _POSE,
         lambda s, i: _numbers(s._objs[i].pose),
-        lambda s, i, row: _set(s._objs[i], "pose", pose_of_row(row)),
+        lambda s, i, row: _ENTITY_POSE(s._objs[i], pose_of_row(row)),
     ),
     StateProperty(
         PhysxRigidDynamicComponentStruct,
@@ -139,7 +155,7 @@ STATE_PROPERTIES = (
         "bodies",
         _LINEAR,
         lambda s, i: s._bodies[i].linear_velocity,
-        lambda s, i, row: _set_velocity(s._bodies[i], "linear_velocity", row),
+        lambda s, i, row: _write_velocity(s, i, row, "linear_velocity"),
     ),
     StateProperty(
         PhysxRigidDynamicComponentStruct,
@@ -148,7 +164,7 @@ STATE_PROPERTIES = (
         "bodies",
         _ANGULAR,
         lambda s, i: s._bodies[i].angular_velocity,
-        lambda s, i, row: _set_velocity(s._bodies[i], "angular_velocity", row),
+        lambda s, i, row: _write_velocity(s, i, row, "angular_velocity"),
     ),
     StateProperty(
         Link,
@@ -157,7 +173,7 @@ STATE_PROPERTIES = (
         "links",
         _POSE,
         lambda s, i: _numbers(s._objs[i].entity_pose),
-        lambda s, i, row: _set(s._objs[i], "pose", pose_of_row(row)),
+        lambda s, i, row: _LINK_POSE(s._objs[i], pose_of_row(row)),
     ),
     StateProperty(
         PhysxRigidBodyComponentStruct,
@@ -182,7 +198,7 @@ STATE_PROPERTIES = (
         "links",
         _LINEAR,
         lambda s, i: s._objs[i].links[0].linear_velocity,
-        lambda s, i, row: s._objs[i].set_root_linear_velocity(row),
+        lambda s, i, row: _ROOT_VELOCITY["root_linear_velocity"](s._objs[i], row),
     ),
     StateProperty(
         Articulation,
@@ -191,7 +207,7 @@ STATE_PROPERTIES = (
         "links",
         _ANGULAR,
         lambda s, i: s._objs[i].links[0].angular_velocity,
-        lambda s, i, row: s._objs[i].set_root_angular_velocity(row),
+        lambda s, i, row: _ROOT_VELOCITY["root_angular_velocity"](s._objs[i], row),
     ),
     _of_articulation("qpos", "joints"),
     _of_articulation("qvel", "joints"),
