@@ -21,7 +21,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.sensors import camera as camera_module
-from mani_skill.sensors.camera import CameraConfig
+from mani_skill.sensors.camera import Camera, CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
@@ -566,10 +566,10 @@ def flatten_observation(env: Any, obs: Any) -> Any:
 def camera_components(camera: Any) -> list[Any]:
     """The ``RenderCameraComponent`` of every env behind a ManiSkill camera: ``camera._render_cameras``.
 
-    Empty for other sensors: tactile ones, or the stereo depth camera (which ManiSkill 3.0.1 cannot build: its
+    Empty for other sensors: of a task's own class, or the stereo depth camera (which ManiSkill 3.0.1 cannot build: its
     constructor needs an argument that BaseEnv does not pass).
     """
-    inner = getattr(camera, "camera", None)
+    inner = camera.camera if isinstance(camera, Camera) else None
     return inner._render_cameras if isinstance(inner, RenderCamera) else []
 
 

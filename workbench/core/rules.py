@@ -85,6 +85,13 @@ _TABLE = (
         "The call raises.",
     ),
     Rule(
+        "one-env-only",
+        "warn",
+        "Nothing is used that exists for one env only, such as scene.get_contacts() or scene.px.raycast().",
+        "It does not exist in GPU simulation; here one env is opened.",
+        "evaluate",
+    ),
+    Rule(
         "rows-rewritten",
         "warn",
         "_initialize_episode(env_idx) changes the rows of env_idx only in what a task keeps on itself.",
@@ -138,6 +145,13 @@ _TABLE = (
         "stop",
         "evaluate() returns a row for each env.",
         "It is broadcast over the envs, or an error comes up somewhere else.",
+        "evaluate",
+    ),
+    Rule(
+        "evaluate-flags",
+        "warn",
+        "The entries success and fail of evaluate() are bool tensors.",
+        "ManiSkill's wrappers fail on them, as ManiSkillVectorEnv with record_metrics does.",
         "evaluate",
     ),
     Rule(

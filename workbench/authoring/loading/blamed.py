@@ -19,7 +19,7 @@ from workbench.authoring.problem import (
     problem_from_exception,
     problem_from_return,
 )
-from workbench.core.broken_rule import BrokenRule, WrongReturn
+from workbench.core.broken_rule import BrokenRule, NeedsOneEnv, WrongReturn
 from workbench.core.env.cpu_scene import ForgottenInit
 from workbench.core.env.task_env import TaskEnv
 
@@ -56,7 +56,7 @@ class blamed:
         if isinstance(error, WrongReturn):
             return problem_from_return(loaded.cls, error.hook, error.problem, loaded.source_files)
         env = self._task.env if self._task is not None else _env_on_traceback(error, loaded.cls)
-        if isinstance(error, (BrokenRule, ForgottenInit)):
+        if isinstance(error, (BrokenRule, ForgottenInit, NeedsOneEnv)):
             return _problem_at_its_place(error, self._stage, loaded)
         known = _raised_in(error, loaded.source_files)
         if env is not None and not known:
@@ -84,7 +84,7 @@ def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, A
     return check
 
 
-def _problem_at_its_place(error: BrokenRule | ForgottenInit, stage: str, loaded: LoadedTask) -> Problem:
+def _problem_at_its_place(error: BrokenRule | ForgottenInit | NeedsOneEnv, stage: str, loaded: LoadedTask) -> Problem:
     """The problem at the line at fault, which may have ended earlier and be on no traceback."""
     problem = problem_from_exception(error, stage, loaded.source_files, loaded.cls)
     if error.place is None or Path(error.place[0]) not in loaded.source_files:

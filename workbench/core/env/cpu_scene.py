@@ -77,7 +77,7 @@ _NO_WINDOW = (
     'use render_mode="rgb_array", "sensors" or "all" and render().'
 )
 _MOST_NESTED = 16
-"""Calls of `step` or `reset` within each other; a hook that steps in each step would do so without end."""
+"""Calls of `step` or `reset` within each other; a hook that steps in each step would do so until Python's recursion ends."""
 
 
 class BatchedSimDevice:
@@ -97,9 +97,16 @@ class CpuCameraGroup:
     """One camera of every env, with the interface of SAPIEN's ``RenderCameraGroup``."""
 
     def __init__(
-        self, cameras: list[sapien.render.RenderCameraComponent], scene: BatchedCpuScene, key: CameraKey
+        self,
+        cameras: list[sapien.render.RenderCameraComponent],
+        scene: BatchedCpuScene,
+        key: CameraKey | None,
     ) -> None:
-        self._cameras, self._scene, self._key = cameras, scene, key
+        """
+        Args:
+            key: None for a camera that the task added to the scene: it is no sensor, and always exact.
+        """
+        self._cameras, self._scene, self.key = cameras, scene, key
 
         self.textures = {"Color"}
         """Those of a fast picture: what was ever read."""
@@ -108,19 +115,27 @@ class CpuCameraGroup:
         self._has: set[str] = set()
 
     def take_picture(self) -> None:
+        if self.key is None:
+            self._scene.px.refused_by_gpu(  # type: ignore[union-attr]
+                f"A picture is taken with '{self._cameras[0].name.partition('_')[2]}', which was added to the scene and is no "
+                "sensor: on the GPU this fails. Name it in _default_sensor_configs."
+            )
+            for camera in self._cameras:
+                camera.take_picture()
+            return
         self._has = {*self.textures}
         self._drawn = [
-            self._scene.take_picture(env, self._key, camera, self._has)
+            self._scene.take_picture(env, self.key, camera, self._has)
             for env, camera in enumerate(self._cameras)
         ]
 
     def get_picture_cuda(self, name: str) -> CpuArray:
         """(N, H, W, C) texture `name` of every env, on the CPU."""
         self.textures.add(name)
-        if name not in self._has and self._drawn != self._cameras:
+        if self.key is not None and name not in self._has and self._drawn != self._cameras:
             # For this once by the exact cameras, which the last `update_render` has moved too.
             for env, camera in enumerate(self._cameras):
-                self._scene.take_picture(env, self._key, camera, None)
+                self._scene.take_picture(env, self.key, camera, None)
             self._drawn = self._cameras
         pictures = [torch.from_numpy(camera.get_picture(name)) for camera in self._drawn]
         return CpuArray(torch.stack(pictures))
@@ -209,6 +224,7 @@ class BatchedCpuScene(ManiSkillScene):
             self.gpu_sim_enabled = True
         for component in camera._render_cameras:
             give_brdf_table(component)
+        camera.camera_group = CpuCameraGroup(camera._render_cameras, self, None)  # type: ignore[assignment]
         return camera
 
     def _sapien_update_render(
@@ -222,7 +238,7 @@ class BatchedCpuScene(ManiSkillScene):
         for kind, cameras in chosen:
             for name, sensor in cameras.items():
                 components = camera_components(sensor)  # none of a sensor that is no camera
-                if components and sensor.camera.camera_group is None:
+                if components and getattr(sensor.camera.camera_group, "key", None) is None:
                     group = CpuCameraGroup(components, self, (kind, name))
                     sensor.camera.camera_group = self.camera_groups[name] = group  # type: ignore
         self._system.catch_up()
@@ -395,7 +411,7 @@ class BatchedCpuMixin:
         """Within this the env is stepped or reset."""
         if self._nested >= _MOST_NESTED:
             raise RuntimeError(
-                f"{what}() is called by a hook that it calls itself, {_MOST_NESTED} times within each other."
+                f"{what}() was called {_MOST_NESTED} times within itself: a hook that it runs calls it again."
             )
         self._nested += 1
         try:

@@ -42,7 +42,10 @@ def can_exchange_cameras(env: BaseEnv) -> bool:
     ManiSkill has no name for it any more."""
     if maniskill_private.why_not(maniskill_private.EXCHANGING):
         return False
-    return batched_system(env.scene) is not None
+    plain = all(
+        maniskill_private.camera_components(camera) for camera in maniskill_private.cameras(env).values()
+    )
+    return plain and batched_system(env.scene) is not None
 
 
 def exchange_cameras(env: BaseEnv) -> None:

@@ -16,7 +16,12 @@ from workbench.core.broken_rule import (
     place_of_hook,
     warn_of,
 )
-from workbench.core.env.evaluate_entries import wrong_evaluate, wrong_observation, wrong_reward
+from workbench.core.env.evaluate_entries import (
+    wrong_evaluate,
+    wrong_flags,
+    wrong_observation,
+    wrong_reward,
+)
 from workbench.core.env.kept_rows import ResetWatch
 from workbench.core.env.partial_reset import untouched_envs
 from workbench.core.rules import Degree, Finding, degrees_of
@@ -128,6 +133,7 @@ class StrictMixin:
     def evaluate(self) -> dict[str, Any]:
         evaluated = super().evaluate()  # type: ignore[misc]
         self._returned("evaluate-rows", "evaluate", wrong_evaluate(evaluated, self.num_envs))
+        self._returned("evaluate-flags", "evaluate", wrong_flags(evaluated))
         return evaluated
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:

@@ -21,6 +21,7 @@ from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct, PhysxRi
 from mani_skill.utils.structs.drive import Drive
 from mani_skill.utils.structs.link import Link
 from mani_skill.utils.structs.pose import vectorize_pose
+from mani_skill.utils.structs.render_camera import RenderCamera
 from numpy.typing import NDArray
 
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
@@ -386,8 +387,38 @@ def _install_cpu_only() -> None:
     Articulation.compute_passive_force = compute_passive_force  # type: ignore[method-assign]
     Articulation.create_pinocchio_model = create_pinocchio_model  # type: ignore[method-assign]
     Actor.remove_from_scene = remove_from_scene  # type: ignore[method-assign]
+    for name in _OF_CAMERAS:
+        stock: Any = RenderCamera.__dict__[name]
+        if isinstance(stock, property):
+            setattr(
+                RenderCamera, name, property(stock.fget, _of_chosen_cameras(stock.fset), doc=stock.__doc__)  # type: ignore[arg-type]
+            )
+        else:
+            setattr(RenderCamera, name, _of_chosen_cameras(stock))
     for name in ("get_collision_meshes", "get_visual_meshes"):
         setattr(Articulation, name, _with_link_poses(Articulation.__dict__[name]))
+
+
+_OF_CAMERAS = (
+    *("local_pose", "near", "far", "set_local_pose", "set_near", "set_far", "set_fovx", "set_fovy", "set_skew"),
+    *("set_focal_lengths", "set_perspective_parameters", "set_principal_point"),
+)
+
+
+def _of_chosen_cameras(stock: Callable[..., Any]) -> Callable[..., Any]:
+    """In a partial reset, of the envs that are being reset; the matrices that ManiSkill keeps are computed again."""
+
+    @wraps(stock)
+    def call(self: Any, *args: Any, **kwargs: Any) -> Any:
+        if batched_system(self.scene) is None:
+            return stock(self, *args, **kwargs)
+        some = copy.copy(self)
+        chosen = np.flatnonzero(self.scene._reset_mask.numpy())
+        some._render_cameras = [self._render_cameras[i] for i in chosen]
+        self._cached_local_pose = self._cached_extrinsic_matrix = self._cached_model_matrix = None
+        return stock(some, *args, **kwargs)
+
+    return call
 
 
 def _with_link_poses(stock: Callable[..., Any]) -> Callable[..., Any]:

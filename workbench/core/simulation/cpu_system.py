@@ -354,7 +354,9 @@ class BatchedCpuSystem:
                 _INSTEAD.get(name, ""),
                 place,
             )
-        self.refused_by_gpu(f"scene.px.{name} does not exist in GPU simulation.{_INSTEAD.get(name, '')}")
+        self.report(
+            "one-env-only", f"scene.px.{name} does not exist in GPU simulation.{_INSTEAD.get(name, '')}"
+        )
         self.packs()  # makes pending substeps, and writes pending targets
         member = getattr(self.systems[0], name)
         if name not in _WRITES:

@@ -219,14 +219,16 @@ class StrictCpuSystem(BatchedCpuSystem):
 
     def _fetch(self, group: Group) -> None:
         self._follow_structure()
-        for mirror in self._mirrors.of[group]:
-            self._refuse_loss(mirror)
-        super()._fetch(group)
-        self._settled(group)
-        self._stale.discard(group)
-        self._moved_unfetched.pop(group, None)
-        if group == "links":
-            self._outdated &= self._not_updated
+        try:
+            for mirror in self._mirrors.of[group]:
+                self._refuse_loss(mirror)
+        finally:
+            super()._fetch(group)
+            self._settled(group)
+            self._stale.discard(group)
+            self._moved_unfetched.pop(group, None)
+            if group == "links":
+                self._outdated &= self._not_updated
 
     def _settled(self, group: Group) -> None:
         """The group was fetched."""
