@@ -153,6 +153,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     stock_set_ee_action = PDEEPosController.set_action
     stock_get_contacts = ManiSkillScene.get_contacts
 
+    @wraps(stock_body_data)
     def link_data(self: Any) -> torch.Tensor:
         # Only velocities are read this way (`Link.pose` reads the tensor itself), and a root's are fetched with
         # every step: reading a root alone must not fetch all links.
@@ -161,6 +162,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
             system.fetch_link_velocities()
         return stock_body_data(self)
 
+    @wraps(stock_set_ee_action)
     def set_ee_action(self: Any, action: torch.Tensor) -> None:
         if batched_system(self.scene) is None:
             stock_set_ee_action(self, action)
@@ -170,12 +172,14 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     def check_frame(stock: Callable[[Any], None]) -> Callable[[Any], None]:
         """Nightly builds refuse the frames that GPU simulation lacks by ``scene.gpu_sim_enabled``, 3.0.1 by the device."""
 
+        @wraps(stock)
         def check(self: Any) -> None:
             if batched_system(self.scene) is None:
                 stock(self)
 
         return check
 
+    @wraps(stock_get_contacts)
     def get_contacts(self: Any) -> Any:
         # Nightly builds raise before they ask the system, whose message says what to call instead.
         system = batched_system(self)
@@ -185,6 +189,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
         """Replace the cached property `name`: in a batched CPU scene it gives the row of each of the struct's `things`."""
         stock = owner.__dict__[name].func
 
+        @wraps(stock)
         def rows(self: Any) -> torch.Tensor:
             known = self.__dict__.get(name)
             system = batched_system(self.scene)
@@ -194,8 +199,12 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
                 found = 0, stock(self)
             else:
                 place = system.row_of if find == "row" else system.index_of
+                version = system.layout_version
                 each = [place(thing) for thing in getattr(self, things)]
-                # After `place`, which may lay out the scene again.
+                if (
+                    version != system.layout_version
+                ):  # a body that was not known made it lay out the scene again
+                    each = [place(thing) for thing in getattr(self, things)]
                 found = system.layout_version, torch.tensor(each, device=self.device, dtype=dtype)
             self.__dict__[name] = found
             return found[1]

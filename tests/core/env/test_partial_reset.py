@@ -200,7 +200,8 @@ def test_states_that_are_given_go_where_set_state_puts_them_and_observations_as_
         ([0, -4], ValueError, "names an env twice"),
         ([4], IndexError, "out of range for 4 envs"),
         ([-5], IndexError, "out of range for 4 envs"),
-        (torch.tensor([True, False, True, False]), TypeError, "convert a mask"),
+        (torch.tensor([True, False]), TypeError, "convert a mask"),
+        ([], ValueError, "env_idx is empty"),
         ([0.5], TypeError, "must be integers"),
     ],
 )
@@ -215,10 +216,20 @@ def test_what_is_no_list_of_different_envs_is_refused_and_changes_nothing(
     assert np.array_equal(starts._batched_episode_rng[0].get_state()[1], states)
 
 
+def test_a_mask_with_a_row_for_each_env_names_those_that_are_true(starts: Any) -> None:
+    starts.reset(seed=[5, 6, 7, 8])
+    before = starts.box.pose.raw_pose.clone()
+    starts.reset(seed=[1, 2], options={"env_idx": torch.tensor([True, False, True, False])})
+    moved = (starts.box.pose.raw_pose != before).any(dim=1)
+    assert moved.tolist() == [True, False, True, False]
+
+
 class WrongBatch(PICK_CUBE):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        self.cube.set_pose(Pose.create(torch.zeros(self.num_envs, 7)))
+        self.cube.set_pose(
+            Pose.create(torch.zeros(len(env_idx) + 1, 7) if len(env_idx) < 4 else torch.zeros(4, 7))
+        )
 
 
 class ForgetsRows(PICK_CUBE):
@@ -265,9 +276,9 @@ def test_an_error_of_the_task_is_called_its_own(task: type[BaseEnv], words: list
 def test_an_error_from_within_the_core_is_not_called_the_tasks() -> None:
     class FindsAMistake(PICK_CUBE):
         def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-            # A KeyError out of a file of the core: what a mistake there would look like.
-            self.scene.px.row_of(None)
+            # A TypeError out of a file of the core: what a mistake there would look like.
+            self.scene.px.mirror(None)
 
-    with pytest.raises(KeyError) as caught:
+    with pytest.raises(TypeError) as caught:
         made(FindsAMistake)
     assert not getattr(caught.value, "__notes__", [])

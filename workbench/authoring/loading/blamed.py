@@ -84,7 +84,9 @@ def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, A
     return check
 
 
-def _problem_at_its_place(error: BrokenRule | ForgottenInit | NeedsOneEnv, stage: str, loaded: LoadedTask) -> Problem:
+def _problem_at_its_place(
+    error: BrokenRule | ForgottenInit | NeedsOneEnv, stage: str, loaded: LoadedTask
+) -> Problem:
     """The problem at the line at fault, which may have ended earlier and be on no traceback."""
     problem = problem_from_exception(error, stage, loaded.source_files, loaded.cls)
     if error.place is None or Path(error.place[0]) not in loaded.source_files:

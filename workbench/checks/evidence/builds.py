@@ -121,6 +121,7 @@ def noting_poses(placed: list[PoseSet], files: Collection[str]) -> Iterator[None
     """Within this, add to `placed` each pose that is set on an actor or a root link."""
 
     def note(stock: Any) -> Any:
+        @wraps(stock.fset)
         def set_pose(struct: Any, pose: Any) -> None:
             name = struct.name if isinstance(struct, Actor) else struct.articulation.name
             placed.append(PoseSet(str(name), _quaternions(pose), author_place(files)))

@@ -6,6 +6,7 @@ import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from traceback import walk_tb
 from types import TracebackType
@@ -79,14 +80,16 @@ def refuse_downloads(task: str) -> Iterator[None]:
     MissingAssets; other exceptions pass.
     """
 
+    @wraps(download_asset.prompt_yes_no)
     def ask(message: str) -> bool:
         robot = re.search(r"Robot (\S+) has assets", message)
         if robot is None:
             raise _missing(task, [], message.split(" Would you")[0])
         raise _robot_without_file(task, robot[1])
 
-    def download(source: data.DataSource, *args: object, **kwargs: object) -> None:
-        names = [name for name, known in assets.DATA_SOURCES.items() if known is source]
+    @wraps(download_asset.download)
+    def download(data_source: data.DataSource, *args: object, **kwargs: object) -> None:
+        names = [name for name, known in assets.DATA_SOURCES.items() if known is data_source]
         raise _missing(task, names)
 
     stock_ask, stock_download = download_asset.prompt_yes_no, download_asset.download

@@ -334,6 +334,8 @@ def _some(struct: Any, chosen: NDArray[np.int64]) -> Any:
     some._objs = [struct._objs[i] for i in chosen]
     if hasattr(struct, "_bodies"):
         some._bodies = [struct._bodies[i] for i in chosen]
+    for rows in ("_body_data_index", "_data_index"):
+        vars(some).pop(rows, None)
     return some
 
 
@@ -391,7 +393,9 @@ def _install_cpu_only() -> None:
         stock: Any = RenderCamera.__dict__[name]
         if isinstance(stock, property):
             setattr(
-                RenderCamera, name, property(stock.fget, _of_chosen_cameras(stock.fset), doc=stock.__doc__)  # type: ignore[arg-type]
+                RenderCamera,
+                name,
+                property(stock.fget, _of_chosen_cameras(stock.fset), doc=stock.__doc__),  # type: ignore[arg-type]
             )
         else:
             setattr(RenderCamera, name, _of_chosen_cameras(stock))
@@ -400,7 +404,17 @@ def _install_cpu_only() -> None:
 
 
 _OF_CAMERAS = (
-    *("local_pose", "near", "far", "set_local_pose", "set_near", "set_far", "set_fovx", "set_fovy", "set_skew"),
+    *(
+        "local_pose",
+        "near",
+        "far",
+        "set_local_pose",
+        "set_near",
+        "set_far",
+        "set_fovx",
+        "set_fovy",
+        "set_skew",
+    ),
     *("set_focal_lengths", "set_perspective_parameters", "set_principal_point"),
 )
 

@@ -332,7 +332,6 @@ class StrictCpuSystem(BatchedCpuSystem):
             "`if self.gpu_sim_enabled:`).",
             self._writes.frames("forces", hit),
         )
-        self._held.pop(id(qf.now), None)
 
     def _stepped(self) -> None:
         super()._stepped()
