@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.observations import CameraObsTextures
@@ -170,7 +171,8 @@ def _built(
 
 
 def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
-    if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
+    whole = isinstance(num_envs, (int, float, np.integer)) and not isinstance(num_envs, bool)
+    if not whole or num_envs != num_envs // 1 or num_envs < 1:
         raise ValueError(f"num_envs must be a whole number from 1 on, not {num_envs!r}")
     if "sim_backend" in kwargs:
         raise ValueError(

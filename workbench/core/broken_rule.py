@@ -55,6 +55,23 @@ class WrongReturn(BrokenRule):
         self.problem, self.hook = problem, hook
 
 
+class NeedsOneEnv(CoreRefusal, RuntimeError):
+    """The task does what exists for one env only: the tools open it with one."""
+
+    def __init__(self, reason: str, instead: str, place: Place | None) -> None:
+        """
+        Args:
+            reason: a sentence without its full stop.
+            instead: further sentences, which begin with a space; or empty.
+            place: the author's line.
+        """
+        super().__init__(
+            f"{reason}{in_brackets(place)}. With one env it runs: num_envs=1, or --num-envs 1.{instead}",
+            place=place,
+        )
+        self.reason = reason
+
+
 class RuleWarning(UserWarning):
     """A broken rule that does not stop the task."""
 

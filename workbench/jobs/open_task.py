@@ -25,7 +25,7 @@ from workbench.authoring.problem import (
 )
 from workbench.checks.evidence.places import rules_of_outliers
 from workbench.core.backends import BackendUnavailable, find_renderer, unused_gpu_text
-from workbench.core.broken_rule import class_is_installed, warn_of
+from workbench.core.broken_rule import NeedsOneEnv, class_is_installed, in_brackets, warn_of
 from workbench.core.camera_data import CameraInfo
 from workbench.core.cameras.render import (
     findings_of_shaders,
@@ -200,7 +200,26 @@ def import_task(
 
 
 def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
-    """Build, rehearse and reset an imported task. On TaskError the caller undoes the import (`undo_load`)."""
+    """Build, rehearse and reset an imported task: with one env if it does what exists for one only, and a notice says so.
+
+    On TaskError the caller undoes the import (`undo_load`).
+    """
+    try:
+        return _built(loaded, options, opening)
+    except TaskError as error:
+        needs = error.__cause__
+        if options.num_envs == 1 or not isinstance(needs, NeedsOneEnv):
+            raise
+    opened = _built(loaded, replace(options, num_envs=1), opening)
+    notice = f"One env is open, not {options.num_envs}: {needs.reason}"
+    if opened.env.broken_rules is not None:
+        opened.env.broken_rules.report_breach("one-env-only", f"{notice}.", None, needs.place, needs)
+    description = opened.description
+    notice = f"{notice}{in_brackets(needs.place)}."
+    return replace(opened, description=replace(description, notices=(*description.notices, notice)))
+
+
+def _built(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
     on_activity, clock = opening.on_activity, opening.clock
     on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
     with blamed("build", loaded):

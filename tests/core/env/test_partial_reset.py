@@ -201,7 +201,8 @@ def test_states_that_are_given_go_where_set_state_puts_them_and_observations_as_
         ([0, -4], ValueError, "names an env twice"),
         ([4], IndexError, "out of range for 4 envs"),
         ([-5], IndexError, "out of range for 4 envs"),
-        (torch.tensor([True, False, True, False]), TypeError, "convert a mask"),
+        (torch.tensor([True, False]), TypeError, "convert a mask"),
+        ([], ValueError, "env_idx is empty"),
         ([0.5], TypeError, "must be integers"),
     ],
 )
@@ -214,6 +215,14 @@ def test_what_is_no_list_of_different_envs_is_refused_and_changes_nothing(
         starts.reset(options={"env_idx": wrong})
     assert torch.equal(starts.box.pose.raw_pose, before)
     assert np.array_equal(starts._batched_episode_rng[0].get_state()[1], states)
+
+
+def test_a_mask_with_a_row_for_each_env_names_those_that_are_true(starts: Any) -> None:
+    starts.reset(seed=[5, 6, 7, 8])
+    before = starts.box.pose.raw_pose.clone()
+    starts.reset(seed=[1, 2], options={"env_idx": torch.tensor([True, False, True, False])})
+    moved = (starts.box.pose.raw_pose != before).any(dim=1)
+    assert moved.tolist() == [True, False, True, False]
 
 
 class ForgetsRows(PICK_CUBE):

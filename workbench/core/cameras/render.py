@@ -25,8 +25,7 @@ from workbench.core.env.task_env import TaskEnv
 from workbench.core.env_numbers import require_env
 from workbench.core.rules import Finding
 from workbench.core.scene.scene_index import hidden_poses, scene_index
-from workbench.core.simulation.cpu_system import batched_system
-from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, camera_pose, drawn_at, temporarily
+from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, drawn_at, temporarily
 from workbench.core.simulation.hiding import shown_visibility
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
@@ -125,8 +124,8 @@ def take_pictures(
     ones are rendered, from the env's own sub-scene, with ManiSkill's shaders and texture transforms.
 
     Args:
-        poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where the
-            tensors have them, applied or not (`drawn_poses`). Only what is drawn moves, so a past moment can be
+        poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where they
+            are. Only what is drawn moves, so a past moment can be
             rendered without changing the simulation. A camera moves with its mount; colours and lights are today's.
         degree: None for the one that the env was made with. Only a batch on the CPU has fast ones, others are exact.
 
@@ -240,11 +239,10 @@ def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) 
     Args:
         poses: as in `take_pictures`.
     """
-    if poses is not None:
-        each = zip(scene_index(env).entities[env_index], poses, strict=True)
-        return {id(entity): (entity, pose) for entity, pose in each if np.isfinite(pose).all()}
-    px = batched_system(env.scene)
-    return NOWHERE_ELSE if px is None else px.elsewhere([env_index]).get(env_index, NOWHERE_ELSE)
+    if poses is None:
+        return NOWHERE_ELSE
+    each = zip(scene_index(env).entities[env_index], poses, strict=True)
+    return {id(entity): (entity, pose) for entity, pose in each if np.isfinite(pose).all()}
 
 
 def cameras_of(env: Any) -> dict[CameraKey, Any]:
@@ -428,11 +426,9 @@ def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[P
     scene: Any = task.env.scene
     if scene.gpu_sim_enabled:
         scene.px.sync_poses_gpu_to_cpu()
-    px = batched_system(scene)
-    elsewhere = {} if px is None else px.elsewhere(env_idx)
     found = []
     for at, env in enumerate(env_idx):
-        pose = camera_pose(components[env], elsewhere.get(env, NOWHERE_ELSE))
+        pose = components[env].get_global_pose()
         found.append(
             Picture(
                 camera=name,

@@ -71,7 +71,7 @@ def temporary_camera(
         kind: sensors do not see what the task hides from them.
         settings: its lens; `look` takes the pose.
         size: width and height of the pictures, which show the same view; None for its own.
-        poses: (B, 7) where to draw the env's bodies; None for where the tensors have them.
+        poses: (B, 7) where to draw the env's bodies; None for where they are.
 
     Raises:
         IndexError: there is no such env.

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from traceback import walk_tb
 from types import TracebackType
@@ -84,14 +85,16 @@ def refuse_downloads(task: str) -> Iterator[None]:
     MissingAssets; other exceptions pass.
     """
 
+    @wraps(download_asset.prompt_yes_no)
     def ask(message: str) -> bool:
         asking = sys._getframe(1)
         if asking.f_code.co_filename == base_agent.__file__:
             raise _robot_without_file(task, type(asking.f_locals["self"]))
         raise _missing(task, [], message.split(" Would you")[0])
 
-    def download(source: data.DataSource, *args: object, **kwargs: object) -> None:
-        names = [name for name, known in assets.DATA_SOURCES.items() if known is source]
+    @wraps(download_asset.download)
+    def download(data_source: data.DataSource, *args: object, **kwargs: object) -> None:
+        names = [name for name, known in assets.DATA_SOURCES.items() if known is data_source]
         raise _missing(task, names)
 
     stock_ask, stock_download = download_asset.prompt_yes_no, download_asset.download

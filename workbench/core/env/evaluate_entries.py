@@ -61,13 +61,14 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
             continue
         name = _name(path, columns, others)
         array = _array(value)
-        if array is None:
+        if name in FLAGS and array is not None:
+            # ManiSkill takes a single one for all envs, and numbers for bools; the page needs a row each.
+            one_each = array.reshape(-1) if array.size == num_envs else array
+            columns[name] = np.broadcast_to(one_each.astype(bool), (num_envs, *one_each.shape[1:])).copy()
+        elif array is None:
             others[name] = _other(value, num_envs)
         elif array.ndim and len(array) == num_envs:
             columns[name] = array
-        elif name in FLAGS:
-            # ManiSkill takes a single bool for all envs; the page needs a row each.
-            columns[name] = np.broadcast_to(array, (num_envs, *array.shape)).copy()
         else:
             others[name] = _numbers(value, array)
     if left_out:
@@ -232,7 +233,7 @@ def clean_text(text: str) -> str:
 
 
 def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
-    """What is wrong with ``evaluate()``'s return value, or None: a dict in which ``success`` and ``fail`` are bool tensors (N,).
+    """What is wrong with ``evaluate()``'s return value, or None: a dict in which ``success`` and ``fail`` are tensors (N,).
 
     Other entries may be anything, as in ManiSkill (`split_entries`).
     """
@@ -241,9 +242,19 @@ def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
     for name in FLAGS:
         value = evaluate.get(name)
         if name in evaluate and not (
-            isinstance(value, torch.Tensor) and value.dtype == torch.bool and _a_row_each(value, num_envs)
+            isinstance(value, torch.Tensor) and not value.is_complex() and _a_row_each(value, num_envs)
         ):
             return f"returned {name!r} as {describe(value)}; expected a bool tensor of shape ({num_envs},)"
+    return None
+
+
+def wrong_flags(evaluate: object) -> str | None:
+    """Which of ``success`` and ``fail`` is a tensor of another type than bool, or None: ManiSkill's step takes it, and its
+    wrappers do not."""
+    for name in FLAGS:
+        value = evaluate.get(name) if isinstance(evaluate, Mapping) else None
+        if isinstance(value, torch.Tensor) and value.dtype != torch.bool:
+            return f"returned {name!r} as {describe(value)}; expected a bool tensor: append .bool()"
     return None
 
 
@@ -271,8 +282,8 @@ def _floating(num_envs: int) -> str:
 
 
 def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:
-    # Tasks written for one env return shape (), which ManiSkill and its wrappers take.
-    return value.shape == (num_envs,) or (num_envs == 1 and value.ndim == 0)
+    # Tasks written for one env return other shapes of one number, which ManiSkill's step takes.
+    return value.shape == (num_envs,) or num_envs == value.numel() == 1
 
 
 def wrong_observation(obs: object, num_envs: int) -> str | None:

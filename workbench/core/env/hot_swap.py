@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -97,9 +98,12 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
 def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
     """Call `do`, and undo what it did to the env; returns and raises as `rehearse_hooks`."""
     every = list(range(env.num_envs))
-    kept = take_snapshot(env)
+    kept, px = take_snapshot(env), batched_system(env.scene)
     try:
-        with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+        with (
+            torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []),
+            nullcontext() if px is None else px.holding_back(),
+        ):
             do()
     finally:
         maniskill_private.set_reset_mask(env, every)

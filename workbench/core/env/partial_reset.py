@@ -68,13 +68,16 @@ def untouched_envs(env: Any, options: dict[str, Any] | None) -> list[int]:
 
 
 def _chosen(env: Any, options: Mapping[str, Any]) -> list[int] | None:
-    """The named envs to reset; None for all. As in ManiSkill, -1 is the last env and an empty list is allowed."""
+    """The named envs to reset; None for all. As in ManiSkill, -1 is the last env, and a mask with a row for each env names
+    those where it is True."""
     named = options.get("env_idx")
     if named is None:
         return None
     count = env.num_envs
+    if isinstance(named, (torch.Tensor, np.ndarray)) and named.dtype in (torch.bool, np.bool_):
+        named = np.flatnonzero(np.asarray(named)) if named.shape == (count,) else named
     chosen = [i + count if -count <= i < 0 else i for i in env_numbers(named)]
-    return envs_of_batch(chosen, count) if chosen else []
+    return envs_of_batch(chosen, count)
 
 
 def in_ascending_order(
@@ -92,7 +95,8 @@ def in_ascending_order(
         The options, and the seeds if there is one for each env of a partial reset.
 
     Raises:
-        TypeError, IndexError, ValueError: ``env_idx`` is a mask, or names an env that does not exist, or one twice.
+        TypeError, IndexError, ValueError: ``env_idx`` is a mask of another length, or names an env that does not exist, one
+            twice, or none.
     """
     chosen = _chosen(env, options)
     if chosen is None:

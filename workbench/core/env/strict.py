@@ -23,6 +23,7 @@ from workbench.core.broken_rule import (
 from workbench.core.env.evaluate_entries import (
     without_rows,
     wrong_evaluate,
+    wrong_flags,
     wrong_observation,
     wrong_reward,
 )
@@ -30,7 +31,6 @@ from workbench.core.env.kept_rows import ResetWatch
 from workbench.core.env.partial_reset import TARGET_FLAGS, untouched_envs, without_target_flags
 from workbench.core.error_notes import CoreRefusal, Note
 from workbench.core.rules import Degree, Finding, degrees_of
-from workbench.core.simulation.accessors import guard_scenes
 from workbench.core.simulation.strict_system import StrictCpuSystem
 
 _REWARD_HOOK = {
@@ -43,19 +43,18 @@ _REWARD_HOOK = {
 class StrictMixin:
     """Checks of the rules for a batched task class, as the first of its bases.
 
-    Most mistakes that the GPU does not forgive stop in the batched CPU core too. These are silent, and reported at the
-    author's line:
+    The batched CPU core does what a stock CPU env does. Where a GPU does otherwise is reported at the author's line:
 
     * state set and not applied, applied or read without a fetch after a step, links read before their articulation's new
       qpos reached them (`strict_system`);
+    * what the GPU refuses: state touched while the scene is built, static actors moved, masses set later (`accessors`);
     * SAPIEN's own setters, which the GPU ignores (`accessors`);
     * in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or changed (here,
       and `kept_rows`);
     * returns of ``evaluate``, the reward and the observation hooks without a row for each env (`evaluate_entries`).
 
-    What the GPU refuses in any case (another batch size, a static actor moved, two applies without a fetch, state touched
-    while the scene loads) is refused at every degree, see `accessors`. Values are compared, so only what goes wrong is
-    reported; ``tests/core/env/test_strict.py`` lists the ManiSkill tasks that break a rule.
+    Values are compared, so only what goes wrong is reported; ``tests/core/env/test_strict.py`` lists the ManiSkill tasks that
+    break a rule.
     """
 
     num_envs: int
@@ -73,10 +72,9 @@ class StrictMixin:
         """Breaches so far; belongs to the env, and outlives its scene and class."""
         return BrokenRules(degrees_of(self._rule_choice), self._on_finding)
 
-    def _setup_scene(self) -> None:
-        super()._setup_scene()  # type: ignore[misc]
+    def _make_scene(self) -> None:
+        super()._make_scene()  # type: ignore[misc]
         self._strict_system.rules = self.broken_rules
-        guard_scenes(self._strict_system)
 
     @property
     def _strict_system(self) -> StrictCpuSystem:
@@ -133,7 +131,7 @@ class StrictMixin:
         if bool(reset.all()):
             return super()._initialize_episode(env_idx, options)  # type: ignore[misc]
         state = system.copy_of_state()
-        system.being_reset, system.stepped_in_reset = reset, False
+        system.being_reset = reset
         system.reported_elsewhere.clear()
         system.hook_of_reset = place_of_hook(self._workbench_task, "_initialize_episode")
         watch = self._watch
@@ -153,6 +151,7 @@ class StrictMixin:
     def evaluate(self) -> dict[str, Any]:
         evaluated = super().evaluate()  # type: ignore[misc]
         self._returned("evaluate-rows", "evaluate", wrong_evaluate(evaluated, self.num_envs))
+        self._returned("evaluate-flags", "evaluate", wrong_flags(evaluated))
         return evaluated
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from workbench.core import maniskill_private
 from workbench.core.scene.shapes import BodyKind
+from workbench.core.simulation.cpu_system import batched_system
 
 _T = TypeVar("_T")
 _AWAY = 5e4
@@ -21,15 +22,16 @@ _AWAY = 5e4
 
 
 def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
-    """Cache ``find(env)`` on the env's scene, so that it is called once a scene."""
+    """Cache ``find(env)`` on the env's scene, so that it is called once a scene, and again when bodies came or went."""
     name = f"_workbench {find.__module__}.{find.__qualname__}"
 
     @wraps(find)
     def known(env: Any) -> _T:
-        held = vars(env.scene)
-        if name not in held:
-            held[name] = find(env)
-        return held[name]
+        held, px = vars(env.scene), batched_system(env.scene)
+        version = 0 if px is None else px.layout_version
+        if name not in held or held[name][0] != version:
+            held[name] = version, find(env)
+        return held[name][1]
 
     return known
 
@@ -114,8 +116,9 @@ def scene_index(env: Any) -> SceneIndex:
                 if kinds[body] == "static":
                     fixed[e, body] = [*entity.pose.p, *entity.pose.q]
             if kinds[body] != "static" and scene.gpu_sim_enabled:
-                slots.append(envs * len(names) + body)
-                rows.append(maniskill_private.data_rows_of(struct))
+                own = maniskill_private.data_rows_of(struct)
+                slots.append((envs * len(names) + body)[(own >= 0).numpy(force=True)])
+                rows.append(own[own >= 0])  # a body that was removed has none
     slot_of = {id(entity): slot for slot, entity in enumerate(entities.ravel()) if entity is not None}
     hidden = {
         id(entity)
@@ -158,6 +161,12 @@ def read_poses(env: Any) -> NDArray[np.float32]:
     index = scene_index(env)
     poses = index.fixed.copy()
     flat = poses.reshape(-1, 7)
+    px = batched_system(env.scene)
+    if px is not None and px.static_moves:
+        for env_idx, body in np.argwhere(~np.isnan(index.fixed[:, :, 0])):
+            entity: Any = index.entities[env_idx, body]
+            pose = entity.pose
+            poses[env_idx, body] = [*pose.p, *pose.q]
     if index.rows is None:
         # A stock CPU env has no such tensor, and does not move what it hides.
         for slot, entity in enumerate(index.entities.ravel()):
@@ -273,16 +282,18 @@ def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, in
     every, rows, still = np.arange(env.num_envs), [], []
     places: dict[str, tuple[Any, int | None, Any, int]] = {}
     for name, struct in scene_index(env).states.items():
-        if not np.array_equal(maniskill_private.envs_of(struct), every):
+        body = struct if name.startswith("actors/") else struct.root
+        removed = bool((maniskill_private.data_rows_of(body) < 0).any())
+        if removed or not np.array_equal(maniskill_private.envs_of(struct), every):
             places[name] = struct, None, None, 0
             continue
         if name.startswith("actors/"):
             if struct.px_body_type != "dynamic":
                 still.append(len(rows))
-            places[name], body = (struct, len(rows), None, 0), struct
+            places[name] = struct, len(rows), None, 0
         else:
             joints = row_index(maniskill_private.data_rows_of_articulation(struct))
-            places[name], body = (struct, len(rows), joints, maniskill_private.joints_of(struct)), struct.root
+            places[name] = struct, len(rows), joints, maniskill_private.joints_of(struct)
         rows.append(maniskill_private.data_rows_of(body).long())
     none = torch.zeros((env.num_envs, 0), dtype=torch.long, device=env.device)
     return row_index(torch.stack(rows, dim=1) if rows else none), still, places

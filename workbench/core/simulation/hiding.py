@@ -10,6 +10,7 @@ import sapien.render
 from mani_skill.utils.structs.actor import Actor
 
 from workbench.core import maniskill_private
+from workbench.core.error_notes import RefusedCall
 from workbench.core.simulation.cpu_system import batched_system
 
 _KEPT = "_workbench_visibility"
@@ -38,7 +39,7 @@ def _in_batched_scenes(ours: Callable[[Any], None], stock: Callable[[Any], None]
         if batched_system(self.scene) is None:
             stock(self)
         elif why := why_not_hidden(self):
-            raise RuntimeError(f"ManiSkill cannot hide {self.name!r} from cameras: {why}.")
+            raise RefusedCall(f"ManiSkill cannot hide {self.name!r} from cameras: {why}.")
         else:
             ours(self)
 

@@ -58,9 +58,10 @@ class CpuState:
       they differ, the bytes are put together from the target's and the source's.
     * *Sleep*: writing a pose wakes a body, which then moves by micrometres. What slept is put to sleep again. Every body is
       asked (2 us each): a velocity in the pack does not mean that one is awake (cubes of StackCube sleep with some left).
-    * *Forces* of ``set_qf``, and which drives were ever set (`BatchedCpuSystem.drive_flags`).
+    * *Forces* of ``set_qf``.
     * *Contacts*: after a restore PhysX's list is that of another moment, and ``is_grasping`` would answer for it. The counted
       impulses are kept, and answer queries until the next substep.
+    * *Static actors* are where they were built, unless the task has moved one.
     """
 
     contents: tuple[Contents, ...]
@@ -71,12 +72,12 @@ class CpuState:
     """(n,) one for each of its `contents`."""
     qf: NDArray[np.float32]
     """(A, D) joint forces of their articulations, env after env, padded with zeros."""
-    driven: NDArray[np.bool_]
-    """(2, A) whether position and velocity targets were ever set."""
     touching: tuple[tuple[int, str, str], ...]
     """(T,) contacts that a query counts: which of the n envs, and the names of two bodies."""
     impulses: NDArray[np.float32]
     """(T, 3) N s on the first body of each."""
+    statics: tuple[dict[str, tuple[float, ...]], ...]
+    """(n,) poses (7,) of static actors, by name; empty where none was ever moved."""
 
     def articulations(self, k: int) -> slice:
         """Which of `qf` are env k's."""
@@ -86,8 +87,7 @@ class CpuState:
     def essence(self, k: int) -> tuple[Any, ...]:
         """Equal for equal states of env k in PhysX."""
         rows = self.articulations(k)
-        numbers = self.qf[rows].tobytes(), self.driven[:, rows].tobytes()
-        return self.contents[k], self.packed[k], self.asleep[k], *numbers
+        return self.contents[k], self.packed[k], self.asleep[k], self.qf[rows].tobytes(), self.statics[k]
 
 
 def _articulations(contents: Contents) -> int:
@@ -108,6 +108,8 @@ class CpuStatePlan:
     """Env and name of a body, by the ``id`` of its component."""
     bodies: list[dict[str, int]]
     """Of each env: the ``id`` of the component, by name."""
+    statics: list[dict[str, Any]]
+    """Of each env: entities of static actors, by name."""
     held: list[Any]
     """Objects whose ids are used, kept alive: ids are reused once an object is gone."""
     settled: list[dict[int, tuple[bytes, bytes]]]
@@ -125,7 +127,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         return scene.name_of(component) or component.entity.name
 
     alike: dict[Contents, Contents] = {}
-    plan = CpuStatePlan([], [], [], {}, [], [], [{} for _ in px.systems])
+    plan = CpuStatePlan([], [], [], {}, [], [], [], [{} for _ in px.systems])
     first_articulation = 0
     for index, system in enumerate(px.systems):
         bodies, links = system.rigid_dynamic_components, system.articulation_link_components
@@ -133,6 +135,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         plan.held += [*bodies, *links, *statics]
         by_name = {name_of(c): id(c) for c in [*statics, *links, *bodies]}
         plan.bodies.append(by_name)
+        plan.statics.append({name_of(c): c.entity for c in statics})
         plan.names.update({component: (index, name) for name, component in by_name.items()})
         parts, sleepers = [], []
         for body in bodies:
@@ -179,10 +182,16 @@ def read_cpu_state(env: Any, env_idx: list[int]) -> CpuState:
         packed=tuple([packs[i] for i in env_idx]),
         asleep=tuple(asleep),
         qf=px.cuda_articulation_qf.torch().numpy()[rows],
-        driven=np.stack(px.drive_flags)[:, rows],
         touching=tuple([touch for touch, _ in touches]),
         impulses=np.array([impulse for _, impulse in touches], np.float32).reshape(-1, 3),
+        statics=tuple(
+            [_poses(plan.statics[i]) for i in env_idx] if px.static_moves else [{} for _ in env_idx]
+        ),
     )
+
+
+def _poses(entities: dict[str, Any]) -> dict[str, tuple[float, ...]]:
+    return {name: tuple(map(float, (*e.pose.p, *e.pose.q))) for name, e in entities.items()}
 
 
 def write_cpu_state(
@@ -215,6 +224,12 @@ def write_cpu_state(
             alike[id(contents)], matches[i] = contents, range(len(contents))
         else:
             packed[i], matches[i] = _joined(contents, own[i], state, k, carried, missed)
+    for i, k in zip(env_idx, positions, strict=True):
+        there = _poses(plan.statics[i]) if state.statics[k] else {}
+        for name, pose in state.statics[k].items():
+            if there.get(name, pose) != pose:
+                plan.statics[i][name].pose = sapien.Pose(pose[:3], pose[3:])
+                px.static_moves += 1
     _unpack(px, plan, packed)
     _write_joint_forces(px, plan, dict(zip(env_idx, positions, strict=True)), state, matches, fresh_physics)
     touches: dict[int, list[tuple[str, str, Any]]] = {}
@@ -284,7 +299,7 @@ def _write_joint_forces(
     matches: dict[int, Sequence[int | None]],
     fresh_physics: bool,
 ) -> None:
-    """Write ``set_qf``'s forces and the drives' flags into each env; `matches` as of `_joined`."""
+    """Write ``set_qf``'s forces into each env; `matches` as of `_joined`."""
     rows, theirs = [], []
     firsts = list(accumulate(map(_articulations, state.contents), initial=0))
     for i, k in sources.items():
@@ -297,8 +312,6 @@ def _write_joint_forces(
     qf = px.cuda_articulation_qf.torch().numpy()
     width = min(qf.shape[1], state.qf.shape[1])
     qf[rows, :width] = state.qf[theirs, :width]
-    for flags, was in zip(px.drive_flags, state.driven, strict=True):
-        flags[rows] = was[theirs]
     px.gpu_apply_articulation_qf()
     if fresh_physics and qf.any():
         for row in (row for i in sources for row in plan.articulations[i]):
