@@ -6,7 +6,7 @@ import linecache
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.envs.utils.observations import CameraObsTextures
 
 from workbench.authoring.loading import registry
 from workbench.authoring.loading.load import LoadedTask, class_of_module, load_task, task_of_class
@@ -87,7 +86,6 @@ def make(
     """
     _refuse_contradictions(num_envs, kwargs)
     found = _find_task(task)
-    _refuse_unknown_modes(found.cls, kwargs)
     given = {**found.default_kwargs, **kwargs}
     if rules is None and not found.followed and class_is_installed(found.cls):
         rules = "warn"  # an installed task cannot be fixed here
@@ -180,21 +178,6 @@ def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
             'backend="cpu" (batched on the CPU), "gpu" (ManiSkill\'s GPU simulation) or "auto". '
             "For stock ManiSkill use gym.make."
         )
-
-
-def _refuse_unknown_modes(cls: type[BaseEnv], kwargs: Mapping[str, Any]) -> None:
-    textures = {*(texture.name for texture in fields(CameraObsTextures)), "rgbd"}
-    known: dict[str, set[Any]] = {
-        "obs_mode": {*cls.SUPPORTED_OBS_MODES, *_STATE_MODES, *textures},
-        "reward_mode": set(cls.SUPPORTED_REWARD_MODES),
-        "render_mode": set(cls.SUPPORTED_RENDER_MODES),
-    }
-    for name, modes in known.items():
-        value = kwargs.get(name)
-        parts = {value} if value in modes or not isinstance(value, str) else set(value.split("+"))
-        if value is not None and (parts - modes or (name != "obs_mode" and value not in modes)):
-            sums = ", or a sum of some as in rgb+depth" if name == "obs_mode" else ""
-            raise ValueError(f"{name}={value!r} is none of {', '.join(sorted(map(str, modes)))}{sums}")
     if kwargs.get("render_backend", "found") in (None, "none"):
         needs = _what_needs_pictures(None, kwargs)
         if needs is not None:

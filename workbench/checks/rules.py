@@ -34,7 +34,7 @@ _TABLE = (
     Rule(
         "id-taken",
         "warn",
-        "No other task has the registered id.",
+        "No other task or robot has a name that the file registers, unless it overrides that on purpose.",
         "Stock ManiSkill skips the registration, and gym.make gives the other task.",
         "class",
     ),

@@ -84,8 +84,8 @@ class LoadedTask:
     """The class that was tried first and failed."""
     robot: Robot | None = None
     """Shown in a scene of ManiSkill, for a file without a task."""
-    replaced_ids: tuple[str, ...] = ()
-    """Ids that another task had (``PickCube-v1``): plain ManiSkill would skip this file's class."""
+    replaced: tuple[registry.Registration, ...] = ()
+    """Names that another task or robot had (``PickCube-v1``): plain ManiSkill would skip this file's class."""
     named_like_libraries: tuple[Path, ...] = ()
     """Files of its folder that no import finds, because a library has their name."""
 
@@ -109,11 +109,11 @@ class LoadedTask:
             found.append(f"{name} was tried first and failed ({why}): {self.chosen} is open in its place.")
         if self.robot is not None and self.file is not None:
             found.append(robot_scene_text(self.robot, self.file))
-        if self.replaced_ids:
-            ids = ", ".join(self.replaced_ids)
+        if self.replaced:
+            names = ", ".join(one.name for one in self.replaced)
             found.append(
-                f"{self.file} registers {ids}, which belonged to another task: here it is this file's class from now "
-                "on, and plain ManiSkill would skip that class. Register another id to have both."
+                f"{self.file} registers {names}, which exists already: here it is this file's class from now on, and "
+                "plain ManiSkill would skip that class. Choose another name to have both, or register with override=True."
             )
         return tuple(found)
 
@@ -445,7 +445,7 @@ def _task_in(module: ModuleType, requested: str | None, load: _Load) -> LoadedTa
         others=chosen.others,
         alternatives=chosen.alternatives,
         robot=chosen.robot,
-        replaced_ids=load.registrations.replaced_names(),
+        replaced=load.registrations.replaced(),
         named_like_libraries=hidden_by_libraries(finder.file, finder.search_folder),
         **_source_fields(finder),
     )
