@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -380,7 +381,10 @@ class Supervisor:
             gives_up = self._deaths >= _MOST_DEATHS
         seen = state.stack if state.stack_of == beat.number else ""
         stack = report if fatal_error(report) is not None else seen
-        self._on_death(Death(state.why or describe_exit(code), state.end, _doing(beat), stack, gives_up))
+        # A crash may take a while, and is then seen as a main thread that ended, or as half a message.
+        crashed = code is not None and code < 0 and code != -signal.SIGKILL
+        why = describe_exit(code) if crashed or state.why is None else state.why
+        self._on_death(Death(why, state.end, _doing(beat), stack, gives_up))
         with self._condition:
             if gives_up:
                 self._condition.wait_for(lambda: self._replace_asked or self._closing)
