@@ -74,4 +74,4 @@ def test_a_hidden_goal_that_the_policy_is_not_told(checked: Checked, renderer: N
 
 
 def test_without_hidden_bodies_there_is_no_hidden_goal(checked: Checked, renderer: None) -> None:
-    assert checked("hidden-goal", (GOAL, "")).state == "skipped"
+    assert checked("hidden-goal", (GOAL, "")).state == "not_applicable"

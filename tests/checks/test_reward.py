@@ -37,7 +37,7 @@ def test_a_sparse_reward_above_one(checked: Checked) -> None:
     finding = the_finding(checked("reward-normalized", sparse, reward_mode="sparse"))
     assert "goes from 2 to 2" in finding.message and finding.function == "compute_sparse_reward"
     assert checked("reward-normalized", reward_mode="sparse").state == "kept"
-    assert checked("reward-normalized", reward_mode="dense").state == "skipped"
+    assert checked("reward-normalized", reward_mode="dense").state == "not_applicable"
 
 
 def test_a_reward_that_is_nan_where_random_actions_do_not_lead(checked: Checked) -> None:
@@ -68,7 +68,7 @@ def test_a_normalized_reward_with_an_offset_is_noted(checked: Checked) -> None:
 
 def test_a_reward_without_a_normalized_one_has_no_ratio(checked: Checked) -> None:
     edit = 'SUPPORTED_REWARD_MODES = ("normalized_dense", "dense"', 'SUPPORTED_REWARD_MODES = ("dense"'
-    assert checked("reward-ratio", edit).state == "skipped"
+    assert checked("reward-ratio", edit).state == "not_applicable"
 
 
 def test_success_that_earns_less_than_the_way_to_it(checked: Checked) -> None:

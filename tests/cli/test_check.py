@@ -201,12 +201,12 @@ def test_rules_that_one_error_leaves_undecided_stand_below_it(
     (place / "raises.py").write_text(text.replace('name="goal"', "name=self.gone"))
     rules = "reward-finite,reward-changes,success-at-reset,success-and-fail,entry-name"
     ended = run(capsys, "raises.py", "--select", rules, *FEW)
-    why = ended.out.index("not decided ")
+    why = ended.out.index("not known ")
     assert "'gone'" in ended.out[why:].split("\n")[0]
     # Where its lines break is the terminal's matter.
     words = " ".join(ended.out[why:].split())
     assert " 5 rules: success-at-reset, success-and-fail, entry-name, reward-finite, reward-changes " in words
-    assert ended.err.count("not decided") == 1
+    assert ended.err.count("not known") == 1
 
 
 def test_a_comment_that_silences_nothing_any_more_is_told(
@@ -237,7 +237,7 @@ def test_what_acts_in_further_episodes_is_named(place: Path, capsys: pytest.Capt
     ended = check("policies.py:still")
     assert ended.code == 0 and "note success-stays-possible: success in 0 of 2 given episodes" in ended.out
     ended = check("policies.py:wrong")
-    assert ended.code == 1 and "not decided success-stays-possible" in ended.out
+    assert ended.code == 1 and "not known success-stays-possible" in ended.out
     assert "policies.py:9: KeyError" in ended.out and "1 rule kept, 0 broken" in ended.out
     ended = check("policies.py:gone")
     assert ended.code == 2 and "has no function gone" in ended.err
@@ -290,7 +290,11 @@ def test_pictures_are_not_asked_of_a_task_that_is_made_without_a_renderer(
 ) -> None:
     ended = run(capsys, "good.py", "--select", "ground-truth,camera-sees,runs", "--json", *FEW)
     states = {one["rule"]: one["state"] for one in json.loads(ended.out)["rules"]}
-    assert ended.code == 0 and states == {"runs": "kept", "ground-truth": "skipped", "camera-sees": "skipped"}
+    assert ended.code == 0 and states == {
+        "runs": "kept",
+        "ground-truth": "not_known",
+        "camera-sees": "not_known",
+    }
 
 
 def test_json_is_all_that_is_printed_and_equals_the_file(
@@ -384,14 +388,14 @@ def test_reports_hold_whatever_a_task_says(place: Path, capsys: pytest.CaptureFi
     (place / "loud.py").write_text(text.replace("distance = torch.linalg.norm(self.cube", f"{raises}\n        distance = torch.linalg.norm(self.cube", 1))  # fmt: skip
     files = ("--junit", "a.xml", "--sarif", "a.sarif", "--json-file", "a.json")
     ended = run(capsys, "loud.py", "--select", "reward-finite", *files, *FEW)
-    assert ended.code == 1 and "not decided reward-finite" in ended.out and "1 not decided" in ended.out
+    assert ended.code == 1 and "not known reward-finite" in ended.out and "1 not known" in ended.out
     assert "\x1b[2J" not in ended.out and "\x00" not in ended.out and "[red]<&" in ended.out
     (case,) = ElementTree.parse(place / "a.xml").getroot()[0]
     error = case.find("error")
     assert error is not None and "ValueError" in error.get("message", "") and "\\x1b[2J" in (error.text or "")
     (made,) = json.loads((place / "a.sarif").read_text())["runs"]
     assert made["invocations"][0]["executionSuccessful"] is False
-    assert json.loads((place / "a.json").read_text())["rules"][0]["state"] == "failed"
+    assert json.loads((place / "a.json").read_text())["rules"][0]["state"] == "not_known"
 
 
 def test_other_tasks_of_the_file_are_named(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -453,4 +457,4 @@ def test_parts_that_are_merged_print_what_the_whole_would(
     capsys.readouterr()
     with pytest.raises(SystemExit) as ended:
         main(["merge", "check-2-of-2.job"])
-    assert ended.value.code == 1 and "groups of rules are in none of these files" in capsys.readouterr().out
+    assert ended.value.code == 1 and "results of rules are in none of these files" in capsys.readouterr().out

@@ -18,9 +18,9 @@ from workbench.core.rules import Finding
 from workbench.jobs.task import TaskOptions
 from workbench.session.checks.checks import RUNNING, Checks, ChecksView
 from workbench.session.process.askers import GaveWay
-from workbench.session.process.job_lane import Job, JobFailed
+from workbench.session.process.job_lane import Job, JobFailed, ProcessDied
 from workbench.session.protocol.messages import Load
-from workbench.session.protocol.questions import CheckedGroup, CheckGroup
+from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.session.rescore.background import StoppedBy
 
 FIRST, SECOND = "success-at-reset", "reward-changes"
@@ -47,6 +47,8 @@ class ScriptedBackground:
         self.loads: list[Load] = []
         self.give_way_after = 99
         """Results of a group after which a job of higher priority comes, once."""
+        self.dies_at = ""
+        """The rule that ends the process."""
         self.fails: JobFailed | None = None
         self.let = threading.Semaphore(1000)
 
@@ -76,7 +78,11 @@ class ScriptedBackground:
                 check()
             check()
             if rule not in question.known:
-                on_progress(done, 2, self.comes_to.get(rule, RuleResult(rule, "kept")))
+                on_progress(done - 1, 2, RuleProgress(rule))
+                if rule == self.dies_at:
+                    raise ProcessDied("the process in the background was killed by SIGSEGV")
+                result = self.comes_to.get(rule, RuleResult(rule, "kept"))
+                on_progress(done, 2, RuleProgress(rule, result))
             if done >= self.give_way_after:
                 self.give_way_after = 99
                 raise GaveWay
@@ -179,6 +185,18 @@ def test_a_group_that_gave_way_is_asked_without_the_rules_that_are_known(
     checks.loaded(LOAD, same_task=True)
     assert ended(checks).state == "done"
     assert [question.group for question in background.asked] == [0, 0, 1]
+    assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
+
+
+def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
+    checks: Checks, background: ScriptedBackground
+) -> None:
+    background.dies_at = FIRST
+    checks.loaded(LOAD, same_task=True)
+    view = ended(checks)
+    assert view.state == "done" and [result.state for result in view.results] == ["failed", "kept"]
+    first = view.results[0]
+    assert "SIGSEGV" in first.why and first.problem is not None
     assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from workbench.authoring.loading.blamed import blamed
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
 from workbench.core.camera_data import CameraKey
@@ -52,7 +52,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
             in_view.setdefault(thing.name, []).append(np.where(thing.present, thing.alone > 0, True))
             uncovered.setdefault(thing.name, []).append(np.where(thing.present, thing.pixels > 0, True))
     if not in_view:
-        raise CannotCheck("it has no objects besides the robot and the scenery")
+        raise NotApplicable("it has no objects besides the robot and the scenery")
     covered: list[str] = []
     for name, of_cameras in in_view.items():
         missed = ~np.any(of_cameras, axis=0)
@@ -86,9 +86,12 @@ def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
     """Over the pictures of sensor cameras that are not mounted on a body."""
     reports = checkup.look(sensor_reports)
     env = checkup.pictured.env
-    for key, report in reports.items():
+    fixed = {key: report for key, report in reports.items() if mount_of(env, cameras_of(env)[key]) is None}
+    if not fixed:
+        raise NotApplicable("its sensor cameras are mounted on bodies")
+    for key, report in fixed.items():
         share = float(report.depth.background.mean())
-        if mount_of(env, cameras_of(env)[key]) is None and share > BACKGROUND_SHARE:
+        if share > BACKGROUND_SHARE:
             yield Found(
                 f"{share:.0%} of the picture of sensor camera {key[1]!r} is empty background, whose depth is 0. Aim it "
                 "down at the scene, narrow its fov, or build a ground.",
@@ -111,6 +114,8 @@ def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
 def camera_names(checkup: Checkup) -> Iterator[Found | Note]:
     """The configs that the hooks of task and robot return."""
     of_task, of_robot = checkup.look(sensor_configs)
+    if not of_task and not of_robot:
+        raise NotApplicable("it has no sensor camera")
     robots = {config.uid for config in of_robot}
     for name, count in Counter(config.uid for config in of_task).items():
         if count > 1 or name in robots:
@@ -151,7 +156,7 @@ def sensor_reports(checkup: Checkup) -> dict[CameraKey, CameraReport]:
     task = checkup.pictured
     sensors: list[CameraKey] = [key for key in cameras_of(task.env) if key[0] == "sensor"]
     if not sensors:
-        raise CannotCheck("it has no sensor camera")
+        raise NotApplicable("it has no sensor camera")
     reports: dict[CameraKey, list[CameraReport]] = {key: [] for key in sensors}
     objects = _objects(task.env)
     for first in range(0, RESETS * task.num_envs, task.num_envs):
@@ -185,7 +190,7 @@ def _objects(env: Any) -> list[SceneObject]:
 def _own_configs(checkup: Checkup) -> list[Any]:
     of_task, _ = checkup.look(sensor_configs)
     if not of_task:
-        raise CannotCheck("it has no sensor camera of its own")
+        raise NotApplicable("it has no sensor camera of its own")
     return of_task
 
 
