@@ -103,7 +103,7 @@ def with_advice(
         and _runs_alone(again, options)
     ):
         advice.append(
-            f"it fails with {options.num_envs} envs and runs with one: --num-envs 1, or --envs-per-worker 1. "
+            f"it fails with {options.num_envs} envs and runs with one: --num-envs 1. "
             "Or it fails in some states alone: a task is reset once while it is built, each env to another state"
         )
     if loaded.others and loaded.file is not None and not knows_others:

@@ -53,6 +53,7 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
 
 def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     """After a reset, and again after resets and steps of other seeds."""
+    checkup.require_task()
     task, seeds = checkup.task, next(checkup.batches())
     first = _seen(task, checkup.reset(task, seeds))
     # Others that have their own generators may be at an equal place after a reset.
@@ -135,6 +136,7 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
 
 def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
     """Twice from the same seeds. Each reset begins with physics that has no past, so only the task's code can differ."""
+    checkup.require_task()
     seeds = next(checkup.batches())
     task = checkup.task
     if not task.parts:

@@ -129,6 +129,7 @@ def see_reward_normalized(checkup: Checkup) -> Iterator[Seen]:
         yield Seen(("ManiSkill's own",), tried=1)
         return
     if "success" not in checkup.starts.evaluate:
+        yield Seen(("no success",))
         return
     seen = checkup.look(odd_states)
     success = flags(np.stack([entries["success"] for entries in seen.evaluate]))
@@ -152,8 +153,10 @@ def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             row.place,
             row.count,
         )
+    elif any(row.names == ("no success",) for row in rows):
+        raise NotKnown("evaluate() has no success: which states pay most is not known")
     elif not any(row.tried for row in rows):
-        raise NotKnown("no tried episode succeeds: what the reward is then was not seen")
+        raise NotKnown("no tried episode succeeds, where the reward is largest")
 
 
 def paid_at_success(seen: OddStates, mode: str) -> float | None:

@@ -226,7 +226,10 @@ def raised(error: Problem, checkup: Checkup) -> Found:
         error.file,
         error.line,
     )
-    return Found(f"{error.stage}: {error.message}{f' {ONE_ENV}' if alike else ''}", place)
+    advice = f". {ONE_ENV}" if alike else ""
+    return Found(
+        f"{error.stage}: {error.message.removesuffix('.') if alike else error.message}{advice}", place
+    )
 
 
 def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:

@@ -12,7 +12,7 @@ from workbench.core.env.task_env import TaskEnv, given_arguments
 from workbench.planning.episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
 from workbench.planning.report import few_seeds_text
-from workbench.planning.rollouts import NotAlike, control_mode_to_plan
+from workbench.planning.rollouts import NotAlike, NothingToPlan, control_mode_to_plan, require_plannable
 from workbench.planning.verdicts import ENOUGH_SEEDS, MOST_OF, PlannedEpisodes
 from workbench.planning.verdicts import RULES as VERDICTS
 
@@ -38,12 +38,12 @@ def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
     checkup.require_several()
     cls, found = checkup.loaded.cls, list[PlannedEpisode]()
     given = {**checkup.loaded.default_kwargs, **checkup.env_kwargs}
+    try:
+        require_plannable(checkup.task.env)
+    except NothingToPlan as reason:
+        raise NotApplicable(str(reason)) from None
     mode = control_mode_to_plan(checkup.task.env, given)
     with checkup.env(1, **mode) as live:  # type: ignore[arg-type]
-        if live.env.reward_mode == "none":
-            raise NotApplicable("it has no reward")
-        if not live.parts:
-            raise NotApplicable("there is nothing to plan: it has no robot with a controller")
         made_with = given_arguments(cls, checkup.env_kwargs, checkup.loaded.default_kwargs)
         with blamed("build", checkup.loaded):
             planner = Planner(live.env, made_with=made_with)  # type: ignore[arg-type]

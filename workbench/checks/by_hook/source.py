@@ -86,6 +86,7 @@ def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
 
 def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
     """Of the class, with the constructor's default."""
+    checkup.require_task()
     cls = checkup.loaded.cls
     robot = robots_of(cls, checkup.loaded.default_kwargs)
     supported = cls.SUPPORTED_ROBOTS
@@ -106,6 +107,7 @@ def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
 
 def reward_modes(checkup: Checkup) -> Iterator[Found | Note]:
     """Of the class, with the methods that it overrides."""
+    checkup.require_task()
     cls = checkup.loaded.cls
     if cls.get_reward is not BaseEnv.get_reward:
         raise NotApplicable("it has a get_reward() of its own")
@@ -224,8 +226,7 @@ def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _spec(checkup: Checkup) -> Any:
-    if checkup.loaded.robot is not None:
-        raise NotApplicable("it is a robot in a scene of ManiSkill's")
+    checkup.require_task()
     return registry.environment(checkup.loaded.env_id)
 
 

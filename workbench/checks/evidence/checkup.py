@@ -205,6 +205,11 @@ class Checkup:
         if not self.places.modules:
             raise NotKnown("its source is not known")
 
+    def require_task(self) -> None:
+        """Raise NotApplicable for a robot that is shown in a scene of ManiSkill: the task is not the author's."""
+        if self.loaded.robot is not None:
+            raise NotApplicable("it is a robot in a scene of ManiSkill's")
+
     def at_most(self, wanted: int) -> int:
         """So many envs; one where one was asked for."""
         return wanted if self.num_envs > 1 else 1
