@@ -79,7 +79,12 @@ def test_a_rule_of_gpu_simulation_is_looked_at_where_no_other_is(tmp_path: Path)
     report = check(options(task_of(tmp_path, LOSES_ROWS), "rows-lost"))
     (finding,) = report.findings
     assert finding.degree == "stop" and finding.code == "self.drawn = torch.rand((b, 2))"
-    assert states(check(options(task_of(tmp_path), "rows-lost"))) == {"rows-lost": "kept"}
+    assert states(check(options(task_of(tmp_path), "rows-lost"))) == {"rows-lost": "not_applicable"}
+    drawn = (
+        "            self.drawn = self.drawn if hasattr(self, 'drawn') else torch.rand((self.num_envs, 2))\n"
+    )
+    keeps = LOSES_ROWS[0], f"{LOSES_ROWS[0]}{drawn}"
+    assert states(check(options(task_of(tmp_path, keeps), "rows-lost"))) == {"rows-lost": "kept"}
 
 
 @pytest.mark.slow

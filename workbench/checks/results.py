@@ -82,6 +82,11 @@ class RuleResult:
     problem: Problem | None = None
     """What was raised: by the author's code, or by the check where it failed."""
 
+    @property
+    def is_crash(self) -> bool:
+        """Whether the check raised. Of a process that ended nobody knows the cause."""
+        return self.state == "failed" and self.problem is not None and bool(self.problem.traceback)
+
 
 def failed(rule: str, problem: Problem, seconds: float = 0.0) -> RuleResult:
     """The result of a rule whose check raised, or whose process died."""

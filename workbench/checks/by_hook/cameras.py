@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from workbench.authoring.loading.blamed import blamed
-from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
 from workbench.core.camera_data import CameraKey
@@ -54,9 +54,11 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
     if not in_view:
         raise NotApplicable("it has no objects besides the robot and the scenery")
     covered: list[str] = []
+    found = False
     for name, of_cameras in in_view.items():
         missed = ~np.any(of_cameras, axis=0)
         if missed.mean() > MISSED_SHARE:
+            found = True
             yield Found(
                 f"{name} is out of view of every sensor camera ({', '.join(key[1] for key in reports)}) in "
                 f"{of(int(missed.sum()), missed.size, 'picture')} after a reset. Aim one at it: "
@@ -72,6 +74,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
         # Where it is the only one, each object says so.
         one_of_several = len(reports) > 1 and mount_of(env, cameras_of(env)[key]) is None
         if one_of_several and not any((thing.alone > 0).any() for thing in things):
+            found = True
             yield Found(
                 f"sensor camera {key[1]!r} has none of the task's objects in any picture after a reset "
                 f"({listed([thing.name for thing in things])}). Aim it at them: `sapien_utils.look_at(eye=..., "
@@ -80,6 +83,8 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
             )
     if covered:
         yield Note(f"covered by other things in every picture after a reset: {listed(covered)}")
+    if not found and (count := len(_drawn(env))) > MOST_OBJECTS:
+        raise NotKnown(f"{MOST_OBJECTS} of {count} objects were looked for")
 
 
 def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
@@ -176,15 +181,20 @@ def _measured(env: Any, e: int, key: CameraKey, objects: list[SceneObject]) -> C
 
 
 def _objects(env: Any) -> list[SceneObject]:
-    """Robots and scenery, and the first objects that have anything to see: a body may only carry a camera."""
-    index, every = scene_index(env), list_objects(env)
-    drawn = [
+    """Robots and scenery, and the first of the others."""
+    scenery = [thing for thing in list_objects(env) if thing.robot or thing.scenery]
+    return [*scenery, *_drawn(env)[:MOST_OBJECTS]]
+
+
+def _drawn(env: Any) -> list[SceneObject]:
+    """Objects that are neither robot nor scenery and have anything to see: a body may only carry a camera."""
+    index = scene_index(env)
+    return [
         thing
-        for thing in every
-        if any(is_drawn(entity) for e in range(env.num_envs) for entity in entities_of(thing, e, index))
+        for thing in list_objects(env)
+        if not (thing.robot or thing.scenery)
+        and any(is_drawn(entity) for e in range(env.num_envs) for entity in entities_of(thing, e, index))
     ]
-    scenery = [thing for thing in every if thing.robot or thing.scenery]
-    return [*scenery, *[thing for thing in drawn if thing not in scenery][:MOST_OBJECTS]]
 
 
 def _own_configs(checkup: Checkup) -> list[Any]:

@@ -164,6 +164,13 @@ def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
             f"{checkup.pictured.env.obs_mode!r}. Put it behind `if self.obs_mode_struct.use_state:`.",
             _place(checkup, f"extra/{leaf}"),
         )
+    if not told:
+        _require_all_moved(checkup)
+
+
+def _require_all_moved(checkup: Checkup) -> None:
+    if (count := len(scene_index(checkup.pictured.env).states)) > MOST_BODIES:
+        raise NotKnown(f"{MOST_BODIES} of {count} bodies were looked at")
 
 
 def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
@@ -171,13 +178,17 @@ def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
     bodies = {body: moved for body, moved in checkup.look(followers).items() if moved.hidden}
     if not bodies:
         raise NotApplicable("it hides nothing from pictures")
+    found = False
     for body, moved in bodies.items():
         if moved.meaning and not moved.observation:
+            found = True
             yield Found(
                 f"{body} is hidden from pictures, {listed(sorted(moved.meaning))} of evaluate() or the reward depends "
                 "on where it is, and nothing in _get_obs_extra() does. Add its position there, in all modes.",
                 checkup.places.hook("_get_obs_extra"),
             )
+    if not found:
+        _require_all_moved(checkup)
 
 
 # --- leaves by name ------------------------------------------------------------------------------------------

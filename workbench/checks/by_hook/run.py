@@ -40,6 +40,8 @@ from workbench.checks.evidence.over_seeds import OverSeeds
 from workbench.checks.results import RuleResult, Seen, Silenced, State, failed, merged
 from workbench.checks.rules import core_rules_of
 from workbench.core.env import actions
+from workbench.core.env.kept_rows import KeptRows
+from workbench.core.env.task_env import TaskEnv
 from workbench.core.rules import Degree, Finding, silence_of
 from workbench.machine.processes.wire import Unpacker, pack
 
@@ -236,12 +238,14 @@ def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResu
     """Step, and reset random envs among them, while the rules of GPU simulation look. Gives what each came to, but for breaches:
     those are in `Checkup.findings`, of all that ran, and `core_results` makes results of them. Raises CheckEnded."""
     further: list[RuleResult] = []
+    not_applicable: dict[str, str] = {}
     try:
         ended = ended_as(lambda: _run_core(checkup))
         error = ended.problem
+        if error is None:
+            not_applicable = _nothing_there(checkup.task)
         if error is not None and degrees["runs"] != "off" and not _is_known(error, checkup, degrees):
             further.append(result_of("runs", degrees["runs"], [raised(error, checkup)]))
-        without_reward = error is None and checkup.task.env.reward_mode == "none"
     except CheckEnded:
         raise
     except Exception as error:
@@ -250,8 +254,8 @@ def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResu
     results: list[RuleResult] = []
     for rule in core_rules_of(degrees):
         of_rule = ended
-        if error is None and rule == "reward-rows" and without_reward:
-            of_rule = Ended("not_applicable", "it has no reward")
+        if rule in not_applicable:
+            of_rule = Ended("not_applicable", not_applicable[rule])
         elif error is None and rule in _OF_SEVERAL:
             of_rule = ended_as(checkup.require_several)
         results.append(_ended(RuleResult(rule, "kept"), of_rule))
@@ -266,6 +270,16 @@ def _run_core(checkup: Checkup) -> None:
             checkup.step(task, actions.random_action(task.parts, task.num_envs, rng))
         count = int(rng.integers(1, max(2, task.num_envs)))
         checkup.reset(task, None, sorted(rng.choice(task.num_envs, count, replace=False).tolist()))
+
+
+def _nothing_there(task: TaskEnv) -> dict[str, str]:
+    """Rules of GPU simulation that say nothing about this task, with the reason."""
+    found: dict[str, str] = {}
+    if task.env.reward_mode == "none":
+        found["reward-rows"] = "it has no reward"
+    if not KeptRows(task.env, [0]).before:
+        found |= dict.fromkeys(("rows-lost", "rows-rewritten"), "it keeps nothing with a row for each env")
+    return found
 
 
 def core_results(

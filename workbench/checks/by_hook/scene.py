@@ -186,14 +186,18 @@ def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
     files = _mesh_files(checkup, "convex_mesh")
     if not files:
         raise NotApplicable("no body of its own collides as the convex hull of a mesh file")
+    unknown: list[str] = []
     for file, each in files.items():
-        if is_hollow(file):
+        if (hollow := is_hollow(file)) is None:
+            unknown.append(Path(file).name)
+        elif hollow:
             yield Found(
                 f"{each.name} collides as the convex hull of {Path(file).name}, which is hollow: nothing can be put into "
                 "it. Use add_multiple_convex_collisions_from_file with a decomposed mesh, or boxes; for a body that "
                 "never moves, add_nonconvex_collision_from_file.",
                 each.place,
             )
+    _require_read(unknown)
 
 
 def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
@@ -220,13 +224,22 @@ def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
     files = _mesh_files(checkup, "file")
     if not files:
         raise NotApplicable("no body of its own is drawn from a mesh file")
+    unknown: list[str] = []
     for file, each in files.items():
-        if (count := triangles_in(file, MOST_TRIANGLES)) > MOST_TRIANGLES:
+        if (count := triangles_in(file, MOST_TRIANGLES)) is None:
+            unknown.append(Path(file).name)
+        elif count > MOST_TRIANGLES:
             yield Found(
                 f"{each.name} is drawn with {count:,} triangles ({Path(file).name}). Reduce the mesh "
                 "(trimesh: mesh.simplify_quadric_decimation(face_count=20_000)).",
                 each.place,
             )
+    _require_read(unknown)
+
+
+def _require_read(unknown: list[str]) -> None:
+    if unknown:
+        raise NotKnown(f"cannot be read, or has too many triangles to look at: {listed(unknown)}")
 
 
 def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:

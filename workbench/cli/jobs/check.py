@@ -220,11 +220,11 @@ def _print_finding(finding: Finding, root: Path, style: str) -> None:
 
 
 def _print_summary(report: CheckReport, root: Path) -> None:
-    for result in report.of_state("failed"):
-        # Not wrapped into a reason: each is an error of its own, of the workbench.
+    failed = report.of_state("failed")
+    for result in failed:
         _print(f"[bold red]failed[/] {result.rule}: {_safe(result.why)}")
-    if report.of_state("failed"):
-        _print(f"[bold red]failed[/] {REPORT_IT}")
+    if crashed := [result.rule for result in failed if result.is_crash]:
+        _print(f"{', '.join(crashed)}: {REPORT_IT}")
     for result in report.results:
         for one in result.silenced:
             file = shown_path(one.finding.file or "", root)

@@ -26,7 +26,9 @@ DISTRIBUTION = "maniskill-workbench"
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 LEVELS = {"stop": "error", "warn": "warning", "off": "none"}
 """Degree to SARIF's level."""
-REPORT_IT = "is an error of the workbench, not of the task: please report it, with the traceback that --json-file writes"
+REPORT_IT = (
+    "an error of the workbench, not of the task; please report it, with the traceback that --json-file writes"
+)
 CANNOT_CHECK = "cannot-check"
 """In a report the id of what ends a check before a rule is looked at; no rule has it."""
 _UNDECIDED: tuple[State, ...] = ("failed", "not_known")
@@ -219,7 +221,7 @@ def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element
             kind = "workbench.failed" if result.state == "failed" else "TaskError"
             error = ElementTree.SubElement(case, "error", type=kind, message=message)
             trace = result.problem.traceback
-            error.text = xml_text(f"{REPORT_IT}\n\n{trace}" if result.state == "failed" else result.why)
+            error.text = xml_text(f"{REPORT_IT}\n\n{trace}" if result.is_crash else result.why)
     lines = [_text(finding, root) for finding in result.findings if not said.fails(finding)]
     lines += [f"silenced: {_text(one.finding, root)}\nreason: {one.reason}" for one in result.silenced]
     lines += result.notes
