@@ -66,7 +66,13 @@ def test_of_one_env_no_rule_makes_more_and_what_needs_more_is_not_known(
     assert [result for result in results.values() if result.problem is not None or result.findings] == []
     assert rules == results.keys()
     needs_more = {rule for rule, result in results.items() if "several envs" in result.why}
-    assert {"other-env-written", "evaluate-rows", "batch-of-reset", "loop-over-envs", "reward-flat"} <= needs_more
+    assert {
+        "other-env-written",
+        "evaluate-rows",
+        "batch-of-reset",
+        "loop-over-envs",
+        "reward-flat",
+    } <= needs_more
     assert not needs_more & {"success-at-reset", "reward-finite", "state-restores", "device-copies"}
     assert {results[rule].state for rule in needs_more} == {"not_known"}
 

@@ -72,7 +72,8 @@ def walk(task: str, folder: Path) -> Iterator[Ran]:
     reference = task
     if task in EXAMPLES:
         reference = f"{task}.py"
-        shutil.copy(ROOT / "tasks" / reference, folder)
+        for file in (ROOT / "tasks").glob(f"{task}.*"):
+            shutil.copy(file, folder)
     elif task in FROM_TEMPLATES:
         reference = "from_template.py"
         made = command(task, "new", folder, "from_template", "--from", task.removeprefix("template "))
