@@ -95,6 +95,24 @@ def test_a_task_that_is_written_for_one_env_is_told_so_at_its_line(
     assert checked(rule, edit, num_envs=1).findings == ()
 
 
+def test_what_a_robot_of_the_author_raises_is_theirs(checked: Checked) -> None:
+    """The reach is measured by its property, which no hook of the task calls here."""
+    robot = (
+        "@register_agent()\nclass Odd(Panda):\n    uid = 'odd_arm'\n\n    @property\n    def tcp(self):\n"
+        "        raise ValueError('no tcp yet')\n\n    @tcp.setter\n    def tcp(self, value):\n        self.kept = value\n\n\n"
+    )
+    imports = "from mani_skill.agents.registration import register_agent\nfrom mani_skill.agents.robots import Panda\n"
+    above = '@register_env("WorkbenchPushCube-v1"'
+    edits = (
+        ("import numpy as np\n", f"import numpy as np\n{imports}"),
+        (above, robot + above),
+        ("self.agent.tcp.pose", "self.agent.kept.pose"),
+    )
+    result = checked("outside-reach", *edits, robot_uids="odd_arm")
+    assert result.state == "not_known" and result.problem is not None
+    assert result.problem.code == "raise ValueError('no tcp yet')"
+
+
 def test_what_one_env_raises_too_gets_no_advice_to_take_one(checked: Checked) -> None:
     edit = '"cube_height": height,', '"cube_height": height / self.gone,'
     assert "--num-envs" not in the_finding(checked("runs", edit)).message

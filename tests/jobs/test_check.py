@@ -134,6 +134,19 @@ def test_a_reward_with_rows_of_rows_breaks_one_rule_at_its_line(tmp_path: Path) 
     assert finding.rule == "runs" and finding.line is not None and "shape (4, 4)" in finding.message
 
 
+def test_what_raises_when_an_env_is_closed_ends_no_check(tmp_path: Path) -> None:
+    raises = (
+        "    def evaluate(self)",
+        "    def close(self):\n        raise ValueError('closed')\n\n    def evaluate(self)",
+    )
+    report = check(options(task_of(tmp_path, raises), "runs", "success-at-reset", "state-restores"))
+    assert states(report) == {
+        "runs": "broken", "success-at-reset": "kept", "state-restores": "not_known"
+    }  # fmt: skip
+    (finding,) = report.findings
+    assert finding.code == "raise ValueError('closed')"
+
+
 def test_a_rule_that_is_not_decided_is_no_success(tmp_path: Path) -> None:
     """Where `runs` is not asked for, nothing else would tell a job in CI."""
     report = check(options(task_of(tmp_path, RAISES), "reward-finite"))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import workbench
-from workbench.authoring.problem import Problem, TaskError, shorten
+from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
 from workbench.checks.by_hook import (
     cameras,
     devices,
@@ -122,7 +122,7 @@ def _checked(rule: str, check: Check, checkup: Checkup, degree: Degree, rows: li
         for found in check.judge(rows) if isinstance(check, OverSeeds) else check(checkup):
             seen.append(found)  # one by one: the next may raise
 
-    ended = ended_as(look)
+    ended = ended_as(lambda: _of_task(look, checkup))
     if ended.problem is not None and isinstance(check, OverSeeds):
         # What it had found before that is true all the same.
         seen.extend(check.so_far(rows))
@@ -149,6 +149,29 @@ def ended_as(look: Callable[[], None]) -> Ended:
     except TaskError as error:
         return Ended("not_known", str(error), error.problem)
     return Ended()
+
+
+def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
+    """Call it. What the author's code raises in it, a robot's property say, is a TaskError."""
+    try:
+        look()
+    except (NotApplicable, NotKnown, TaskError, CheckEnded):
+        raise
+    except Exception as error:
+        if not _is_of_task(error, checkup):
+            raise
+        loaded = checkup.loaded
+        raise TaskError(problem_from_exception(error, "step", loaded.source_files, loaded.cls)) from error
+
+
+def _is_of_task(error: Exception, checkup: Checkup) -> bool:
+    """Whether the last line of the traceback that is the author's or the workbench's is the author's."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if frame.filename in checkup.files:
+            return True
+        if Path(frame.filename).is_relative_to(_PACKAGE):
+            return False
+    return False
 
 
 def _ended(result: RuleResult, ended: Ended) -> RuleResult:
@@ -240,7 +263,7 @@ def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResu
     further: list[RuleResult] = []
     not_applicable: dict[str, str] = {}
     try:
-        ended = ended_as(lambda: _run_core(checkup))
+        ended = ended_as(lambda: _of_task(lambda: _run_core(checkup), checkup))
         error = ended.problem
         if error is None:
             not_applicable = _nothing_there(checkup.task)

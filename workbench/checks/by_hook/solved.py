@@ -51,7 +51,8 @@ def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
             for seed in checkup.seeds[:SEEDS]:
                 found.append(_solved(checkup, live, planner, seed))
         finally:
-            planner.close()
+            with blamed("step", checkup.loaded):
+                planner.close()
     return PlannedEpisodes(tuple(found))
 
 

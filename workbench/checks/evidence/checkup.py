@@ -5,7 +5,7 @@ from __future__ import annotations
 import linecache
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
 from typing import Any, TypeVar
@@ -176,7 +176,9 @@ class Checkup:
 
     def close(self) -> None:
         while self._open:
-            self._open.pop().close()
+            # Rules that make an env of their own tell what its close raises; here the results are known already.
+            with suppress(TaskError):
+                self._close(self._open.pop())
         self._looked.clear()
         for name in ("task", "pictured", "starts", "overlaps", "still", "random", "acted"):
             self.__dict__.pop(name, None)
@@ -227,7 +229,14 @@ class Checkup:
         task = self._made(num_envs or self.num_envs, render or self._needs_renderer, rules, kwargs)
         try:
             yield task
-        finally:
+        except BaseException:
+            with suppress(TaskError):  # the first error is told
+                self._close(task)
+            raise
+        self._close(task)
+
+    def _close(self, task: TaskEnv) -> None:
+        with blamed("step", self.loaded, task):
             task.close()
 
     @evidence
@@ -460,7 +469,8 @@ class Checkup:
             return error.problem
         finally:
             if task is not None:
-                task.close()
+                with suppress(TaskError):
+                    self._close(task)
         return None
 
     @evidence
