@@ -6,25 +6,28 @@ import linecache
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.envs.utils.observations import CameraObsTextures
 
 from workbench.authoring.loading import registry
 from workbench.authoring.loading.load import LoadedTask, class_of_module, load_task, task_of_class
 from workbench.authoring.loading.reference import split_reference
 from workbench.authoring.problem import definition_line
 from workbench.core.backends import BackendUnavailable, find_renderer
-from workbench.core.broken_rule import class_is_installed, is_installed
+from workbench.core.broken_rule import class_is_installed, warn_of
 from workbench.core.camera_data import PictureDegree
+from workbench.core.cameras.render import findings_of_shaders, list_cameras
+from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.task_env import Backend, EnvOptions, build_env, default_reward_mode
 from workbench.core.rules import Degree
+from workbench.machine.library_files import is_installed
 
 _STATE_MODES = {"state", "state_dict", "none"}
 """The parts of an ``obs_mode`` for which nothing is drawn."""
@@ -83,7 +86,6 @@ def make(
     """
     _refuse_contradictions(num_envs, kwargs)
     found = _find_task(task)
-    _refuse_unknown_modes(found.cls, kwargs)
     given = {**found.default_kwargs, **kwargs}
     if rules is None and not found.followed and class_is_installed(found.cls):
         rules = "warn"  # an installed task cannot be fixed here
@@ -159,11 +161,16 @@ def _built(
                 "`workbench doctor` says which one to install."
             )
     # gym.make(env.spec, num_envs=2) may change the number.
-    return build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
+    env = build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
+    if isinstance(env, BatchedCpuMixin):
+        for finding in findings_of_shaders(list_cameras(env)):
+            warn_of(finding)
+    return env
 
 
 def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
-    if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
+    whole = isinstance(num_envs, (int, float, np.integer)) and not isinstance(num_envs, bool)
+    if not whole or num_envs != num_envs // 1 or num_envs < 1:
         raise ValueError(f"num_envs must be a whole number from 1 on, not {num_envs!r}")
     if "sim_backend" in kwargs:
         raise ValueError(
@@ -171,21 +178,6 @@ def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
             'backend="cpu" (batched on the CPU), "gpu" (ManiSkill\'s GPU simulation) or "auto". '
             "For stock ManiSkill use gym.make."
         )
-
-
-def _refuse_unknown_modes(cls: type[BaseEnv], kwargs: Mapping[str, Any]) -> None:
-    textures = {*(texture.name for texture in fields(CameraObsTextures)), "rgbd"}
-    known: dict[str, set[Any]] = {
-        "obs_mode": {*cls.SUPPORTED_OBS_MODES, *_STATE_MODES, *textures},
-        "reward_mode": set(cls.SUPPORTED_REWARD_MODES),
-        "render_mode": set(cls.SUPPORTED_RENDER_MODES),
-    }
-    for name, modes in known.items():
-        value = kwargs.get(name)
-        parts = {value} if value in modes or not isinstance(value, str) else set(value.split("+"))
-        if value is not None and (parts - modes or (name != "obs_mode" and value not in modes)):
-            sums = ", or a sum of some as in rgb+depth" if name == "obs_mode" else ""
-            raise ValueError(f"{name}={value!r} is none of {', '.join(sorted(map(str, modes)))}{sums}")
     if kwargs.get("render_backend", "found") in (None, "none"):
         needs = _what_needs_pictures(None, kwargs)
         if needs is not None:

@@ -34,7 +34,7 @@ _TABLE = (
     Rule(
         "id-taken",
         "warn",
-        "No other task has the registered id.",
+        "No other task or robot has a name that the file registers, unless it overrides that on purpose.",
         "Stock ManiSkill skips the registration, and gym.make gives the other task.",
         "class",
     ),
@@ -156,6 +156,13 @@ _TABLE = (
         "warn",
         "Of actors that are made per env and merged, only the merged one is in the state.",
         "The state dict has leaves of another batch size: it cannot be saved, sliced or restored.",
+        "_load_scene",
+    ),
+    Rule(
+        "hidden-objects",
+        "warn",
+        "_hidden_objects has actors without collision shapes, and the merged actor in place of its parts.",
+        "Poses are wrong and sensors see what is hidden; or every picture fails.",
         "_load_scene",
     ),
     Rule(
@@ -404,7 +411,7 @@ _TABLE = (
         "camera-pose",
         "warn",
         "A camera's quaternion has length 1.",
-        "Extrinsics come out scaled: look_at straight down or up does this (tilt the view a little).",
+        "The picture is turned and zoomed, and extrinsics are scaled: look_at straight down or up does this (tilt the view a little).",
         "_default_sensor_configs",
     ),
     Rule(
@@ -420,6 +427,13 @@ _TABLE = (
         "A sensor camera has at most 512 x 512 pixels.",
         "Thousands of envs do not fit the GPU's memory.",
         "_default_sensor_configs",
+    ),
+    Rule(
+        "ray-traced",
+        "warn",
+        "No camera is ray traced: shader_pack is minimal or default.",
+        'render() of several envs raises "ray tracing shaders do not work with parallel rendering".',
+        "_default_human_render_camera_configs",
     ),
     # --- solved by planning (--solve) ------------------------------------------------------------------------
     Rule(

@@ -26,6 +26,7 @@ from workbench.cli.terminal.arguments import (
 )
 from workbench.cli.terminal.output import Exit, end_quietly, interrupted, lacks_maniskill, refuse, warn
 from workbench.jobs.task import ShownPictures
+from workbench.machine.processes.time_limit import end_after, end_limit
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.machine.text import guard_terminal
 
@@ -341,6 +342,7 @@ def show_help(topic: Annotated[str, tyro.conf.Positional] = "", /) -> int:
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point of the ``workbench`` command."""
     guard_terminal()
+    end_after()
     given = list(sys.argv[1:] if args is None else args)
     given, renamed = with_new_names(given)
     for sentence in renamed:
@@ -357,6 +359,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )
         finally:
+            end_limit()
             if sys.stdout is not None:
                 sys.stdout.flush()
     except KeyboardInterrupt:  # during the imports of a command: torch takes seconds

@@ -49,7 +49,7 @@ def test_a_file_gives_its_class_with_what_it_was_registered_with(write: Write) -
     assert (task.file, task.source_files, task.followed) == (path, (path,), True)
     assert task.source == {str(path): path.read_text()}
     assert len(task.source_hash) == 12
-    assert (task.others, task.replaced_ids) == ((), ())
+    assert (task.others, task.replaced) == ((), ())
     assert gym.spec("AuthorPush-v1").max_episode_steps == 7
     assert sys.modules[task.cls.__module__].__file__ == str(path)
 
@@ -210,7 +210,7 @@ def test_a_new_version_is_what_the_tables_have_and_a_dropped_id_is_gone(write: W
     second = load_task(str(path))
     assert second.cls is not first
     assert REGISTERED_ENVS["AuthorPush-v1"].cls is second.cls
-    assert second.replaced_ids == ()
+    assert second.replaced == ()
     # gymnasium refuses a versioned id while the unversioned one is registered, and the reverse.
     for env_id in ("AuthorPush", "AuthorPush-v2", "AuthorPush"):
         path.write_text(path.read_text().replace("AuthorPush-v1", env_id).replace("AuthorPush-v2", env_id))
@@ -227,7 +227,7 @@ def test_a_built_in_id_is_taken_over_and_given_back(write: Write) -> None:
     task = load_task(str(path))
     assert REGISTERED_ENVS["PickCube-v1"].cls is task.cls
     assert gym.spec("PickCube-v1").max_episode_steps == 7
-    assert task.replaced_ids == ("PickCube-v1",)
+    assert [one.name for one in task.replaced] == ["PickCube-v1"]
     path.write_text(path.read_text().replace("PickCube-v1", "AuthorPush-v1"))
     load_task(str(path))
     assert REGISTERED_ENVS["PickCube-v1"].cls is built_in

@@ -119,7 +119,7 @@ def test_taking_a_load_back_leaves_what_a_newer_one_put_under_the_name() -> None
     before = registered()
     first, old = _registered("AuthorRegistry-v1")
     second, new = _registered("AuthorRegistry-v1")
-    assert second.replaced_names() == ("AuthorRegistry-v1",) and first.replaced_names() == ()
+    assert [one.name for one in second.replaced()] == ["AuthorRegistry-v1"] and first.replaced() == ()
     first.undo()
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is new
     # The failed load that came between has no part in the name either.
@@ -211,9 +211,18 @@ def test_a_robot_that_replaces_another_is_put_in_its_place() -> None:
             agents.register_agent()(type("Robot", (Panda,), {}))
         again = agents.register_agent(override=True)(type("Robot", (Panda,), {}))
     assert robot is not again and agent_registration.REGISTERED_AGENTS["panda"].agent_cls is again
-    assert registrations.replaced_names() == ("panda",)
+    assert [(one.name, one.is_robot) for one in registrations.replaced()] == [("panda", True)]
     registrations.undo()
     assert registered() == before
+
+
+def test_what_overrides_another_on_purpose_is_not_told_as_taken() -> None:
+    registrations = registry.Registrations()
+    with registry.registering(lambda file: file == THIS_FILE, registrations):
+        agents.register_agent(override=True)(type("Robot", (Panda,), {}))
+        env_registration.register_env("PickCube-v1", override=True)(type("Task", (BaseEnv,), {}))
+    assert registrations.replaced() == ()
+    registrations.undo()
 
 
 def test_a_librarys_agents_are_registered_as_they_always_are() -> None:
@@ -239,6 +248,6 @@ def test_a_name_is_somebody_elses_in_any_table_but_that_of_downloads() -> None:
         class Robot(Panda):
             uid = "fetch"
 
-    assert registrations.replaced_names() == ("CartPole-v1", "fetch")
+    assert [one.name for one in registrations.replaced()] == ["CartPole-v1", "fetch"]
     registrations.undo()
     assert registry.is_other_gymnasium_id("CartPole-v1") and assets.DATA_GROUPS["AuthorDownloads-v1"] == []

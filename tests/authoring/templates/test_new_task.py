@@ -54,7 +54,7 @@ def test_a_task_of_maniskill_is_copied_with_its_class_wherever_it_is_named(tmp_p
     assert len(task.ids) > 1 and made.reference == "lift_it.py:LiftItEnv"
     assert all(uid.startswith("LiftIt") for uid in task.ids)
     loaded = load_task(f"{made.file}:LiftItEnv")
-    assert (loaded.env_id, loaded.replaced_ids) == ("LiftIt-v1", ())
+    assert (loaded.env_id, loaded.replaced) == ("LiftIt-v1", ())
 
 
 def test_every_literal_id_of_maniskill_can_be_looked_up_without_importing_it() -> None:

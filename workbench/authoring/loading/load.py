@@ -7,7 +7,6 @@ import difflib
 import importlib
 import inspect
 import sys
-import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 from workbench.authoring.loading import registry
 from workbench.authoring.loading.library_names import (
     files_named_like_libraries,
-    is_own_file,
     named_like_library_text,
     remove_library_finder,
     search_first,
@@ -86,8 +84,8 @@ class LoadedTask:
     """The class that was tried first and failed."""
     robot: Robot | None = None
     """Shown in a scene of ManiSkill, for a file without a task."""
-    replaced_ids: tuple[str, ...] = ()
-    """Ids that another task had (``PickCube-v1``): plain ManiSkill would skip this file's class."""
+    replaced: tuple[registry.Registration, ...] = ()
+    """Names that another task or robot had (``PickCube-v1``): plain ManiSkill would skip this file's class."""
     named_like_libraries: tuple[Path, ...] = ()
     """Files of its folder that no import finds, because a library has their name."""
 
@@ -111,11 +109,11 @@ class LoadedTask:
             found.append(f"{name} was tried first and failed ({why}): {self.chosen} is open in its place.")
         if self.robot is not None and self.file is not None:
             found.append(robot_scene_text(self.robot, self.file))
-        if self.replaced_ids:
-            ids = ", ".join(self.replaced_ids)
+        if self.replaced:
+            names = ", ".join(one.name for one in self.replaced)
             found.append(
-                f"{self.file} registers {ids}, which belonged to another task: here it is this file's class from now "
-                "on, and plain ManiSkill would skip that class. Register another id to have both."
+                f"{self.file} registers {names}, which exists already: here it is this file's class from now on, and "
+                "plain ManiSkill would skip that class. Choose another name to have both, or register with override=True."
             )
         return tuple(found)
 
@@ -447,7 +445,7 @@ def _task_in(module: ModuleType, requested: str | None, load: _Load) -> LoadedTa
         others=chosen.others,
         alternatives=chosen.alternatives,
         robot=chosen.robot,
-        replaced_ids=load.registrations.replaced_names(),
+        replaced=load.registrations.replaced(),
         named_like_libraries=hidden_by_libraries(finder.file, finder.search_folder),
         **_source_fields(finder),
     )
@@ -498,12 +496,7 @@ def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
 
 def _named_module_problem(exc: BaseException, module: NamedModule) -> Problem:
     """The problem of a named module that is imported as Python does."""
-    folder = module.own_folder or module.file.parent
-    files = [Path(frame.filename) for frame in traceback.extract_tb(exc.__traceback__)]
-    if isinstance(exc, SyntaxError) and exc.filename is not None:
-        files.append(Path(exc.filename))
-    own = [file for file in files if file == module.file or is_own_file(str(file), folder)]
-    problem = problem_from_exception(exc, "import", own)
+    problem = problem_from_exception(exc, "import", [module.file])
     message = f"{module.name} cannot be imported: {problem.message}"
     return dataclasses.replace(problem, message=message, file=problem.file or str(module.file))
 

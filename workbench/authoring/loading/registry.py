@@ -41,6 +41,12 @@ class Registration:
     cls: type
     file: str
     line: int
+    override: bool
+    """It was asked to take the place of another."""
+
+    @property
+    def is_robot(self) -> bool:
+        return issubclass(self.cls, BaseAgent)
 
 
 @dataclass
@@ -70,11 +76,14 @@ class Registrations:
             self.displaced[name] = _take(name)
             _put(name, self.placed[name])
 
-    def replaced_names(self) -> tuple[str, ...]:
-        """Names that were registered before, such as those of built-in tasks."""
-        return tuple(
-            name for name, slot in self.displaced.items() if any(value is not _NOTHING for value in slot[:3])
-        )
+    def replaced(self) -> tuple[Registration, ...]:
+        """Those that plain ManiSkill skips: the name was registered before, as those of built-in tasks, and they do not
+        override it."""
+        first = {made.name: made for made in reversed(self.made)}
+        taken = [
+            name for name, slot in self.displaced.items() if any(one is not _NOTHING for one in slot[:3])
+        ]
+        return tuple(first[name] for name in taken if name in first and not first[name].override)
 
 
 def environment(env_id: str) -> EnvSpec | None:
@@ -132,7 +141,7 @@ def registering(is_own: Callable[[str], bool], registrations: Registrations) -> 
         registrations.displaced.setdefault(name, _take(name))
         _put(name, (_NOTHING,) * len(_TABLES))
         result = register()
-        registrations.made.append(Registration(name, cls, file, line))
+        registrations.made.append(Registration(name, cls, file, line, override))
         registrations.placed[name] = _take(name)
         return result
 

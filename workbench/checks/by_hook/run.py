@@ -244,7 +244,8 @@ def _is_known(error: Problem, checkup: Checkup, degrees: Mapping[str, Degree]) -
 
 def raised(error: Problem, checkup: Checkup) -> Found:
     """What the task raised, as a breach of the rule `runs`."""
-    place = None if error.file is None else (error.file, error.line or 1, error.stage)
+    file, line = error.file, error.line
+    place = None if file is None or line is None else (file, line, error.stage)
     early = checkup.fails_with_several
     alike = early is not None and (early.stage, early.file, early.line) == (
         error.stage,

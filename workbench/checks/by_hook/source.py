@@ -76,11 +76,12 @@ def time_limit(checkup: Checkup) -> Iterator[Found | Note]:
 def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
     """What was registered before this file was loaded."""
     _needs_id(checkup)
-    for env_id in checkup.loaded.replaced_ids:
+    for made in checkup.loaded.replaced:
+        of, gives = ("robot", "robot_uids=") if made.is_robot else ("task", "gym.make of ")
         yield Found(
-            f"{env_id} is another task's: plain ManiSkill skips this class, and gym.make({env_id!r}) makes the "
-            "other. Choose an id that no task has.",
-            _decorator(checkup),
+            f"{made.name} is another {of}'s: plain ManiSkill skips this class, and {gives}{made.name!r} gives the other. "
+            f"Choose a name that no {of} has, or register with override=True.",
+            (made.file, made.line, made.cls.__name__),
         )
 
 

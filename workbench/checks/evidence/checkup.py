@@ -200,7 +200,7 @@ class Checkup:
     def require_several(self) -> None:
         """Raise NotKnown for one env."""
         if self.num_envs == 1:
-            raise NotKnown("it needs several envs, and one was asked for")
+            raise NotKnown("it needs several envs, and one was looked at")
 
     def require_source(self) -> None:
         """Raise NotKnown for a class without a file: from a notebook, or shipped as bytecode."""

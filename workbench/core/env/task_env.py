@@ -24,6 +24,7 @@ from workbench.core.env.keywords import constructor_arguments
 from workbench.core.env.partial_reset import in_ascending_order, seeded
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.strict import StrictMixin
+from workbench.core.env.wrong_options import wrong_option
 from workbench.core.env_numbers import envs_of_batch
 from workbench.core.maniskill_private import episode_seeds, flatten_observation, keep_observation
 from workbench.core.rules import Degree, Finding, degrees_of
@@ -96,6 +97,7 @@ def make_env(
     Raises:
         MissingAssets: the task or its robot needs a download; names it and the command.
         BackendUnavailable: ``backend="gpu"`` on a machine that cannot, or a ManiSkill that lacks names which are needed.
+        WrongOption: a keyword argument of `options` does not exist, or has an unknown value.
         Exception: raised by the author's class while it builds.
     """
     reward = {"reward_mode": default_reward_mode(task)}
@@ -125,15 +127,20 @@ def build_env(
     kwargs["render_backend"] = backend.render_backend if wanted == "found" else wanted
     if kwargs["render_backend"] != "none":
         keep_render_device(kwargs["render_backend"])
-    with refuse_downloads(task.__name__):
-        if backend.simulation == "gpu":
-            if options.pictures == "fast":
-                raise BackendUnavailable(_NO_FAST_PICTURES)
-            env = task(sim_backend="physx_cuda", **kwargs)
-            refuse_unbuilt_env(env, task, options.num_envs)
-            return env
-        made = batched_class(task, options.threads, options.rules, options.on_finding, options.pictures)
-        return made(**kwargs)
+    if backend.simulation == "gpu" and options.pictures == "fast":
+        raise BackendUnavailable(_NO_FAST_PICTURES)
+    try:
+        with refuse_downloads(task.__name__):
+            if backend.simulation == "gpu":
+                env = task(sim_backend="physx_cuda", **kwargs)
+                refuse_unbuilt_env(env, task, options.num_envs)
+                return env
+            made = batched_class(task, options.threads, options.rules, options.on_finding, options.pictures)
+            return made(**kwargs)
+    except Exception as error:
+        if (wrong := wrong_option(task, options.kwargs, error)) is not None:
+            raise wrong from error
+        raise
 
 
 _NO_FAST_PICTURES = (
@@ -360,6 +367,8 @@ def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
 def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
     """(N, ...), a copy; a single value (of a task written for one env) is repeated."""
     array = np.array(value.numpy(force=True) if isinstance(value, torch.Tensor) else value, dtype)
+    if num_envs == array.size == 1:
+        return array.reshape(1)
     batched = array.ndim > 0 and len(array) == num_envs
     return array if batched else np.broadcast_to(array, (num_envs, *array.shape)).copy()
 

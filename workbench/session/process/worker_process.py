@@ -177,7 +177,10 @@ class WorkerProcess:
             return ""  # before its handlers are installed the signal would end it
         with self._look_lock:
             start = size = os.fstat(self._stacks).st_size
-            os.kill(self.pid, STACK_SIGNAL)
+            try:
+                os.kill(self.pid, STACK_SIGNAL)
+            except ProcessLookupError:
+                return ""  # it died meanwhile; `receive` reports it
             deadline = time.monotonic() + patience
             while time.monotonic() < deadline:
                 time.sleep(0.005)

@@ -1,0 +1,51 @@
+"""Keyword arguments that ManiSkill refuses are told as the caller's, with what exists instead."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import workbench
+from workbench.core.env.wrong_options import WrongOption
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [
+        ({"robot_uids": "pnada"}, ["robot_uids", "pnada", "panda"]),
+        ({"robot_uid": "panda"}, ["robot_uid", "robot_uids"]),
+        ({"control_mode": "pd_joint_delta"}, ["control_mode", "pd_joint_delta_pos"]),
+        ({"obs_mode": "state+rbg"}, ["obs_mode", "'rbg'", "rgb"]),
+        ({"reward_mode": "dens"}, ["reward_mode", "'dens'", "dense"]),
+        ({"sensor_configs": {"base_camra": {"width": 64}}}, ["sensor_configs", "base_camra", "base_camera"]),
+        ({"sensor_configs": {"base_camera": {"shader_pack": "rt-fats"}}}, ["base_camera", "rt-fast"]),
+        ({"sensor_configs": {"widht": 64}}, ["widht", "width"]),
+        ({"sim_config": {"scene_config": {"gravty": [0, 0, 0]}}}, ["scene_config", "gravty", "gravity"]),
+    ],
+)
+def test_it_is_named_with_the_nearest_that_exists(given: dict[str, Any], names: list[str]) -> None:
+    with pytest.raises(WrongOption) as caught:
+        workbench.make("PickCube-v1", num_envs=2, **given)
+    for name in names:
+        assert name in str(caught.value)
+
+
+def test_an_error_of_the_task_itself_stays_the_tasks(tmp_path: Path) -> None:
+    file = tmp_path / "own.py"
+    file.write_text(
+        "from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv\n"
+        "from mani_skill.utils.registration import register_env\n"
+        "@register_env('OwnOptions-v1')\n"
+        "class Own(PickCubeEnv):\n"
+        "    def __init__(self, *args, **kwargs):\n"
+        "        size = kwargs.pop('size')\n"
+        "        if size > 1:\n"
+        "            raise TypeError('too large')\n"
+        "        super().__init__(*args, **kwargs)\n"
+    )
+    workbench.make(str(file), num_envs=2, size=1).close()
+    with pytest.raises(TypeError) as caught:
+        workbench.make(str(file), num_envs=2, size=2)
+    assert not isinstance(caught.value, WrongOption)
