@@ -263,9 +263,12 @@ class Page:
 
     def _draw_scene(self, view: SessionView) -> None:
         task, step, seen = view.task, view.step, view.shown_cameras
+        if task is None:
+            # The bodies are those of the page before.
+            self._scene.hide()
+            return
         if (
-            task is None
-            or step is None
+            step is None
             or seen is None
             or step.poses.shape[:2]
             != (
