@@ -59,10 +59,8 @@ def test_every_fold_is_reached_by_tab_and_opened_by_enter_and_space(
         assert desk.errors == []
 
 
-def test_the_palette_finds_places_envs_cameras_and_control_modes(
-    example_without_pictures: At, browser: Browser
-) -> None:
-    with example_without_pictures(browser) as desk:
+def test_the_palette_finds_places_envs_cameras_and_control_modes(example: At, browser: Browser) -> None:
+    with example(browser) as desk:
         page = desk.page
         choose(page, "reward tab")
         expect(page.get_by_role("tab", name="Reward")).to_have_attribute("aria-selected", "true")
@@ -71,8 +69,8 @@ def test_the_palette_finds_places_envs_cameras_and_control_modes(
         expect(fold).to_have_attribute("aria-expanded", "true")
         expect(fold).to_be_in_viewport()
         expect(fold).to_be_focused()
-        choose(page, "env 2")
-        desk.timeline_says("env 2")
+        choose(page, "env 1")
+        desk.timeline_says("env 1")
         choose(page, "base_camera")
         expect(page.get_by_role("tab", name="Studio")).to_have_attribute("aria-selected", "true")
         expect(page.get_by_role("combobox", name="Camera")).to_have_value(re.compile("base_camera"))

@@ -258,9 +258,8 @@ def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_o
     file = folder / "work/torn.py"
     with page_at(browser, started.url) as (page, errors):
         open_list(page)
-        page.keyboard.type("push.py")
-        page.keyboard.press("Enter")
-        runs(page, "WorkbenchPushCube-v1")
+        row(page, "sub/small.py").click()
+        runs(page, "WorkbenchMinimal-v1")
         assert len(np.unique(view_of(page).reshape(-1, 3), axis=0)) > 100, "the task is seen"
         file.write_text(
             "from x import y\n\nclass Task(BaseEnv):\n    def evaluate(self)\n        return {}\n"
@@ -274,8 +273,8 @@ def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_o
         expect(page.get_by_text("torn.py", exact=True)).to_be_visible()
         assert len(np.unique(view_of(page).reshape(-1, 3), axis=0)) < 100, "an empty view"
         started.wait_for_line(r"torn\.py:4")
-        shutil.copy(TASK.parent / "minimal.py", file)
-        runs(page, "WorkbenchMinimal-v1")
+        shutil.copy(TASK, file)
+        runs(page, "WorkbenchPushCube-v1")
         expect(banner).to_be_hidden()
         assert errors == []
 
