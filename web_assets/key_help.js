@@ -1,5 +1,7 @@
 // The keys where they are looked for: in the tooltip of the button that does the same, and in a list that "?" opens.
 //
+// The palette shows a key as viser calls it (arrowleft) behind the name that people use: the former is taken away.
+//
 // viser's buttons have no tooltips of their own. Which key belongs to which button, and the list, come with the page
 // (.wb-all-keys); a panel that is folded takes them out of the page, so the last ones are kept.
 "use strict";
@@ -30,6 +32,13 @@
     },
     true,
   );
+
+  new MutationObserver(() => {
+    for (const { firstChild } of document.querySelectorAll(".mantine-Spotlight-actionDescription")) {
+      const name = firstChild?.nodeValue?.replace(/ {2}\(.*\)$/, "");
+      if (name && name !== firstChild.nodeValue) firstChild.nodeValue = name;
+    }
+  }).observe(document, { childList: true, subtree: true });
 
   function open() {
     read();

@@ -75,6 +75,7 @@
       const named = (tab) => tab.textContent.trim().replace(/ \d+$/, "") === sheet.dataset.openTab;
       const enter = { key: "Enter", code: "Enter", bubbles: true };
       [...document.querySelectorAll("[role=tab]")].find(named)?.dispatchEvent(new KeyboardEvent("keydown", enter));
+      if (sheet.dataset.openFold) wb.openFold(sheet.dataset.openFold);
     },
 
     follow(sheet) {

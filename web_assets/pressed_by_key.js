@@ -32,6 +32,7 @@
     (event) => {
       byPointer = false;
       remember(event);
+      if (event.key === "Tab") walkedTo = ""; // or the last part of the page would get the focus back for ever
       const part = event.target instanceof Element && event.target.matches(PARTS) ? event.target : null;
       if (!part || event.altKey) return;
       const list = part.closest("[data-roving]");

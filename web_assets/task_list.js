@@ -3,6 +3,8 @@
 // The marked row is the browser's own matter: two people at two browsers do not move each other's. A row is pressed as by
 // a mouse (pressed.js), so only its number is sent. Enter waits until the list is that of the words in the field: they
 // arrive a moment after they were typed, and it would open what was marked before.
+//
+// The list follows its folder: where a row comes or goes above the one under the pointer, the page is scrolled by as much.
 "use strict";
 {
   const PATIENCE = 2000; // milliseconds
@@ -103,6 +105,27 @@
     if (row) mark(row.closest(".wb-tasks"), row.dataset.row);
   });
 
+  let pointer = null; // where it is, and the row under it
+  const rowAt = (x, y) => document.elementFromPoint(x, y)?.closest(".wb-tasks [data-row]");
+  function remember(x, y) {
+    const row = rowAt(x, y);
+    pointer = { x, y, row: row?.dataset.row, top: row?.getBoundingClientRect().top, words: lists()?.dataset.words };
+  }
+  window.addEventListener("pointermove", ({ clientX, clientY }) => lists() && remember(clientX, clientY), true);
+  window.addEventListener("scroll", () => pointer && lists() && remember(pointer.x, pointer.y), true);
+
+  function keepUnderPointer(list) {
+    if (!pointer?.row || pointer.words !== list.dataset.words) return;
+    const row = list.querySelector(`[data-row="${CSS.escape(pointer.row)}"]`);
+    const moved = row ? row.getBoundingClientRect().top - pointer.top : 0;
+    for (let around = list; moved && around; around = around.parentElement) {
+      if (around.scrollHeight > around.clientHeight && ["auto", "scroll"].includes(getComputedStyle(around).overflowY)) {
+        around.scrollTop += moved;
+        return;
+      }
+    }
+  }
+
   let there = null;
   new MutationObserver(() => {
     const list = lists();
@@ -110,6 +133,7 @@
       there = null;
       return;
     }
+    keepUnderPointer(list);
     markAgain(list);
     if (there) return;
     there = list;

@@ -179,7 +179,7 @@ def shoot_reload(browser: Browser) -> None:
             desk.edit(*edit)
             expect(desk.page.get_by_text(level).first).to_be_visible(timeout=60_000)
             desk.page.get_by_text("Code version", exact=True).scroll_into_view_if_needed()
-            desk.page.get_by_role("button", name="Rebuild", exact=True).scroll_into_view_if_needed()
+            desk.page.get_by_role("button", name="Rebuild the scene", exact=True).scroll_into_view_if_needed()
             for theme in THEMES:
                 desk.wear(theme)
                 time.sleep(FRAME)

@@ -164,7 +164,7 @@ def test_a_patch_keeps_the_step_and_says_so_and_a_rebuild_can_be_asked_for(calm:
     expect(
         calm.page.get_by_text("only compute_dense_reward changed").locator("visible=true").first
     ).to_be_visible()
-    calm.button("Rebuild").click()
+    calm.button("Rebuild the scene").click()
     expect(calm.page.get_by_text("rebuilt was requested").locator("visible=true").first).to_be_visible()
     calm.tab("Reward")
     assert calm.elapsed() == 1

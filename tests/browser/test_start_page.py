@@ -9,14 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from tests.drive.page import TASK, Opened, close_notice, open_workbench, page_at
+from tests.drive.page import TASK, Opened, close_notice, open_workbench, page_at, picture_of_view
 from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.machine.maniskill_installed import installed_maniskills
 from workbench.session.tasks.registered import LIST_FILE
-from workbench.ui.app.trust_dialog import ONCE
+from workbench.ui.app.trust_dialog import DO_NOT, ONCE
 
 # The first begins at the start page, which is gone once a task is open.
 pytestmark = [pytest.mark.browser, pytest.mark.random_order(disabled=True)]
@@ -71,12 +73,58 @@ def runs(page: Page, title: str, envs: str = "2 envs") -> None:
     expect(status).to_contain_text("paused", timeout=PATIENT)
 
 
+def view_of(page: Page) -> NDArray[np.uint8]:
+    """The middle of the 3-D view."""
+    return picture_of_view(page, {"x": 150, "y": 250, "width": 500, "height": 250})
+
+
 def open_list(page: Page) -> None:
     """The dialog; where no task is open yet, the list is there already."""
     expect(page.locator(".wb-status, .wb-start").first).to_be_visible(timeout=PATIENT)
     if page.locator(".wb-status").count():
         page.keyboard.press("Control+o")
         expect(page.get_by_role("dialog").locator(".wb-tasks")).to_be_visible()
+
+
+def test_the_list_follows_its_folder_and_takes_a_path(
+    started: Opened, folder: Path, browser: Browser
+) -> None:
+    with page_at(browser, started.url) as (page, errors):
+        expect(row(page, "push.py")).to_be_visible(timeout=PATIENT)
+        close_notice(page)
+        # What is under the pointer stays there, while rows come and go above it.
+        example = row(page, "swing_up.py")
+        example.hover()
+        before = example.bounding_box()
+        shutil.copy(TASK, folder / "work/a_new_one.py")
+        (folder / "work/broken.py").write_text("class Task(BaseEnv):\n    def evaluate(self)\n")
+        expect(row(page, "a_new_one.py")).to_be_attached()
+        expect(row(page, "broken.py")).to_contain_text("line 2")
+        assert before is not None and (box := example.bounding_box()) is not None
+        assert abs(box["y"] - before["y"]) < 2
+        (folder / "work/a_new_one.py").rename(folder / "work/renamed.py")
+        expect(row(page, "renamed.py")).to_be_attached()
+        expect(row(page, "a_new_one.py")).to_have_count(0)
+        for name in ("renamed.py", "broken.py"):
+            (folder / "work" / name).unlink()
+            expect(row(page, name)).to_have_count(0)
+        # A path that is wrong, and one as a terminal gives it.
+        search = page.get_by_role("textbox").first
+        search.fill(f"{folder}/elsewhere/othr.py")
+        expect(page.locator(".wb-tasks")).to_contain_text("did you mean other.py")
+        search.fill(f" '{folder}/elsewhere/other.py' ")
+        expect(row(page, f"{folder}/elsewhere/other.py")).to_be_visible()
+        expect(marked(page)).to_contain_text("elsewhere/other.py")
+        page.keyboard.press("Enter")
+        # It is outside of the folder: nothing runs unasked.
+        question = page.get_by_role("dialog")
+        expect(question).to_contain_text(f"{folder}/elsewhere/other.py", timeout=PATIENT)
+        question.get_by_role("button", name=DO_NOT).click()
+        expect(question).to_be_hidden()
+        # The search is the same for all browsers.
+        search.fill("")
+        expect(row(page, "push.py")).to_be_visible()
+        assert errors == []
 
 
 @pytest.mark.slow
@@ -201,6 +249,33 @@ def test_a_new_task_is_created_with_the_mouse_and_opens(
         expect(page.locator(".wb-status")).to_contain_text("ant")
         text = (folder / "work/walk_far.py").read_text()
         assert "class WalkFarEnv(BaseEnv)" in text and '@register_env("WalkFar-v1"' in text
+        assert errors == []
+
+
+def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_once_mended(
+    started: Opened, folder: Path, browser: Browser
+) -> None:
+    file = folder / "work/torn.py"
+    with page_at(browser, started.url) as (page, errors):
+        open_list(page)
+        row(page, "sub/small.py").click()
+        runs(page, "WorkbenchMinimal-v1")
+        assert len(np.unique(view_of(page).reshape(-1, 3), axis=0)) > 100, "the task is seen"
+        file.write_text(
+            "from x import y\n\nclass Task(BaseEnv):\n    def evaluate(self)\n        return {}\n"
+        )
+        open_list(page)
+        page.keyboard.type("torn")
+        expect(row(page, "torn.py")).to_contain_text("line 4")
+        page.keyboard.press("Enter")
+        banner = page.locator(".wb-banner")
+        expect(banner).to_contain_text("torn.py:4", timeout=PATIENT)
+        expect(page.get_by_text("torn.py", exact=True)).to_be_visible()
+        assert len(np.unique(view_of(page).reshape(-1, 3), axis=0)) < 100, "an empty view"
+        started.wait_for_line(r"torn\.py:4")
+        shutil.copy(TASK, file)
+        runs(page, "WorkbenchPushCube-v1")
+        expect(banner).to_be_hidden()
         assert errors == []
 
 

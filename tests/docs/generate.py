@@ -98,8 +98,9 @@ def keys_page(commands: Commands) -> str:
         [
             "# Keys",
             "",
-            "`?` on the page shows its keys. Ctrl+K opens a list of all commands by name, including those without a key. Keys do not",
-            "work while you type in a text or number field. This page is made from the code.",
+            "`?` on the page shows its keys. Ctrl+K opens a list of all commands by name, including those without a key,",
+            "and of tabs, folds, envs, cameras and control modes: type `env 7`, `base_camera` or `pd_ee_delta_pose`, then Enter. Keys",
+            "do not work while you type in a text or number field. This page is made from the code.",
             "",
             "## Live page",
             "",
@@ -118,15 +119,8 @@ def keys_page(commands: Commands) -> str:
 
 
 def table(commands: Iterator[Command] | Sequence[Command]) -> list[str]:
-    rows = [f"| {key_of(one)} | {one.label} |" for one in commands if one.key]
+    rows = [f"| {one.key_name} | {one.label} |" for one in commands if one.key]
     return ["| key | what it does |", "| --- | --- |", *rows]
-
-
-def key_of(command: Command) -> str:
-    """``Shift+R``; the page writes it with a space."""
-    held = [part for part in (command.modifier or "").split("+") if part]
-    name = command.key_name.split(" ", len(held))[-1]
-    return "+".join([*(part.removeprefix("cmd/").capitalize() for part in held), name])
 
 
 # --- commands -----------------------------------------------------------------------------------------

@@ -102,6 +102,20 @@ class Problem:
     """As Python prints it, shortened; may be empty."""
     interrupted: bool = False
     """A person stopped it."""
+    column: int | None = None
+    """1-based, in `code`: where Python cannot read on."""
+
+    @property
+    def what_failed(self) -> str:
+        """Begins a message in the terminal."""
+        if self.stage == "syntax":
+            return "not Python yet"
+        return "not loaded" if self.has_no_place else f"{self.stage} failed"
+
+    @property
+    def has_no_place(self) -> bool:
+        """No line of the file failed: it is empty, has no task, or is not there."""
+        return self.stage == "import" and self.line is None
 
 
 class TaskError(Exception):
@@ -298,7 +312,11 @@ def _syntax_problem(exc: SyntaxError) -> Problem:
     text = exc.text or linecache.getline(exc.filename, exc.lineno or 1)
     # Only the exception itself: the frames are those of the compiler's caller.
     lines = "".join(tracebacks.format_exception_only(type(exc), exc)).rstrip("\n")
-    return Problem("syntax", _message(exc), exc.filename, exc.lineno, shorten(text) or None, lines)
+    code = shorten(text)
+    column = (exc.offset or 0) - (len(text) - len(text.lstrip()))
+    if code != text.strip() or not 1 <= column <= len(code) + 1:
+        column = None
+    return Problem("syntax", _message(exc), exc.filename, exc.lineno, code or None, lines, column=column)
 
 
 def _message(exc: BaseException) -> str:

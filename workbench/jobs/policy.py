@@ -8,6 +8,7 @@ import importlib
 import importlib.machinery
 import importlib.util
 import linecache
+import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping
@@ -144,7 +145,7 @@ def policy_problem(
 def _is_module_of(file: Path, reference: str, task_folder: Path | None) -> bool:
     name = reference.rpartition(":")[0]
     if name.endswith(".py"):
-        path = Path(name).expanduser()
+        path = Path(os.path.expanduser(name))
         return file in (path.resolve(), (task_folder or Path()).joinpath(path).resolve())
     module = sys.modules.get(name)
     if module is not None and module.__spec__ is not None:
@@ -156,7 +157,7 @@ def _is_module_of(file: Path, reference: str, task_folder: Path | None) -> bool:
 
 def _find(name: str, task_folder: Path | None) -> Path:
     """The file's path: in the current folder, else in the task's."""
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))
     here = path.resolve()
     if here.is_file():
         return here
@@ -242,7 +243,7 @@ class PolicyFile:
         name = (reference or "").rpartition(":")[0]
         files: list[Path] = []
         if name.endswith(".py"):
-            path = Path(name).expanduser()
+            path = Path(os.path.expanduser(name))
             files = [path, *([] if task_folder is None else [task_folder / path])]
         if files == self._files:
             return

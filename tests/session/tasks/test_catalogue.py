@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,10 +15,12 @@ from PIL import Image
 
 from tests.drive.waiting import until
 from workbench.jobs.task import TaskOptions
+from workbench.session.tasks import catalogue as catalogue_module
 from workbench.session.tasks import registered as registered_module
 from workbench.session.tasks.catalogue import Catalogue, Entry, Section
 from workbench.session.tasks.recents import RecentTasks
 from workbench.session.tasks.registered import LIST_FILE, RegisteredTasks
+from workbench.session.tasks.typed import NotAPath
 
 TASK = "class Task(BaseEnv): pass\n"
 
@@ -52,7 +55,7 @@ def made(tmp_path: Path) -> Iterator[Callable[..., Catalogue]]:
 
 def listed(catalogue: Catalogue) -> dict[Section, list[Entry]]:
     catalogue.refresh()
-    until(lambda: not catalogue.view().searching and not catalogue.registered.view.doing, "the list")
+    until(lambda: catalogue._searching is None and not catalogue.registered.view.doing, "the list")
     until(lambda: catalogue.registered.view.ids or catalogue.registered.view.problem, "the ids")
     rows = catalogue.view().entries
     return {section: [one for one in rows if one.section is section] for section in Section}
@@ -96,6 +99,115 @@ def test_only_a_listed_number_is_an_entry_and_it_is_never_anothers(
     file.write_text(TASK)
     again = {one.name: one.number for one in listed(catalogue)[Section.FOLDER]}
     assert again == {"push.py": entry.number, "other.py": other.number}
+
+
+def test_the_list_follows_its_folder_and_stays_the_same_while_nothing_changes(
+    made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(catalogue_module, "SEARCH_SECONDS", 0.02)
+    catalogue = made()
+    work = tmp_path / "work"
+
+    def comes_to(*names: str) -> None:
+        def seen() -> list[str]:
+            catalogue.follow()
+            return [one.name for one in catalogue.view().entries if one.section is Section.FOLDER]
+
+        until(lambda: seen() == list(names), f"the rows {names}", seen=seen)
+
+    comes_to()
+    (work / "push.py").write_text(TASK)
+    comes_to("push.py")
+    (work / "pull.py").write_text("class Task(BaseEnv)\n    pass\n")
+    comes_to("pull.py", "push.py")
+    assert "line 1" in catalogue.view().entries[0].about, "where it is not Python yet"
+    (work / "pull.py").write_text(TASK)
+    until(
+        lambda: (catalogue.follow(), catalogue.view().entries[0].about)[1] == "Task",
+        "the class, once it is mended",
+    )
+    (work / "push.py").rename(work / "shove.py")
+    comes_to("pull.py", "shove.py")
+    (work / "pull.py").unlink()
+    comes_to("shove.py")
+    searches: list[int] = []
+    find = catalogue_module.find_task_files
+    monkeypatch.setattr(
+        catalogue_module, "find_task_files", lambda *given: (searches.append(1), find(*given))[1]
+    )
+    serial = catalogue.view().serial
+    until(lambda: (catalogue.follow(), len(searches))[1] > 2, "further searches")
+    assert catalogue.view().serial == serial
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{work}/my task.py",
+        "my task.py",
+        "./my task.py",
+        "../work/my task.py",
+        "  {work}/my task.py \t",
+        "'{work}/my task.py'",
+        '"my task.py" ',
+        "file://{work}/my%20task.py",
+        "~/work/my task.py",
+        "{work}/my task.py:88",
+        "my task.py:88:4",
+    ],
+)
+def test_a_typed_path_is_a_row(
+    made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    catalogue, work = made(), tmp_path / "work"
+    monkeypatch.chdir(work)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (work / "my task.py").write_text(TASK)
+    entry = catalogue.typed(text.format(work=work))
+    assert entry is not None and catalogue.entry(entry.number) == entry
+    assert (entry.section, entry.file, entry.reference) == (
+        Section.TYPED,
+        work / "my task.py",
+        str(work / "my task.py"),
+    )
+
+
+def test_a_typed_class_is_opened_and_words_are_no_path(
+    made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    catalogue, work = made(), tmp_path / "work"
+    monkeypatch.chdir(work)
+    (work / "lab").mkdir()
+    (work / "lab/push.py").write_text(TASK)
+    for text in ("lab/push.py:Task", " 'lab/push.py:Task' ", "lab.push:Task"):
+        entry = catalogue.typed(text)
+        assert entry is not None and entry.reference == f"{work}/lab/push.py:Task"
+    for text in ("", "   ", "push", "lab", "push cube", "PickCube-v1", "nolab.push:Task"):
+        assert catalogue.typed(text) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("/no/such/push.py", "/no/such"),
+        ("pusch.py", "push.py"),
+        ("{work}", "push.py"),
+        ("~", "folder"),
+        ("notes.txt", "not a .py file"),
+        ("~nosuchuser/push.py", "~nosuchuser"),
+        ("/dev/null", "/dev/null"),
+        ("/" + "x" * 300 + ".py", "xxx"),
+    ],
+)
+def test_what_is_wrong_with_a_typed_path_is_told(
+    made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, said: str
+) -> None:
+    catalogue, work = made(), tmp_path / "work"
+    monkeypatch.chdir(work)
+    (work / "push.py").write_text(TASK)
+    (work / "notes.txt").write_text("")
+    with pytest.raises(NotAPath, match=re.escape(said)):
+        catalogue.typed(text.format(work=work))
 
 
 def test_a_cached_list_names_no_file_and_no_module(made: Callable[..., Catalogue]) -> None:

@@ -239,8 +239,8 @@ def test_buttons_name_their_keys_and_every_key_is_listed(opened: Opened) -> None
     told = opened.panels.html("wb-all-keys")
     for button, key in (
         ("Play", "Space"),
-        ("Reset this env", "Shift R"),
-        ("‹ event", "Shift ←"),
+        ("Reset this env", "Shift+R"),
+        ("‹ event", "Shift+Left arrow"),
         ("live", "End"),
     ):
         escaped = json.dumps({button: key})[1:-1].replace('"', "&#34;")

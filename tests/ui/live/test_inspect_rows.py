@@ -83,7 +83,7 @@ PRESSED = Touching(
 def test_a_contact_is_told_in_newtons_with_its_place() -> None:
     html = inspect_html("contacts", running(1), Inspection(0, 5, contacts=(PRESSED,)), None)
     for words in (
-        "<b>cube</b> by &lt;i&gt;table&lt;/i&gt;",
+        "<b>cube</b> ← &lt;i&gt;table&lt;/i&gt;",
         ">5 N<",
         "force 0.000, 3.000, 4.000; impulse 0.05 N s",
         "at 0.100, 0.000, 0.000; 2 points, 1.00 mm deep",

@@ -13,7 +13,6 @@ import viser
 from tests.drive.panels import Panels
 from tests.ui.scenes import PLAN, problem, running
 from workbench.core.env.keywords import HowMade, Keyword
-from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.session.live.solver import SolveView
 from workbench.session.live.view import SessionView
@@ -63,8 +62,8 @@ class RecordedSession:
     def save_past(self, envs: tuple[int, ...]) -> None:
         self.asked.append(("save", envs))
 
-    def apply_options(self, options: TaskOptions) -> None:
-        self.asked.append(options.env_kwargs)
+    def use_control_mode(self, mode: str) -> None:
+        self.asked.append(mode)
 
 
 @dataclass
@@ -212,7 +211,7 @@ def test_the_control_mode_in_which_plans_are_found_is_offered_where_the_robot_ha
     with_modes = replace(view.task, made=HowMade(modes=modes))
     shown.draw(task=with_modes)
     shown.panels.press(USE_MODE)
-    assert shown.session.asked == [{"control_mode": "pd_ee_delta_pose"}]
+    assert shown.session.asked == ["pd_ee_delta_pose"]
     shown.draw(task=replace(with_modes, control_mode="pd_ee_delta_pose"))
     assert not shown.panels.shows(USE_MODE)
 

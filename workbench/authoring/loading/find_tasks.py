@@ -40,6 +40,10 @@ class TaskFile:
     """Ids that it registers, as far as they are written as plain text."""
     classes: tuple[str, ...]
     """Its task classes, in the order of the file."""
+    not_python: bool = False
+    """Its text does not parse."""
+    line: int | None = None
+    """Where it does not parse, if that is known."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,31 @@ class FoundTasks:
     """Why it may have missed files, as a sentence; empty if it has seen all."""
 
 
-def find_task_files(folder: Path, stopped: Callable[[], bool] = lambda: False) -> FoundTasks:
+class TaskFileReader:
+    """Reads task files, each again only when its ``stat`` has changed."""
+
+    def __init__(self) -> None:
+        self._known: dict[Path, tuple[tuple[int, ...], TaskFile | None]] = {}
+
+    def read(self, path: Path) -> TaskFile | None:
+        """As `read_task_file`."""
+        try:
+            found = os.stat(path)
+        except OSError:
+            self._known.pop(path, None)
+            return None
+        status = found.st_mtime_ns, found.st_ctime_ns, found.st_size, found.st_ino
+        known = self._known.get(path)
+        if known is None or known[0] != status:
+            known = self._known[path] = status, read_task_file(path)
+        return known[1]
+
+
+def find_task_files(
+    folder: Path,
+    stopped: Callable[[], bool] = lambda: False,
+    read: Callable[[Path], TaskFile | None] | None = None,
+) -> FoundTasks:
     """The task files in and below a folder.
 
     Hidden folders, Python environments, installed packages and links are left out. The search ends early, and says so, in
@@ -60,7 +88,9 @@ def find_task_files(folder: Path, stopped: Callable[[], bool] = lambda: False) -
 
     Args:
         stopped: asked often; True ends the search.
+        read: reads a file; None for `read_task_file`.
     """
+    read = read or read_task_file
     root = Path(os.path.realpath(folder))
     ends_at = time.monotonic() + LONGEST
     found: list[TaskFile] = []
@@ -74,7 +104,7 @@ def find_task_files(folder: Path, stopped: Callable[[], bool] = lambda: False) -
             left_out = f"The search ended after {LONGEST:.0f} s."
         if left_out:
             break
-        if (task := read_task_file(path)) is not None:
+        if (task := read(path)) is not None:
             found.append(task)
     found.sort(key=lambda task: (len(task.path.relative_to(root).parts), str(task.path)))
     return FoundTasks(tuple(found), left_out)
@@ -94,9 +124,10 @@ def read_task_file(path: Path) -> TaskFile | None:
             # A text with "\d" would warn in the terminal.
             warnings.simplefilter("ignore")
             tree = parse_python(raw)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         # A broken file that names BaseEnv most likely is a task that somebody is writing.
-        return TaskFile(path, (), ()) if b"(BaseEnv)" in raw else None
+        line = error.lineno if isinstance(error, SyntaxError) else None
+        return TaskFile(path, (), (), not_python=True, line=line) if b"(BaseEnv)" in raw else None
     ids, classes = _tasks_of(tree)
     return TaskFile(path, ids, classes) if classes else None
 

@@ -65,12 +65,27 @@ def named_file(reference: TaskName) -> Path | None:
         module = find_module(named[0])
         return None if module is None else module.file
     file, _ = file_and_class(reference)
+<<<<<<< HEAD
     return real_path(Path(file).expanduser()) if file else None
+=======
+    # Not Path.expanduser, which raises where there is no such user.
+    return Path(os.path.expanduser(file)).resolve() if file else None
+>>>>>>> start
 
 
 def looks_like_file(env_id: str) -> bool:
     """Whether `env_id` has the form of a path to a task; the file need not exist."""
     return bool(file_and_class(env_id)[0]) or env_id.startswith(("/", "./", "../", "~")) or "\\" in env_id
+
+
+def is_path(reference: str) -> bool:
+    """Whether `reference` has the form of a path, or is one of something other than a folder beside.
+
+    A folder may have the name of an env id.
+    """
+    if looks_like_file(reference) or reference in (".", ".."):
+        return True
+    return os.path.exists(reference) if "/" in reference else os.path.isfile(reference)
 
 
 def followed_folder(reference: TaskName) -> Path | None:
@@ -87,7 +102,13 @@ def why_missing(reference: str) -> str | None:
     if (named := split_reference(reference)) is not None:
         return not_found_text(named[0]) if find_module(named[0]) is None else None
     file = named_file(reference)
-    return None if file is None or file.is_file() else f"there is no file {file}"
+    if file is None and not is_path(reference):
+        return None
+    try:
+        check_task_file(file or Path(os.path.expanduser(reference)).resolve())
+    except TaskError as error:
+        return error.problem.message
+    return None
 
 
 def check_task_file(file: Path) -> None:

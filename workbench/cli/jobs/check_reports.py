@@ -244,7 +244,7 @@ def _error_case(said: Reported, error: Problem, root: Path) -> ElementTree.Eleme
         where = place_text(file, line)
     found = ElementTree.SubElement(case, "error", type=xml_text(error.stage), message=xml_text(error.message))
     code = f"\n    {error.code}" if error.code else ""
-    found.text = xml_text(f"{where}{error.stage} failed\n{error.message}{code}\n{error.traceback}".rstrip())
+    found.text = xml_text(f"{where}{error.what_failed}\n{error.message}{code}\n{error.traceback}".rstrip())
     return case
 
 
@@ -346,7 +346,7 @@ def _error_result(said: Reported, error: Problem, root: Path) -> dict[str, Any]:
         "ruleId": CANNOT_CHECK,
         "ruleIndex": 0,
         "level": "error",
-        "message": {"text": f"{error.stage} failed: {error.message}"},
+        "message": {"text": f"{error.what_failed}: {error.message}"},
         "locations": [] if place is None else [_location(*place, root)],
         "partialFingerprints": {"primaryLocationLineHash": _fingerprint(key)},
     }

@@ -161,7 +161,7 @@ def print_problem(problem: Problem) -> None:
     """Print an error in the author's code, with its line."""
     place = place_text(problem.file, problem.line)
     message = escape(plain_text(f"{place}{problem.message}"))
-    err.print(f"[red]{escape(problem.stage)} failed[/] {message}", soft_wrap=True)
+    err.print(f"[red]{escape(problem.what_failed)}[/] {message}", soft_wrap=True)
     if problem.code:
         err.print(f"    {escape(plain_text(problem.code))}", soft_wrap=True)
     if problem.traceback:

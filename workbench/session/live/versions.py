@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -261,6 +261,14 @@ class Versions:
         with self._shared.lock:
             self._shared.state.apply_options(options)
         self.reload()
+
+    def use_control_mode(self, mode: str) -> None:
+        """Make the envs with this control mode, unless it is in effect."""
+        with self._shared.lock:
+            state = self._shared.state
+            options, task = state.options, state.now.task
+        if task is not None and task.control_mode != mode:
+            self.apply_options(replace(options, env_kwargs={**options.env_kwargs, "control_mode": mode}))
 
     def open_file(self, file: Path, class_name: str) -> None:
         """Open a task class of another file instead, and watch that file."""

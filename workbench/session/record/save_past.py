@@ -86,7 +86,11 @@ def find_episode(history: History, env: int, serial: int | None, before: bool = 
     if before and isinstance(found, PastEpisode):
         found = _episode_before(history, env, found) or "there is no episode before it in memory"
     if isinstance(found, PastEpisode) and found.steps == 0:
-        return "its episode has no step yet"
+        return (
+            "the episode before has no step: it was reset at once"
+            if before
+            else "its episode has no step yet"
+        )
     return found
 
 
@@ -266,8 +270,12 @@ def _unfinished_text(count: int, kept: int) -> str:
 def _lost_seed_text(count: int, kept: int) -> str:
     if not count:
         return ""
-    what = "its start was" if kept == 1 else "their starts were" if count == kept else f"{count} starts were"
-    return f"; {what} drawn for several envs at once, so their first state is recorded and no seed"
+    what = "it" if kept == 1 else "they" if count == kept else f"{count} of them"
+    one = count == 1
+    return (
+        f"; {what} {'comes' if one else 'come'} from a reset of several envs, so {'it has' if one else 'they have'} no seed and "
+        f"{'replays from its' if one else 'replay from their'} first state"
+    )
 
 
 def _earlier_text(count: int, kept: int) -> str:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import ast
 import os
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache
 from pathlib import Path
 
-from workbench.authoring.loading.find_tasks import FoundTasks, TaskFile, find_task_files
+from workbench.authoring.loading.find_tasks import FoundTasks, TaskFile, TaskFileReader, find_task_files
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import example_tasks
 from workbench.machine.parse_python import parse_python
@@ -19,13 +20,19 @@ from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.text import short_line
 from workbench.session.tasks.recents import MOST_ENVS, RecentTask, RecentTasks
 from workbench.session.tasks.registered import RegisteredTasks, RegisteredView
+from workbench.session.tasks.typed import typed_path
 
 LONGEST_SHOWN = 300
+SEARCH_SECONDS = 1.0
+"""Pause between two searches of the folder."""
+SEARCH_SHARE = 0.05
+"""Largest share of the time that is spent on searches: a slow folder is searched less often."""
 
 
 class Section(Enum):
     """Part of the list, in the order of the page; the value is its heading."""
 
+    TYPED = "Path"
     RECENT = "Recent"
     FOLDER = "In this folder"
     EXAMPLES = "Examples"
@@ -69,6 +76,7 @@ class CatalogueView:
     """In the order of the sections."""
     folder: str = ""
     searching: bool = False
+    """The folder is searched for the first time."""
     left_out: str = ""
     """Why the search may have missed files."""
     registered: RegisteredView = RegisteredView()
@@ -78,7 +86,7 @@ class CatalogueView:
 class Catalogue:
     """Lists recent tasks, task files of a folder, examples, recordings and registered ids. Thread-safe.
 
-    A page chooses by number, so that it cannot name a path: `entry` knows only what was listed.
+    A page chooses by number: `entry` knows only what was listed, or typed and found.
 
     Args:
         folder: searched for task files.
@@ -103,20 +111,28 @@ class Catalogue:
         self._closing = threading.Event()
         self._searching: threading.Thread | None = None
         self._numbers: dict[tuple[Section, str], int] = {}
-        self._found = FoundTasks()
+        self._found: FoundTasks | None = None
+        """None before the first search has ended."""
+        self._files = TaskFileReader()
+        self._search_again = 0.0
+        self._typed: dict[int, Entry] = {}
         self._seen: tuple[int, int] | None = None
         self._changes = 0
         self._view = CatalogueView(folder=_shown(str(self.folder)))
 
     def refresh(self) -> None:
-        """Look at the folder and at the recent tasks again. Returns at once."""
+        """Search the folder and look at the recent tasks again. Returns at once."""
         self.registered.start()
         with self._lock:
             if self._closing.is_set() or (self._searching is not None and self._searching.is_alive()):
                 return
-            self._changes += 1
             self._searching = threading.Thread(target=self._search, name="find-tasks", daemon=True)
             self._searching.start()
+
+    def follow(self) -> None:
+        """`refresh`, unless the last search has just ended. Call it while the list is in sight."""
+        if time.monotonic() >= self._search_again:
+            self.refresh()
 
     def view(self) -> CatalogueView:
         """The list; cheap while nothing changes."""
@@ -125,27 +141,46 @@ class Catalogue:
             now = self._changes, registered.serial
             if now != self._seen:
                 self._seen = now
-                searching = self._searching is not None and self._searching.is_alive()
-                self._view = CatalogueView(
-                    tuple(self._entries(registered)),
-                    self._view.folder,
-                    searching,
-                    self._found.left_out,
-                    registered,
-                    self._view.serial + 1,
+                view = replace(
+                    self._view,
+                    entries=tuple(self._entries(registered)),
+                    searching=self._found is None,
+                    left_out="" if self._found is None else self._found.left_out,
+                    registered=registered,
                 )
+                if view != self._view:
+                    self._view = replace(view, serial=view.serial + 1)
             return self._view
 
     def entry(self, number: int) -> Entry | None:
-        """The listed row of this number; None if there is none."""
-        return next((entry for entry in self.view().entries if entry.number == number), None)
+        """The row of this number that is listed or was typed; None if there is none."""
+        listed = next((entry for entry in self.view().entries if entry.number == number), None)
+        return self._typed.get(number) if listed is None else listed
+
+    def typed(self, text: str) -> Entry | None:
+        """The row of the task file that a person has typed the path of; None for a text that is no path.
+
+        Raises:
+            NotAPath: the file cannot be opened.
+        """
+        named = typed_path(text, self.folder)
+        if named is None:
+            return None
+        file, class_name = named
+        reference = f"{file}:{class_name}" if class_name else str(file)
+        with self._lock:
+            about = _about(self._files.read(file) or TaskFile(file, (), ()))
+            entry = self._entry(Section.TYPED, reference, reference, about, file=file)
+            self._typed[entry.number] = entry
+        return entry
 
     def add_file(self, file: Path, env_id: str) -> Entry:
         """List a task file of the folder that was just written; returns its row."""
         task = TaskFile(file, (env_id,), ())
         with self._lock:
-            if all(known.path != file for known in self._found.files):
-                self._found = replace(self._found, files=(task, *self._found.files))
+            found = self._found or FoundTasks()
+            if all(known.path != file for known in found.files):
+                self._found = replace(found, files=(task, *found.files))
                 self._changes += 1
             return self._of_folder(task)
 
@@ -159,20 +194,22 @@ class Catalogue:
             searching.join()
 
     def _search(self) -> None:
-        found = FoundTasks()
+        found, began = FoundTasks(), time.monotonic()
         try:
-            found = find_task_files(self.folder, self._closing.is_set)
+            found = find_task_files(self.folder, self._closing.is_set, self._files.read)
         except Exception as error:
             report_failure("The folder could not be searched for tasks", error)
         with self._lock:
             self._found, self._searching = found, None
             self._changes += 1
+            took = time.monotonic() - began
+            self._search_again = time.monotonic() + max(SEARCH_SECONDS, took / SEARCH_SHARE)
 
     # --- entries -------------------------------------------------------------------------------------
 
     def _entries(self, registered: RegisteredView) -> Iterator[Entry]:
         yield from map(self._recent, self.recents.list())
-        yield from map(self._of_folder, self._found.files)
+        yield from map(self._of_folder, () if self._found is None else self._found.files)
         for task in example_tasks():
             yield self._entry(Section.EXAMPLES, str(task), task.name, _first_line(task), file=task)
         yield self._entry(
@@ -212,11 +249,8 @@ class Catalogue:
         )
 
     def _of_folder(self, task: TaskFile) -> Entry:
-        names = task.ids or task.classes
-        about = ", ".join((*names[:3], *(("…",) if len(names) > 3 else ())))
-        return self._entry(
-            Section.FOLDER, str(task.path), str(task.path.relative_to(self.folder)), about, file=task.path
-        )
+        name = str(task.path.relative_to(self.folder))
+        return self._entry(Section.FOLDER, str(task.path), name, _about(task), file=task.path)
 
     def _place(self, file: Path) -> str:
         """The folder of a file, as a person would write it."""
@@ -240,6 +274,13 @@ class Catalogue:
     ) -> Entry:
         number = self._numbers.setdefault((section, reference), len(self._numbers) + 1)
         return Entry(number, section, _shown(name), _shown(about), reference, file, gone, options, env_id)
+
+
+def _about(task: TaskFile) -> str:
+    if task.not_python:
+        return "not Python yet" if task.line is None else f"not Python yet: line {task.line}"
+    names = task.ids or task.classes
+    return ", ".join((*names[:3], *(("…",) if len(names) > 3 else ())))
 
 
 def _shown(text: str) -> str:

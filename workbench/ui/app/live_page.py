@@ -12,6 +12,7 @@ from typing import get_args
 import numpy as np
 import viser
 
+from workbench.authoring.loading.reference import named_file
 from workbench.jobs.task import ShownPictures
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -32,6 +33,7 @@ from workbench.ui.live.reward import CurvesPanel, NumbersPanel
 from workbench.ui.live.run_panel import NEXT, PREVIOUS, RESET_ALL, RESET_THIS, STEP, RunPanel
 from workbench.ui.live.solve_panel import SolvePanel
 from workbench.ui.live.status_line import StatusLine
+from workbench.ui.live.task_commands import TaskCommands
 from workbench.ui.live.timeline import GO_ON, LIVE, UNDO, TimelinePanel
 from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.live.version_panel import AS_NEEDED, VersionPanel
@@ -102,7 +104,9 @@ class Page:
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH)
-        server.gui.set_panel_label("Workbench")
+        # Until it has loaded, and for good where it fails.
+        file = named_file(session.reference)
+        server.gui.set_panel_label(str(session.reference) if file is None else file.name)
 
         status = StatusLine(
             server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged(), clock=clock
@@ -138,6 +142,7 @@ class Page:
         self._forces = ForceArrows(server)
         commands = (*self._commands(), *commands)
         register(server, commands)
+        self._parts.add(TaskCommands(server, session))
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", commands=commands))
         server.scene.on_click()(self._on_scene_click)
@@ -263,9 +268,12 @@ class Page:
 
     def _draw_scene(self, view: SessionView) -> None:
         task, step, seen = view.task, view.step, view.shown_cameras
+        if task is None:
+            # The bodies are those of the page before.
+            self._scene.hide()
+            return
         if (
-            task is None
-            or step is None
+            step is None
             or seen is None
             or step.poses.shape[:2]
             != (

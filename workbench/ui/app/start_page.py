@@ -45,7 +45,6 @@ class StartPage:
         commands = [
             Command("Review recordings", lambda: place.pages.show("review")),
             Command("Dark or light", self._toggle_dark),
-            Command("Search the folder again", place.open_task.catalogue.refresh),
             *place.commands,
         ]
         register(server, commands)

@@ -78,8 +78,11 @@ class CameraSuggest:
                     hint=hint,
                 )
                 for label, hint in (
-                    ("Eye from", "Lowest corner of the box in which the eye may be, in metres."),
-                    ("Eye to", "Highest corner of that box, metres."),
+                    (
+                        "Search box from",
+                        "Lowest corner of the box that the camera may be placed in, in metres.",
+                    ),
+                    ("Search box to", "Highest corner of that box, metres."),
                 )
             )
             self._show_box = server.gui.add_checkbox(

@@ -29,7 +29,7 @@ SHOWN_AFTER = 4.0
 """Seconds. The status line shows it earlier; a banner is for code that one may want to end."""
 
 DOING = {
-    "syntax": "cannot be read",
+    "syntax": "is not Python yet",
     "import": "failed to import",
     "build": "failed to build its scene",
     "reset": "failed in reset",
@@ -147,6 +147,8 @@ def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) ->
     else:
         subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
     doing = DOING.get(problem.stage, f"failed in {problem.stage}")
+    if problem.has_no_place:
+        doing = "was not loaded"
     if problem.interrupted:
         doing = INTERRUPTED.get(problem.stage, f"was interrupted in {problem.stage}")
     return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view), link=link)
@@ -163,7 +165,7 @@ def _kept(view: SessionView) -> str:
     if _stopped(view):
         return "No process runs the task. Restart the worker to load the file as it is now."
     if view.task is None and not (view.problem is not None and view.problem.file):
-        return "There is nothing to show yet. Open another task (Ctrl O) or change how the envs are made (Run tab)."
+        return "There is nothing to show yet. Open another task (Ctrl+O) or change how the envs are made (Run tab)."
     if view.task is None:
         return "No version has loaded yet. Fix the file and save it, and the page will show it."
     if view.state in ("starting", "loading"):

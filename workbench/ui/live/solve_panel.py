@@ -31,7 +31,7 @@ METHODS: dict[str, Method] = {
 SAVE_SOLVED = "Save the solved episode"
 TOOL = "the robot's tool"
 BETTER_MODE = "pd_ee_delta_pose"
-USE_MODE = f"Use {BETTER_MODE}"
+USE_MODE = "Plan in end-effector control (resets the envs)"
 MOST_ROLLOUTS, LONGEST_HORIZON = 256, 3.0
 MOST_TOLD = 4
 """Solved envs that are named."""
@@ -161,9 +161,7 @@ class SolvePanel(PagePart[SessionView]):
         self._session.save_past(tuple(env for env, _ in view.solve.solved) or (view.selected_env,))
 
     def _use_mode(self) -> None:
-        options = self._session.view().options
-        kwargs = {**options.env_kwargs, "control_mode": BETTER_MODE}
-        self._session.versions.apply_options(replace(options, env_kwargs=kwargs))
+        self._session.versions.use_control_mode(BETTER_MODE)
 
     # --- drawing ---------------------------------------------------------------------------------
 

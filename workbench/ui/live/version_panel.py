@@ -16,12 +16,17 @@ from workbench.ui.widgets.inputs import Control
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 
-AS_NEEDED, PATCHED, CAMERAS, REBUILT = "Reload", "Patch", "Cameras", "Rebuild"
+AS_NEEDED, REBUILT, PATCHED, CAMERAS = (
+    "Reload",
+    "Rebuild the scene",
+    "Only reload code",
+    "Only reload cameras",
+)
 LEVELS: dict[str, LoadLevel] = {
     AS_NEEDED: "auto",
+    REBUILT: "rebuilt",
     PATCHED: "patched",
     CAMERAS: "cameras",
-    REBUILT: "rebuilt",
 }
 LAST_LOADS = "Last reloads"
 MOST_SHOWN = 8
@@ -46,14 +51,16 @@ class VersionPanel(PagePart[SessionView]):
                 send=session.versions.choose_class,
             )
             self._html = server.gui.add_html("")
-            self._again = server.gui.add_button_group(
-                "",
-                tuple(LEVELS),
-                hint="Reload: as little as is safe. Patch: only the code. Cameras: code and cameras. "
-                "Rebuild: the scene too, with the moment restored. A patch that was not found safe can leave old "
-                "and new code mixed.",
+            rows = (
+                ((AS_NEEDED, REBUILT), "As little as is safe; or the scene too, with the moment restored."),
+                (
+                    (PATCHED, CAMERAS),
+                    "Also where that was not found safe: old and new code may then be mixed. With the cameras, the code too.",
+                ),
             )
-            self._again.on_click(lambda event: self._load(event.target.value))
+            self._again = [server.gui.add_button_group("", names, hint=hint) for names, hint in rows]
+            for row in self._again:
+                row.on_click(lambda event: self._load(event.target.value))
             self._loads_folder = server.gui.add_folder(LAST_LOADS, expand_by_default=False, visible=False)
             with self._loads_folder:
                 self._loads = server.gui.add_html("")
@@ -73,7 +80,8 @@ class VersionPanel(PagePart[SessionView]):
     def draw(self, view: SessionView) -> None:
         task = view.task
         can_load = view.state != "stopped"
-        self._again.visible = can_load
+        for row in self._again:
+            row.visible = can_load
         if len(view.choices) > 1:
             # Sorted, so that the order does not depend on the shown one.
             if tuple(sorted(view.choices)) != self._names:

@@ -136,6 +136,14 @@ class SceneView:
         if self._leaving:
             self._leaving, self._rows = [], None
 
+    def hide(self) -> None:
+        """Show no bodies until the next `build`; they stay in the browser, and equal ones are not sent again."""
+        if self._rows is not None:
+            self._remove_leaving()
+            self._rows = None
+            for group in self._drawn.values():
+                group.handle.visible = False
+
     def clear(self) -> None:
         self._remove_leaving()
         for group in self._drawn.values():

@@ -212,8 +212,8 @@ def light(server: viser.ViserServer) -> None:
 class Stage:
     """Bodies, lights and viewpoint on this server, shared by the pages.
 
-    The bodies stay in the browser while one page replaces the other, so that equal ones are not sent again and the view
-    is never empty. Labels, frustums, marks and handles go with their page.
+    The bodies stay in the browser while one page replaces the other, so that equal ones are not sent again, and the view
+    is empty only until a task has loaded. Labels, frustums, marks and handles go with their page.
     """
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:

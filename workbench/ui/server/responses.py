@@ -35,6 +35,7 @@ SCRIPTS = (
     "typed_ahead.js",
     "typed_first.js",
     "pressed.js",
+    "folds.js",
     "curve_clicks.js",
     "keys.js",
     "pressed_by_key.js",

@@ -139,6 +139,20 @@ def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
         tab._parent._rebuild_tab_props()
 
 
+def places(server: viser.ViserServer) -> Iterator[tuple[str, str]]:
+    """Tabs of a page, and folds in them or outside of tabs: the labels of both, empty for none; in the order of making."""
+    containers = server.gui._container_handle_from_uuid
+    for handle in list(containers.values()):
+        if isinstance(handle, viser.GuiTabHandle):
+            if isinstance(handle._parent, viser.GuiTabGroupHandle):
+                yield handle._label, ""
+        elif isinstance(handle, viser.GuiFolderHandle) and handle.label is not None:
+            around: Any = handle
+            while isinstance(around, viser.GuiFolderHandle):
+                around = containers.get(around._impl.parent_container_id)
+            yield (around._label if isinstance(around, viser.GuiTabHandle) else ""), handle.label
+
+
 def send_lines(
     handle: viser.GuiUplotHandle,
     data: tuple[NDArray[np.float64], ...],

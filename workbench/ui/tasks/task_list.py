@@ -11,16 +11,19 @@ import viser
 
 from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.session.tasks.catalogue import Catalogue, CatalogueView, Entry, Section
+from workbench.session.tasks.typed import NotAPath
 from workbench.ui.library.dialogs import Dialog
 from workbench.ui.server.control_values import limit_text
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.inputs import Control, refusals_told
 from workbench.ui.widgets.parts import Clock, PagePart
-from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.templates import render, sentence
 
 PICTURES = "/task_pictures/"
 """Where the server gives the pictures of registered tasks."""
-LONGEST_WORDS = 200
+LONGEST_WORDS = 4096
+"""Characters of the search; a path may be as long."""
+LONGEST_NAME = 200
 TYPING = 0.15
 """Seconds without a keystroke after which the search runs."""
 MOST_RECENT = 6
@@ -84,7 +87,9 @@ class TaskList:
         self._drawn: object = None
         self._find = Control(
             server.gui.add_text(
-                "Search", "", hint="Words in the name or the folder, all of which must be found"
+                "Search",
+                "",
+                hint="Words in the name or the folder, all of which must be found; or the path of a file",
             ),
             send=self._look_for,
             settle=TYPING,
@@ -94,7 +99,7 @@ class TaskList:
             self._name = server.gui.add_text(
                 "Name", "", hint="Such as stack_two, which is written to stack_two.py"
             )
-            limit_text(self._name, LONGEST_WORDS)
+            limit_text(self._name, LONGEST_NAME)
             about = [f"{template.name}: {template.about}" for template in TEMPLATES]
             self._template = server.gui.add_dropdown("Template", about)
             create = server.gui.add_button(CREATE, icon=viser.Icon.FILE_PLUS, color="gray")
@@ -108,13 +113,20 @@ class TaskList:
     def draw(self) -> None:
         """Draw it if something has changed."""
         self._find.show(self._words)
-        view, doing = self._chooser.catalogue.view(), self._chooser.doing()
-        wanted = view.serial, self._words, doing
+        catalogue = self._chooser.catalogue
+        catalogue.follow()
+        view, doing = catalogue.view(), self._chooser.doing()
+        typed, why_not = None, ""
+        try:
+            typed = catalogue.typed(self._words)
+        except NotAPath as error:
+            why_not = sentence(str(error))
+        wanted = view.serial, self._words, doing, typed, why_not
         if wanted == self._drawn:
             return
         self._drawn = wanted
         self._html.content = tasks_html(
-            view, self._words, doing, self._numbers, self._clear, self._chooser.is_open
+            view, self._words, doing, self._numbers, self._clear, self._chooser.is_open, typed, why_not
         )
 
     def _look_for(self, words: str) -> None:
@@ -143,6 +155,8 @@ def tasks_html(
     numbers: str,
     clear: str,
     is_open: Callable[[Entry], bool] = lambda entry: False,
+    typed: Entry | None = None,
+    why_not: str = "",
 ) -> str:
     """The list.
 
@@ -151,9 +165,13 @@ def tasks_html(
         doing: what is being opened, if anything.
         numbers, clear: ids of the input that takes a row's number, and of the button that clears the search.
         is_open: whether a row is the open task, which is marked and which Enter does not choose.
+        typed: the file whose path the words are.
+        why_not: why the path in the words cannot be opened.
     """
     wanted = words.lower().split()
     found = [entry for entry in view.entries if entry.matches(wanted)]
+    if typed is not None and all(entry.reference != typed.reference for entry in found):
+        found.insert(0, typed)
     sections = []
     for section in Section:
         rows = [entry for entry in found if entry.section is section]
@@ -170,6 +188,7 @@ def tasks_html(
         numbers=numbers,
         clear=clear,
         found=len(found),
+        why_not=why_not,
         sections=sections,
         pictures=view.registered.pictures,
         registered=Section.REGISTERED,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import viser
 from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
 
 from workbench.machine.kept_choices import close_hints, kept_choices
+from workbench.ui.server.viser_private import places
 from workbench.ui.widgets.click_targets import Presses, in_turn
 from workbench.ui.widgets.templates import render
 
@@ -18,16 +18,16 @@ _LAST = 2e6
 """viser's order of elements: after all others of the panel."""
 _NAMES = {
     "space": "Space",
-    "arrowleft": "←",
-    "arrowright": "→",
-    "arrowup": "↑",
-    "arrowdown": "↓",
-    "pageup": "Page up",
-    "pagedown": "Page down",
+    "arrowleft": "Left arrow",
+    "arrowright": "Right arrow",
+    "arrowup": "Up arrow",
+    "arrowdown": "Down arrow",
+    "pageup": "Page Up",
+    "pagedown": "Page Down",
     "home": "Home",
     "end": "End",
     "enter": "Enter",
-    "escape": "Escape",
+    "escape": "Esc",
     "delete": "Delete",
 }
 
@@ -48,15 +48,21 @@ class Command:
     """Labels, or their first words, of the buttons that do the same: their tooltips name the key (``key_help.js``)."""
     registered: Callable[[viser.CommandHandle], None] | None = None
     """Called with its handle, which can disable the command."""
+    about: str = ""
+    """Below its label in the palette, which looks for words in it too."""
+    tab: str = ""
+    """The tab that is opened before it runs, on the page that asked."""
+    fold: str = ""
+    """Likewise the fold."""
 
     @property
     def key_name(self) -> str:
-        """As the page shows it: ``Space``, ``Shift R``."""
+        """As the page and the docs show it: ``Space``, ``Shift+R``."""
         if self.key is None:
             return ""
         name = _NAMES.get(self.key, self.key)
         held = [word.removeprefix("cmd/").capitalize() for word in (self.modifier or "").split("+") if word]
-        return " ".join([*held, name])
+        return "+".join([*held, name])
 
     @property
     def combination(self) -> str:
@@ -70,14 +76,44 @@ def register(server: viser.ViserServer, commands: Sequence[Command]) -> None:
     names = {button: command.key_name for command in commands if command.key for button in command.buttons}
     server.gui.add_html(render("all_keys", commands=commands, buttons=json.dumps(names)), order=_LAST)
     for command in commands:
-        handle = server.gui.add_command(
-            command.label,
-            hotkey=command.key,
-            modifier=command.modifier,
-        )
-        handle.on_trigger(_triggered(command.run))
+        handle = add(server, command)
         if command.registered is not None:
             command.registered(handle)
+    for tab, fold in places(server):
+        label, about = (fold, f"in {tab}" if tab else "") if fold else (f"{tab} tab", "")
+        add(server, Command(label, lambda: None, about=about, tab=tab, fold=fold))
+
+
+def add(server: viser.ViserServer, command: Command) -> viser.CommandHandle:
+    """Put one command into the palette of every page."""
+    # viser shows the key's name of the browser behind it, which `key_help.js` takes away.
+    about = command.about or command.key_name
+    handle = server.gui.add_command(
+        command.label, description=about or None, hotkey=command.key, modifier=command.modifier
+    )
+    shown = _Shown()
+
+    async def triggered(event: viser.CommandEvent) -> None:
+        if event.client is not None and (command.tab or command.fold):
+            shown.show(event.client, command)
+        await in_turn(event.client, command.run)
+
+    handle.on_trigger(triggered)
+    return handle
+
+
+class _Shown:
+    """Opens the tab and the fold of a command; keeps, by page, the element that did so last."""
+
+    def __init__(self) -> None:
+        self._by_page: dict[int, viser.GuiHtmlHandle] = {}
+
+    def show(self, client: viser.ClientHandle, command: Command) -> None:
+        before = self._by_page.pop(client.client_id, None)
+        if before is not None:
+            before.remove()
+        html = render("open_tab", tab=command.tab, fold=command.fold)
+        self._by_page[client.client_id] = client.gui.add_html(html)
 
 
 def add_hints(server: viser.ViserServer) -> None:
@@ -91,10 +127,3 @@ def add_hints(server: viser.ViserServer) -> None:
         close_hints()
 
     hints.content = render("hints", close=Presses(server).id_of("close the hints", lambda _: close()))
-
-
-def _triggered(run: Callable[[], None]) -> Callable[[viser.CommandEvent], Coroutine[Any, Any, None]]:
-    async def triggered(event: viser.CommandEvent) -> None:
-        await in_turn(event.client, run)
-
-    return triggered

@@ -70,7 +70,8 @@ def short_text(text: str, longest: int = 120) -> str:
 
 def sentence(why: str) -> str:
     """The text with a capital and a full stop."""
-    return f"{why[:1].upper()}{why[1:].removesuffix('.')}." if why else ""
+    end = "" if why.endswith((".", "?", "!", "…")) else "."
+    return f"{why[:1].upper()}{why[1:]}{end}" if why else ""
 
 
 def counted(count: int, what: str) -> str:
