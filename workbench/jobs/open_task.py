@@ -107,11 +107,7 @@ def with_advice(
         tried = min(options.num_envs, _MOST_TRIED)
         if _runs_alone(again, options, tried):
             advice.append(
-<<<<<<< HEAD
-                f"with {options.num_envs} envs it fails, with one it runs, from each of {tried} seeds: --num-envs 1"
-=======
                 f"this works with 1 env, from each of {tried} seeds, and not with {options.num_envs}; --num-envs 1 opens it"
->>>>>>> start
             )
     if loaded.others and loaded.file is not None and not knows_others:
         file = loaded.file.name

@@ -65,12 +65,8 @@ def named_file(reference: TaskName) -> Path | None:
         module = find_module(named[0])
         return None if module is None else module.file
     file, _ = file_and_class(reference)
-<<<<<<< HEAD
-    return real_path(Path(file).expanduser()) if file else None
-=======
     # Not Path.expanduser, which raises where there is no such user.
-    return Path(os.path.expanduser(file)).resolve() if file else None
->>>>>>> start
+    return real_path(Path(os.path.expanduser(file))) if file else None
 
 
 def looks_like_file(env_id: str) -> bool:
