@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import tyro
 
 from workbench.core.rules import DEGREES, Degree
+from workbench.machine.files import real_path
 from workbench.planning.options import PlanArguments, PlanOptions
 
 if TYPE_CHECKING:
@@ -262,7 +263,7 @@ def why_unwritable(*files: Path | None) -> str | None:
     for file in files:
         if file is None:
             continue
-        folder = file.resolve().parent
+        folder = real_path(file).parent
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
