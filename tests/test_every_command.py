@@ -15,11 +15,16 @@ WITHOUT_SUCCESS, WITHOUT_REWARD, SEVERAL_ROBOTS = "swing_up", "Empty-v1", "two_r
 NO_TABLE, FAILS_IN_PARTIAL_RESETS = "template minimal", "MS-HopperHop-v1"
 QUICK = (WITHOUT_SUCCESS, WITHOUT_REWARD, SEVERAL_ROBOTS, NO_TABLE, FAILS_IN_PARTIAL_RESETS)
 RULES = ALL_RULES.keys() - SOLVE_RULES
-NO_PLAN: dict[str, str] = {
-    "different_objects": "builds another body in each env",
-    WITHOUT_REWARD: "has no reward",
-}
-"""Tasks that ``solve`` refuses with exit code 2, and why."""
+NO_REWARD = WITHOUT_REWARD, "TableTopFreeDraw-v1"
+OTHER_BODIES_IN_EACH_ENV = (
+    "different_objects",
+    "PegInsertionSide-v1",
+    "SO100GraspCube-v1",
+    "RotateSingleObjectInHandLevel1-v1",
+    *(f"RotateValveLevel{level}-v1" for level in range(5)),
+)
+NO_PLAN = *NO_REWARD, *OTHER_BODIES_IN_EACH_ENV
+"""Tasks that ``solve`` refuses with exit code 2."""
 
 
 @pytest.mark.timeout(300)
