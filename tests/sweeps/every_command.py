@@ -38,7 +38,6 @@ from workbench.session.checks.checks import RUNNING
 ROOT = Path(__file__).parents[2]
 EXAMPLES = tuple(sorted(file.stem for file in (ROOT / "tasks").glob("*.py")))
 FROM_TEMPLATES = tuple(f"template {template.name}" for template in TEMPLATES)
-STEPS = ("--max-steps", "10")
 SECONDS = 1800.0
 """For one command, on a busy machine."""
 ALONE = ("--workers", "1", "--num-envs", "2")
@@ -95,6 +94,7 @@ def walk(task: str, folder: Path, quick: bool = False) -> Iterator[Ran]:
     """
     alone = ("--num-envs", "1") if fails_in_partial_resets(task) else ()
     num_envs = 1 if alone else 16
+    steps = "--max-steps", "3" if quick else "10"
     reference, command = task, in_this_process if quick else in_a_process
     if task in EXAMPLES:
         reference = f"{task}.py"
@@ -107,11 +107,11 @@ def walk(task: str, folder: Path, quick: bool = False) -> Iterator[Ran]:
     at = folder / reference if reference.endswith(".py") else reference
     yield opened_here(task, at, num_envs) if quick else opened(task, at, folder, num_envs)
     yield command(task, "check", folder, reference, "--json")
-    yield command(task, "record", folder, reference, *STEPS, *alone)
+    yield command(task, "record", folder, reference, *steps, *alone)
     yield command(task, "rescore", folder, "recordings", "--json", *alone)
     yield command(task, "export", folder, "recordings", "--lerobot", "lerobot")
     yield command(task, "export", folder, "recordings", "--maniskill", "demos.h5")
-    yield command(task, "solve", folder, reference, "--seeds", "1", *STEPS, "--out", "solved", "--json")
+    yield command(task, "solve", folder, reference, "--seeds", "1", *steps, "--out", "solved", "--json")
 
 
 def in_this_process(task: str, name: str, folder: Path, *words: str) -> Ran:
