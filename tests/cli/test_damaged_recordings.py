@@ -171,7 +171,7 @@ def test_a_name_that_is_not_utf_8_is_one_like_the_others(
     with zipfile.ZipFile(archive) as opened:
         assert sorted(opened.namelist()) == [f"od\\udcffd{suffix}" for suffix in (".h5", ".json", ".rrd")]
     table = tmp_path / "table"
-    arguments = "--trust", "--workers", 2, "--envs-per-worker", 1
+    arguments = "--trust", "--workers", 2, "--num-envs", 1
     assert run("rescore", folder, "--csv-file", table, "--json-file", f"{table}.json", *arguments) == 0
     names = [row["episode"] for row in json.loads(Path(f"{table}.json").read_text())]
     assert names == [f"by {odd}#traj_0", odd, "theirs#traj_0"]

@@ -12,7 +12,7 @@ import pytest
 from tests.drive.session import TASKS
 from workbench.cli.main import main
 
-FEW = ("--envs-per-worker", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
+FEW = ("--num-envs", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
 Check = Callable[..., dict[str, Any]]
 
 
@@ -274,7 +274,7 @@ def test_a_mesh_that_is_not_there_is_told_with_the_link_that_names_it(
     described.write_text(URDF.replace('<link name="arm">', f'<link name="arm">{visual}'))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        main(["record", "stick.py", "--episodes", "1", "--envs-per-worker", "1"])
+        main(["record", "stick.py", "--episodes", "1", "--num-envs", "1"])
     said = capsys.readouterr().err
     assert ended.value.code == 1
     assert f"{robot}:{line_of(robot, 'urdf_path')}" in said, said

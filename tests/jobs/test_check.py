@@ -368,3 +368,20 @@ def test_a_policy_that_cannot_be_imported_ends_the_check_at_its_line(tmp_path: P
     with pytest.raises(TaskError, match="policies.py:1: ModuleNotFoundError") as raised:
         check(what)
     assert raised.value.problem.stage == "policy"
+
+
+def test_a_task_that_only_one_env_can_run_is_checked_with_one(tmp_path: Path) -> None:
+    """It asks the simulation of one env for its contacts, in a step alone, when much was seen of several envs already."""
+    hook = next(line for line in TEXT.splitlines() if "def compute_dense_reward" in line)
+    task = task_of(tmp_path, (hook, f"{hook}\n        self.scene.px.get_contacts()"))
+    report = check(
+        options(task, "success-at-reset", "runs", "reward-finite", "same-for-any-batch", "one-env-only")
+    )
+    assert states(report) == {
+        "success-at-reset": "kept",
+        "reward-finite": "kept",
+        "runs": "not_known",
+        "same-for-any-batch": "not_known",
+        "one-env-only": "broken",
+    }
+    assert {finding.code for finding in report.findings} == {"self.scene.px.get_contacts()"}

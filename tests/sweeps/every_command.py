@@ -2,12 +2,14 @@
 
     python -m tests.sweeps.every_command                     all examples, templates and built-in tasks, a line each
     python -m tests.sweeps.every_command swing_up PickCube-v1
+    python -m tests.sweeps.every_command --quick     with few envs, seeds and rollouts, in one process: a twentieth of the time
 
 The commands are those of a terminal, in processes of their own. Only the length of episodes is bounded.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -16,22 +18,36 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from tests.drive.session import live_session, step
 from tests.drive.waiting import until
+from tests.sweeps.upstream_faults import faults_of
+from workbench.authoring.loading.load import undo_load
 from workbench.authoring.templates.new_task import TEMPLATES
+from workbench.cli.main import main as workbench
+from workbench.core.env.actions import hold_action
+from workbench.jobs.open_task import open_task
+from workbench.jobs.task import TaskOptions
 from workbench.session.checks.checks import RUNNING
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = tuple(sorted(file.stem for file in (ROOT / "tasks").glob("*.py")))
 FROM_TEMPLATES = tuple(f"template {template.name}" for template in TEMPLATES)
-STEPS = ("--max-steps", "10")
 SECONDS = 1800.0
 """For one command, on a busy machine."""
+ALONE = ("--workers", "1", "--num-envs", "2")
+FEW: Mapping[str, Sequence[str]] = {
+    "check": (*ALONE, "--seeds", "2"),
+    "record": (*ALONE, "--episodes", "2"),
+    "rescore": ALONE,
+    "solve": ("--workers", "1", "--rollouts", "4", "--knots", "2"),
+}
+"""Options of a quick walk."""
 
 
 def built_in() -> tuple[str, ...]:
@@ -39,6 +55,10 @@ def built_in() -> tuple[str, ...]:
     page = (ROOT / "web_assets" / "docs" / "reference" / "task_ids.md").read_text()
     rows = re.findall(r"^\| (\S+-v\d+) \| [^|]* \| ([^|]+) \|", page, re.M)
     return tuple(env_id for env_id, outcome in rows if outcome != "download")
+
+
+def fails_in_partial_resets(task: str) -> bool:
+    return "partial reset" in faults_of(task)
 
 
 @dataclass(frozen=True)
@@ -62,14 +82,20 @@ class Ran:
         return [one["rule"] for one in self.told["rules"] if one["state"] == "broken"]
 
 
-def walk(task: str, folder: Path) -> Iterator[Ran]:
+def walk(task: str, folder: Path, quick: bool = False) -> Iterator[Ran]:
     """Each command on a task, as it is done.
 
     Args:
         task: the name of an example, ``template`` and the name of one, or an id.
         folder: empty; everything is written there.
+        quick: in this process, with `FEW` of all; ``open`` without a session.
+
+    A task of ManiSkill's that fails in a partial reset has one env where the batch is refused, as the message says.
     """
-    reference = task
+    alone = ("--num-envs", "1") if fails_in_partial_resets(task) else ()
+    num_envs = 1 if alone else 16
+    steps = "--max-steps", "3" if quick else "10"
+    reference, command = task, in_this_process if quick else in_a_process
     if task in EXAMPLES:
         reference = f"{task}.py"
         for file in (ROOT / "tasks").glob(f"{task}.*"):
@@ -78,16 +104,29 @@ def walk(task: str, folder: Path) -> Iterator[Ran]:
         reference = "from_template.py"
         made = command(task, "new", folder, "from_template", "--from", task.removeprefix("template "))
         assert made.code == 0, made.err
-    yield opened(task, folder / reference if reference.endswith(".py") else reference, folder)
+    at = folder / reference if reference.endswith(".py") else reference
+    yield opened_here(task, at, num_envs) if quick else opened(task, at, folder, num_envs)
     yield command(task, "check", folder, reference, "--json")
-    yield command(task, "record", folder, reference, *STEPS)
-    yield command(task, "rescore", folder, "recordings", "--json")
+    yield command(task, "record", folder, reference, *steps, *alone)
+    yield command(task, "rescore", folder, "recordings", "--json", *alone)
     yield command(task, "export", folder, "recordings", "--lerobot", "lerobot")
     yield command(task, "export", folder, "recordings", "--maniskill", "demos.h5")
-    yield command(task, "solve", folder, reference, "--seeds", "1", *STEPS, "--out", "solved", "--json")
+    yield command(task, "solve", folder, reference, "--seeds", "1", *steps, "--out", "solved", "--json")
 
 
-def command(task: str, name: str, folder: Path, *words: str) -> Ran:
+def in_this_process(task: str, name: str, folder: Path, *words: str) -> Ran:
+    """Run ``workbench`` in this folder, with `FEW` of all."""
+    began, code = time.monotonic(), 0
+    out, err = io.StringIO(), io.StringIO()
+    with chdir(folder), redirect_stdout(out), redirect_stderr(err):
+        try:
+            workbench([name, *FEW.get(name, ()), *words])
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+    return _ran(task, name, words, code, began, out.getvalue(), err.getvalue())
+
+
+def in_a_process(task: str, name: str, folder: Path, *words: str) -> Ran:
     """Run ``workbench`` in this folder."""
     began = time.monotonic()
     ended = subprocess.run(
@@ -99,16 +138,32 @@ def command(task: str, name: str, folder: Path, *words: str) -> Ran:
         text=True,
         timeout=SECONDS,
     )
-    told = json.loads(ended.stdout) if "--json" in words and ended.stdout.startswith(("{", "[")) else None
+    return _ran(task, name, words, ended.returncode, began, ended.stdout, ended.stderr)
+
+
+def _ran(task: str, name: str, words: Sequence[str], code: int, began: float, out: str, err: str) -> Ran:
+    told = json.loads(out) if "--json" in words and out.startswith(("{", "[")) else None
     words = (name, *(word for word in words if word in ("--lerobot", "--maniskill")))
-    seconds = round(time.monotonic() - began, 1)
-    return Ran(task, " ".join(words), ended.returncode, seconds, told, ended.stderr[-6000:])
+    return Ran(task, " ".join(words), code, round(time.monotonic() - began, 1), told, err[-6000:])
 
 
-def opened(task: str, reference: Path | str, folder: Path) -> Ran:
+def opened_here(task: str, reference: Path | str, num_envs: int) -> Ran:
+    """Opened as a session does, and stepped."""
+    began = time.monotonic()
+    done = open_task(str(reference), TaskOptions(num_envs=num_envs))
+    try:
+        for _ in range(3):
+            done.env.step(hold_action(done.env.parts, done.env.num_envs))
+    finally:
+        done.env.close()
+        undo_load(done.loaded)
+    return Ran(task, "open", 0, round(time.monotonic() - began, 1), None)
+
+
+def opened(task: str, reference: Path | str, folder: Path, num_envs: int) -> Ran:
     """A session of it, as a page has one: opened, stepped, and all rules of the Checks tab looked at."""
     began = time.monotonic()
-    with live_session(reference, folder / "live", num_envs=16, draw=True) as session:
+    with live_session(reference, folder / "live", num_envs=num_envs, draw=True) as session:
         step(session, 3)
         session.check_now()
         until(
@@ -123,11 +178,12 @@ def opened(task: str, reference: Path | str, folder: Path) -> Ran:
     return Ran(task, "open", 0 if checks.state == "done" else 2, round(time.monotonic() - began, 1), told)
 
 
-def main(tasks: Sequence[str]) -> None:
+def main(words: Sequence[str]) -> None:
+    quick, tasks = "--quick" in words, [word for word in words if word != "--quick"]
     for task in tasks or (*EXAMPLES, *FROM_TEMPLATES, *built_in()):
         with tempfile.TemporaryDirectory() as folder:
             try:
-                for ran in walk(task, Path(folder)):
+                for ran in walk(task, Path(folder), quick):
                     print(json.dumps(asdict(ran)), flush=True)
             except Exception as error:
                 print(json.dumps({"task": task, "crash": f"{type(error).__name__}: {error}"}), flush=True)

@@ -39,6 +39,7 @@ from workbench.checks.evidence.checkup import (
 from workbench.checks.evidence.over_seeds import OverSeeds
 from workbench.checks.results import RuleResult, Seen, Silenced, State, failed, merged
 from workbench.checks.rules import core_rules_of
+from workbench.core.broken_rule import NeedsOneEnv
 from workbench.core.env import actions
 from workbench.core.env.kept_rows import KeptRows
 from workbench.core.env.task_env import TaskEnv
@@ -116,6 +117,8 @@ def _checked(rule: str, check: Check, checkup: Checkup, degree: Degree, rows: li
     seen: list[Found | Note] = []
 
     def look() -> None:
+        seen.clear()
+        rows.clear()
         if isinstance(check, OverSeeds):
             for row in check.see(checkup):
                 rows.append(_with_code(rule, row))
@@ -152,10 +155,16 @@ def ended_as(look: Callable[[], None]) -> Ended:
 
 
 def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
-    """Call it. What the author's code raises in it, a robot's property say, is a TaskError."""
+    """Call it; again with one env where the task does what exists for one only, as opening it does. What the author's code
+    raises in it, a robot's property say, is a TaskError."""
     try:
         look()
-    except (NotApplicable, NotKnown, TaskError, CheckEnded):
+    except TaskError as error:
+        if checkup.num_envs == 1 or not isinstance(error.__cause__, NeedsOneEnv):
+            raise
+        checkup.go_on_with_one_env()
+        _of_task(look, checkup)
+    except (NotApplicable, NotKnown, CheckEnded):
         raise
     except Exception as error:
         if not _is_of_task(error, checkup):

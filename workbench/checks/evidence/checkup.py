@@ -172,6 +172,7 @@ class Checkup:
         self._open: list[TaskEnv] = []
         self._built_with_renderer = False
         self._rules: BrokenRules | None = None
+        self._silenced_before: list[Silenced] = []
         self._looked: dict[Callable[[Checkup], Any], Any] = {}
 
     def close(self) -> None:
@@ -180,8 +181,17 @@ class Checkup:
             with suppress(TaskError):
                 self._close(self._open.pop())
         self._looked.clear()
-        for name in ("task", "pictured", "starts", "overlaps", "still", "random", "acted"):
-            self.__dict__.pop(name, None)
+        for name, member in vars(Checkup).items():
+            if isinstance(member, cached_property):
+                self.__dict__.pop(name, None)
+
+    def go_on_with_one_env(self) -> None:
+        """Forget what several envs have shown, but for breaches: the task does what exists for one env only."""
+        self._silenced_before = self.silenced
+        self.close()
+        self.num_envs, self._rules = 1, None
+        for seen in (self.failed, self.builds, self.merges):
+            seen.clear()
 
     def _once(self, see: Callable[[Checkup], _Value]) -> _Value:
         """What `see` gives; if it raised before, the same error."""
@@ -265,7 +275,8 @@ class Checkup:
     def silenced(self) -> list[Silenced]:
         """Breaches of the rules of GPU simulation that a comment silences, seen so far."""
         known = () if self._rules is None else self._rules.silenced
-        return [Silenced(finding, silence.reason, silence.line) for finding, silence in known]
+        of_task = [Silenced(finding, silence.reason, silence.line) for finding, silence in known]
+        return [*self._silenced_before, *of_task]
 
     @property
     def _needs_renderer(self) -> bool:

@@ -18,7 +18,6 @@ from workbench.checks.by_hook.run import CORE, check_core, check_rule, findings_
 from workbench.checks.evidence.checkup import CheckEnded, Checkup
 from workbench.checks.rules import degree_of_each
 from workbench.core.backends import find_renderer, keep_render_device
-from workbench.core.broken_rule import NeedsOneEnv
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.step_result import StepResult
@@ -71,7 +70,6 @@ class _Worker:
         self._what, self._loaded, self._runs, self._here, self._queue = what, loaded, runs, here, queue
         self._degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
         self._plan = plan_of(what, self._degrees)
-        self._num_envs = what.options.num_envs
         self._number = -1
         self._part = -1
         self._checkup: Checkup | None = None
@@ -92,13 +90,7 @@ class _Worker:
             activity = name if count == 1 else f"seeds, part {item.part + 1} of {count}: {name}"
             self._queue.send_update(CheckUpdate(activity=activity))
             task = self.task if number == first else None
-            outcome = self._checked(item, checkup, task)
-            if self._num_envs > 1 and any(_needs_one_env(error) for error in checkup.failed.values()):
-                self._num_envs = 1
-                self.close()
-                self._checkup = None
-                outcome = self._checked(item, self._checkup_of(item.part), task)
-            self._queue.send_result(number, outcome)
+            self._queue.send_result(number, self._checked(item, checkup, task))
 
     def _keep_going(self) -> None:
         if self._queue.limit() <= self._number:
@@ -120,7 +112,7 @@ class _Worker:
         self._checkup = Checkup(
             self._loaded,
             what.options.env_kwargs,
-            num_envs=self._num_envs,
+            num_envs=what.options.num_envs,
             seeds=len(episodes),
             first_seed=what.options.seed + episodes.start,
             actors=[given] if given is not None and given.seeds else [],
@@ -142,10 +134,6 @@ class _Worker:
             checkup.picture_seconds,
             task,
         )
-
-
-def _needs_one_env(error: Exception) -> bool:
-    return isinstance(error.__cause__, NeedsOneEnv)
 
 
 def _require_assets(loaded: LoadedTask, what: CheckOptions) -> None:

@@ -53,7 +53,7 @@ class WorkerChecks:
         from workbench.checks.evidence.checkup import CheckEnded
         from workbench.checks.evidence.step_profile import profile_step
 
-        checkup = self._checkup_of(opened.loaded, options)
+        checkup = self._checkup_of(opened, options)
         try:
             if isinstance(question, CheckGroup):
                 with on_free_cores(self._waits):
@@ -104,16 +104,17 @@ class WorkerChecks:
         following = question.group + 1
         return CheckedGroup(len(groups), total, groups[following].name if following < len(groups) else "")
 
-    def _checkup_of(self, loaded: LoadedTask, options: TaskOptions) -> Checkup:
+    def _checkup_of(self, opened: OpenedTask, options: TaskOptions) -> Checkup:
         from workbench.checks.evidence.checkup import Checkup  # late: the worker that plays checks nothing
 
+        loaded = opened.loaded
         if self._checkup is None or self._of is not loaded:
             self.close()
             self._checkup, self._of = (
                 Checkup(
                     loaded,
                     options.env_kwargs,
-                    num_envs=1 if options.num_envs == 1 else NUM_ENVS,
+                    num_envs=1 if opened.env.num_envs == 1 else NUM_ENVS,
                     seeds=SEEDS,
                     keep_going=self._keep_going,
                 ),
