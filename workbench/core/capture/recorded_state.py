@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -53,14 +54,18 @@ def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
     written by ManiSkill's own setters. Fetches the tensors.
     """
     missed = {i: state_mismatches(env, i, state) for i, state in states.items()}
-    for name, struct in scene_index(env).states.items():
-        fitting = [
-            i for i in maniskill_private.envs_of(struct).tolist() if i in states and name not in missed[i]
-        ]
-        rows = {i: states[i][name] for i in fitting}
-        if rows:
-            values = torch.as_tensor(np.stack([*rows.values()]).astype(np.float32), device=env.device)
-            struct.set_state(values, torch.tensor([*rows], device=env.device))
+    px = batched_system(env.scene)
+    maniskill_private.fetch(env)
+    # Only what differs is written: a root pose that is set once more reads back with another rounding.
+    with nullcontext() if px is None else px.holding_back():
+        for name, struct in scene_index(env).states.items():
+            fitting = [
+                i for i in maniskill_private.envs_of(struct).tolist() if i in states and name not in missed[i]
+            ]
+            rows = {i: states[i][name] for i in fitting}
+            if rows:
+                values = torch.as_tensor(np.stack([*rows.values()]).astype(np.float32), device=env.device)
+                struct.set_state(values, torch.tensor([*rows], device=env.device))
     maniskill_private.apply_and_fetch(env)
     _write_controllers(env, states)
 
