@@ -216,5 +216,6 @@ def test_a_cluster_that_dies_ends_the_command_with_a_sentence_and_keeps_what_is_
     assert "Ray" in said and "--job" in said, said
     kept = [path.stem for path in out.glob("*.json")]
     assert kept and all((out / f"{stem}{suffix}").exists() for stem in kept for suffix in (".rrd", ".h5"))
-    _, alive = psutil.wait_procs(family, timeout=40)
+    # Its agents look for it a while.
+    _, alive = psutil.wait_procs(family, timeout=100)
     assert not alive

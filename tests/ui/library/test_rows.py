@@ -14,10 +14,10 @@ from workbench.ui.library.rows import (
     COLUMNS,
     SECOND_LINE,
     Column,
+    Running,
     cells,
     chosen,
     in_words,
-    newest_sources,
     none_like_that,
     ordered,
 )
@@ -113,19 +113,21 @@ def test_no_row_is_lost_by_sorting(facts: list[dict[str, Any]], column: Column, 
     rows = [row(str(k), **values) for k, values in enumerate(facts)]
     assert sorted(ids(ordered(rows, column, descending))) == sorted(ids(rows))
     for one in rows:
-        cells(one, newest_sources(rows), NOW)
+        cells(one, Running(one.task, "aa"), NOW)
 
 
-def test_another_version_of_the_source_than_the_newest_recordings_is_marked() -> None:
+def test_another_version_of_the_source_than_the_open_tasks_is_marked() -> None:
     rows = [
         row("a", source_hash="old0123456789", written=1.0),
-        row("b", source_hash="new", written=2.0),
-        row("c", source_hash="older", written=0.5, task="Pick-v1"),
-        row("d"),
+        row("b", source_hash="of a bug, and newest", written=3.0),
+        row("c", source_hash="as it is now", written=2.0),
+        row("d", source_hash="older", written=0.5, task="Pick-v1"),
+        row("e"),
     ]
-    said = [cells(one, newest_sources(rows), NOW) for one in rows]
-    assert [one["other_version"] for one in said] == [True, False, False, False]
-    assert [one["version"] for one in said] == ["old0123", "new", "older", ""]
+    said = [cells(one, Running(rows[0].task, "as it is now"), NOW) for one in rows]
+    assert [one["other_version"] for one in said] == [True, True, False, False, False]
+    assert [one["version"] for one in said] == ["old0123", "of a bu", "as it i", "older", ""]
+    assert not any(cells(one, None, NOW)["other_version"] for one in rows)
 
 
 def test_cells_say_what_there_is_and_nothing_where_nothing_is_known() -> None:
