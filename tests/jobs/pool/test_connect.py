@@ -189,6 +189,13 @@ def test_ctrl_c_keeps_what_is_over_and_ends_the_cluster(tmp_path: Path, ray_fold
     assert not alive
 
 
+def named(process: psutil.Process) -> str:
+    try:
+        return process.name()
+    except psutil.NoSuchProcess:
+        return ""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("daemon", ["raylet", "gcs_server"])
 def test_a_cluster_that_dies_ends_the_command_with_a_sentence_and_keeps_what_is_recorded(
@@ -209,7 +216,7 @@ def test_a_cluster_that_dies_ends_the_command_with_a_sentence_and_keeps_what_is_
     )
     until(lambda: started.poll() is not None or any(out.glob("*.json")), "an episode", 120)
     family = psutil.Process(started.pid).children(recursive=True)
-    (victim,) = [process for process in family if process.name() == daemon]
+    (victim,) = [process for process in family if named(process) == daemon]
     victim.kill()
     _, said = started.communicate(timeout=55)  # after 60 s Ray would end it from native code
     assert started.returncode == 1 and "Traceback" not in said and "core_worker" not in said, said
