@@ -140,7 +140,7 @@ def test_no_command_runs_what_lies_in_the_current_folder(tmp_path: Path) -> None
     plain = ("--env", "render_backend=none")
     recording = start(
         tmp_path, "record", "minimal.py", "--episodes", "2", "--max-steps", "3", "--workers", "2",
-        "--no-pictures", "--envs-per-worker", "2", "--out", "recordings", *plain,
+        "--no-pictures", "--num-envs", "2", "--out", "recordings", *plain,
     )  # fmt: skip
     doctor = start(tmp_path, "doctor")
     said = finished(recording)

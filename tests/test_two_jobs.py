@@ -179,7 +179,7 @@ def recording(folder: Path, name: str, seed: int) -> Iterator[subprocess.Popen[s
         "--seed",
         str(seed),
     ]
-    command += ["--actions", f"{name}.py:act", "--episodes", "1", "--envs-per-worker", "1", "--no-pictures"]
+    command += ["--actions", f"{name}.py:act", "--episodes", "1", "--num-envs", "1", "--no-pictures"]
     command += ["--env", "render_backend=none"]
     process = subprocess.Popen(
         command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

@@ -49,7 +49,7 @@ MANY = 1000
 class Options:
     task: str = "PushCube-v1"
     episodes: int = 512
-    envs_per_worker: int = 16
+    num_envs: int = 16
     turns: int = 3
     write: bool = False
 
@@ -74,7 +74,7 @@ def recorded(options: Options, executor: Executor, episodes: int) -> tuple[Run, 
             Path(folder),
             episodes,
             pictures=False,
-            options=TaskOptions(options.envs_per_worker, env_kwargs={"render_backend": "none"}),
+            options=TaskOptions(options.num_envs, env_kwargs={"render_backend": "none"}),
         )
         began = time.monotonic()
         done = record(
@@ -164,7 +164,7 @@ def text(options: Options) -> Iterator[str]:
     local, cluster, alone = middle["local"], middle["ray"], middle["one"]
     yield (
         f"Measured on {date.today():%B %-d, %Y}, {CORES} cores, {options.task}, {options.episodes} episodes of 50 steps "
-        f"without pictures, {options.envs_per_worker} envs a worker; medians of {options.turns} turns of all sides in one run "
+        f"without pictures, {options.num_envs} envs a worker; medians of {options.turns} turns of all sides in one run "
         "(`tests/benchmarks/cluster.py`)."
     )
     yield ""
@@ -192,7 +192,7 @@ def text(options: Options) -> Iterator[str]:
         f"| the files that travel ({len(baggage.data) / 1e6:.1f} MB, the examples in `tasks/`), packed once | {1000 * packed:.0f} ms |"
     )
     yield ""
-    yield from on_paper(cluster.rate / CORES, messages, taken, kept, options.envs_per_worker)
+    yield from on_paper(cluster.rate / CORES, messages, taken, kept, options.num_envs)
 
 
 def on_paper(rate: float, messages: float, taken: float, kept: float, envs: int) -> Iterator[str]:

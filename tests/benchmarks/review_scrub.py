@@ -176,7 +176,7 @@ def main(options: Options) -> None:
         folder = Path(name)
         envs = str(options.envs)
         subprocess.run(
-            [sys.executable, "-m", "workbench.cli.main", "record", str(TASK), "--episodes", envs, "--envs-per-worker", envs,
+            [sys.executable, "-m", "workbench.cli.main", "record", str(TASK), "--episodes", envs, "--num-envs", envs,
              "--no-pictures", "--out", str(folder)],
             check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip

@@ -144,7 +144,7 @@ def factories(env_id: str, count: int, folder: Path) -> dict[str, list[str]]:
     """The command of each side."""
     cores = str(len(os.sched_getaffinity(0)))
     ours = ["workbench.cli.main", "record", env_id, "--actions", "solve", "--successes", str(count)]
-    ours += ["--no-pictures", "--envs-per-worker", "1", "--workers", cores]
+    ours += ["--no-pictures", "--num-envs", "1", "--workers", cores]
     ours += ["--env", "render_backend=none", "--out", str(folder / "ours")]
     theirs = ["mani_skill.examples.motionplanning.panda.run", "--env-id", env_id, "--num-traj", str(count)]
     theirs += ["--only-count-success", "--num-procs", cores, "--sim-backend", "cpu"]

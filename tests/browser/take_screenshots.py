@@ -345,9 +345,9 @@ def shoot_review(browser: Browser) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(shutil.copy(TASK, Path(folder) / TASK.name))
         recordings = Path(folder) / "recordings"
-        record(file, recordings, "--episodes", "8", "--envs-per-worker", "8")
+        record(file, recordings, "--episodes", "8", "--num-envs", "8")
         file.write_text(TASK.read_text().replace("CUBE_HALF_SIZE = 0.02", "CUBE_HALF_SIZE = 0.025"))
-        record(file, recordings, "--episodes", "2", "--envs-per-worker", "8", "--no-pictures")
+        record(file, recordings, "--episodes", "2", "--num-envs", "8", "--no-pictures")
         with open_workbench(str(recordings), cwd=Path(folder), what="review") as opened:
             page, _ = new_page(browser)
             page.goto(opened.url)

@@ -89,3 +89,41 @@ def test_a_tab_that_a_key_opens_while_the_page_comes_back_stays_open(desk: Desk)
     until(opened, "the tab")
     page.wait_for_timeout(1500)
     expect(checks).to_have_attribute("aria-selected", "true")
+
+
+BREAKS = """
+import os, signal
+from workbench.checks.by_hook.run import GROUPS
+
+def crashes(checkup):
+    raise KeyError("our own mistake")
+
+def dies(checkup):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+for group in GROUPS:
+    for rule, broken in (("versioned-id", crashes), ("entry-name", dies)):
+        if rule in group.checks:
+            group.checks[rule] = broken
+"""
+
+
+@pytest.mark.slow
+def test_rules_whose_checks_fail_are_shown_and_all_others_are_checked(
+    tmp_path: Path, browser: Browser
+) -> None:
+    file = Path(shutil.copy(TASK, tmp_path))
+    (tmp_path / "breaks.py").write_text(BREAKS)
+    arguments = ("--num-envs", "2", "--env", "render_backend=none", "--import", "breaks")
+    with page_on(file, *arguments, browser=browser, checks=True) as (page, errors, _):
+        page.get_by_role("tab", name=re.compile("^Checks")).click()
+        told = page.get_by_text(re.compile(r"^\d+ rules checked in "))
+        expect(told).to_be_visible(timeout=240_000)
+        for rule, why in (("versioned-id", "our own mistake"), ("entry-name", "SIGKILL")):
+            card = page.locator(f"[data-rule={rule}]")
+            expect(card).to_contain_text(why)
+            expect(card.locator(".wb-tag")).to_have_text("failed")
+        expect(page.get_by_text(re.compile(r"\d+ kept, \d+ not known, \d+ not applicable, 2 failed"))).to_be_visible()  # fmt: skip
+        page.get_by_text("rules without a finding").click()
+        expect(page.locator(".wb-check-rest")).to_contain_text("no random episode succeeds")
+        assert errors == []

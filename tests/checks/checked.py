@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import linecache
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,10 @@ import pytest
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from workbench.authoring.loading.load import load_task, undo_load
-from workbench.checks.by_hook.run import GROUPS, RuleResult, core_results, run_group
+from workbench.checks.by_hook import run
 from workbench.checks.evidence.checkup import Checkup
-from workbench.checks.rules import RULES
+from workbench.checks.results import RuleResult, by_rule
+from workbench.checks.rules import CHECK_RULES, RULES
 from workbench.core.rules import Finding
 
 EXAMPLE = Path(__file__).parents[2] / "tasks" / "push_cube.py"
@@ -66,15 +67,23 @@ def check_rules(
     degrees = dict.fromkeys(RULES, "off") | {rule: RULES[rule].degree for rule in rules}
     loaded = load_task(reference)
     checkup = Checkup(loaded, env_kwargs, num_envs=num_envs, seeds=seeds)
-    results: list[RuleResult] = []
     try:
-        for group in GROUPS:
-            results += run_group(group, checkup, degrees)  # type: ignore[arg-type]
-        results += core_results(checkup.findings, checkup.silenced, degrees)  # type: ignore[arg-type]
+        return by_rule(results_of(checkup, degrees))
     finally:
         checkup.close()
         undo_load(loaded)
-    return {result.rule: result for result in results}
+
+
+def results_of(checkup: Checkup, degrees: Mapping[str, Any]) -> list[RuleResult]:
+    """What the rules that are not off came to, those of GPU simulation last."""
+    results: list[RuleResult] = []
+    for group in run.GROUPS:
+        for rule, check in group.checks.items():
+            if degrees.get(rule, "off") != "off":
+                results += run.check_rule(rule, check, checkup, degrees)
+    if any(rule not in CHECK_RULES and degree != "off" for rule, degree in degrees.items()):
+        results += run.check_core(checkup, degrees)
+    return [*results, *run.core_results(run.findings_of(checkup), checkup.silenced, degrees)]
 
 
 def the_finding(result: RuleResult) -> Finding:

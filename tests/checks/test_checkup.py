@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.checks.checked import EXAMPLE, Checked
+import pytest
+
+from tests.checks.checked import EXAMPLE, Checked, check_rules, results_of, the_finding
 from workbench.authoring.loading.load import load_task, undo_load
-from workbench.checks.by_hook.run import GROUPS, run_group
 from workbench.checks.evidence.checkup import Checkup
+from workbench.checks.rules import RULES
 
 
 def test_a_task_that_cannot_be_built_without_a_renderer_gets_one(renderer: None) -> None:
@@ -29,14 +31,15 @@ def test_a_task_that_raises_with_a_renderer_too_is_told_once(renderer: None, tmp
     loaded = load_task(str(file))
     checkup = Checkup(loaded, num_envs=2, seeds=2)
     try:
-        group = next(group for group in GROUPS if "loop-over-envs" in group.checks)
-        results = list(run_group(group, checkup, dict.fromkeys(("runs", *group.checks), "warn")))
+        rules = "runs", "loop-over-envs", "device-copies", "foreign-device"
+        results = results_of(checkup, dict.fromkeys(RULES, "off") | dict.fromkeys(rules, "warn"))
     finally:
         checkup.close()
         undo_load(loaded)
-    (runs,) = (result for result in results if result.rule == "runs")
-    assert "self.gone" in runs.findings[0].code
-    assert {result.state for result in results if result is not runs} == {"failed"}
+    runs = [result for result in results if result.rule == "runs"]
+    assert {finding.key for result in runs for finding in result.findings} == {runs[0].findings[0].key}
+    assert "self.gone" in runs[0].findings[0].code
+    assert {result.state for result in results if result.rule != "runs"} == {"not_known"}
 
 
 def test_a_loop_in_the_source_is_told_where_the_task_cannot_be_built(checked: Checked) -> None:
@@ -44,5 +47,72 @@ def test_a_loop_in_the_source_is_told_where_the_task_cannot_be_built(checked: Ch
     loop = "        for i in range(self.num_envs): pass\n"
     edits = (at, at + loop), ('name="goal"', "name=self.gone")
     result = checked("loop-over-envs", *edits, render_backend="none")
-    assert result.state == "failed" and "gone" in result.why
+    assert result.state == "broken" and "gone" in result.why
     assert [finding.code for finding in result.findings] == [loop.strip()]
+
+
+ONE_ENV = "        super().__init__(*args, robot_uids=robot_uids, **kwargs)\n"
+ONLY = "        if kwargs.get('num_envs', 1) != 1: raise ValueError('one env only')\n"
+
+
+def test_of_one_env_no_rule_makes_more_and_what_needs_more_is_not_known(
+    tmp_path: Path, renderer: None
+) -> None:
+    text = EXAMPLE.read_text()
+    assert ONE_ENV in text
+    (tmp_path / "task.py").write_text(text.replace(ONE_ENV, ONLY + ONE_ENV))
+    rules = RULES.keys() - {"runs"}
+    results = check_rules(rules, str(tmp_path / "task.py"), num_envs=1, seeds=3)
+    assert [result for result in results.values() if result.problem is not None or result.findings] == []
+    assert rules == results.keys()
+    needs_more = {rule for rule, result in results.items() if "several envs" in result.why}
+    assert {
+        "other-env-written",
+        "evaluate-rows",
+        "batch-of-reset",
+        "loop-over-envs",
+        "reward-flat",
+    } <= needs_more
+    assert not needs_more & {"success-at-reset", "reward-finite", "state-restores", "device-copies"}
+    assert {results[rule].state for rule in needs_more} == {"not_known"}
+
+
+WRITTEN_FOR_ONE = (
+    pytest.param("runs", '        reward[info["fail"]] = 0\n', "if info['fail']: reward = 0 * reward", id="an if"),
+    pytest.param("evaluate-rows", "        return {\n", "distance, height = distance[:1], height[:1]", id="one row"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("rule", "before", "line"), WRITTEN_FOR_ONE)
+def test_a_task_that_is_written_for_one_env_is_told_so_at_its_line(
+    checked: Checked, rule: str, before: str, line: str
+) -> None:
+    edit = before, f"        {line}\n{before}"
+    finding = the_finding(checked(rule, edit))
+    assert "--num-envs 1" in finding.message and finding.line is not None
+    if rule == "runs":
+        assert finding.code == line
+    assert checked(rule, edit, num_envs=1).findings == ()
+
+
+def test_what_a_robot_of_the_author_raises_is_theirs(checked: Checked) -> None:
+    """The reach is measured by its property, which no hook of the task calls here."""
+    robot = (
+        "@register_agent()\nclass Odd(Panda):\n    uid = 'odd_arm'\n\n    @property\n    def tcp(self):\n"
+        "        raise ValueError('no tcp yet')\n\n    @tcp.setter\n    def tcp(self, value):\n        self.kept = value\n\n\n"
+    )
+    imports = "from mani_skill.agents.registration import register_agent\nfrom mani_skill.agents.robots import Panda\n"
+    above = '@register_env("WorkbenchPushCube-v1"'
+    edits = (
+        ("import numpy as np\n", f"import numpy as np\n{imports}"),
+        (above, robot + above),
+        ("self.agent.tcp.pose", "self.agent.kept.pose"),
+    )
+    result = checked("outside-reach", *edits, robot_uids="odd_arm")
+    assert result.state == "not_known" and result.problem is not None
+    assert result.problem.code == "raise ValueError('no tcp yet')"
+
+
+def test_what_one_env_raises_too_gets_no_advice_to_take_one(checked: Checked) -> None:
+    edit = '"cube_height": height,', '"cube_height": height / self.gone,'
+    assert "--num-envs" not in the_finding(checked("runs", edit)).message

@@ -61,7 +61,7 @@ def test_a_comment_whose_rule_found_nothing_there_is_told() -> None:
 
 
 def test_a_rule_that_was_not_decided_says_nothing_of_a_comment() -> None:
-    for state in ("failed", "skipped"):
+    for state in ("failed", "not_known", "not_applicable"):
         assert told(RuleResult("reward-finite", state)) == []
     assert told() == []
 

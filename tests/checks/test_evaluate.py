@@ -31,14 +31,14 @@ def test_no_entry_for_success(checked: Checked) -> None:
 
 def test_a_dense_reward_needs_no_success() -> None:
     result = check_rule("success-stays-possible", "MS-CartpoleSwingUp-v1", num_envs=4, seeds=4)
-    assert result.state == "kept" and "no success rate" in result.notes[0]
+    assert result.state == "not_applicable" and "no success rate" in result.notes[0]
 
 
 def test_how_many_random_episodes_succeed_is_noted(checked: Checked) -> None:
     result = checked(
         "success-stays-possible", ('"success": (distance < GOAL_RADIUS)', '"success": (distance < 1)')
     )
-    assert result.state == "kept" and result.notes == ("success in 8 of 8 random episodes",)
+    assert result.state == "not_applicable" and result.notes == ("success in 8 of 8 random episodes",)
 
 
 def test_an_entry_that_is_nearly_success(checked: Checked) -> None:
@@ -68,7 +68,11 @@ def test_success_and_fail_together(checked: Checked) -> None:
         ("height < -0.1", "height < 1"),
     )
     assert "`success & ~fail`" in the_finding(checked("success-and-fail", *edits)).message
-    assert checked("success-and-fail").state == "kept"
+    result = checked("success-and-fail")
+    assert (result.state, result.why) == ("not_known", "no tried episode succeeds")
+    seldom = '"success": (distance < 1) & (self.elapsed_steps > 4)', '"fail": self.elapsed_steps < 3,'
+    edits = (('"success": (distance < GOAL_RADIUS)', seldom[0]), ('"fail": height < -0.1,', seldom[1]))
+    assert checked("success-and-fail", *edits).state == "kept"
 
 
 def test_success_that_is_true_for_a_single_step_at_a_time(checked: Checked) -> None:
@@ -87,7 +91,7 @@ def test_why_nothing_is_said_of_success_that_comes_and_goes(checked: Checked) ->
         ("(distance < 9) & (self.elapsed_steps == 50)", "success comes at the last step only"),
     ):
         result = checked("success-flickers", (edit, f'"success": {success}'))
-        assert (result.state, result.why) == ("skipped", why)
+        assert (result.state, result.why) == ("not_known", why)
 
 
 def test_a_comment_with_a_reason_silences_a_finding(checked: Checked) -> None:

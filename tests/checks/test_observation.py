@@ -88,4 +88,4 @@ def test_a_goal_whose_parts_are_hidden_is_hidden(checked: Checked, renderer: Non
 
 
 def test_without_hidden_bodies_there_is_no_hidden_goal(checked: Checked, renderer: None) -> None:
-    assert checked("hidden-goal", (GOAL, "")).state == "skipped"
+    assert checked("hidden-goal", (GOAL, "")).state == "not_applicable"

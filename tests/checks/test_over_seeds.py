@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Literal
+
 import pytest
 
+from workbench.authoring.problem import Problem
 from workbench.checks.by_hook.run import RULES_OVER_SEEDS, over_seeds, result_of
-from workbench.checks.evidence.checkup import CannotCheck, Found, Note
+from workbench.checks.evidence.checkup import Found, Note, NotKnown
 from workbench.checks.results import RuleResult, Seen
 
 PLACE = "task.py", 12, "evaluate"
@@ -19,8 +23,8 @@ def result(rule: str, *rows: Seen) -> RuleResult:
     """Of one part of the seeds."""
     try:
         found = judged(rule, *rows)
-    except CannotCheck as reason:
-        return RuleResult(rule, "skipped", why=str(reason), seen=rows)
+    except NotKnown as reason:
+        return RuleResult(rule, "not_known", why=str(reason), seen=rows)
     from_rows = result_of(rule, "warn", found, rows)
     return RuleResult(
         rule, from_rows.state, from_rows.findings, from_rows.silenced, from_rows.notes, seen=rows
@@ -44,9 +48,15 @@ def test_breaches_are_counted_over_all_seeds() -> None:
 
 
 def test_the_worst_of_all_parts_is_told() -> None:
-    def falls(metres: float, *seeds: int) -> tuple[Seen, Seen]:
+    loose = Seen(("loose", "cube"))
+
+    def falls(metres: float, *seeds: int) -> tuple[Seen, ...]:
         text = (f"falls {metres:.2f} m and turns 0 degrees",)
-        return Seen(tried=32), Seen(("body", "cube", "cube"), PLACE, seeds=seeds, size=metres, texts=text)
+        return (
+            Seen(tried=32),
+            loose,
+            Seen(("body", "cube", "cube"), PLACE, seeds=seeds, size=metres, texts=text),
+        )
 
     parts = [result("falls-at-reset", *falls(0.1, 4)), result("falls-at-reset", *falls(0.3, 40, 41))]
     (finding,) = over_seeds(parts, "warn").findings
@@ -55,8 +65,8 @@ def test_the_worst_of_all_parts_is_told() -> None:
         and "3 of 64 seeds (seed 4, 40, 41)" in finding.message
     )
     # What is held at one seed may slip at all.
-    held = result("falls-at-reset", Seen(("wanted", "cube")), Seen(tried=32))
-    assert over_seeds([*parts, held], "warn").state == "kept"
+    held = result("falls-at-reset", Seen(("wanted", "cube")), loose, Seen(tried=32))
+    assert over_seeds([*parts, held], "warn").state == "not_known"
 
 
 def test_what_changes_between_parts_is_not_constant() -> None:
@@ -85,15 +95,16 @@ def test_what_changes_between_parts_is_not_constant() -> None:
     assert over_seeds([shelf(0.1), shelf(0.1)], "warn").state == "broken"
     # One seed alone in its part says nothing by itself, and is counted with the others.
     last = result("kinematic-never-moved", Seen(tried=1), Seen(("shelf",), PLACE, numbers=(0.0,) * 14))
-    assert last.state == "skipped" and over_seeds([shelf(0.1), last], "warn").state == "kept"
+    assert last.state == "not_known" and over_seeds([shelf(0.1), last], "warn").state == "kept"
 
 
-def test_what_is_out_of_reach_at_some_seeds_is_told_and_what_always_is_is_not() -> None:
+def test_what_is_out_of_reach_at_some_seeds_is_told_and_what_always_is_is_not_known() -> None:
     def cube(tried: int, *beyond: int) -> RuleResult:
         return result("outside-reach", Seen(("cube",), PLACE, tried, beyond, size=0.9, numbers=(0.8,)))
 
-    assert cube(2, 0, 1).state == "kept"
-    assert over_seeds([cube(2, 0, 1), cube(2, 2, 3)], "warn").state == "kept"
+    assert cube(2, 0, 1).state == "not_known"
+    assert over_seeds([cube(2, 0, 1), cube(2, 2, 3)], "warn").state == "not_known"
+    assert over_seeds([cube(2), cube(2)], "warn").state == "kept"
     (finding,) = over_seeds([cube(2, 0, 1), cube(2)], "warn").findings
     assert "in 2 of 4 seeds" in finding.message
 
@@ -110,28 +121,32 @@ def test_successes_are_counted_over_all_parts() -> None:
         return Seen(("random",), PLACE, tried=times, count=gone, numbers=(0.0, float(times > 0)))
 
     never, often = result("success-flickers", flickers(0, 0)), result("success-flickers", flickers(4, 2))
-    assert (never.state, often.state) == ("skipped", "broken")
+    assert (never.state, often.state) == ("not_known", "broken")
     assert over_seeds([never, often], "warn").state == "broken"
     holds = result("success-flickers", flickers(20, 0))
     assert over_seeds([often, holds], "warn").state == "kept", "2 of 24 times"
-    assert over_seeds([never, never], "warn").state == "skipped"
+    assert over_seeds([never, never], "warn").state == "not_known"
 
 
-def test_a_part_that_raises_leaves_the_rule_undecided_unless_another_breaks_it() -> None:
-    raised = RuleResult("success-at-reset", "failed", why="it raised")
+@pytest.mark.parametrize("state", ["not_known", "failed"])
+def test_a_part_that_raises_leaves_the_rule_undecided_unless_another_breaks_it(
+    state: Literal["not_known", "failed"],
+) -> None:
+    problem = Problem("step", "it raised", "task.py", 3, "x()", "")
+    raised = RuleResult("success-at-reset", state, why="it raised", problem=problem)
     kept = result("success-at-reset", succeeds_at_reset(32))
     broken = result("success-at-reset", succeeds_at_reset(32, 40))
     whole = over_seeds([kept, raised], "stop")
-    assert (whole.state, whole.why) == ("failed", "it raised")
+    assert (whole.state, whole.why, whole.problem) == (state, "it raised", problem)
     assert over_seeds([raised, broken], "stop").state == "broken"
-    assert over_seeds([raised, raised], "stop").state == "failed"
+    assert over_seeds([raised, raised], "stop").state == state
 
 
-def test_a_rule_that_says_nothing_in_any_part_is_skipped() -> None:
-    none = RuleResult("success-at-reset", "skipped", why="evaluate() has no entry success", seconds=1.0)
-    assert over_seeds([none, none], "stop") == RuleResult(
-        "success-at-reset", "skipped", why="evaluate() has no entry success", seconds=2.0
+def test_a_rule_that_says_nothing_in_any_part_is_not_applicable() -> None:
+    none = RuleResult(
+        "success-at-reset", "not_applicable", why="evaluate() has no entry success", seconds=1.0
     )
+    assert over_seeds([none, none], "stop") == replace(none, seconds=2.0)
 
 
 @pytest.mark.parametrize("rule", RULES_OVER_SEEDS)

@@ -51,7 +51,8 @@ def test_a_cube_that_is_thrown_may_fly(checked: Checked) -> None:
     thrown = (
         f"{CUBE_POSE}\n            self.cube.set_linear_velocity(torch.tensor([[0.5, 0, 0]]).repeat(b, 1))"
     )
-    assert checked("falls-at-reset", (CUBE_POSE, thrown)).state == "kept"
+    result = checked("falls-at-reset", (CUBE_POSE, thrown))
+    assert result.state == "not_known" and "cube" in result.why
 
 
 def test_a_whole_batch_in_a_partial_reset(checked: Checked) -> None:
@@ -64,6 +65,43 @@ def test_a_whole_batch_in_a_partial_reset(checked: Checked) -> None:
 def test_a_whole_batch_of_which_rows_are_taken_is_right(checked: Checked) -> None:
     edit = "torch.rand((b, 2))", "torch.rand((self.num_envs, 2))[env_idx]"
     assert checked("batch-of-reset", edit).state == "kept"
+
+
+LAZY = "            if not hasattr(self, 'begun'):\n                self.begun = torch.zeros((self.num_envs, 3))\n"
+KEPT = f"{LAZY}            self.begun[env_idx] = cube\n"
+MINE = "            if len(env_idx) < self.num_envs: raise ValueError('my own mistake')\n"
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        pytest.param(("builder.initial_pose = sapien.Pose(p=[0, 0", "self.gone\n        builder.initial_pose = sapien.Pose(p=[0, 0"), id="in the build"),
+        pytest.param((f"            {CUBE_POSE}\n", f"            {CUBE_POSE}\n{KEPT}{MINE}"), id="in a partial reset"),
+    ],
+)  # fmt: skip
+def test_a_buffer_of_all_envs_is_not_to_blame_for_another_mistake(
+    checked: Checked, edit: tuple[str, str]
+) -> None:
+    buffer = f"            {CUBE_POSE}\n", f"            {CUBE_POSE}\n{KEPT}"
+    assert checked("batch-of-reset", buffer).state == "kept"
+    edits = (edit,) if "begun" in edit[1] else (edit, buffer)
+    result = checked("batch-of-reset", *edits)
+    assert result.state == "not_known" and result.findings == () and result.problem is not None
+
+
+def test_another_task_of_the_file_is_not_looked_at(checked: Checked) -> None:
+    other = (
+        '@register_env("Other-v1", max_episode_steps=5)\nclass Other(BaseEnv):\n'
+        "    def _initialize_episode(self, env_idx, options):\n"
+        "        p = torch.zeros((self.num_envs, 3)) + np.random.rand()\n"
+        "        self.cube.set_pose(Pose.create_from_pq(p))\n\n"
+        "    def evaluate(self):\n        return {'success': [x for x in range(self.num_envs)]}\n\n\n"
+    )
+    above = '@register_env("WorkbenchPushCube-v1"'
+    # A rule that is broken in the same hook of the task that is checked.
+    breaks = (HEIGHT, f"{HEIGHT}            self.drawn = torch.rand((b, 2))\n")
+    for rule in ("batch-of-reset", "unseeded-random", "loop-over-envs"):
+        assert checked(rule, (above, other + above), breaks).state == "kept"
 
 
 TURNED = """half = torch.rand(b) * 3

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.checks.checked import Checked, the_finding
 
 
@@ -37,7 +39,7 @@ def test_a_sparse_reward_above_one(checked: Checked) -> None:
     finding = the_finding(checked("reward-normalized", sparse, reward_mode="sparse"))
     assert "goes from 2 to 2" in finding.message and finding.function == "compute_sparse_reward"
     assert checked("reward-normalized", reward_mode="sparse").state == "kept"
-    assert checked("reward-normalized", reward_mode="dense").state == "skipped"
+    assert checked("reward-normalized", reward_mode="dense").state == "not_applicable"
 
 
 def test_a_reward_that_is_nan_where_random_actions_do_not_lead(checked: Checked) -> None:
@@ -68,15 +70,43 @@ def test_a_normalized_reward_with_an_offset_is_noted(checked: Checked) -> None:
 
 def test_a_reward_without_a_normalized_one_has_no_ratio(checked: Checked) -> None:
     edit = 'SUPPORTED_REWARD_MODES = ("normalized_dense", "dense"', 'SUPPORTED_REWARD_MODES = ("dense"'
-    assert checked("reward-ratio", edit).state == "skipped"
+    assert checked("reward-ratio", edit).state == "not_applicable"
 
 
-def test_success_that_earns_less_than_the_way_to_it(checked: Checked) -> None:
-    finding = the_finding(
-        checked("reward-order", ('reward[info["success"]] = 3', 'reward[info["success"]] = 0'))
-    )
-    assert "at success" in finding.message and finding.function == "compute_dense_reward"
+@pytest.mark.parametrize("paid", ["0", "0.5"])
+def test_success_that_earns_less_than_the_way_to_it(checked: Checked, paid: str) -> None:
+    edit = 'reward[info["success"]] = 3', f'reward[info["success"]] = {paid}'
+    finding = the_finding(checked("reward-order", edit))
+    assert f"{float(paid) / 3:.4g} " in finding.message and finding.function == "compute_dense_reward"
     assert checked("reward-order").state == "kept"
+
+
+OUT_OF_REACH = '"success": (distance < GOAL_RADIUS)', '"success": (self.elapsed_steps > 1000)'
+
+
+def test_success_that_pays_less_is_found_though_no_episode_succeeds(checked: Checked) -> None:
+    edit = 'reward[info["success"]] = 3', 'reward[info["success"]] = 0.5'
+    finding = the_finding(checked("reward-order", OUT_OF_REACH, edit))
+    assert 'is 0.1667 wherever info["success"] is true' in finding.message
+
+
+@pytest.mark.parametrize("rule", ["reward-order", "reward-needs-success", "success-flickers"])
+def test_what_success_pays_is_not_known_where_none_was_seen(checked: Checked, rule: str) -> None:
+    result = checked(rule, OUT_OF_REACH)
+    assert result.state == "not_known" and "episode succeeds" in result.why
+    without = (
+        ('"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),', ""),
+        ('reward[info["success"]] = 3', ""),
+    )
+    assert checked(rule, *without).state == "not_applicable"
+
+
+RULES_OF_REWARDS = ("reward-finite", "reward-changes", "reward-order", "reward-needs-success")
+
+
+@pytest.mark.parametrize("rule", [*RULES_OF_REWARDS, "reward-normalized", "reward-rows", "reward-flat"])
+def test_a_task_without_a_reward_has_no_rules_of_rewards(checked: Checked, rule: str) -> None:
+    assert checked(rule, seeds=4, reward_mode="none").state == "not_applicable"
 
 
 def test_the_largest_reward_without_success(checked: Checked) -> None:

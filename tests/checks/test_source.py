@@ -28,7 +28,7 @@ def test_the_example_keeps_it(rule: str, checked: Checked) -> None:
 def test_a_class_without_an_id(checked: Checked) -> None:
     finding = the_finding(checked("registered", (REGISTERED, "")))
     assert finding.code.startswith("class PushCubeEnv") and '@register_env("PushCube-v1"' in finding.message
-    assert checked("versioned-id", (REGISTERED, "")).state == "skipped"
+    assert checked("versioned-id", (REGISTERED, "")).state == "not_applicable"
 
 
 def test_an_id_without_a_version(checked: Checked) -> None:

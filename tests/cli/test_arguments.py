@@ -77,3 +77,22 @@ def test_a_package_that_is_older_than_the_range_is_named_with_the_command(
     first, second = capsys.readouterr().err.splitlines()
     assert ended.value.code == 2
     assert first.startswith("viser>=99 is wanted, ") and second.endswith(" 'viser>=99'")
+
+
+@pytest.mark.parametrize("command", ["open", "check", "record", "rescore", "solve", "sweep"])
+def test_how_many_envs_run_at_once_has_one_name(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main.main([command, "--help"])
+    assert "--num-envs INT" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("given", [["--envs-per-worker", "0"], ["--envs_per_worker=0"]])
+def test_the_old_name_of_an_option_works_and_is_told_once(
+    given: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    example = str(Path(__file__).parents[2] / "tasks" / "push_cube.py")
+    with pytest.raises(SystemExit) as ended:
+        main.main(["check", example, *given])
+    told = capsys.readouterr().err
+    assert ended.value.code == 2 and "--num-envs must be from 1 to 4096, not 0" in told
+    assert told.count("is called --num-envs now") == 1

@@ -33,7 +33,7 @@ EDITS = (
 )
 """One breach of a rule that stops, one of a rule that warns, one that is silenced, and a comment that silences nothing."""
 RULES_OF_IT = "success-at-reset,success-and-fail,reward-normalized,reward-finite,reward-rows"
-FEW = ("--envs-per-worker", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
+FEW = ("--num-envs", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def test_what_is_ignored_is_in_the_summary_and_in_each_report(
 
 def test_as_many_seeds_as_were_asked_for_are_tried(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of three, with two envs: the fourth is not counted."""
-    few = ("--envs-per-worker", "2", "--seeds", "3", "--workers", "1", "--env", "render_backend=none")
+    few = ("--num-envs", "2", "--seeds", "3", "--workers", "1", "--env", "render_backend=none")
     ended = run(capsys, "bad.py", "--select", "success-at-reset,success-stays-possible", "--json", *few)
     said = json.loads(ended.out)
     (finding,) = said["findings"]
@@ -201,12 +201,12 @@ def test_rules_that_one_error_leaves_undecided_stand_below_it(
     (place / "raises.py").write_text(text.replace('name="goal"', "name=self.gone"))
     rules = "reward-finite,reward-changes,success-at-reset,success-and-fail,entry-name"
     ended = run(capsys, "raises.py", "--select", rules, *FEW)
-    why = ended.out.index("not decided ")
+    why = ended.out.index("not known ")
     assert "'gone'" in ended.out[why:].split("\n")[0]
     # Where its lines break is the terminal's matter.
     words = " ".join(ended.out[why:].split())
     assert " 5 rules: success-at-reset, success-and-fail, entry-name, reward-finite, reward-changes " in words
-    assert ended.err.count("not decided") == 1
+    assert ended.err.count("not known") == 1
 
 
 def test_a_comment_that_silences_nothing_any_more_is_told(
@@ -237,7 +237,7 @@ def test_what_acts_in_further_episodes_is_named(place: Path, capsys: pytest.Capt
     ended = check("policies.py:still")
     assert ended.code == 0 and "note success-stays-possible: success in 0 of 2 given episodes" in ended.out
     ended = check("policies.py:wrong")
-    assert ended.code == 1 and "not decided success-stays-possible" in ended.out
+    assert ended.code == 1 and "not known success-stays-possible" in ended.out
     assert "policies.py:9: KeyError" in ended.out and "1 rule kept, 0 broken" in ended.out
     ended = check("policies.py:gone")
     assert ended.code == 2 and "has no function gone" in ended.err
@@ -272,7 +272,7 @@ def test_a_task_that_needs_a_renderer_gets_one(place: Path, child_process: None)
     words = [
         "check",
         "drawn.py",
-        "--envs-per-worker",
+        "--num-envs",
         "2",
         "--seeds",
         "2",
@@ -290,7 +290,11 @@ def test_pictures_are_not_asked_of_a_task_that_is_made_without_a_renderer(
 ) -> None:
     ended = run(capsys, "good.py", "--select", "ground-truth,camera-sees,runs", "--json", *FEW)
     states = {one["rule"]: one["state"] for one in json.loads(ended.out)["rules"]}
-    assert ended.code == 0 and states == {"runs": "kept", "ground-truth": "skipped", "camera-sees": "skipped"}
+    assert ended.code == 0 and states == {
+        "runs": "kept",
+        "ground-truth": "not_known",
+        "camera-sees": "not_known",
+    }
 
 
 def test_json_is_all_that_is_printed_and_equals_the_file(
@@ -366,7 +370,9 @@ def test_junit_has_a_test_case_for_each_rule(place: Path, capsys: pytest.Capture
         for name in ("failure", "skipped", "error"):
             told = {"failure": "failures", "error": "errors"}.get(name, name)
             assert suite.get(told) == str(sum(case.find(name) is not None for case in suite))
-    assert good[0].get("failures") == "0" and good[0].get("skipped") == "1"
+    assert good[0].get("failures") == "0" and good[0].get("skipped") == "2"
+    skipped = [case.find("skipped") for case in good[0].findall("testcase")]
+    assert {each.get("type") for each in skipped if each is not None} == {"workbench.not_known"}
     cases = {case.get("name"): case for case in bad[0].findall("testcase")}
     failure = cases["success-at-reset"].find("failure")
     assert failure is not None and failure.get("type") == "success-at-reset"
@@ -384,14 +390,89 @@ def test_reports_hold_whatever_a_task_says(place: Path, capsys: pytest.CaptureFi
     (place / "loud.py").write_text(text.replace("distance = torch.linalg.norm(self.cube", f"{raises}\n        distance = torch.linalg.norm(self.cube", 1))  # fmt: skip
     files = ("--junit", "a.xml", "--sarif", "a.sarif", "--json-file", "a.json")
     ended = run(capsys, "loud.py", "--select", "reward-finite", *files, *FEW)
-    assert ended.code == 1 and "not decided reward-finite" in ended.out and "1 not decided" in ended.out
+    assert ended.code == 1 and "not known reward-finite" in ended.out and "1 not known" in ended.out
     assert "\x1b[2J" not in ended.out and "\x00" not in ended.out and "[red]<&" in ended.out
     (case,) = ElementTree.parse(place / "a.xml").getroot()[0]
     error = case.find("error")
     assert error is not None and "ValueError" in error.get("message", "") and "\\x1b[2J" in (error.text or "")
     (made,) = json.loads((place / "a.sarif").read_text())["runs"]
     assert made["invocations"][0]["executionSuccessful"] is False
-    assert json.loads((place / "a.json").read_text())["rules"][0]["state"] == "failed"
+    assert json.loads((place / "a.json").read_text())["rules"][0]["state"] == "not_known"
+
+
+BREAKS = """
+import os, signal
+from workbench.checks.by_hook.run import GROUPS
+
+def crashes(checkup):
+    raise KeyError("our own mistake")
+
+def dies(checkup):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+for group in GROUPS:
+    if "versioned-id" in group.checks:
+        group.checks["versioned-id"] = crashes
+    if "entry-name" in group.checks:
+        group.checks["entry-name"] = {entry}
+"""
+"""Breaks checks of the workbench, in each process that imports the task."""
+
+
+@pytest.mark.parametrize("workers", [pytest.param("1", marks=pytest.mark.slow), "2"])
+def test_a_rule_whose_check_raises_fails_and_no_other(
+    place: Path, capsys: pytest.CaptureFixture[str], child_process: None, workers: str
+) -> None:
+    (place / "breaks.py").write_text(BREAKS.format(entry="group.checks['entry-name']"))
+    rules = "versioned-id,time-limit,success-at-reset"
+    files = ("--json-file", "a.json", "--sarif", "a.sarif", "--junit", "a.xml")
+    words = ["check", "good.py", "--import", "breaks", "--select", rules, *files]
+    words += [*FEW[:4], "--workers", workers, "--env", "render_backend=none"]
+    ended = in_a_process(*words)
+    said = json.loads((place / "a.json").read_text())
+    assert ended.returncode == 1 and said["fails"] and said["findings"] == []
+    of_rule = {one["rule"]: one for one in said["rules"]}
+    states = {rule: one["state"] for rule, one in of_rule.items()}
+    assert states == {"versioned-id": "failed", "time-limit": "kept", "success-at-reset": "kept"}
+    error = of_rule["versioned-id"]["error"]
+    assert "our own mistake" in of_rule["versioned-id"]["why"] and "in crashes" in error["traceback"]
+    assert "1 failed" in ended.stdout and "please report it" in ended.stdout
+    (invocation,) = json.loads((place / "a.sarif").read_text())["runs"][0]["invocations"]
+    (note,) = invocation["toolExecutionNotifications"]
+    assert note["level"] == "error" and note["associatedRule"]["id"] == "versioned-id"
+    assert invocation["executionSuccessful"] is False
+    cases = {case.get("name"): case for case in ElementTree.parse(place / "a.xml").getroot()[0]}
+    broken = cases["versioned-id"].find("error")
+    assert broken is not None and "in crashes" in (broken.text or "")
+    assert [name for name, case in cases.items() if len(case)] == ["versioned-id"]
+
+
+@pytest.mark.slow
+def test_a_rule_that_ends_its_process_fails_and_no_other(place: Path, child_process: None) -> None:
+    (place / "breaks.py").write_text(BREAKS.format(entry="dies"))
+    rules = "entry-name,success-at-reset,info-rows,time-limit"
+    words = ["check", "good.py", "--import", "breaks", "--select", rules, "--json", *FEW[:4]]
+    ended = in_a_process(*words, "--workers", "2", "--env", "render_backend=none")
+    said = json.loads(ended.stdout)
+    states = {one["rule"]: one["state"] for one in said["rules"]}
+    assert ended.returncode == 1 and states.pop("entry-name") == "failed"
+    assert states == {"success-at-reset": "kept", "info-rows": "kept", "time-limit": "kept"}
+    (why,) = (one["why"] for one in said["rules"] if one["state"] == "failed")
+    assert "SIGKILL" in why
+
+
+def test_what_is_not_known_is_told_with_its_reason_and_fails_nothing(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = ("--json-file", "a.json", "--sarif", "a.sarif")
+    ended = run(capsys, "good.py", "--select", "success-flickers,camera-names", *files, *FEW)
+    said = json.loads((place / "a.json").read_text())
+    assert ended.code == 0 and said["counts"] == {"not_known": 1, "kept": 1}
+    assert "not known success-flickers: no random episode succeeds" in ended.out
+    (invocation,) = json.loads((place / "a.sarif").read_text())["runs"][0]["invocations"]
+    (note,) = invocation["toolExecutionNotifications"]
+    assert (note["level"], note["associatedRule"]["id"]) == ("note", "success-flickers")
+    assert invocation["executionSuccessful"] is True
 
 
 def test_other_tasks_of_the_file_are_named(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -407,7 +488,7 @@ def test_other_tasks_of_the_file_are_named(place: Path, capsys: pytest.CaptureFi
 @pytest.mark.slow
 def test_the_command_as_a_job_in_ci_runs_it(place: Path, child_process: None) -> None:
     """In processes of its own, with an id that has no file here, and no terminal."""
-    words = ["check", "PushCube-v1", "--envs-per-worker", "2", "--seeds", "2", "--workers", "2"]
+    words = ["check", "PushCube-v1", "--num-envs", "2", "--seeds", "2", "--workers", "2"]
     words += ["--select", "success-at-reset,reward-finite", "--env", "render_backend=none", "--json"]
     ended = in_a_process(*words)
     assert ended.returncode == 0, ended.stderr
@@ -453,4 +534,4 @@ def test_parts_that_are_merged_print_what_the_whole_would(
     capsys.readouterr()
     with pytest.raises(SystemExit) as ended:
         main(["merge", "check-2-of-2.job"])
-    assert ended.value.code == 1 and "groups of rules are in none of these files" in capsys.readouterr().out
+    assert ended.value.code == 1 and "results of rules are in none of these files" in capsys.readouterr().out

@@ -43,7 +43,7 @@ def bits(folder: Path) -> dict[str, bytes]:
 
 
 def record(*arguments: str) -> int:
-    few = ("--episodes", "6", "--envs-per-worker", "2", "--no-pictures", "--workers", "1")
+    few = ("--episodes", "6", "--num-envs", "2", "--no-pictures", "--workers", "1")
     return run("record", "my_task.py", *few, *QUICK, *arguments)
 
 

@@ -79,7 +79,7 @@ def options_of(file: Path, seeds: int = 3) -> SolveOptions:
         file.parent / "out",
         seeds,
         plan=PlanOptions(rollouts=16, horizon=0.2),
-        options=TaskOptions(seed=4, env_kwargs={"render_backend": "none"}),
+        options=TaskOptions(num_envs=1, seed=4, env_kwargs={"render_backend": "none"}),
     )
 
 

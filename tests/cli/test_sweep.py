@@ -20,7 +20,7 @@ SHORT = (
     "3",
     "--max-steps",
     "2",
-    "--envs-per-worker",
+    "--num-envs",
     "2",
     "--env",
     "render_backend=none",

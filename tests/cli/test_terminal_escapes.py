@@ -147,9 +147,7 @@ def test_a_task_that_is_recorded_does_nothing_to_the_terminal(
         f"import sys\nprint({EVIL!r} + 'printed')\nprint({EVIL!r} + 'said', file=sys.stderr)\n"
         f"print('\\x1b[1;32mgreen\\x1b[0m')\nraise RuntimeError({EVIL!r} + 'raised')\n"
     )
-    with on_terminal(
-        tmp_path, "record", "mine.py", "--workers", workers, "--envs-per-worker", "1"
-    ) as terminal:
+    with on_terminal(tmp_path, "record", "mine.py", "--workers", workers, "--num-envs", "1") as terminal:
         terminal.process.wait(timeout=120)
     text = BARS.sub("", terminal.text)
     assert harmful(text) == set(), text

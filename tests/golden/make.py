@@ -130,7 +130,7 @@ def read_folder(folder: Path) -> dict[str, Any]:
 
 
 def command(folder: Path, task: str, policy: str, *arguments: str) -> list[str]:
-    record = [sys.executable, "-m", "workbench.cli.main", "record", f"tasks/{task}", "--envs-per-worker", "1"]
+    record = [sys.executable, "-m", "workbench.cli.main", "record", f"tasks/{task}", "--num-envs", "1"]
     return [*record, "--actions", f"tasks/push/act.py:{policy}", "--out", str(folder), *arguments]
 
 

@@ -72,7 +72,7 @@ WRONG_CALLS = {
     "check": [
         "check",
         "check gone.py",
-        "check push.py --envs-per-worker 0",
+        "check push.py --num-envs 0",
         "check push.py --seeds 0",
         "check push.py --workers 0",
         "check push.py --select nonsense",

@@ -175,7 +175,7 @@ def test_an_unfinished_one_is_mended_by_the_next_that_records_there(
     task = place.parent / "tasks" / "push" / "push.py"
     code, _, err = run(
         capsys,
-        *("record", task, "--out", folder, "--no-pictures", "--episodes", 1, "--envs-per-worker", 1),
+        *("record", task, "--out", folder, "--no-pictures", "--episodes", 1, "--num-envs", 1),
         *("--max-steps", 2, "--env", "render_backend=none"),
     )
     assert code == Exit.DONE and "1 episode that an earlier recording left half written: recovered" in err

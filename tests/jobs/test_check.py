@@ -11,11 +11,11 @@ import pytest
 from mani_skill.utils import assets
 
 from workbench.authoring.problem import TaskError
-from workbench.checks.by_hook.run import RuleResult
+from workbench.checks.results import RuleResult, merged
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
-from workbench.jobs.check.plan import CheckOptions, GroupOutcome
-from workbench.jobs.check.run import CheckReport, check, merged, report_of
+from workbench.jobs.check.plan import CheckOptions, Outcome
+from workbench.jobs.check.run import CheckReport, check, report_of
 from workbench.jobs.pool.deal import Shard, ThisProcess
 from workbench.jobs.pool.job_file import JobFile, Kept, job_of, read_parts
 from workbench.jobs.pool.processes import Processes
@@ -62,7 +62,7 @@ def test_each_rule_has_its_result_in_the_order_of_the_table_whoever_looked(
     rules = ("reward-finite", "success-at-reset", "rows-lost")
     seen: list[str] = []
     alone = check(options(task, *rules), on_result=lambda result: seen.append(result.rule))
-    assert seen == ["success-at-reset", "reward-finite"], "as they come"
+    assert seen == ["success-at-reset", "reward-finite", "rows-lost"], "as they come"
     several = check(options(task, *rules, workers=2), executor=Processes(2))
     assert states(alone) == states(several) and list(states(alone)) == [r for r in RULES if r in rules]
     assert states(alone) == {"rows-lost": "broken", "success-at-reset": "broken", "reward-finite": "kept"}
@@ -79,7 +79,12 @@ def test_a_rule_of_gpu_simulation_is_looked_at_where_no_other_is(tmp_path: Path)
     report = check(options(task_of(tmp_path, LOSES_ROWS), "rows-lost"))
     (finding,) = report.findings
     assert finding.degree == "stop" and finding.code == "self.drawn = torch.rand((b, 2))"
-    assert states(check(options(task_of(tmp_path), "rows-lost"))) == {"rows-lost": "kept"}
+    assert states(check(options(task_of(tmp_path), "rows-lost"))) == {"rows-lost": "not_applicable"}
+    drawn = (
+        "            self.drawn = self.drawn if hasattr(self, 'drawn') else torch.rand((self.num_envs, 2))\n"
+    )
+    keeps = LOSES_ROWS[0], f"{LOSES_ROWS[0]}{drawn}"
+    assert states(check(options(task_of(tmp_path, keeps), "rows-lost"))) == {"rows-lost": "kept"}
 
 
 @pytest.mark.slow
@@ -106,11 +111,13 @@ def test_a_task_that_raises_breaks_one_rule_and_leaves_the_others_undecided(tmp_
     task = task_of(tmp_path, RAISES)
     report = check(options(task, "runs", "reward-finite", "success-at-reset", "rows-lost"))
     assert states(report) == {
-        "rows-lost": "failed", "runs": "broken", "success-at-reset": "failed", "reward-finite": "failed"
+        "rows-lost": "not_known", "runs": "broken", "success-at-reset": "not_known", "reward-finite": "not_known"
     }  # fmt: skip
     (finding,) = report.findings
     assert (
-        "self.gone" in finding.code and finding.rule == "runs" and "gone" in report.of_state("failed")[0].why
+        "self.gone" in finding.code
+        and finding.rule == "runs"
+        and "gone" in report.of_state("not_known")[0].why
     )
 
 
@@ -119,12 +126,25 @@ def test_a_reward_with_rows_of_rows_breaks_one_rule_at_its_line(tmp_path: Path) 
     task = task_of(tmp_path, square)
     report = check(options(task, "runs", "reward-rows", "reward-finite", "reward-ratio"))
     assert states(report) == {
-        "runs": "failed", "reward-rows": "broken", "reward-finite": "failed", "reward-ratio": "failed"
+        "runs": "not_known", "reward-rows": "broken", "reward-finite": "not_known", "reward-ratio": "not_known"
     }  # fmt: skip
     (finding,) = report.findings
     assert finding.line is not None and "shape (4, 4)" in finding.message
     (finding,) = check(options(task, "runs")).findings
     assert finding.rule == "runs" and finding.line is not None and "shape (4, 4)" in finding.message
+
+
+def test_what_raises_when_an_env_is_closed_ends_no_check(tmp_path: Path) -> None:
+    raises = (
+        "    def evaluate(self)",
+        "    def close(self):\n        raise ValueError('closed')\n\n    def evaluate(self)",
+    )
+    report = check(options(task_of(tmp_path, raises), "runs", "success-at-reset", "state-restores"))
+    assert states(report) == {
+        "runs": "broken", "success-at-reset": "kept", "state-restores": "not_known"
+    }  # fmt: skip
+    (finding,) = report.findings
+    assert finding.code == "raise ValueError('closed')"
 
 
 def test_a_rule_that_is_not_decided_is_no_success(tmp_path: Path) -> None:
@@ -263,7 +283,7 @@ def test_parts_of_a_job_are_put_together_and_a_job_goes_on_where_it_was(tmp_path
         assert part.missing == (2, 3)[number - 1]
         file.close()
     kept = read_parts(files)
-    assert told(report_of(what, kept.results(GroupOutcome))) == told(whole)
+    assert told(report_of(what, kept.results(Outcome))) == told(whole)
 
     file = JobFile(files[0], job_of("check", task, what, ("workers",)))
     seen: list[str] = []
@@ -325,7 +345,7 @@ def test_what_is_wrong_in_given_episodes_alone_is_found(tmp_path: Path) -> None:
     fails = '"fail": height < -0.1,', '"fail": self.agent.robot.qpos[:, 0] > 0.5,'
     task = task_of(tmp_path, TURNED, fails)
     np.save(tmp_path / "one.npy", turns(20))
-    assert states(check(options(task, "success-and-fail")))["success-and-fail"] == "kept"
+    assert states(check(options(task, "success-and-fail")))["success-and-fail"] == "not_known"
     what = replace(options(task, "success-and-fail"), actions=str(tmp_path / "one.npy"))
     (finding,) = check(what).findings
     assert "in 4 of 4 given episodes" in finding.message
@@ -338,8 +358,8 @@ def test_actions_of_another_robot_leave_the_rules_of_success_undecided_and_blame
     task = task_of(tmp_path)
     what = replace(options(task, "success-stays-possible", "runs"), actions=str(tmp_path / "wide.npy"))
     report = check(what)
-    assert states(report) == {"runs": "kept", "success-stays-possible": "failed"}
-    assert "9 dimensions" in report.of_state("failed")[0].why and report.fails("stop")
+    assert states(report) == {"runs": "kept", "success-stays-possible": "not_known"}
+    assert "9 dimensions" in report.of_state("not_known")[0].why and report.fails("stop")
 
 
 def test_a_policy_that_cannot_be_imported_ends_the_check_at_its_line(tmp_path: Path) -> None:

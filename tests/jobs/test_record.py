@@ -42,7 +42,7 @@ pytestmark = pytest.mark.usefixtures("child_process")
 TASKS = Path(__file__).parents[2] / "tasks"
 PUSHER = Path(__file__).parents[1] / "browser" / "pusher.py"
 PLAIN = {"render_backend": "none"}
-ONE_ENV = ("record", "PickCube-v1", "--workers", "1", "--envs-per-worker", "1")
+ONE_ENV = ("record", "PickCube-v1", "--workers", "1", "--num-envs", "1")
 """Without a renderer, for whose shaders each process takes some seconds."""
 PUSHED = {"control_mode": "pd_ee_delta_pos", **PLAIN}
 
@@ -461,7 +461,7 @@ def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
             "out",
         ),
         *("--env", "render_backend=none"),
-        *("--envs-per-worker", "1", "--workers", "2", "--actions", "hangs.py:act"),
+        *("--num-envs", "1", "--workers", "2", "--actions", "hangs.py:act"),
     ]
     process = subprocess.Popen(
         command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
@@ -480,7 +480,7 @@ def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
     command = [
         *(sys.executable, "-m", "workbench.cli.main", "record", "PushCube-v1", "--no-pictures"),
         *("--env", "render_backend=none"),
-        *("--episodes", "100000", "--max-steps", "3", "--envs-per-worker", "2", "--workers", workers),
+        *("--episodes", "100000", "--max-steps", "3", "--num-envs", "2", "--workers", workers),
         *("--out", str(tmp_path)),
     ]
     process = subprocess.Popen(
@@ -529,7 +529,7 @@ def test_arguments_are_refused_with_a_sentence(
     ("arguments", "says"),
     [
         (["record", "PickCub-v1"], "PickCube-v1"),
-        (["record", "PickCube-v1", "--envs-per-worker", "0"], "envs-per-worker"),
+        (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
         (["record", "PickCube-v1", "--actions", "demo.h5"], "demo.h5"),
         (["record", "PickCube-v1", "--actions", "gone.py:act"], "there is no file"),
         (["record", "PickCube-v1", "--actions", "randomly"], "module:function"),

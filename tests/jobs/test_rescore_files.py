@@ -381,7 +381,7 @@ def test_parts_that_are_merged_print_what_the_whole_would(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     edit(author, REWARD, f"{REWARD} + 0.25")
-    few = [str(author / "recordings"), "--envs-per-worker", "1"]
+    few = [str(author / "recordings"), "--num-envs", "1"]
     code, whole, _ = run([*few, "--workers", "1", "--json-file", "whole.json"], capsys)
     assert code == 0
     for part in ("1/2", "2/2"):

@@ -127,8 +127,8 @@ def _checked(env_id: str, select: tuple[str, ...]) -> dict[str, Any]:
         "findings": [asdict(finding) for finding in report.findings],
         "silenced": [asdict(one) for result in report.results for one in result.silenced],
         "notes": {result.rule: list(result.notes) for result in report.results if result.notes},
-        "undecided": {result.rule: result.why for result in report.of_state("failed")},
-        "skipped": {result.rule: result.why for result in report.of_state("skipped")},
+        "failed": {result.rule: result.why for result in report.of_state("failed")},
+        "not_known": {result.rule: result.why for result in report.of_state("not_known")},
         "slowest": {
             result.rule: round(result.seconds, 1)
             for result in sorted(report.results, key=lambda result: -result.seconds)[:5]
@@ -145,8 +145,8 @@ def line_of(row: dict[str, Any]) -> str:
         return f"{row['env_id']}: {row['outcome']}: {row['why']}"
     rules = Counter(finding["rule"] for finding in row["findings"])
     found = ", ".join(f"{rule} ({count})" for rule, count in rules.items()) or "nothing"
-    undecided = f"; not decided: {', '.join(row['undecided'])}" if row["undecided"] else ""
-    return f"{row['env_id']}: {found}{undecided}; {row['seconds']} s"
+    failed = f"; failed: {', '.join(row['failed'])}" if row["failed"] else ""
+    return f"{row['env_id']}: {found}{failed}; {row['seconds']} s"
 
 
 def main(arguments: Sequence[str]) -> int:

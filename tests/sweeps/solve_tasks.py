@@ -161,7 +161,7 @@ def run(row: Row, options: Options, known: Known) -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         if first < most:
-            plain = TaskOptions(seed=first, env_kwargs={} if task in DRAWN else PLAIN)
+            plain = TaskOptions(num_envs=1, seed=first, env_kwargs={} if task in DRAWN else PLAIN)
             what = SolveOptions(
                 task, Path(folder), most - first, options.workers, False, steps, options=plain
             )

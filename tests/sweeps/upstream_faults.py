@@ -70,22 +70,6 @@ FAULTS = (
         "no report found",
     ),
     Fault(
-        ("MS-AntWalk-v1", "MS-AntRun-v1"),
-        "partial reset",
-        "tasks/control/ant.py",
-        "self.camera_mount.set_pose(",
-        "the camera mount gets the torso's pose of every env",
-        "no report found",
-    ),
-    Fault(
-        ("FMBAssembly1Easy-v1",),
-        "partial reset",
-        "tasks/fmb/fmb.py",
-        "self.bridge_grasp.set_pose(self.bridge.pose * self.bridge_grasp_offset)",
-        "the grasp marker gets the bridge's pose of every env",
-        "no report found",
-    ),
-    Fault(
         ("DrawSVG-v1",),
         "partial reset",
         "tasks/drawing/draw_svg.py",

@@ -5,12 +5,26 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
+from workbench.authoring.problem import Problem
 from workbench.core.rules import Finding
 
-State = Literal["kept", "broken", "silenced", "skipped", "failed"]
-_WORST: tuple[State, ...] = ("broken", "failed", "silenced", "kept", "skipped")
+State = Literal["broken", "failed", "silenced", "not_known", "kept", "not_applicable"]
+"""What a rule came to; where it came to several in one check, the first of these counts.
+
+- ``broken``: it has findings. ``silenced``: comments in the source silence all of them.
+- ``kept``: what it speaks of was tried, and it held.
+- ``not_known``: what it speaks of was not tried, or not to the end: no episode succeeded, the task raised, and so on.
+- ``not_applicable``: it says nothing about this task.
+- ``failed``: the check of the rule itself raised, or its process died.
+"""
+STATES: tuple[State, ...] = get_args(State)
+
+
+def state_text(state: State) -> str:
+    """``not known``."""
+    return state.replace("_", " ")
 
 
 @dataclass(frozen=True)
@@ -56,36 +70,64 @@ class RuleResult:
 
     rule: str
     state: State
-    """``skipped`` where it says nothing about this task, ``failed`` where the task raised; `why` says more."""
     findings: tuple[Finding, ...] = ()
     silenced: tuple[Silenced, ...] = ()
     notes: tuple[str, ...] = ()
     """Worth knowing, and no breach."""
     why: str = ""
+    """The reason why it is not known, not applicable or failed; for a broken rule, why not all was looked at."""
     seconds: float = 0.0
     seen: tuple[Seen, ...] = ()
     """Of a rule that looks at all seeds: by this the results of further seeds are put together with it."""
+    problem: Problem | None = None
+    """What was raised: by the author's code, or by the check where it failed."""
+
+    @property
+    def is_crash(self) -> bool:
+        """Whether the check raised. Of a process that ended nobody knows the cause."""
+        return self.state == "failed" and self.problem is not None and bool(self.problem.traceback)
+
+
+def failed(rule: str, problem: Problem, seconds: float = 0.0) -> RuleResult:
+    """The result of a rule whose check raised, or whose process died."""
+    at = "" if problem.file is None else f", at {problem.file}:{problem.line}"
+    return RuleResult(rule, "failed", why=f"{problem.message}{at}", seconds=seconds, problem=problem)
 
 
 def by_rule(results: Iterable[RuleResult]) -> dict[str, RuleResult]:
-    """One result a rule: of several (``runs`` is broken at many places) all findings, each once, and the worst state."""
-    found: dict[str, RuleResult] = {}
+    """One result a rule."""
+    found: dict[str, list[RuleResult]] = {}
     for one in results:
-        before = found.get(one.rule)
-        if before is None:
-            found[one.rule] = one
-            continue
-        findings = {each.key: each for each in (*before.findings, *one.findings)}
-        found[one.rule] = replace(
-            before,
-            state=min(before.state, one.state, key=_WORST.index),
-            findings=tuple(findings.values()),
-            silenced=tuple(dict.fromkeys((*before.silenced, *one.silenced))),
-            notes=tuple(dict.fromkeys((*before.notes, *one.notes))),
-            why=before.why or one.why,
-            seconds=before.seconds + one.seconds,
-        )
-    return found
+        found.setdefault(one.rule, []).append(one)
+    return {rule: merged(each) for rule, each in found.items()}
+
+
+def merged(results: Iterable[RuleResult], other_seeds: bool = False) -> RuleResult:
+    """One result of those that one rule has.
+
+    Args:
+        other_seeds: each is of other seeds: the breaches of all are counted. Else they are of several rules' checks, which
+            look at the same seeds, and the same breach counts once.
+    """
+    results = sorted(results, key=lambda result: STATES.index(result.state))
+    findings: dict[object, Finding] = {}
+    for finding in (finding for result in results for finding in result.findings):
+        # Two things may be wrong at one line; of other seeds the same thing has other numbers in its message.
+        key = finding.key if other_seeds else (finding.key, finding.message)
+        known = findings.setdefault(key, finding)
+        if known is not finding and other_seeds:
+            findings[key] = replace(known, count=known.count + finding.count)
+        elif finding.count > known.count:
+            findings[key] = finding
+    silenced = {(one.finding.key, one.line): one for result in results for one in result.silenced}
+    return replace(
+        results[0],
+        findings=tuple(findings.values()),
+        silenced=tuple(silenced.values()),
+        notes=tuple(dict.fromkeys(note for result in results for note in result.notes)),
+        seconds=sum(result.seconds for result in results),
+        seen=tuple(row for result in results for row in result.seen),
+    )
 
 
 def counts(results: Iterable[RuleResult]) -> Counter[State]:

@@ -543,3 +543,8 @@ def degree_of_each(
     if not solve and not select:
         chosen -= SOLVE_RULES
     return {rule.id: (choice or rule.degree) if rule.id in chosen else "off" for rule in RULES.values()}
+
+
+def core_rules_of(degrees: Mapping[str, Degree]) -> list[str]:
+    """The rules of GPU simulation that are not off."""
+    return [rule for rule in core_rules.RULES if degrees[rule] != "off"]

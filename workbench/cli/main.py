@@ -22,8 +22,9 @@ from workbench.cli.terminal.arguments import (
     Task,
     history_bytes,
     imported,
+    with_new_names,
 )
-from workbench.cli.terminal.output import Exit, end_quietly, interrupted, lacks_maniskill, refuse
+from workbench.cli.terminal.output import Exit, end_quietly, interrupted, lacks_maniskill, refuse, warn
 from workbench.jobs.task import ShownPictures
 from workbench.machine.processes.time_limit import end_after, end_limit
 from workbench.machine.software_vulkan import use_private_driver
@@ -343,6 +344,9 @@ def main(args: Sequence[str] | None = None) -> None:
     guard_terminal()
     end_after()
     given = list(sys.argv[1:] if args is None else args)
+    given, renamed = with_new_names(given)
+    for sentence in renamed:
+        warn(sentence)
     if not given or (given[0].startswith("-") and given[0] not in ("-h", "--help")):
         given = ["start", *given]
     try:

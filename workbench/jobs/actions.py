@@ -30,6 +30,7 @@ from workbench.machine.folders import CurrentFolder
 from workbench.planning.episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.options import PlanOptions
 from workbench.planning.planner import Planner
+from workbench.planning.rollouts import require_plannable
 from workbench.recording.reader.reading import find_sources, read_recording
 
 
@@ -198,8 +199,9 @@ class PlannedActions:
 
         Raises:
             TaskError: the task fails while the envs of the rollouts are built.
-            ValueError: it has no actions.
+            NothingToPlan: it has no actions, or no reward.
         """
+        require_plannable(task.env)
         self._loaded, self._task = loaded, task
         made_with = given_arguments(loaded.cls, env_kwargs, loaded.default_kwargs)
         with blamed("build", loaded):

@@ -107,8 +107,7 @@ def with_advice(
         tried = min(options.num_envs, _MOST_TRIED)
         if _runs_alone(again, options, tried):
             advice.append(
-                f"with {options.num_envs} envs it fails, with one it runs, from each of {tried} seeds: --num-envs 1, or "
-                "--envs-per-worker 1"
+                f"with {options.num_envs} envs it fails, with one it runs, from each of {tried} seeds: --num-envs 1"
             )
     if loaded.others and loaded.file is not None and not knows_others:
         file = loaded.file.name

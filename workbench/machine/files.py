@@ -70,6 +70,12 @@ def create_file(path: Path, content: bytes, mode: int = 0o666) -> bool:
     return True
 
 
+def real_path(path: Path) -> Path:
+    """The absolute path behind links. Where links lead in a circle, the path itself: before Python 3.13 ``Path.resolve``
+    raises RuntimeError there."""
+    return Path(os.path.realpath(path))
+
+
 def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> bool:
     """Write or replace a file in one step. Returns False, and changes nothing, if its content is no longer `expected`.
 
@@ -78,7 +84,7 @@ def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> b
     Raises:
         OSError: it cannot be written; its content is unchanged.
     """
-    path = path.resolve()
+    path = real_path(path)
     with written_beside(path, content) as temporary:
         with contextlib.suppress(FileNotFoundError):  # a new file has no mode to keep
             status = path.stat()

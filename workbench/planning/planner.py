@@ -15,7 +15,7 @@ from workbench.core.env_numbers import envs_of_batch
 from workbench.core.maniskill_private import episode_seeds, open_env
 from workbench.core.snapshots.snapshot import take_snapshot
 from workbench.planning.options import PlanOptions
-from workbench.planning.rollouts import Plan, RolloutPlanner, make_rollout_env
+from workbench.planning.rollouts import Plan, RolloutPlanner, make_rollout_env, require_plannable
 
 
 class Planner:
@@ -53,10 +53,12 @@ class Planner:
 
         Raises:
             TypeError: `env` is no ManiSkill env, or there is no option of a name.
-            ValueError: an option is out of its range, or the task has no actions.
+            NothingToPlan: the task has no actions, or no reward.
+            ValueError: an option is out of its range.
             Exception: raised by the author's class while the envs for the rollouts are built.
         """
         self._live = open_env(env)
+        require_plannable(self._live)
         self.options = PlanOptions(**options)
         given: Mapping[str, Any] = made_with or (env.spec.kwargs if env.spec is not None else {})
         rolled = make_rollout_env(self._live, given, self.options.rollouts, threads)

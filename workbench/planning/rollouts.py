@@ -35,6 +35,20 @@ class NotAlike(ValueError):
     """The envs of the task are not built alike, so that none can stand for another."""
 
 
+class NothingToPlan(ValueError):
+    """The task has no actions, or no reward by which one is better than another."""
+
+
+def require_plannable(env: BaseEnv) -> None:
+    """Raise NothingToPlan, before anything is built."""
+    if env.reward_mode == "none":
+        raise NothingToPlan(
+            "the task has no reward, and actions are planned by the reward: there is nothing to plan"
+        )
+    if not actions.action_parts(env):
+        raise NothingToPlan("there is nothing to plan: the task has no robot with a controller")
+
+
 @dataclass(frozen=True)
 class Plan:
     """What was found for one env, and what the last round of its rollouts earned."""
@@ -137,14 +151,12 @@ class RolloutPlanner:
             exact: whether to restore exactly, so that the same snapshot, options and seed give the same plan to the last bit.
 
         Raises:
-            ValueError: another number of envs than rollouts, or a task without actions.
+            ValueError: another number of envs than rollouts.
         """
         if env.num_envs != options.rollouts:
             raise ValueError(f"{options.rollouts} rollouts need as many envs, not {env.num_envs}")
         self.env, self._options, self._exact = env, options, exact
         self._parts = actions.action_parts(env)
-        if not self._parts:
-            raise ValueError("there is nothing to plan: the task has no robot with a controller")
         self.horizon = options.steps(env.control_timestep, "success" in env.get_info())
         """H, control steps that a plan looks ahead."""
         low, high = actions.bounds(self._parts)

@@ -290,7 +290,7 @@ def test_it_stops_from_outside_and_from_its_own_call(tmp_path: Path) -> None:
     idle.stop()
 
 
-@pytest.mark.parametrize("what", ["pipe", "device", "large"])
+@pytest.mark.parametrize("what", ["pipe", "device", "large", "loop"])
 def test_what_is_no_file_any_more_counts_as_gone_and_is_followed_on(tmp_path: Path, what: str) -> None:
     file, other = tmp_path / "task.py", tmp_path / "other"
     file.write_text("x = 1\n")
@@ -301,6 +301,8 @@ def test_what_is_no_file_any_more_counts_as_gone_and_is_followed_on(tmp_path: Pa
         os.mkfifo(other)
     elif what == "device":
         other.symlink_to("/dev/zero")
+    elif what == "loop":
+        other.symlink_to(file)
     else:
         with other.open("wb") as large:
             large.truncate(2**40)

@@ -140,7 +140,7 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
 
 @pytest.mark.slow
 def test_a_recording_waits_for_a_debugger_and_stops_for_it(task_file: Path, tmp_path: Path) -> None:
-    asked = ("--debug", "--episodes", "1", "--envs-per-worker", "1", "--max-steps", "2", "--no-pictures")
+    asked = ("--debug", "--episodes", "1", "--num-envs", "1", "--max-steps", "2", "--no-pictures")
     command = python_command(
         "-m", "workbench.cli.main", "record", str(task_file), "--out", str(tmp_path), *asked
     )

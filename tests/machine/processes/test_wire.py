@@ -56,7 +56,7 @@ def same(one: object, other: object) -> bool:
         )
     if isinstance(one, tuple):
         return isinstance(other, tuple) and len(one) == len(other) and all(map(same, one, other))
-    return one == other
+    return one == other or (one != one and other != other)  # NaN
 
 
 @st.composite

@@ -18,9 +18,9 @@ from workbench.core.rules import Finding
 from workbench.jobs.task import TaskOptions
 from workbench.session.checks.checks import RUNNING, Checks, ChecksView
 from workbench.session.process.askers import GaveWay
-from workbench.session.process.job_lane import Job, JobFailed
+from workbench.session.process.job_lane import Job, JobFailed, ProcessDied
 from workbench.session.protocol.messages import Load
-from workbench.session.protocol.questions import CheckedGroup, CheckGroup
+from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.session.rescore.background import StoppedBy
 
 FIRST, SECOND = "success-at-reset", "reward-changes"
@@ -47,6 +47,8 @@ class ScriptedBackground:
         self.loads: list[Load] = []
         self.give_way_after = 99
         """Results of a group after which a job of higher priority comes, once."""
+        self.dies_at = ""
+        """The rule that ends the process."""
         self.fails: JobFailed | None = None
         self.let = threading.Semaphore(1000)
 
@@ -76,7 +78,11 @@ class ScriptedBackground:
                 check()
             check()
             if rule not in question.known:
-                on_progress(done, 2, self.comes_to.get(rule, RuleResult(rule, "kept")))
+                on_progress(done - 1, 2, RuleProgress(rule))
+                if rule == self.dies_at:
+                    raise ProcessDied("the process in the background was killed by SIGSEGV")
+                result = self.comes_to.get(rule, RuleResult(rule, "kept"))
+                on_progress(done, 2, RuleProgress(rule, result))
             if done >= self.give_way_after:
                 self.give_way_after = 99
                 raise GaveWay
@@ -182,6 +188,18 @@ def test_a_group_that_gave_way_is_asked_without_the_rules_that_are_known(
     assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
 
 
+def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
+    checks: Checks, background: ScriptedBackground
+) -> None:
+    background.dies_at = FIRST
+    checks.loaded(LOAD, same_task=True)
+    view = ended(checks)
+    assert view.state == "done" and [result.state for result in view.results] == ["failed", "kept"]
+    first = view.results[0]
+    assert "SIGSEGV" in first.why and first.problem is not None
+    assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
+
+
 def test_it_comes_before_the_rescoring_for_the_first_seconds_alone(
     checks: Checks, background: ScriptedBackground, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,3 +269,22 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
             "the rule checked anew",
         )
         assert all(one.rule != FIRST for one in session.view().checks.before)
+
+
+@pytest.mark.slow
+def test_the_rules_of_a_session_with_one_env_are_looked_at_on_one(
+    child_process: None, task_file: Path, tmp_path: Path
+) -> None:
+    begins = "        super().__init__(*args, robot_uids=robot_uids, **kwargs)\n"
+    only = "        if kwargs.get('num_envs', 1) != 1: raise ValueError('one env only')\n"
+    text = task_file.read_text()
+    assert begins in text
+    file = tmp_path / "one_env.py"
+    file.write_text(text.replace(begins, only + begins))
+    with live_session(file, tmp_path / "recordings", num_envs=1) as session:
+        session.check_now()
+        until(lambda: session.view().checks.state not in RUNNING, "the end of the checks", 300)
+        checks = session.view().checks
+    states = {result.rule: result.state for result in checks.results}
+    assert checks.state == "done" and not any(result.problem for result in checks.results)
+    assert states["batch-of-reset"] == "not_known" and states["success-at-reset"] == "kept"

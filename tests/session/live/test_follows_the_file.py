@@ -151,6 +151,21 @@ def test_a_module_beside_the_task_is_followed_too(session: Session, task_file: P
     wait_until(session, lambda v: v.problem is None, "the banner's end")
 
 
+def test_a_file_that_becomes_a_link_to_itself_ends_no_worker(
+    session: Session, task_file: Path, good: str
+) -> None:
+    before, worker = session.view(), session.worker_pid
+    link = task_file.with_name("link.py")
+    link.symlink_to(task_file)
+    link.replace(task_file)
+    view = wait_until(session, lambda v: v.problem is not None, "the banner")
+    assert str(task_file) in view.problem.message
+    link.write_text(good)
+    link.replace(task_file)
+    view = wait_until(session, lambda v: v.problem is None, "the banner's end")
+    assert view.task.source_hash == before.task.source_hash and session.worker_pid == worker
+
+
 def test_a_worker_that_is_killed_comes_back_with_the_last_good_version(
     session: Session, task_file: Path, good: str
 ) -> None:

@@ -74,7 +74,7 @@ def test_an_id_that_a_package_registers_is_recorded_with_import(project: Path) -
     plain = (
         "--episodes",
         "2",
-        "--envs-per-worker",
+        "--num-envs",
         "2",
         "--max-steps",
         "2",

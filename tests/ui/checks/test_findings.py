@@ -26,7 +26,7 @@ DONE = ChecksView(
         RuleResult("reward-changes", "broken", (WARNS, finding("reward-changes", line=30))),
         RuleResult("success-at-reset", "broken", (STOPS,)),
         RuleResult("entry-name", "kept"),
-        RuleResult("camera-sees", "skipped", why="it has no camera"),
+        RuleResult("camera-sees", "not_applicable", why="it has no camera"),
     ),
 )
 

@@ -9,7 +9,8 @@ import pytest
 
 from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import running
-from workbench.checks.results import HookTime, LineTime, RuleResult, StepProfile
+from workbench.authoring.problem import Problem
+from workbench.checks.results import HookTime, LineTime, RuleResult, StepProfile, failed
 from workbench.core.rules import Finding
 from workbench.machine.kept_choices import kept_choices
 from workbench.session.checks.checks import ChecksView
@@ -40,7 +41,7 @@ FOUND = Finding(
 RESULTS = (
     RuleResult("success-at-reset", "broken", (FOUND,)),
     RuleResult("reward-changes", "kept"),
-    RuleResult("camera-sees", "skipped", why="it has no camera"),
+    RuleResult("camera-sees", "not_applicable", why="it has no camera"),
 )
 DONE = ChecksView("done", 5, RESULTS, total=3, seconds=2.0)
 
@@ -149,10 +150,33 @@ def test_why_and_the_rules_without_a_finding_are_folded_out_by_a_press(shown: Sh
     shown.panels.press(f"fold {REST}")
     shown.draw(DONE)
     text = shown.panels.html("wb-checks")
-    assert "<b>Why</b>" in text and "not applicable: it has no camera" in text and "reward-changes" in text
+    assert "<b>Why</b>" in text and "reward-changes" in text
+    assert "<td>not applicable</td><td>it has no camera" in text
     shown.panels.press(f"fold {REST}")
     shown.draw(DONE)
     assert "it has no camera" not in shown.panels.html("wb-checks")
+
+
+def test_a_rule_whose_check_failed_is_shown_with_its_place_and_traceback(shown: Shown) -> None:
+    problem = Problem("worker", "KeyError: <none>", "workbench/checks/x.py", 12, "x[y]", "Traceback <1>")
+    shown.draw(replace(DONE, results=(*RESULTS, failed("reward-finite", problem))))
+    text = shown.panels.html("wb-checks")
+    assert (
+        'data-rule="reward-finite"' in text and "KeyError: &lt;none&gt;, at workbench/checks/x.py:12" in text
+    )
+    assert 'data-copy="Traceback &lt;1&gt;"' in text and "1 failed" in shown.panels.html()
+
+
+def test_rules_that_are_not_known_are_listed_by_their_reason(shown: Shown) -> None:
+    why = "no tried episode succeeds"
+    unknown = [RuleResult(rule, "not_known", why=why) for rule in ("reward-order", "success-flickers")]
+    view = replace(DONE, results=(*RESULTS, *unknown))
+    shown.draw(view)
+    shown.panels.press(f"fold {REST}")
+    shown.draw(view)
+    text = shown.panels.html("wb-checks")
+    assert text.count(why) == 1 and "reward-order" in text and "success-flickers" in text
+    assert "2 not known" in shown.panels.html()
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from workbench.authoring.loading.library_names import is_library, is_own_file
 from workbench.authoring.problem import TaskError, task_error
+from workbench.machine.files import real_path
 
 _FILE = re.compile(r"(?P<file>.+\.py)(:(?P<cls>[^/\\]*))?", re.DOTALL)
 _NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
@@ -64,7 +65,7 @@ def named_file(reference: TaskName) -> Path | None:
         module = find_module(named[0])
         return None if module is None else module.file
     file, _ = file_and_class(reference)
-    return Path(file).expanduser().resolve() if file else None
+    return real_path(Path(file).expanduser()) if file else None
 
 
 def looks_like_file(env_id: str) -> bool:
@@ -170,7 +171,7 @@ def find_module(name: str) -> NamedModule | None:
         file, folders = find_in(folders, part)
     if file is None or file.suffix not in SOURCE_SUFFIXES:
         return None
-    file = file.resolve()
+    file = real_path(file)
     parts = [*name.split("."), "__init__"] if file.stem == "__init__" else name.split(".")
     if [*file.parts[-len(parts) : -1], file.stem] != parts:
         return NamedModule(name, file, None, None)

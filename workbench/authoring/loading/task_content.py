@@ -14,6 +14,7 @@ from workbench.authoring.loading.library_names import is_library, is_own_file
 from workbench.authoring.loading.modules import module_name, read_exactly
 from workbench.authoring.loading.reference import find_in
 from workbench.authoring.source.text import plain_line_ends
+from workbench.machine.files import real_path
 from workbench.machine.parse_python import parse_python
 
 MOST_MODULES = 300
@@ -76,7 +77,7 @@ def read_content(file: Path) -> TaskContent:
     Raises:
         CannotRead: it is not an ordinary file of Python text, or there is too much of it.
     """
-    file = file.resolve()
+    file = real_path(file)
     return _ContentReader(file).content()
 
 

@@ -10,7 +10,7 @@ from itertools import cycle, islice
 from pathlib import Path
 
 from workbench.authoring.loading.modules import decode
-from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file
+from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file, real_path
 from workbench.machine.processes.watched_thread import report_failure, watched_thread
 
 POLL_S = 0.04
@@ -152,8 +152,8 @@ class SourceWatcher:
 
 def _real(path: Path) -> Path:
     """The file behind links. A link to something else (a device, by mistake) is watched itself, until it is a file again."""
-    real = path.resolve()
-    return real if real.is_file() else path.parent.resolve() / path.name
+    real = real_path(path)
+    return real if os.path.isfile(real) else real_path(path.parent) / path.name
 
 
 def _status(path: Path) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from workbench.authoring.loading.blamed import blamed
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
 from workbench.core.camera_data import CameraKey, CameraKind
@@ -57,11 +57,13 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
             in_view.setdefault(thing.name, []).append(np.where(thing.present, thing.alone > 0, True))
             uncovered.setdefault(thing.name, []).append(np.where(thing.present, thing.pixels > 0, True))
     if not in_view:
-        raise CannotCheck("it has no objects besides the robot and the scenery")
+        raise NotApplicable("it has no objects besides the robot and the scenery")
     covered: list[str] = []
+    found = False
     for name, of_cameras in in_view.items():
         missed = ~np.any(of_cameras, axis=0)
         if missed.mean() > MISSED_SHARE:
+            found = True
             yield Found(
                 f"{name} is out of view of every sensor camera ({', '.join(key[1] for key in reports)}) in "
                 f"{of(int(missed.sum()), missed.size, 'picture')} after a reset. Aim one at it: "
@@ -77,6 +79,7 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
         # Where it is the only one, each object says so.
         one_of_several = len(reports) > 1 and mount_of(env, cameras_of(env)[key]) is None
         if one_of_several and not any((thing.alone > 0).any() for thing in things):
+            found = True
             yield Found(
                 f"sensor camera {key[1]!r} has none of the task's objects in any picture after a reset "
                 f"({listed([thing.name for thing in things])}). Aim it at them: `sapien_utils.look_at(eye=..., "
@@ -85,15 +88,20 @@ def camera_sees(checkup: Checkup) -> Iterator[Found | Note]:
             )
     if covered:
         yield Note(f"covered by other things in every picture after a reset: {listed(covered)}")
+    if not found and (count := len(_drawn(env))) > MOST_OBJECTS:
+        raise NotKnown(f"{MOST_OBJECTS} of {count} objects were looked for")
 
 
 def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
     """Over the pictures of sensor cameras that are not mounted on a body."""
     reports = checkup.look(sensor_reports)
     env = checkup.pictured.env
-    for key, report in reports.items():
+    fixed = {key: report for key, report in reports.items() if mount_of(env, cameras_of(env)[key]) is None}
+    if not fixed:
+        raise NotApplicable("its sensor cameras are mounted on bodies")
+    for key, report in fixed.items():
         share = float(report.depth.background.mean())
-        if mount_of(env, cameras_of(env)[key]) is None and share > BACKGROUND_SHARE:
+        if share > BACKGROUND_SHARE:
             yield Found(
                 f"{share:.0%} of the picture of sensor camera {key[1]!r} is empty background, whose depth is 0. Aim it "
                 "down at the scene, narrow its fov, or build a ground.",
@@ -107,7 +115,7 @@ def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
     robots = {config.uid for config in checkup.look(sensor_configs)[1]}
     own = {key: config for key, config in configs.items() if key[0] == "human" or key[1] not in robots}
     if not own:
-        raise CannotCheck("it has no camera of its own")
+        raise NotApplicable("it has no camera of its own")
     for (kind, _), config in own.items():
         lengths = np.linalg.norm(rows_of_pose(config)[:, 3:], axis=1)
         if np.abs(lengths - 1).max() > UNIT:
@@ -122,6 +130,8 @@ def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
 def camera_names(checkup: Checkup) -> Iterator[Found | Note]:
     """The configs that the hooks of task and robot return."""
     of_task, of_robot = checkup.look(sensor_configs)
+    if not of_task and not of_robot:
+        raise NotApplicable("it has no sensor camera")
     robots = {config.uid for config in of_robot}
     for name, count in Counter(config.uid for config in of_task).items():
         if count > 1 or name in robots:
@@ -147,7 +157,10 @@ def camera_size(checkup: Checkup) -> Iterator[Found | Note]:
 
 def ray_traced(checkup: Checkup) -> Iterator[Found | Note]:
     """The configs that the hooks return, for sensors and for people."""
-    for (kind, name), config in checkup.look(hook_configs).items():
+    configs = checkup.look(hook_configs)
+    if not configs:
+        raise NotApplicable("it has no camera")
+    for (kind, name), config in configs.items():
         if is_ray_traced(str(config.shader_pack)):
             yield Found(
                 f"camera {name!r} is ray traced (shader_pack {config.shader_pack!r}), which ManiSkill refuses for several "
@@ -183,7 +196,7 @@ def sensor_reports(checkup: Checkup) -> dict[CameraKey, CameraReport]:
     task = checkup.pictured
     sensors: list[CameraKey] = [key for key in cameras_of(task.env) if key[0] == "sensor"]
     if not sensors:
-        raise CannotCheck("it has no sensor camera")
+        raise NotApplicable("it has no sensor camera")
     reports: dict[CameraKey, list[CameraReport]] = {key: [] for key in sensors}
     objects = _objects(task.env)
     for first in range(0, RESETS * task.num_envs, task.num_envs):
@@ -203,21 +216,26 @@ def _measured(env: Any, e: int, key: CameraKey, objects: list[SceneObject]) -> C
 
 
 def _objects(env: Any) -> list[SceneObject]:
-    """Robots and scenery, and the first objects that have anything to see: a body may only carry a camera."""
-    index, every = scene_index(env), list_objects(env)
-    drawn = [
+    """Robots and scenery, and the first of the others."""
+    scenery = [thing for thing in list_objects(env) if thing.robot or thing.scenery]
+    return [*scenery, *_drawn(env)[:MOST_OBJECTS]]
+
+
+def _drawn(env: Any) -> list[SceneObject]:
+    """Objects that are neither robot nor scenery and have anything to see: a body may only carry a camera."""
+    index = scene_index(env)
+    return [
         thing
-        for thing in every
-        if any(is_drawn(entity) for e in range(env.num_envs) for entity in entities_of(thing, e, index))
+        for thing in list_objects(env)
+        if not (thing.robot or thing.scenery)
+        and any(is_drawn(entity) for e in range(env.num_envs) for entity in entities_of(thing, e, index))
     ]
-    scenery = [thing for thing in every if thing.robot or thing.scenery]
-    return [*scenery, *[thing for thing in drawn if thing not in scenery][:MOST_OBJECTS]]
 
 
 def _own_configs(checkup: Checkup) -> list[Any]:
     of_task, _ = checkup.look(sensor_configs)
     if not of_task:
-        raise CannotCheck("it has no sensor camera of its own")
+        raise NotApplicable("it has no sensor camera of its own")
     return of_task
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator, Mapping
 
-from workbench.checks.evidence.checkup import Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note
 from workbench.checks.evidence.places import Module
 from workbench.checks.evidence.step_profile import EVERY_STEP
-from workbench.checks.evidence.tensor_watch import NUM_ENVS, TensorUses
+from workbench.checks.evidence.tensor_watch import TensorUses
 from workbench.core.broken_rule import Place
 
 _ONE_FOR_EACH_ENV = {"num_envs", "_num_envs", "_objs", "_bodies", "sub_scenes"}
@@ -24,10 +24,14 @@ def loop_over_envs(checkup: Checkup) -> Iterator[Found | Note]:
             found.setdefault(place[:2], place)
     # Before anything runs: of a task that raises they are known too.
     yield from map(_found_loop, found.values())
+    if not any(True for _ in checkup.places.reached_from(*EVERY_STEP)):
+        raise NotApplicable("it has no hook of its own that runs at every step")
     for place in checkup.tensor_uses.iterated:
         if _is_loop(checkup, place) and place[:2] not in found:
             found[place[:2]] = place
             yield _found_loop(place)
+    if not found:
+        checkup.require_several()
 
 
 def _found_loop(place: Place) -> Found:
@@ -43,20 +47,20 @@ def device_copies(checkup: Checkup) -> Iterator[Found | Note]:
     uses = checkup.tensor_uses
     for place, count in uses.copies.items():
         yield Found(
-            f"{place[2]}() copies a tensor to the host {_how_often(count, uses.steps)} ({uses.written[place]}): a GPU has to "
+            f"{place[2]}() copies a tensor to the host {_how_often(count, uses)} ({uses.written[place]}): a GPU has to "
             "wait each time. Stay in tensors: torch.where for an if, x.any(dim=1) for a condition, indices and masks for "
             "rows.",
             place,
         )
 
 
-def _how_often(count: int, steps: int) -> str:
+def _how_often(count: int, uses: TensorUses) -> str:
     """``once in each step``, ``2 times for each env in each step``; ``4 times in 3 steps`` where they differ."""
-    if count % steps:
-        return f"{_times(count)} in {steps} steps"
-    a_step = count // steps
-    if a_step % NUM_ENVS == 0:
-        return f"{_times(a_step // NUM_ENVS)} for each env in each step"
+    if count % uses.steps:
+        return f"{_times(count)} in {uses.steps} steps"
+    a_step = count // uses.steps
+    if uses.num_envs > 1 and a_step % uses.num_envs == 0:
+        return f"{_times(a_step // uses.num_envs)} for each env in each step"
     return f"{_times(a_step)} in each step"
 
 

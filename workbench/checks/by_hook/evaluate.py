@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.episodes import Episodes
 from workbench.checks.evidence.over_seeds import OverSeeds, first_kind, together, tried
 from workbench.checks.results import Seen
@@ -41,16 +42,21 @@ def success_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_success_and_fail(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts, up to the kind that has both."""
+    """Over all rollouts, up to the kind that has both; and whether there was a success and a fail at all."""
     for episodes in checkup.rollouts:
-        both = _flag(episodes, "success") & _flag(episodes, "fail")
+        success, fail = _flag(episodes, "success"), _flag(episodes, "fail")
+        both = success & fail
         place = checkup.places.entry("success")
-        yield _seen_at(both, episodes, (episodes.kind,), place)
+        seen = _seen_at(both, episodes, (episodes.kind,), place)
+        yield replace(seen, numbers=(float(success.any()), float(fail.any())))
         if both.any():
             return
 
 
 def success_and_fail(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    for k, what in enumerate(("succeeds", "fails")):
+        if not any(row.numbers[k] for row in rows):
+            raise NotKnown(f"no tried episode {what}")
     if (row := first_kind(rows)) is not None:
         yield Found(
             f"success and fail are both true in {_episodes_of(row)}, {row.texts[0]}. Write `success & ~fail`.",
@@ -93,9 +99,9 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     at_reset, succeeds = (any(row.numbers[k] for row in rows) for k in (0, 1))
     which = " or ".join(dict.fromkeys(row.names[0] for row in rows))
     if not succeeds:
-        raise CannotCheck(f"no {which} episode succeeds")
+        raise NotKnown(f"no {which} episode succeeds")
     if not times:
-        raise CannotCheck(
+        raise NotKnown(
             "where success is true, it is so from the reset on"
             if at_reset
             else "success comes at the last step only"
@@ -112,17 +118,19 @@ def success_flickers(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 def see_success_stays_possible(checkup: Checkup) -> Iterator[Seen]:
     """Whether there is an entry at all, and in how many rollouts it is reached."""
     entries = checkup.starts.evaluate
-    if any(known != "elapsed_steps" for _, known in _misspelt(entries)):
-        raise CannotCheck("an entry has nearly the name that ManiSkill reads, see entry-name")
+    own = checkup.loaded.cls.compute_sparse_reward is not BaseEnv.compute_sparse_reward
+    sparse = checkup.task.env.reward_mode == "sparse" and not own
+    if sparse and any(known != "elapsed_steps" for _, known in _misspelt(entries)):
+        raise NotKnown("an entry has nearly the name that ManiSkill reads, see entry-name")
     if "success" not in entries and "fail" not in entries:
-        own = checkup.loaded.cls.compute_sparse_reward is not BaseEnv.compute_sparse_reward
         # As ManiSkill's tasks of walking, balancing and drawing.
-        as_they_do = checkup.task.env.reward_mode != "sparse" or own
-        yield Seen(place=checkup.places.hook("evaluate"), count=not as_they_do)
+        yield Seen(place=checkup.places.hook("evaluate"), count=int(sparse))
     elif "success" in entries:
         for episodes in checkup.rollouts:
             reached = int(_flag(episodes, "success").any(axis=0).sum())
             yield Seen((episodes.kind,), tried=len(episodes.seeds), count=reached)
+    if not sparse:
+        yield Seen(("not sparse",))
 
 
 def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
@@ -136,7 +144,10 @@ def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
                 row.place,
             )
     for row in together(rows):
-        yield Note(f"success in {of(row.count, row.tried, f'{row.names[0]} episode')}")
+        if row.tried:
+            yield Note(f"success in {of(row.count, row.tried, f'{row.names[0]} episode')}")
+    if any(row.names == ("not sparse",) for row in rows):
+        raise NotApplicable("its reward is not the sparse one of ManiSkill")
 
 
 def entry_name(checkup: Checkup) -> Iterator[Found | Note]:
@@ -159,23 +170,27 @@ def _misspelt(entries: Collection[str]) -> Iterator[tuple[str, str]]:
 
 def info_rows(checkup: Checkup) -> Iterator[Found | Note]:
     """After a reset and after a step."""
-    task = checkup.task
+    task, found = checkup.task, False
     others = checkup.reset(task, checkup.seeds[0]).others
     others = {**others, **checkup.step(task, hold_action(task.parts, task.num_envs)).others}
     for name, entry in others.items():
         if not entry.per_env:
+            found = True
             yield Found(
                 f"the entry {name!r} of evaluate() is a {entry.what} for all {task.num_envs} envs together. Give it a row "
                 "for each env, or leave it out: what only people read can be logged elsewhere.",
                 checkup.places.entry(name.rpartition("/")[2]),
             )
+    if not found:
+        checkup.require_several()
 
 
 def see_entries_finite(checkup: Checkup) -> Iterator[Seen]:
     """Over all rollouts."""
     told: set[str] = set()
     for episodes in checkup.rollouts:
-        yield Seen((episodes.kind,), tried=len(episodes.seeds))
+        numbers = float(sum(rows.dtype.kind == "f" for rows in episodes.evaluate.values()))
+        yield Seen((episodes.kind,), tried=len(episodes.seeds), numbers=(numbers,) if numbers else ())
         for name, rows in episodes.evaluate.items():
             if rows.dtype.kind != "f" or name in told:
                 continue
@@ -188,6 +203,8 @@ def see_entries_finite(checkup: Checkup) -> Iterator[Seen]:
 
 def entries_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     told: set[str] = set()
+    if not any(row.numbers for row in rows):
+        raise NotApplicable("evaluate() returns no numbers")
     for row in together(row for row in rows if len(row.names) == 2):
         kind, name = row.names
         if name in told:
@@ -206,7 +223,7 @@ def _flag(episodes: Episodes, name: str) -> NDArray[np.bool_]:
     """(T + 1, K)"""
     rows = episodes.evaluate.get(name)
     if rows is None:
-        raise CannotCheck(f"evaluate() has no entry {name}")
+        raise NotApplicable(f"evaluate() has no entry {name}")
     return flags(rows)
 
 

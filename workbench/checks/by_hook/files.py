@@ -14,7 +14,7 @@ from mani_skill import ASSET_DIR
 from mani_skill.utils import assets
 
 from workbench.checks.by_hook.source import HOOKS
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, Note
 from workbench.checks.evidence.places import Module
 from workbench.core.broken_rule import Place
 from workbench.core.env.assets import assets_at
@@ -102,8 +102,7 @@ def undeclared_assets(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _named_files(checkup: Checkup) -> Iterator[NamedFile]:
-    if not checkup.places.modules:
-        raise CannotCheck("its source is not known")
+    checkup.require_source()
     for module, function in checkup.places.reached_from(*HOOKS):
         calls = {node.func for node in ast.walk(function) if isinstance(node, ast.Call)}
         if not _WRITES_OR_ASKS.isdisjoint(getattr(each, "attr", getattr(each, "id", "")) for each in calls):

@@ -12,7 +12,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note, leaf_rows
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown, leaf_rows
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, odd_states, write_all
 from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
 from workbench.checks.results import Seen
@@ -64,6 +64,7 @@ def see_observation_finite(checkup: Checkup) -> Iterator[Seen]:
 
 
 def observation_finite(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    _require_leaves(rows)
     found = [row for row in together(rows) if row.count]
     for row in sorted(found, key=lambda row: row.names[0] != "random")[:1]:
         where = row.texts[0]
@@ -96,8 +97,12 @@ def see_observation_constant(checkup: Checkup) -> Iterator[Seen]:
 
 def observation_constant(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     """Leaves that are the same for all seeds."""
+    named = [row for row in rows if row.names]
+    _require_leaves(named)
+    if tried(rows) < 2:
+        raise NotKnown("it needs two seeds")
     values: dict[tuple[str, ...], set[tuple[float, ...]]] = {}
-    for row in rows:
+    for row in named:
         values.setdefault(row.names, set()).add(row.numbers)
     for row in together(rows):
         name, value = row.names[0], np.array(row.numbers)
@@ -128,6 +133,7 @@ def see_observation_huge(checkup: Checkup) -> Iterator[Seen]:
 
 
 def observation_huge(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    _require_leaves(rows)
     for row in together(rows):
         if row.count:
             yield Found(
@@ -138,33 +144,51 @@ def observation_huge(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             )
 
 
+def _require_leaves(rows: Sequence[Seen]) -> None:
+    if not rows:
+        raise NotApplicable("its observation has no numbers")
+
+
 def ground_truth(checkup: Checkup) -> Iterator[Found | Note]:
     """In a mode with pictures: each body that moves freely is moved, and the numbers that follow are found."""
     told: dict[str, list[str]] = {}
-    for body, moved in checkup.look(followers).items():
-        if not moved.hidden:
-            for leaf in moved.observation:
-                told.setdefault(leaf, []).append(body)
+    seen = {body: moved for body, moved in checkup.look(followers).items() if not moved.hidden}
+    if not seen:
+        raise NotApplicable("nothing but its robot moves freely")
+    for body, moved in seen.items():
+        for leaf in moved.observation:
+            told.setdefault(leaf, []).append(body)
     for leaf, bodies in told.items():
         yield Found(
             f"{leaf!r} of _get_obs_extra() follows {listed(bodies)} in obs_mode "
             f"{checkup.pictured.env.obs_mode!r}. Put it behind `if self.obs_mode_struct.use_state:`.",
             _place(checkup, f"extra/{leaf}"),
         )
+    if not told:
+        _require_all_moved(checkup)
+
+
+def _require_all_moved(checkup: Checkup) -> None:
+    if (count := len(scene_index(checkup.pictured.env).states)) > MOST_BODIES:
+        raise NotKnown(f"{MOST_BODIES} of {count} bodies were looked at")
 
 
 def hidden_goal(checkup: Checkup) -> Iterator[Found | Note]:
     """In a mode with pictures: each body that the task hides is moved, and what follows is found."""
     bodies = {body: moved for body, moved in checkup.look(followers).items() if moved.hidden}
     if not bodies:
-        raise CannotCheck("it hides nothing from pictures")
+        raise NotApplicable("it hides nothing from pictures")
+    found = False
     for body, moved in bodies.items():
         if moved.meaning and not moved.observation:
+            found = True
             yield Found(
                 f"{body} is hidden from pictures, {listed(sorted(moved.meaning))} of evaluate() or the reward depends "
                 "on where it is, and nothing in _get_obs_extra() does. Add its position there, in all modes.",
                 checkup.places.hook("_get_obs_extra"),
             )
+    if not found:
+        _require_all_moved(checkup)
 
 
 # --- leaves by name ------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import TaskError
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.episodes import SeenOutlier
 from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
 from workbench.checks.results import Seen
@@ -42,37 +42,96 @@ _REORDERED = ("roll", "scalar_first", "wxyz", "[3, 0, 1, 2]", "xyzw")
 
 
 def batch_of_reset(checkup: Checkup) -> Iterator[Found | Note]:
-    """Whether partial resets fail or change other envs, where the source makes tensors of self.num_envs rows."""
-    if checkup.num_envs < 2:
-        raise CannotCheck("it needs two envs")
+    """Whether a partial reset fails, or breaks a rule, at a line that uses a tensor of self.num_envs rows."""
+    checkup.require_several()
+    task, rng = checkup.task, np.random.default_rng(4)
+    checkup.reset(task, list(range(checkup.num_envs)))
+    # So that what is kept for each env differs from what a reset gives it.
+    checkup.step(task, random_action(task.parts, task.num_envs, rng))
     failed: TaskError | None = None
     try:
-        task, rng = checkup.task, np.random.default_rng(4)
-        checkup.reset(task, list(range(checkup.num_envs)))
-        # So that what is kept for each env differs from what a reset gives it.
-        checkup.step(task, random_action(task.parts, task.num_envs, rng))
         for chosen in ([0], list(range(1, checkup.num_envs))):
             checkup.reset(task, None, chosen)
     except TaskError as error:
         failed = error
-    broken = {(each.file, each.function) for each in checkup.findings}
-    for module, function in checkup.places.functions("_initialize_episode"):
-        if failed is None and (module.file, function.name) not in broken:
+    lines = {(each.file, each.line) for each in checkup.findings}
+    if failed is not None:
+        lines.add((failed.problem.file, failed.problem.line))
+    for module, function in checkup.places.methods:
+        if function.name != "_initialize_episode":
             continue
-        for node in _whole_batches(function):
+        for node in _whole_batches_at(function, {line for file, line in lines if file == module.file}):
             yield Found(
                 "tensors of self.num_envs rows are made in a reset of some envs. Take b = len(env_idx) for their "
                 "number of rows.",
                 module.place(node, function.name),
             )
             return
+    if failed is not None:
+        raise failed
 
 
-def _whole_batches(function: ast.FunctionDef) -> Iterator[ast.AST]:
-    """Calls that make a tensor with self.num_envs in its size, and of which not only rows are taken."""
-    sliced = {id(node.value) for node in ast.walk(function) if isinstance(node, ast.Subscript)}
-    for node in ast.walk(function):
-        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute) or id(node) in sliced:
+def _whole_batches_at(function: ast.FunctionDef, lines: Collection[int | None]) -> Iterator[ast.AST]:
+    """The calls that make a tensor of self.num_envs rows which is used in these lines, beyond its rows of ``env_idx``."""
+    made: dict[str, ast.AST] = {}
+    """By the local name, or the attribute of self, that such a tensor is kept in."""
+    for statement in _statements(function):
+        value = getattr(statement, "value", None)
+        source = None if value is None else next(_uses(value, made), None)
+        if set(range(statement.lineno, (statement.end_lineno or 0) + 1)).intersection(lines):
+            if (used := source or next(_uses(statement, made), None)) is not None:
+                yield used
+        targets = getattr(statement, "targets", [getattr(statement, "target", None)])
+        for name in map(_name_of, filter(None, targets)):
+            if source is not None:
+                made[name] = source
+            elif not isinstance(statement, ast.AugAssign):
+                made.pop(name, None)
+
+
+def _statements(function: ast.FunctionDef) -> list[ast.stmt]:
+    """The simple statements, in the order of the text."""
+    found = (node for node in ast.walk(function) if isinstance(node, ast.stmt) and not hasattr(node, "body"))
+    return sorted(found, key=lambda node: (node.lineno, node.col_offset))
+
+
+def _name_of(node: ast.AST) -> str:
+    """``p``, ``self.begun``; empty for anything else."""
+    if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "self":
+        return f"self.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def _uses(node: ast.AST, made: Mapping[str, ast.AST]) -> Iterator[ast.AST]:
+    """Of the whole batches that a part of the source makes or names, the calls that make them; not where only rows are
+    taken."""
+    batches = {id(batch): batch for batch in _whole_batches(node)}
+    waiting: list[ast.AST] = [node]
+    while waiting:
+        part = waiting.pop()
+        if id(part) in batches:
+            yield part
+        elif name := _name_of(part):
+            if name in made and not isinstance(getattr(part, "ctx", None), ast.Store):
+                yield made[name]
+        elif isinstance(part, ast.Subscript) and _takes_rows(part):
+            waiting.append(part.slice)
+        else:
+            waiting.extend(ast.iter_child_nodes(part))
+
+
+def _takes_rows(node: ast.Subscript) -> bool:
+    """Whether it is ``x[env_idx]``, ``x[env_idx, :2]``, ``x[mask]``; not ``x[:, :2]``, which has all rows."""
+    first = node.slice.elts[0] if isinstance(node.slice, ast.Tuple) and node.slice.elts else node.slice
+    if isinstance(first, ast.Slice):
+        return first.lower is not None or first.upper is not None
+    return not (isinstance(first, ast.Constant) and first.value is ...)
+
+
+def _whole_batches(within: ast.AST) -> Iterator[ast.AST]:
+    """Calls that make a tensor with self.num_envs in its size."""
+    for node in ast.walk(within):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
             continue
         given = [*node.args, *(keyword.value for keyword in node.keywords)]
         if node.func.attr in _CREATED + _SIZED and any(_is_num_envs(part) for part in given):
@@ -137,6 +196,12 @@ def see_falls_at_reset(checkup: Checkup) -> Iterator[Seen]:
     yield from (Seen(("wanted", owner)) for owner in sorted(wanted))
     before, after = still.poses[0], still.poses[-1]
     yield Seen(tried=len(still.seeds))
+    loose_bodies = {
+        index.owners[body]
+        for body, kind in enumerate(index.kinds)
+        if kind == "dynamic" or (kind == "link" and index.owners[body] not in robots)
+    }
+    yield from (Seen(("loose", owner)) for owner in sorted(loose_bodies))
     for body, name in enumerate(index.names):
         loose = index.kinds[body] == "dynamic" or (
             index.kinds[body] == "link" and index.owners[body] not in robots
@@ -165,7 +230,13 @@ def see_falls_at_reset(checkup: Checkup) -> Iterator[Seen]:
 
 
 def falls_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    wanted = {row.names[1] for row in rows if row.names[:1] == ("wanted",)}
+    wanted, loose = (
+        {row.names[1] for row in rows if row.names[:1] == (what,)} for what in ("wanted", "loose")
+    )
+    if not loose:
+        raise NotApplicable("nothing but its robot moves freely")
+    if loose <= wanted:
+        raise NotKnown(f"{listed(sorted(loose))} moves from the start, or touches the robot then")
     for row in together((row for row in rows if row.names[:1] == ("body",)), worst=True):
         _, name, owner = row.names
         if owner in wanted:
@@ -182,20 +253,20 @@ def see_robot_holds(checkup: Checkup) -> Iterator[Seen]:
     """Over all seeds, while the controllers are asked to hold, for a second: a row for each joint."""
     env = checkup.task.env
     if not checkup.task.parts:
-        raise CannotCheck("it has no robot")
+        raise NotApplicable("it has no robot")
     for part in checkup.task.parts:
         delta = getattr(part.controller.config, "use_delta", False)
         absolute = isinstance(part.controller, PDJointPosController) and not isinstance(
             part.controller, PDEEPosController
         )
         if not delta and not absolute:
-            raise CannotCheck(f"no action holds a robot in control mode {env.control_mode}")
+            raise NotKnown(f"no action holds a robot in control mode {env.control_mode}")
     if any(not _is_fixed(robot.robot) for robot in agents(env)):
-        raise CannotCheck("its robot stands on the floor: balancing is what a policy learns")
+        raise NotApplicable("its robot stands on the floor: balancing is what a policy learns")
     driven = {joint.name for part in checkup.task.parts for joint in part.controller.joints}
     still, robots = checkup.still, _robots(checkup)
     if still.qpos is None:
-        raise CannotCheck("its robots have different joints in each env")
+        raise NotKnown("its robots have different joints in each env")
     place = checkup.places.hook("_initialize_episode")
     column = 0
     for owner, articulation in joints_of_scene(env):
@@ -217,6 +288,8 @@ def see_robot_holds(checkup: Checkup) -> Iterator[Seen]:
 
 
 def robot_holds(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    if not rows:
+        raise NotApplicable("no controller moves a joint of its robot")
     for row in together(rows):
         if row.seeds:
             yield Found(
@@ -233,9 +306,15 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
     """Over all seeds: how far each body is."""
     task = checkup.task
     robots = agents(task.env)
-    tool = tool_of(robots[0]) if len(robots) == 1 and _is_fixed(robots[0].robot) else None
+    if not robots:
+        raise NotApplicable("it has no robot")
+    if len(robots) > 1:
+        raise NotKnown("it has several robots: which one is to touch what is not known")
+    if not _is_fixed(robots[0].robot):
+        raise NotApplicable("its robot moves around")
+    tool = tool_of(robots[0])
     if tool is None:
-        raise CannotCheck("it has no single robot with a fixed base and a tcp")
+        raise NotKnown("its robot has no tcp, whose reach is measured")
     base, reach = _reach(checkup, robots[0].robot, tool)
     index, poses = scene_index(task.env), checkup.starts.poses[0]
     for body, name in enumerate(index.names):
@@ -255,7 +334,10 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
 
 def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     """Of bodies that are within reach at some seeds, and beyond at others."""
-    for row in together(rows, worst=True):
+    bodies = together(rows, worst=True)
+    if not bodies:
+        raise NotApplicable("nothing in it moves freely")
+    for row in bodies:
         if 0 < len(row.seeds) < row.tried:
             yield Found(
                 f"{row.names[0]} is up to {row.size:.2f} m from the robot's base, whose tcp reaches {row.numbers[0]:.2f} m, in "
@@ -263,6 +345,8 @@ def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
                 row.place,
                 len(row.seeds),
             )
+    if far := [row.names[0] for row in bodies if len(row.seeds) == row.tried]:
+        raise NotKnown(f"out of reach at every seed: {listed(far)}. Whether it is to be touched is not known")
 
 
 def _reach(checkup: Checkup, articulation: Any, tool: Any) -> tuple[NDArray[np.float32], float]:
@@ -274,7 +358,7 @@ def _reach(checkup: Checkup, articulation: Any, tool: Any) -> tuple[NDArray[np.f
         limits = limits.clamp(-np.pi, np.pi)
         if any(str(joint.type[0]) == "prismatic" and not np.isfinite(np.ravel(joint.limits.cpu())).all()
                for joint in articulation.active_joints):  # fmt: skip
-            raise CannotCheck("its robot drives around")
+            raise NotApplicable("its robot drives around")
     base = articulation.pose.p.cpu().numpy()
     generator = torch.Generator(device=limits.device).manual_seed(0)
     reach = 0.0
@@ -288,6 +372,8 @@ def _reach(checkup: Checkup, articulation: Any, tool: Any) -> tuple[NDArray[np.f
 
 def unit_quaternion(checkup: Checkup) -> Iterator[Found | Note]:
     """Of the poses that the task sets in a reset, and of its initial poses."""
+    if not any(True for _ in _quaternions(checkup)):
+        raise NotApplicable("its own lines set no pose")
     for name, quaternions, place in _quaternions(checkup):
         length = np.linalg.norm(quaternions, axis=1)
         wrong = np.abs(length - 1) > NOT_UNIT
@@ -305,10 +391,14 @@ def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
     for name, quaternions, place in _quaternions(checkup):
         by_name.setdefault(name, []).append((quaternions, place))
     robots, found = _robots(checkup), False
+    one_row: list[str] = []
     for name, given in by_name.items():
         rows, place = np.concatenate([rows for rows, _ in given[-1:]]), given[-1][1]
         flat = (np.abs(rows[:, :2]) < 1e-6).all(axis=1).all()
-        if not flat or len(rows) < 2:
+        if not flat:
+            continue
+        if len(rows) < 2:
+            one_row.append(name)
             continue
         if np.ptp(rows[:, 2:], axis=0).max() > 0.05:
             found = True
@@ -334,6 +424,11 @@ def quaternion_order(checkup: Checkup) -> Iterator[Found | Note]:
                         "as_quat(scalar_first=True).",
                         module.place(node),
                     )
+                    found = True
+    if not by_name:
+        checkup.require_source()
+    if one_row and not found:
+        checkup.require_several()
 
 
 def _quaternions(checkup: Checkup) -> Iterator[tuple[str, NDArray[np.float32], Place | None]]:
@@ -354,7 +449,8 @@ def see_bodies_stay(checkup: Checkup) -> Iterator[Seen]:
     for seen in sorted(rollouts.outliers, key=lambda seen: (seen.step, seen.seed)):
         if seen.kind.rule == "bodies-stay":
             of_owner.setdefault(seen.body.split("/", 1)[0], []).append(seen)
-    yield Seen(tried=len(rollouts.seeds))
+    moves = any(kind in ("dynamic", "link") for kind in scene_index(checkup.task.env).kinds)
+    yield Seen(tried=len(rollouts.seeds), count=int(moves))
     for owner, every in of_owner.items():
         first, seeds = every[0], sorted({seen.seed for seen in every})
         yield Seen(
@@ -367,6 +463,8 @@ def see_bodies_stay(checkup: Checkup) -> Iterator[Seen]:
 
 
 def bodies_stay(rows: Sequence[Seen]) -> Iterator[Found | Note]:
+    if not any(row.count for row in rows if not row.names):
+        raise NotApplicable("nothing in it moves")
     for row in sorted(together(rows, worst=True), key=lambda row: -row.size):
         yield Found(
             f"{row.texts[0]}; in this way or another it leaves the scene in "

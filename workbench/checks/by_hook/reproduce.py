@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.checks.evidence.builds import shapes_of_env
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note, read_obs
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown, read_obs
 from workbench.checks.evidence.random_calls import first_draw, global_draw, torch_draw
 from workbench.checks.evidence.step_profile import EVERY_STEP
 from workbench.core.capture.state_columns import env_states, flat_names, split_flat
@@ -46,11 +46,14 @@ def runs(checkup: Checkup) -> Iterator[Found | Note]:
         checkup.reset(task, None if turn % 2 else [1000 * turn + i for i in chosen], chosen)
         action = random_action(task.parts, task.num_envs, rng)
         checkup.step(task, np.sign(action) if turn == 0 else action)
+    # With one env no reset leaves another in the middle of its episode.
+    checkup.require_several()
     return iter(())
 
 
 def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
     """After a reset, and again after resets and steps of other seeds."""
+    checkup.require_task()
     task, seeds = checkup.task, next(checkup.batches())
     first = _seen(task, checkup.reset(task, seeds))
     # Others that have their own generators may be at an equal place after a reset.
@@ -82,12 +85,11 @@ def same_seed(checkup: Checkup) -> Iterator[Found | Note]:
 
 def same_for_any_batch(checkup: Checkup) -> Iterator[Found | Note]:
     """What one env builds for a seed, beside what the batch built for it."""
-    if checkup.num_envs < 2:
-        raise CannotCheck("it needs two envs")
+    checkup.require_several()
     assert checkup.task
     wrong = [
         seed
-        for env, (seed, alone) in enumerate(checkup.alone.shapes.items())
+        for env, (seed, alone) in zip(range(checkup.num_envs), checkup.alone.shapes.items(), strict=False)
         if alone != shapes_of_env(checkup.builds, env)
     ]
     if wrong:
@@ -134,16 +136,17 @@ def state_restores(checkup: Checkup) -> Iterator[Found | Note]:
 
 def actions_replay(checkup: Checkup) -> Iterator[Found | Note]:
     """Twice from the same seeds. Each reset begins with physics that has no past, so only the task's code can differ."""
+    checkup.require_task()
     seeds = next(checkup.batches())
     task = checkup.task
     if not task.parts:
-        raise CannotCheck("it takes no actions")
+        raise NotApplicable("it takes no actions")
     first, second = (_episode(checkup, task, seeds) for _ in range(2))
     for step, (one, other) in enumerate(zip(first, second, strict=True)):
         if not (differing := _differing(one, other, SAME)):
             continue
         if step == 0:
-            raise CannotCheck("the same seed gives another start")
+            raise NotKnown("the same seed gives another start")
         drawn = next(
             (
                 found

@@ -6,12 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.checks.by_hook.evaluate import flags
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.episodes import Episodes
-from workbench.checks.evidence.odd_states import DENSE_HOOKS, odd_states
+from workbench.checks.evidence.odd_states import DENSE_HOOKS, SHORT, OddStates, odd_states
 from workbench.checks.evidence.over_seeds import OverSeeds, first_kind, tried
 from workbench.checks.results import Seen
 from workbench.core.broken_rule import Place
@@ -33,6 +34,7 @@ CLEARLY_LOWER = 0.05
 
 def see_reward_finite(checkup: Checkup) -> Iterator[Seen]:
     """Over all rollouts, up to the kind with a breach; else over odd states."""
+    _require_reward(checkup)
     place = checkup.places.hook(*_hooks(checkup))
     for episodes in checkup.rollouts:
         reward = _rewards(checkup, episodes)
@@ -95,58 +97,89 @@ def reward_changes(rows: Sequence[Seen]) -> Iterator[Found | Note]:
 
 
 def see_reward_normalized(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts, where the reward is the normalized or the sparse one, up to the kind with a breach."""
+    """Over all rollouts, where the reward is the normalized or the sparse one, up to the kind with a breach; then over the odd
+    states with success."""
     mode = checkup.task.env.reward_mode
     if mode not in REWARD_RANGES:
-        raise CannotCheck("its reward is neither normalized nor sparse")
+        raise NotApplicable("its reward is neither normalized nor sparse")
     least, most = REWARD_RANGES[mode]
     sparse = mode == "sparse"
     hooks = [REWARD_HOOKS[mode]] if sparse else ["compute_normalized_dense_reward", "compute_dense_reward"]
-    for episodes in checkup.rollouts:
-        reward = _rewards(checkup, episodes)
-        known = np.nan_to_num(reward)
+
+    def of(name: str, where: str, rewards: NDArray, successes: int) -> Seen:
+        known = rewards[~np.isnan(rewards)]
         outside = (known < least - ROUNDING) | (known > most + ROUNDING)
-        yield Seen(
-            (episodes.kind,),
+        return Seen(
+            (name,),
             checkup.places.hook(*hooks),
+            tried=successes,
             count=int(outside.sum()),
-            numbers=(float(np.nanmin(reward)), float(np.nanmax(reward)))
-            if not np.isnan(reward).all()
-            else (),
-            texts=("sparse" if sparse else "normalized",),
+            numbers=(float(known.min()), float(known.max())) if known.size else (),
+            texts=("sparse" if sparse else "normalized", where),
         )
-        if outside.any():
+
+    for episodes in checkup.rollouts:
+        success = episodes.evaluate.get("success")
+        reached = 0 if success is None else int(flags(success).any(axis=0).sum())
+        row = of(episodes.kind, f"in {episodes.kind} episodes", _rewards(checkup, episodes), reached)
+        yield row
+        if row.count:
             return
+    if sparse and checkup.loaded.cls.compute_sparse_reward is BaseEnv.compute_sparse_reward:
+        yield Seen(("ManiSkill's own",), tried=1)
+        return
+    if "success" not in checkup.starts.evaluate:
+        yield Seen(("no success",))
+        return
+    seen = checkup.look(odd_states)
+    success = flags(np.stack([entries["success"] for entries in seen.evaluate]))
+    paid = np.stack(seen.reward[mode])[success]
+    if (constant := paid_at_success(seen, mode)) is not None:
+        paid = np.append(paid, constant)
+    yield of("success", "in states with success", paid, len(paid))
 
 
 def reward_normalized(rows: Sequence[Seen]) -> Iterator[Found | Note]:
-    if (row := first_kind(rows)) is None:
-        return
-    ranges = [one.numbers for one in rows if one.names == row.names and one.numbers]
-    low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
-    yield Found(
-        f"the {row.texts[0]} reward goes from {low:.3g} to {high:.3g} in {row.names[0]} episodes. "
-        + (
-            "Return 1 at success, -1 at fail and 0 elsewhere."
-            if row.texts[0] == "sparse"
-            else "Divide the dense reward by the largest that an episode can reach in one step."
-        ),
-        row.place,
-        row.count,
-    )
+    if (row := first_kind(rows)) is not None:
+        ranges = [one.numbers for one in rows if one.names == row.names and one.numbers]
+        low, high = min(low for low, _ in ranges), max(high for _, high in ranges)
+        yield Found(
+            f"the {row.texts[0]} reward goes from {low:.3g} to {high:.3g} {row.texts[1]}. "
+            + (
+                "Return 1 at success, -1 at fail and 0 elsewhere."
+                if row.texts[0] == "sparse"
+                else "Divide the dense reward by the largest that an episode can reach in one step."
+            ),
+            row.place,
+            row.count,
+        )
+    elif any(row.names == ("no success",) for row in rows):
+        raise NotKnown("evaluate() has no success: which states pay most is not known")
+    elif not any(row.tried for row in rows):
+        raise NotKnown("no tried episode succeeds, where the reward is largest")
+
+
+def paid_at_success(seen: OddStates, mode: str) -> float | None:
+    """What the reward is wherever evaluate() reports success, as far as it is one number; None if that is not so."""
+    told = np.concatenate([*seen.told.get(mode, ()), np.zeros(0)])
+    if not len(told) or not np.isfinite(told).all() or np.ptp(told) > ROUNDING:
+        return None
+    return float(told[0])
 
 
 def reward_ratio(checkup: Checkup) -> Iterator[Found | Note]:
-    """Both hooks, called on the same odd states."""
-    rewards = checkup.look(odd_states).reward
-    if not DENSE_HOOKS.keys() <= rewards.keys():
-        raise CannotCheck("it lacks a dense or a normalized dense reward")
-    dense, normalized = (np.concatenate(rewards[mode]) for mode in DENSE_HOOKS)
+    """Both hooks, called on the same odd states, and again with success."""
+    seen = checkup.look(odd_states)
+    if not DENSE_HOOKS.keys() <= seen.reward.keys():
+        raise NotApplicable("it lacks a dense or a normalized dense reward")
+    dense, normalized = (
+        np.concatenate([*seen.reward[mode], *seen.told.get(mode, ())]) for mode in DENSE_HOOKS
+    )
     finite = np.isfinite(dense) & np.isfinite(normalized)
     size = float(np.abs(dense[finite]).max(initial=0))
     telling = finite & (np.abs(dense) > TELLING * size)
     if not telling.any():
-        raise CannotCheck("its dense reward is 0 or not finite in all states that were tried")
+        raise NotKnown("its dense reward is 0 or not finite in all states that were tried")
     constant = float(np.median(normalized[telling] / dense[telling]))
     wrong = np.abs(normalized - constant * dense)
     off = finite & (wrong > SAME_RATIO * np.abs(normalized[finite]).max())
@@ -173,15 +206,17 @@ def _straight_line(dense: NDArray, normalized: NDArray) -> tuple[float, float] |
 
 
 def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
-    """Over all rollouts and odd states: a row for each episode that has success and a higher reward elsewhere."""
+    """Over all rollouts and odd states: a row for each episode that has success and a higher reward elsewhere; and one for what
+    is paid at success, where that is one number."""
     _require_dense(checkup)
     place = checkup.places.hook(*_hooks(checkup))
-    for scored in _scored(checkup):
+    every = _scored(checkup)
+    for scored in every:
         compared, higher = 0, list[Seen]()
         for column in range(scored.reward.shape[1]):
-            reward, success = scored.reward[:, column], scored.success[:, column]
-            if not success.any() or success.all():
+            if not scored.tried(column):
                 continue
+            reward, success = scored.reward[:, column], scored.success[:, column]
             compared += 1
             row = int(np.argmax(np.where(success, -np.inf, reward)))
             at_success, elsewhere = float(reward[success].max()), float(reward[row])
@@ -193,6 +228,17 @@ def see_reward_order(checkup: Checkup) -> Iterator[Seen]:
         ends = float(scored.reward.min()), float(scored.reward.max())
         yield Seen(("all", scored.of), tried=compared, numbers=ends)
         yield from higher
+    paid = paid_at_success(checkup.look(odd_states), checkup.task.env.reward_mode)
+    if paid is not None:
+        most = [np.where(scored.success, -np.inf, scored.reward) for scored in every]
+        best = int(np.argmax([each.max() for each in most]))
+        row, column = (int(i) for i in np.unravel_index(int(np.argmax(most[best])), most[best].shape))
+        where, ends = (
+            every[best].where(row, column),
+            [float(f(s.reward)) for s in every for f in (np.min, np.max)],
+        )
+        numbers = paid, float(most[best].max()), min(ends), max(ends)
+        yield Seen(("paid",), place, numbers=numbers, texts=(where,))
 
 
 def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
@@ -203,8 +249,6 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             ends.setdefault(row.names[1], []).append(row.numbers)
     ranges = {of: max(most for _, most in all) - min(least for least, _ in all) for of, all in ends.items()}
     compared = sum(row.tried for row in rows)
-    if not compared:
-        raise CannotCheck("no episode that was tried succeeds")
     lower: list[tuple[float, float, float, str]] = []
     place: Place | None = None
     for row in rows:
@@ -213,26 +257,41 @@ def reward_order(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             if elsewhere > at_success + CLEARLY_LOWER * ranges[row.names[1]]:
                 lower.append((elsewhere - at_success, at_success, elsewhere, row.texts[0]))
                 place = row.place
+    advice = 'Give success the most: `reward[info["success"]] = LARGEST_REWARD`.'
     if lower:
         _, at_success, elsewhere, where = max(lower)
         yield Found(
             f"the reward is at most {at_success:.4g} at success and {elsewhere:.4g} elsewhere in the same episode "
-            f"({where}), in {of(len(lower), compared, 'episode')}. Give success the most: "
-            '`reward[info["success"]] = LARGEST_REWARD`.',
+            f"({where}), in {of(len(lower), compared, 'episode')}. {advice}",
             place,
             len(lower),
         )
+        return
+    for row in rows:
+        if row.names == ("paid",):
+            paid, elsewhere, least, most = row.numbers
+            if elsewhere > paid + CLEARLY_LOWER * (most - least):
+                yield Found(
+                    f'the reward is {paid:.4g} wherever info["success"] is true, and {elsewhere:.4g} without success '
+                    f"({row.texts[0]}). {advice}",
+                    row.place,
+                )
+                return
+    if not compared:
+        raise NotKnown("no tried episode succeeds")
 
 
 def see_reward_needs_success(checkup: Checkup) -> Iterator[Seen]:
     """Over all rollouts and odd states, where the reward is the normalized one."""
     if checkup.task.env.reward_mode != "normalized_dense":
-        raise CannotCheck("it has no normalized dense reward")
+        raise NotApplicable("its reward is not the normalized dense one")
     for scored in _scored(checkup):
         most = (scored.reward >= ALL_THERE_IS) & ~scored.success
+        tried = sum(scored.tried(column) for column in range(scored.reward.shape[1]))
         places = [scored.where(int(row), int(column)) for row, column in np.argwhere(most)[:1]]
         yield Seen(
             place=checkup.places.hook(*_hooks(checkup)),
+            tried=tried,
             count=int(most.sum()),
             size=float(scored.reward.max()),
             texts=tuple(places),
@@ -241,7 +300,7 @@ def see_reward_needs_success(checkup: Checkup) -> Iterator[Seen]:
 
 def reward_needs_success(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     if any(row.size > LARGEST for row in rows):
-        raise CannotCheck("its normalized reward goes beyond 1")
+        raise NotKnown("its normalized reward goes beyond 1")
     given, places = sum(row.count for row in rows), [text for row in rows for text in row.texts]
     if given:
         yield Found(
@@ -250,6 +309,8 @@ def reward_needs_success(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             rows[0].place,
             given,
         )
+    elif not any(row.tried for row in rows):
+        raise NotKnown("no tried episode succeeds")
 
 
 # --- rewards and success of many states --------------------------------------------------------------------
@@ -267,6 +328,14 @@ class _Scored:
     """(1, K) or (T, K) which state that is, for a sentence."""
     of: str
     """The kind of episodes, or which odd states."""
+    short: NDArray[np.bool_] | None = None
+    """(T,) the odd states that are short of a success; None for episodes, which come there by steps."""
+
+    def tried(self, column: int) -> bool:
+        """Whether an episode has a success, and states without one that are near it."""
+        success = self.success[:, column]
+        near = success if self.short is None else success[self.short]
+        return bool(success.any()) and not bool(near.all())
 
     def where(self, row: int, column: int) -> str:
         if len(self.places) == 1:
@@ -280,7 +349,7 @@ def _scored(checkup: Checkup) -> list[_Scored]:
     for episodes in checkup.rollouts:
         rewards = np.nan_to_num(_rewards(checkup, episodes))
         if "success" not in episodes.evaluate:
-            raise CannotCheck("evaluate() has no entry success")
+            raise NotApplicable("evaluate() has no entry success")
         success = flags(episodes.evaluate["success"][1:])
         actions = "" if episodes.kind == "random" else f" with {episodes.kind} actions"
         found.append(
@@ -296,6 +365,7 @@ def _scored(checkup: Checkup) -> list[_Scored]:
                 flags(np.stack([seen.evaluate[row]["success"] for row in rows])),
                 [[f"{seen.kinds[row]}, seed {seed}" for seed in seeds] for row in rows],
                 f"odd states from seed {seeds[0]}",
+                np.array([seen.kinds[row] == SHORT for row in rows]),
             )
         )
     return found
@@ -303,16 +373,21 @@ def _scored(checkup: Checkup) -> list[_Scored]:
 
 def _rewards(checkup: Checkup, episodes: Episodes) -> NDArray:
     """(T, K)"""
-    if checkup.task.env.reward_mode == "none":
-        raise CannotCheck("it has no reward")
+    _require_reward(checkup)
     if not episodes.reward.size:
-        raise CannotCheck("no step was made")
+        raise NotKnown("no step was made")
     return episodes.reward
 
 
+def _require_reward(checkup: Checkup) -> None:
+    if checkup.task.env.reward_mode == "none":
+        raise NotApplicable("it has no reward")
+
+
 def _require_dense(checkup: Checkup) -> None:
+    _require_reward(checkup)
     if "dense" not in checkup.task.env.reward_mode:
-        raise CannotCheck(f"its reward is {checkup.task.env.reward_mode}")
+        raise NotApplicable(f"its reward is {checkup.task.env.reward_mode}")
 
 
 def _hooks(checkup: Checkup) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from mani_skill.utils.structs.actor import Actor
 
 from workbench.checks.by_hook.placement import immovable
 from workbench.checks.evidence.builds import Built
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.evidence.meshes import is_hollow, triangles_in
 from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
 from workbench.checks.results import Seen
@@ -36,7 +36,7 @@ def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
     """Of what was built."""
     robots = [each for each in _builds(checkup) if each.of_robot and each.kind == "articulation"]
     if not robots:
-        raise CannotCheck("it has no robot")
+        raise NotApplicable("it has no robot")
     for name in dict.fromkeys(each.name for each in robots if each.quaternion is None):
         yield Found(
             f"{name} is built without an initial pose, at the origin. Write "
@@ -48,7 +48,10 @@ def robot_pose(checkup: Checkup) -> Iterator[Found | Note]:
 def initial_pose(checkup: Checkup) -> Iterator[Found | Note]:
     """Of what was built: bodies that collide and are somewhere else later, or inside something. Others cannot hurt."""
     unposed: dict[Place | None, list[str]] = {}
-    for each in _own(checkup):
+    own = [*_own(checkup)]
+    if not own:
+        raise NotApplicable("its own lines build no body")
+    for each in own:
         if _is_unposed(checkup, each) and each.collision:
             unposed.setdefault(each.place, []).append(each.name)
     for place, names in unposed.items():
@@ -118,7 +121,7 @@ def see_kinematic_never_moved(checkup: Checkup) -> Iterator[Seen]:
     if any(
         _sets_a_pose(function) for _, function in checkup.places.functions() if function.name not in _RESETS
     ):
-        raise CannotCheck("it sets poses in a step")
+        raise NotKnown("it sets poses in a step, perhaps later than in the steps that were tried")
     index = scene_index(checkup.task.env)
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])
     yield Seen(tried=poses.shape[1])
@@ -131,8 +134,10 @@ def see_kinematic_never_moved(checkup: Checkup) -> Iterator[Seen]:
 
 def kinematic_never_moved(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     """Bodies that are at the same pose for all seeds."""
+    if not any(row.names for row in rows):
+        raise NotApplicable("its own lines build no kinematic body that is seen")
     if tried(rows) < 2:
-        raise CannotCheck("it needs two seeds")
+        raise NotKnown("it needs two seeds")
     still: dict[Place | None, list[str]] = {}
     for row in together(rows):
         ends = np.array([one.numbers for one in rows if one.names == row.names])
@@ -169,6 +174,8 @@ def body_names(checkup: Checkup) -> Iterator[Found | Note]:
 def too_many_links(checkup: Checkup) -> Iterator[Found | Note]:
     """Of what was built."""
     places = _places_of(checkup)
+    if not checkup.task.env.scene.articulations:
+        raise NotApplicable("it has no articulation")
     for name, articulation in checkup.task.env.scene.articulations.items():
         if (count := len(articulation.links)) > MOST_LINKS:
             yield Found(
@@ -179,18 +186,26 @@ def too_many_links(checkup: Checkup) -> Iterator[Found | Note]:
 
 def hull_fills_hollow(checkup: Checkup) -> Iterator[Found | Note]:
     """Of the mesh files that bodies of the task collide as one convex hull."""
-    for file, each in _mesh_files(checkup, "convex_mesh").items():
-        if is_hollow(file):
+    files = _mesh_files(checkup, "convex_mesh")
+    if not files:
+        raise NotApplicable("no body of its own collides as the convex hull of a mesh file")
+    unknown: list[str] = []
+    for file, each in files.items():
+        if (hollow := is_hollow(file)) is None:
+            unknown.append(Path(file).name)
+        elif hollow:
             yield Found(
                 f"{each.name} collides as the convex hull of {Path(file).name}, which is hollow: nothing can be put into "
                 "it. Use add_multiple_convex_collisions_from_file with a decomposed mesh, or boxes; for a body that "
                 "never moves, add_nonconvex_collision_from_file.",
                 each.place,
             )
+    _require_read(unknown)
 
 
 def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
     """Of the source: building would need the package that decomposes."""
+    checkup.require_source()
     for module, function in checkup.places.functions():
         for node in ast.walk(function):
             for keyword in node.keywords if isinstance(node, ast.Call) else ():
@@ -209,13 +224,25 @@ def decomposition_at_load(checkup: Checkup) -> Iterator[Found | Note]:
 
 def heavy_mesh(checkup: Checkup) -> Iterator[Found | Note]:
     """Of the mesh files that bodies of the task are drawn with."""
-    for file, each in _mesh_files(checkup, "file").items():
-        if (count := triangles_in(file, MOST_TRIANGLES)) > MOST_TRIANGLES:
+    files = _mesh_files(checkup, "file")
+    if not files:
+        raise NotApplicable("no body of its own is drawn from a mesh file")
+    unknown: list[str] = []
+    for file, each in files.items():
+        if (count := triangles_in(file, MOST_TRIANGLES)) is None:
+            unknown.append(Path(file).name)
+        elif count > MOST_TRIANGLES:
             yield Found(
                 f"{each.name} is drawn with {count:,} triangles ({Path(file).name}). Reduce the mesh "
                 "(trimesh: mesh.simplify_quadric_decimation(face_count=20_000)).",
                 each.place,
             )
+    _require_read(unknown)
+
+
+def _require_read(unknown: list[str]) -> None:
+    if unknown:
+        raise NotKnown(f"cannot be read, or has too many triangles to look at: {listed(unknown)}")
 
 
 def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
@@ -250,6 +277,9 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
                 places.get(name) or checkup.places.hook("_load_scene"),
             )
             return
+    if not partial:
+        # One that stands in each env alone has as many rows then as all others.
+        checkup.require_several()
 
 
 def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
@@ -257,7 +287,7 @@ def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
     env: Any = checkup.task.env
     hidden = named_to_hide(env)
     if not hidden:
-        raise CannotCheck("it hides nothing from pictures")
+        raise NotApplicable("it hides nothing from pictures")
     for thing in hidden:
         if why := why_not_hidden(thing):
             yield Found(
@@ -314,6 +344,8 @@ def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
             "__init__, take `reconfiguration_freq=None` and, if it is None, hand on 1 for num_envs == 1 and 0 otherwise.",
             checkup.places.hook("__init__", "_load_scene"),
         )
+    elif not alone.rebuilds:
+        raise NotApplicable(f"the seeds {listed(alone.seeds)} build the same")
 
 
 def see_env_spacing(checkup: Checkup) -> Iterator[Seen]:
@@ -322,7 +354,7 @@ def see_env_spacing(checkup: Checkup) -> Iterator[Seen]:
     moving = [i for i, kind in enumerate(index.kinds) if kind in ("dynamic", "link") and not index.hidden[i]]
     poses = np.concatenate([checkup.starts.poses, checkup.random.poses])[:, :, moving]
     if not moving:
-        raise CannotCheck("nothing in it moves")
+        raise NotApplicable("nothing in it moves")
     away = np.nan_to_num(np.abs(poses[..., :2]).max(axis=-1))
     yield Seen(tried=away.shape[1])
     for row, body in enumerate(moving):

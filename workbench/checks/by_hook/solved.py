@@ -7,13 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from workbench.authoring.loading.blamed import blamed
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.core.env.task_env import TaskEnv, given_arguments
 from workbench.planning.episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
 from workbench.planning.report import few_seeds_text
-from workbench.planning.rollouts import NotAlike, control_mode_to_plan
-from workbench.planning.verdicts import ENOUGH_SEEDS, PlannedEpisodes
+from workbench.planning.rollouts import NotAlike, NothingToPlan, control_mode_to_plan, require_plannable
+from workbench.planning.verdicts import ENOUGH_SEEDS, MOST_OF, PlannedEpisodes
 from workbench.planning.verdicts import RULES as VERDICTS
 
 SEEDS = ENOUGH_SEEDS
@@ -24,22 +24,26 @@ AFTER_SUCCESS = 5
 """Control steps that an episode goes on after its success."""
 HOOK = {"success-lost": "evaluate"}
 """At which a rule is told; the others at the dense reward."""
+_OF_SUCCESS = {"reward-exploited": 1, "reward-stuck": 0, "reward-against": MOST_OF, "success-lost": MOST_OF}
+"""Rules that speak of success, with the fewest solved seeds from which on it says something that they are not broken."""
 
 
 def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
     """The first seeds, each to its success, its fail or the end of its time.
 
     Raises:
-        CannotCheck: nothing can be planned.
+        NotApplicable, NotKnown: nothing can be planned.
     """
+    # Each rollout is an env.
+    checkup.require_several()
     cls, found = checkup.loaded.cls, list[PlannedEpisode]()
     given = {**checkup.loaded.default_kwargs, **checkup.env_kwargs}
+    try:
+        require_plannable(checkup.task.env)
+    except NothingToPlan as reason:
+        raise NotApplicable(str(reason)) from None
     mode = control_mode_to_plan(checkup.task.env, given)
     with checkup.env(1, **mode) as live:  # type: ignore[arg-type]
-        if live.env.reward_mode == "none":
-            raise CannotCheck("it has no reward")
-        if not live.parts:
-            raise CannotCheck("there is nothing to plan: it has no robot with a controller")
         made_with = given_arguments(cls, checkup.env_kwargs, checkup.loaded.default_kwargs)
         with blamed("build", checkup.loaded):
             planner = Planner(live.env, made_with=made_with)  # type: ignore[arg-type]
@@ -47,7 +51,8 @@ def solved_episodes(checkup: Checkup) -> PlannedEpisodes:
             for seed in checkup.seeds[:SEEDS]:
                 found.append(_solved(checkup, live, planner, seed))
         finally:
-            planner.close()
+            with blamed("step", checkup.loaded):
+                planner.close()
     return PlannedEpisodes(tuple(found))
 
 
@@ -58,7 +63,7 @@ def _solved(checkup: Checkup, live: TaskEnv, planner: Planner, seed: int) -> Pla
     try:
         planner.require_alike(0)
     except NotAlike as error:
-        raise CannotCheck(str(error)) from error
+        raise NotKnown(str(error)) from error
     after = 0
     for _ in range(live.max_episode_steps or STEPS):
         with blamed("step", checkup.loaded, rolled):
@@ -71,6 +76,19 @@ def _solved(checkup: Checkup, live: TaskEnv, planner: Planner, seed: int) -> Pla
         if fail or after > AFTER_SUCCESS:
             break
     return log.episode()
+
+
+def _require_tried(rule: str, episodes: PlannedEpisodes) -> None:
+    """Raise NotApplicable or NotKnown where no verdict says nothing."""
+    entries = {name for one in episodes.all for name in one.evaluate}
+    if rule in _OF_SUCCESS and "success" not in entries:
+        raise NotApplicable("evaluate() has no entry success")
+    if rule == "failing-pays" and "fail" not in entries:
+        raise NotApplicable("evaluate() has no entry fail")
+    if len(episodes.all) < ENOUGH_SEEDS:
+        raise NotKnown(f"fewer than {ENOUGH_SEEDS} seeds were planned")
+    if len(episodes.solved) < _OF_SUCCESS.get(rule, 0):
+        raise NotKnown(f"planning solved {len(episodes.solved)} of {len(episodes.all)} seeds")
 
 
 def _check_of(rule: str) -> Check:
@@ -87,6 +105,8 @@ def _check_of(rule: str) -> Check:
             hook = HOOK.get(rule, "compute_dense_reward")
             place = checkup.places.hook(hook, "compute_normalized_dense_reward", "evaluate")
             yield Found(f"{verdict.message[0].upper()}{verdict.message[1:]}.", place, len(verdict.seeds))
+        else:
+            _require_tried(rule, episodes)
 
     return check
 

@@ -17,8 +17,7 @@ from mani_skill.utils.building import ActorBuilder, ArticulationBuilder
 from workbench.authoring.loading import registry
 from workbench.checks.by_hook.devices import EVERY_STEP
 from workbench.checks.by_hook.reward import REWARD_HOOKS
-from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
-from workbench.checks.evidence.places import Module
+from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note
 from workbench.checks.evidence.random_calls import global_draw
 from workbench.core.broken_rule import Place
 from workbench.core.env.assets import robots_of
@@ -88,12 +87,13 @@ def id_taken(checkup: Checkup) -> Iterator[Found | Note]:
 
 def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
     """Of the class, with the constructor's default."""
+    checkup.require_task()
     cls = checkup.loaded.cls
     robot = robots_of(cls, checkup.loaded.default_kwargs)
     supported = cls.SUPPORTED_ROBOTS
     if supported is None:
         if robot is None or robot in ("none", ()):
-            raise CannotCheck("its constructor names no robot")
+            raise NotApplicable("its constructor names no robot")
         yield Found(
             f"the class does not say which robots it is for. Write SUPPORTED_ROBOTS = [{_named(robot)}].",
             checkup.places.task,
@@ -108,9 +108,10 @@ def supported_robots(checkup: Checkup) -> Iterator[Found | Note]:
 
 def reward_modes(checkup: Checkup) -> Iterator[Found | Note]:
     """Of the class, with the methods that it overrides."""
+    checkup.require_task()
     cls = checkup.loaded.cls
     if cls.get_reward is not BaseEnv.get_reward:
-        raise CannotCheck("it has a get_reward() of its own")
+        raise NotApplicable("it has a get_reward() of its own")
     for mode in cls.SUPPORTED_REWARD_MODES:
         hook = REWARD_HOOKS.get(mode)
         if mode == "none" or mode == "sparse":
@@ -133,6 +134,7 @@ def reward_modes(checkup: Checkup) -> Iterator[Found | Note]:
 
 def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
     """By the source, with the names that the classes have."""
+    checkup.require_source()
     read = {
         node.attr
         for module in checkup.places.modules
@@ -154,8 +156,8 @@ def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
                 module.place(node, function.name),
             )
     known_self, known_scene = _names_of(checkup, checkup.loaded.cls), _names_of(checkup, ManiSkillScene)
-    for module, function in _methods_of_task(checkup):
-        for node in ast.walk(function):
+    for module, function in checkup.places.methods:
+        for node in ast.walk(function) if function.args.args else ():
             if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
                 continue
             owner, name = ast.unparse(node.func.value), node.func.attr
@@ -173,6 +175,7 @@ def unknown_name(checkup: Checkup) -> Iterator[Found | Note]:
 
 def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
     """By the source of the hooks and what they call."""
+    checkup.require_source()
     at_resets = {function for _, function in checkup.places.reached_from(*AT_RESETS)}
     for module, function in checkup.places.reached_from(*HOOKS):
         for node in ast.walk(function):
@@ -192,6 +195,7 @@ def unseeded_random(checkup: Checkup) -> Iterator[Found | Note]:
 
 def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
     """By the source of the hooks and what they call."""
+    checkup.require_source()
     after_begin = {function for _, function in checkup.places.reached_from(*AT_RESETS)}
     for module, function in checkup.places.reached_from(*HOOKS):
         guarded = set(_guarded(function.body))
@@ -223,14 +227,13 @@ def backend_only_call(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def _spec(checkup: Checkup) -> Any:
-    if checkup.loaded.robot is not None:
-        raise CannotCheck("it is a robot in a scene of ManiSkill's")
+    checkup.require_task()
     return registry.environment(checkup.loaded.env_id)
 
 
 def _needs_id(checkup: Checkup) -> None:
     if _spec(checkup) is None:
-        raise CannotCheck("it is not registered")
+        raise NotApplicable("it is not registered")
 
 
 def _suggested_id(checkup: Checkup) -> str:
@@ -239,27 +242,23 @@ def _suggested_id(checkup: Checkup) -> str:
 
 def _decorator(checkup: Checkup) -> Place | None:
     """The ``@register_env`` line; else the class."""
-    place = checkup.places.task
-    for module in checkup.places.modules:
-        for node in ast.walk(module.tree):
-            if isinstance(node, ast.ClassDef) and node.name == checkup.loaded.class_name:
-                for each in node.decorator_list:
-                    if "register_env" in ast.unparse(each):
-                        return module.file, each.lineno, node.name
-    return place
+    if (found := checkup.places.class_definition(checkup.loaded.cls)) is not None:
+        module, node = found
+        for each in node.decorator_list:
+            if "register_env" in ast.unparse(each):
+                return module.file, each.lineno, node.name
+    return checkup.places.task
 
 
 def _class_value(checkup: Checkup, name: str) -> Place | None:
     """Where the class, or one that it inherits in the author's files, assigns this; else the class."""
-    owners = [cls.__name__ for cls in checkup.loaded.cls.__mro__ if name in vars(cls)]
-    for module in checkup.places.modules:
-        for node in ast.walk(module.tree):
-            if not isinstance(node, ast.ClassDef) or node.name not in owners[:1]:
-                continue
-            for statement in node.body:
-                targets = getattr(statement, "targets", [getattr(statement, "target", None)])
-                if any(isinstance(target, ast.Name) and target.id == name for target in targets):
-                    return module.file, statement.lineno, node.name
+    owner = next((cls for cls in checkup.loaded.cls.__mro__ if name in vars(cls)), None)
+    if owner is not None and (found := checkup.places.class_definition(owner)) is not None:
+        module, node = found
+        for statement in node.body:
+            targets = getattr(statement, "targets", [getattr(statement, "target", None)])
+            if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+                return module.file, statement.lineno, node.name
     return checkup.places.task
 
 
@@ -297,17 +296,6 @@ def _builders(function: ast.FunctionDef) -> dict[str, set[str]]:
             if isinstance(target, ast.Name) and made in _BUILDERS:
                 found.setdefault(target.id, set()).update(dir(_BUILDERS[made]()))
     return found
-
-
-def _methods_of_task(checkup: Checkup) -> Iterator[tuple[Module, ast.FunctionDef]]:
-    """Methods of the task's class, and of those in the author's files that it inherits."""
-    names = {cls.__name__ for cls in checkup.loaded.cls.__mro__}
-    for module in checkup.places.modules:
-        for owner in ast.walk(module.tree):
-            if isinstance(owner, ast.ClassDef) and owner.name in names:
-                for node in owner.body:
-                    if isinstance(node, ast.FunctionDef) and node.args.args[:1]:
-                        yield module, node
 
 
 def _names_of(checkup: Checkup, cls: type) -> set[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import linecache
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
 from typing import Any, TypeVar
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed, returns_check
 from workbench.authoring.loading.load import LoadedTask
-from workbench.authoring.problem import TaskError
+from workbench.authoring.problem import Problem, TaskError
 from workbench.checks.evidence.builds import (
     Built,
     Merged,
@@ -80,26 +80,28 @@ class Note:
 
 
 Check = Callable[["Checkup"], Iterator[Found | Note]]
-"""Looks whether one rule is kept."""
+"""Looks whether one rule is kept: without a breach it is, unless NotApplicable or NotKnown is raised, in the end too."""
 _Value = TypeVar("_Value")
 
 
-class CannotCheck(Exception):
-    """Why a rule cannot be looked at for this task, as a sentence: it has no dense reward, say."""
+class NotApplicable(Exception):
+    """The rule says nothing about this task; the text is the reason: it has no dense reward, say."""
+
+
+class NotKnown(Exception):
+    """What the rule speaks of was not tried; the text is the reason: no tried episode succeeds, say."""
+
+
+class CheckEnded(Exception):
+    """No result is needed any more: `keep_going` of a `Checkup` raises it."""
 
 
 def evidence(see: Callable[[Checkup], _Value]) -> cached_property[_Value]:
-    """A property of a `Checkup` that is seen once; if the task raises there, it raises the same error each time."""
+    """A property of a `Checkup` that is seen once; if it raises, it raises the same error each time."""
 
     @wraps(see)
     def once(self: Checkup) -> _Value:
-        if (known := self.failed.get(see.__name__)) is not None:
-            raise known
-        try:
-            return see(self)
-        except TaskError as error:
-            self.failed[see.__name__] = error
-            raise
+        return self._once(see)
 
     return cached_property(once)
 
@@ -124,12 +126,14 @@ class Alone:
     """Whether it is rebuilt at resets."""
     overlaps: tuple[Overlap, ...]
     """Where everything is built, before the first reset."""
+    seeds: tuple[int, ...]
+    """With which it was built."""
 
 
 class Checkup:
     """One version of a task under check. Close it in the end.
 
-    All that calls the author's code raises `TaskError` with their line.
+    All that calls the author's code raises `TaskError` with their line. Of one env no set of envs is made that is larger.
     """
 
     def __init__(
@@ -146,7 +150,7 @@ class Checkup:
         """
         Args:
             actors: act in further episodes, beside random actions.
-            keep_going: called between steps; raises to end the checks.
+            keep_going: called between steps; raises CheckEnded to end the checks.
         """
         self.loaded = loaded
         self.env_kwargs = dict(env_kwargs or {})
@@ -156,8 +160,8 @@ class Checkup:
         self.places = Places(loaded)
         self.findings: list[Finding] = []
         """Breaches of the rules of GPU simulation, seen in all that ran so far."""
-        self.failed: dict[str, TaskError] = {}
-        """What raised, by the name of the evidence."""
+        self.failed: dict[Callable[[Checkup], Any], Exception] = {}
+        """What each piece of evidence raised."""
         self.files = frozenset(str(file) for file in loaded.source_files)
         self.builds: list[Built] = []
         """What `task` has built."""
@@ -172,12 +176,45 @@ class Checkup:
 
     def close(self) -> None:
         while self._open:
-            self._open.pop().close()
+            # Rules that make an env of their own tell what its close raises; here the results are known already.
+            with suppress(TaskError):
+                self._close(self._open.pop())
         self._looked.clear()
         for name in ("task", "pictured", "starts", "overlaps", "still", "random", "acted"):
             self.__dict__.pop(name, None)
 
+    def _once(self, see: Callable[[Checkup], _Value]) -> _Value:
+        """What `see` gives; if it raised before, the same error."""
+        if (known := self.failed.get(see)) is not None:
+            raise known
+        try:
+            return see(self)
+        except CheckEnded:
+            raise
+        except Exception as error:
+            self.failed[see] = error
+            raise
+
     # --- envs ---------------------------------------------------------------------------------------------
+
+    def require_several(self) -> None:
+        """Raise NotKnown for one env."""
+        if self.num_envs == 1:
+            raise NotKnown("it needs several envs, and one was looked at")
+
+    def require_source(self) -> None:
+        """Raise NotKnown for a class without a file: from a notebook, or shipped as bytecode."""
+        if not self.places.modules:
+            raise NotKnown("its source is not known")
+
+    def require_task(self) -> None:
+        """Raise NotApplicable for a robot that is shown in a scene of ManiSkill: the task is not the author's."""
+        if self.loaded.robot is not None:
+            raise NotApplicable("it is a robot in a scene of ManiSkill's")
+
+    def at_most(self, wanted: int) -> int:
+        """So many envs; one where one was asked for."""
+        return wanted if self.num_envs > 1 else 1
 
     @contextmanager
     def env(
@@ -192,7 +229,14 @@ class Checkup:
         task = self._made(num_envs or self.num_envs, render or self._needs_renderer, rules, kwargs)
         try:
             yield task
-        finally:
+        except BaseException:
+            with suppress(TaskError):  # the first error is told
+                self._close(task)
+            raise
+        self._close(task)
+
+    def _close(self, task: TaskEnv) -> None:
+        with blamed("step", self.loaded, task):
             task.close()
 
     @evidence
@@ -251,32 +295,27 @@ class Checkup:
         """`PICTURED_ENVS` envs that observe pictures. Whoever uses it resets it first.
 
         Raises:
-            CannotCheck: nothing to render with, or the task has no such observations.
+            NotApplicable: the task has no such observations.
+            NotKnown: there is nothing to render with.
         """
         modes = self.loaded.cls.SUPPORTED_OBS_MODES
         wanted = [m for m in ("rgb", "rgbd", "depth") if m in modes or "any_textures" in modes]
         if not wanted:
-            raise CannotCheck("it has no observations with pictures")
+            raise NotApplicable("it has no observations with pictures")
         if self._render_backend == "none":
-            raise CannotCheck("it is made without a renderer (render_backend=none)")
+            raise NotKnown("it is made without a renderer (render_backend=none)")
         if find_renderer() is None:
-            raise CannotCheck("there is nothing to render with")
+            raise NotKnown("there is nothing to render with here, see `workbench doctor`")
         began = time.monotonic()
-        made = self._made(PICTURED_ENVS, True, "off", {"obs_mode": wanted[0]})
+        made = self._made(self.at_most(PICTURED_ENVS), True, "off", {"obs_mode": wanted[0]})
         self._open.append(made)
         self.picture_seconds = time.monotonic() - began
         return made
 
     def look(self, see: Callable[[Checkup], _Value]) -> _Value:
-        """What `see` gives, seen once: evidence of a module's own rules. If the task raises there, it raises it again."""
-        if (known := self.failed.get(see.__name__)) is not None:
-            raise known
+        """What `see` gives, seen once: evidence of a module's own rules. If it raises, it raises the same error again."""
         if see not in self._looked:
-            try:
-                self._looked[see] = see(self)
-            except TaskError as error:
-                self.failed[see.__name__] = error
-                raise
+            self._looked[see] = self._once(see)
         return self._looked[see]
 
     def _made(self, num_envs: int, render: bool, rules: Degree, kwargs: Mapping[str, Any]) -> TaskEnv:
@@ -380,13 +419,14 @@ class Checkup:
     @evidence
     def tensor_uses(self) -> TensorUses:
         """What the author's lines do with tensors: at a build, a reset and three steps."""
-        watch = TensorWatch({str(file) for file in self.loaded.source_files})
+        count = self.at_most(NUM_ENVS)
+        watch = TensorWatch({str(file) for file in self.loaded.source_files}, count)
         render = self._needs_renderer  # it builds `task`, which is not to be watched here
-        with watch, self.env(NUM_ENVS, render=render) as task:
+        with watch, self.env(count, render=render) as task:
             self.reset(task, self.seeds[0])
             rng = np.random.default_rng(0)
             for _ in range(3):
-                action = actions.random_action(task.parts, NUM_ENVS, rng)
+                action = actions.random_action(task.parts, count, rng)
                 with watch.step():
                     self.step(task, action)
         return watch.uses
@@ -394,7 +434,7 @@ class Checkup:
     @evidence
     def alone(self) -> Alone:
         """Of the seeds with which the first envs of `task` were built."""
-        seeds = [FIRST_BUILT_SEED + i for i in range(min(SEEDS_ALONE, self.num_envs))]
+        seeds = [FIRST_BUILT_SEED + i for i in range(SEEDS_ALONE)]
         built: list[Built] = []
         shapes: dict[int, tuple[Any, ...]] = {}
         render = self._needs_renderer  # it builds `task`, which is not to be noted here
@@ -408,7 +448,30 @@ class Checkup:
                 shapes[seed] = shapes_of_env(built, 0)
             put_where_built(task)
             self.first_substep(task)
-            return Alone(shapes, rebuilds, overlaps_of(task, 0))
+            return Alone(shapes, rebuilds, overlaps_of(task, 0), tuple(seeds))
+
+    @evidence
+    def fails_with_several(self) -> Problem | None:
+        """What several envs raise in a reset and three steps that one env does; None if they do not, or one raises too."""
+        several, alone = (self._raises_early(count) for count in (self.num_envs, 1))
+        return several if alone is None and self.num_envs > 1 else None
+
+    def _raises_early(self, num_envs: int) -> Problem | None:
+        rng, task = np.random.default_rng(0), None
+        built = "task" in self.__dict__
+        try:
+            # Not by `env`: that asks `task`, which several envs may not build.
+            task = self._made(num_envs, self._built_with_renderer if built else self._may_render, "off", {})
+            self.reset(task, self.seeds[0])
+            for _ in range(3):
+                self.step(task, actions.random_action(task.parts, num_envs, rng))
+        except TaskError as error:
+            return error.problem
+        finally:
+            if task is not None:
+                with suppress(TaskError):
+                    self._close(task)
+        return None
 
     @evidence
     def placed(self) -> list[PoseSet]:
@@ -493,14 +556,6 @@ def put_where_built(task: TaskEnv) -> None:
         articulation.set_pose(articulation.initial_pose)
         articulation.set_qpos(articulation.get_qpos() * 0)
     apply_and_fetch(task.env)
-
-
-def raised(error: TaskError) -> Found:
-    """What the task raised, as a breach of the rule `runs`."""
-    problem = error.problem
-    file, line = problem.file, problem.line
-    place = None if file is None or line is None else (file, line, problem.stage)
-    return Found(f"{problem.stage}: {problem.message}", place)
 
 
 def read_obs(task: TaskEnv) -> dict[str, NDArray[np.float64]]:

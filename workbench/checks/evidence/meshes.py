@@ -17,20 +17,22 @@ _LEAST_WALL, _LEAST_OPEN = 0.6, 0.03
 """Shares of all directions, seen from within a hollow, in which there is a wall, and in which it is open."""
 
 
-def triangles_in(file: str, more_than: int) -> int:
-    """Triangles of a mesh file; 0 if it is too small to have `more_than`, or cannot be read."""
+def triangles_in(file: str, more_than: int) -> int | None:
+    """Triangles of a mesh file; 0 if it is too small to have `more_than`, None if it cannot be read."""
     if not Path(file).is_file() or Path(file).stat().st_size < _BYTES_PER_TRIANGLE * more_than:
         return 0
     mesh = _read(file)
-    return 0 if mesh is None else len(mesh.faces)
+    return None if mesh is None else len(mesh.faces)
 
 
 @lru_cache(maxsize=256)
-def is_hollow(file: str) -> bool:
+def is_hollow(file: str) -> bool | None:
     """Whether something could be put into it: from the middle of its convex hull, walls are seen in most directions and
-    nothing in some, on one side. False if that cannot be said."""
+    nothing in some, on one side. None if that cannot be said: it cannot be read, or has too many triangles."""
     mesh = _read(file)
-    if mesh is None or not 4 <= len(mesh.faces) <= _MOST_TRIANGLES:
+    if mesh is None or len(mesh.faces) > _MOST_TRIANGLES:
+        return None
+    if len(mesh.faces) < 4:
         return False
     try:
         hull = mesh.convex_hull

@@ -33,6 +33,9 @@ KINDS = ("right after the reset", "with joints and bodies at random places", "wi
 MOST_GOALS = 4
 """A drawing has hundreds of marks."""
 AT_GOAL = "with bodies at the place of {}"
+SHORT = "on the way back from a success to the reset"
+HALVINGS = 6
+"""Of the way back: the last states are within a 64th of it from where success ends."""
 DENSE_HOOKS = {"dense": "compute_dense_reward", "normalized_dense": "compute_normalized_dense_reward"}
 
 States = dict[str, NDArray[np.float32]]
@@ -53,6 +56,9 @@ class OddStates:
     """(R, N) by reward mode: the present one, and the dense ones that the class has."""
     obs: list[dict[str, NDArray[np.float64]]] = field(default_factory=list)
     """(R,) of (N, D) by leaf, pictures left out."""
+    told: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+    """As `reward`, where evaluate() is said to have reported success in all envs; NaN where the reward raised then. Empty where
+    evaluate() has no success."""
 
 
 def odd_states(checkup: Checkup) -> OddStates:
@@ -65,13 +71,30 @@ def odd_states(checkup: Checkup) -> OddStates:
         for goal in _goals(task.env)[:MOST_GOALS]:
             rounds.append((AT_GOAL.format(goal.partition("/")[2]), _at(task.env, begun, goal)))
         for kind, states in rounds:
-            write_all(task.env, states)
-            action = actions.random_action(task.parts, task.num_envs, rng)
-            seen.seeds.append(seeds)
-            seen.kinds.append(kind)
-            with blamed("step", checkup.loaded, task):
-                _ask(checkup, task, action, seen)
+            succeeded = _put(checkup, kind, states, seeds, rng, seen)
+            if not succeeded.any():
+                continue
+            with_success, without = np.zeros(len(seeds)), np.ones(len(seeds))
+            for _ in range(HALVINGS):
+                share = (with_success + without) / 2
+                there = _put(checkup, SHORT, _between(states, begun, share), seeds, rng, seen)
+                with_success, without = np.where(there, share, with_success), np.where(there, without, share)
     return seen
+
+
+def _put(
+    checkup: Checkup, kind: str, states: States, seeds: list[int], rng: np.random.Generator, seen: OddStates
+) -> NDArray[np.bool_]:
+    """Put all envs into these states and ask the hooks; (N,) where that is a success."""
+    task = checkup.task
+    write_all(task.env, states)
+    action = actions.random_action(task.parts, task.num_envs, rng)
+    seen.seeds.append(seeds)
+    seen.kinds.append(kind)
+    with blamed("step", checkup.loaded, task):
+        _ask(checkup, task, action, seen)
+    success = seen.evaluate[-1].get("success", np.zeros(task.num_envs, bool))
+    return np.logical_or.reduce(success.reshape(task.num_envs, -1).astype(bool), axis=1)
 
 
 def write_all(env: BaseEnv, states: States) -> None:
@@ -94,8 +117,28 @@ def _ask(checkup: Checkup, task: TaskEnv, action: NDArray[np.float32], seen: Odd
             hook = getattr(task.env, DENSE_HOOKS[mode]) if mode in DENSE_HOOKS else task.env.get_reward
             reward = hook(obs=obs, action=given, info=info)
         returns_check(checkup.loaded, task.num_envs)(info, reward)
-        rows = torch.as_tensor(reward).double().numpy(force=True)
-        seen.reward.setdefault(mode, []).append(np.broadcast_to(rows, (task.num_envs,)).copy())
+        seen.reward.setdefault(mode, []).append(_rows(reward, task.num_envs))
+        if "success" in info:
+            with remembering(task.env):
+                _tell_success(seen, mode, hook, obs, given, info, task.num_envs)
+
+
+def _tell_success(
+    seen: OddStates, mode: str, hook: Any, obs: Any, action: Any, info: dict[str, Any], num_envs: int
+) -> None:
+    success = info["success"]
+    told = {**info, "success": torch.ones_like(success) if isinstance(success, torch.Tensor) else True}
+    try:
+        rows = _rows(hook(obs=obs, action=action, info=told), num_envs)
+    except Exception:
+        # No fault of the task: this state has no success. What else a success means may be missing in it.
+        rows = np.full(num_envs, np.nan)
+    seen.told.setdefault(mode, []).append(rows)
+
+
+def _rows(reward: Any, num_envs: int) -> NDArray[np.float64]:
+    """(N,)"""
+    return np.broadcast_to(torch.as_tensor(reward).double().numpy(force=True), (num_envs,)).copy()
 
 
 def reward_modes(checkup: Checkup) -> list[str]:
@@ -182,3 +225,25 @@ def _at(env: BaseEnv, begun: States, goal: str) -> States:
             place[::2, 2] = rows[::2, 2]
             rows[here, :3], rows[here, 7:] = place[here], 0
     return states
+
+
+def _between(states: States, begun: States, shares: NDArray[np.float64]) -> States:
+    """Part of the way back to where the episode began, at rest.
+
+    Args:
+        shares: (N,) from 0 on, where 1 is where it began.
+    """
+    found: States = {}
+    share = shares[:, None]
+    for name, rows in states.items():
+        first = begun[name]
+        between = rows + share * (first - rows)
+        # The shorter way round, to a quaternion of length 1.
+        sign = np.where((rows[:, 3:7] * first[:, 3:7]).sum(axis=1, keepdims=True) < 0, -1, 1)
+        turned = rows[:, 3:7] + share * (sign * first[:, 3:7] - rows[:, 3:7])
+        between[:, 3:7] = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-9)
+        joints = (rows.shape[1] - BODY) // 2
+        between[:, 7:BODY], between[:, BODY + joints :] = 0, 0
+        # A body that an env lacks is NaN, and one that does not move stays as it is.
+        found[name] = np.where(np.isfinite(rows) & (rows != first), between, rows).astype(np.float32)
+    return found

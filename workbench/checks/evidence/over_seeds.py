@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from workbench.checks.evidence.checkup import CannotCheck, Checkup, Found, Note
+from workbench.checks.evidence.checkup import Checkup, Found, NotApplicable, Note, NotKnown
 from workbench.checks.results import Seen
 
 
@@ -17,7 +17,7 @@ class OverSeeds:
     see: Callable[[Checkup], Iterator[Seen]]
     """What is there, of the seeds of a checkup."""
     judge: Callable[[Sequence[Seen]], Iterator[Found | Note]]
-    """What that comes to, of one or several of them in the order of their seeds. Raises CannotCheck as a `Check`."""
+    """What that comes to, of one or several of them in the order of their seeds. Raises as a `Check`."""
 
     def __call__(self, checkup: Checkup) -> Iterator[Found | Note]:
         return self.judge([*self.see(checkup)])
@@ -28,7 +28,7 @@ class OverSeeds:
             return
         try:
             yield from self.judge(seen)
-        except CannotCheck:
+        except (NotApplicable, NotKnown):
             return
 
 

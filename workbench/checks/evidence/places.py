@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import ast
 import linecache
+import os
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+
+from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import hook_definition
@@ -27,6 +31,23 @@ class Module:
     @cached_property
     def functions(self) -> tuple[ast.FunctionDef, ...]:
         return tuple(node for node in ast.walk(self.tree) if isinstance(node, ast.FunctionDef))
+
+    @cached_property
+    def classes(self) -> dict[str, ast.ClassDef]:
+        """By qualified name."""
+        found: dict[str, ast.ClassDef] = {}
+        waiting: list[tuple[str, ast.AST]] = [("", self.tree)]
+        while waiting:
+            prefix, owner = waiting.pop()
+            for node in ast.iter_child_nodes(owner):
+                if isinstance(node, ast.ClassDef):
+                    found[f"{prefix}{node.name}"] = node
+                    waiting.append((f"{prefix}{node.name}.", node))
+                elif isinstance(node, ast.FunctionDef):
+                    waiting.append((f"{prefix}{node.name}.<locals>.", node))
+                else:
+                    waiting.append((prefix, node))
+        return found
 
     @cached_property
     def imports(self) -> dict[str, str]:
@@ -100,26 +121,47 @@ class Places:
     @cached_property
     def task(self) -> Place | None:
         """The ``class`` line."""
+        found = self.class_definition(self._loaded.cls)
+        return None if found is None else (found[0].file, found[1].lineno, found[1].name)
+
+    def class_definition(self, cls: type) -> tuple[Module, ast.ClassDef] | None:
+        """Where a class is defined, if that is in the author's files."""
+        file, name = _identity(cls)
         for module in self.modules:
-            for node in ast.walk(module.tree):
-                if isinstance(node, ast.ClassDef) and node.name == self._loaded.class_name:
-                    return module.file, node.lineno, node.name
+            if module.file == file and name in module.classes:
+                return module, module.classes[name]
         return None
 
+    @cached_property
+    def methods(self) -> tuple[tuple[Module, ast.FunctionDef], ...]:
+        """Methods of the task's class and of those that it inherits, in the author's files; in the order of inheritance."""
+        classes = filter(None, map(self.class_definition, self._loaded.cls.__mro__))
+        return tuple(
+            (module, node)
+            for module, owner in classes
+            for node in owner.body
+            if isinstance(node, ast.FunctionDef)
+        )
+
     def functions(self, *names: str) -> Iterator[tuple[Module, ast.FunctionDef]]:
-        """The functions of these names in the author's files; all if none is named."""
-        for module in self.modules:
-            for function in module.functions:
-                if not names or function.name in names:
-                    yield module, function
+        """The functions of these names in the author's files, all if none is named: the task's methods first, none of other
+        tasks."""
+        methods = {function for _, function in self.methods}
+        others = (
+            (module, function)
+            for module in self.modules
+            for function in module.functions
+            if function not in methods and function not in self._of_other_tasks
+        )
+        for module, function in (*self.methods, *others):
+            if not names or function.name in names:
+                yield module, function
 
     def reached_from(self, *hooks: str) -> Iterator[tuple[Module, ast.FunctionDef]]:
         """These hooks of the task, and the author's functions that they name, directly or not."""
         known: dict[str, list[tuple[Module, ast.FunctionDef]]] = {}
-        for module in self.modules:
-            for function in module.functions:
-                if function not in self._of_other_tasks:
-                    known.setdefault(function.name, []).append((module, function))
+        for module, function in self.functions():
+            known.setdefault(function.name, []).append((module, function))
         waiting, seen = list(hooks), set(hooks)
         while waiting:
             for module, function in known.get(waiting.pop(0), ()):
@@ -132,15 +174,17 @@ class Places:
 
     @cached_property
     def _of_other_tasks(self) -> frozenset[ast.FunctionDef]:
-        """Methods of further tasks in the files."""
-        mine = {cls.__name__ for cls in self._loaded.cls.__mro__}
-        found: set[ast.FunctionDef] = set()
-        for module in self.modules:
-            for node in ast.walk(module.tree):
-                if isinstance(node, ast.ClassDef) and node.name not in mine:
-                    if mine & {getattr(base, "attr", getattr(base, "id", "")) for base in node.bases}:
-                        found.update(part for part in ast.walk(node) if isinstance(part, ast.FunctionDef))
-        return frozenset(found)
+        """Functions within the classes of further tasks in the files."""
+        mine = set(map(_identity, self._loaded.cls.__mro__))
+        others = set(map(_identity, _subclasses(BaseEnv))) - mine
+        return frozenset(
+            part
+            for module in self.modules
+            for name, node in module.classes.items()
+            if (module.file, name) in others
+            for part in ast.walk(node)
+            if isinstance(part, ast.FunctionDef)
+        )
 
     def entry(self, name: str, hook: str = "evaluate") -> Place | None:
         """Where a hook makes this entry, as a key or a keyword; else its ``def``."""
@@ -198,3 +242,16 @@ def _places(node: ast.AST, attributes: set[str]) -> bool:
         return False
     parts = [part.attr for part in ast.walk(node.func.value) if isinstance(part, ast.Attribute)]
     return not attributes.isdisjoint(parts)
+
+
+def _identity(cls: type) -> tuple[str | None, str]:
+    """File and qualified name: two files may have a class of one name."""
+    file = getattr(sys.modules.get(cls.__module__), "__file__", None)
+    # As `LoadedTask.source_files` has it: an environment may be a link.
+    return file and os.path.realpath(file), cls.__qualname__
+
+
+def _subclasses(cls: type) -> Iterator[type]:
+    for each in cls.__subclasses__():
+        yield each
+        yield from _subclasses(each)

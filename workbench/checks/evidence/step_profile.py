@@ -38,12 +38,13 @@ _PARTS = (
 """Object of the env, its method, and how it is called here."""
 
 
-def profile_step(checkup: Checkup, num_envs: int = NUM_ENVS, steps: int = STEPS) -> StepProfile:
-    """Time steps with random actions on envs of their own.
+def profile_step(checkup: Checkup, num_envs: int | None = None, steps: int = STEPS) -> StepProfile:
+    """Time steps with random actions on envs of their own; on `NUM_ENVS` if no number is given.
 
     Hooks are timed in every second step and lines in the others, which a tracer slows: the times of a hook's lines are
     scaled to add up to the hook's. Raises TaskError as the steps of a checkup do.
     """
+    num_envs = num_envs or checkup.at_most(NUM_ENVS)
     with checkup.env(num_envs) as task:
         checkup.reset(task, checkup.seeds[0])
         rng = np.random.default_rng(0)

@@ -59,6 +59,7 @@ class Mix:
 class TensorUses:
     """What the author's lines did with tensors."""
 
+    num_envs: int = NUM_ENVS
     steps: int = 0
     """Control steps that were watched."""
     copies: Counter[Place] = field(default_factory=Counter)
@@ -78,13 +79,14 @@ class TensorWatch(TorchFunctionMode):
     made: without a device, they stay on the host until they are moved.
     """
 
-    def __init__(self, files: Collection[str]) -> None:
+    def __init__(self, files: Collection[str], num_envs: int = NUM_ENVS) -> None:
         """
         Args:
             files: the author's.
+            num_envs: of the env that is watched; a loop over envs is seen with `NUM_ENVS` only.
         """
         super().__init__()
-        self.uses = TensorUses()
+        self.uses = TensorUses(num_envs)
         self._files = frozenset(files)
         self._in_step = False
 
@@ -222,7 +224,7 @@ class TensorWatch(TorchFunctionMode):
                 self.uses.written.setdefault(_place(line), _COPIES[name])
         elif name == "unbind" and frame.f_code.co_filename in self._files:
             inner = sys._getframe(2)
-            if inner.f_code.co_name == "__iter__" and len(tensors[0]) == NUM_ENVS:
+            if inner.f_code.co_name == "__iter__" and len(tensors[0]) == self.uses.num_envs == NUM_ENVS:
                 self.uses.iterated[_place(frame)] += 1
 
 

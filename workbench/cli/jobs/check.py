@@ -14,9 +14,17 @@ from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 
 from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import Problem, TaskError, place_text
-from workbench.checks.results import RuleResult
+from workbench.checks.results import RuleResult, state_text
 from workbench.checks.rules import RULES
-from workbench.cli.jobs.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
+from workbench.cli.jobs.check_reports import (
+    REPORT_IT,
+    Reported,
+    as_json,
+    as_junit,
+    as_sarif,
+    count_text,
+    shown_path,
+)
 from workbench.cli.jobs.run_by import print_part, run_by, shard_of
 from workbench.cli.terminal.arguments import JobArguments
 from workbench.cli.terminal.output import (
@@ -36,7 +44,7 @@ from workbench.jobs.check.plan import (
     CheckedTask,
     CheckOptions,
     count_chunks,
-    count_groups,
+    count_items,
     count_rules,
     degrees_of_request,
 )
@@ -77,7 +85,7 @@ def check_in_terminal(
     here, root = CurrentFolder(), Path.cwd()  # a task may change it
     try:
         total, chunks = count_rules(degrees_of_request(what)), count_chunks(what)
-        groups = count_groups(what, shard_of(run).part(chunks))
+        items = count_items(what, shard_of(run).part(chunks))
         with (
             stdout_to_stderr(),
             run_by(run, "check", chunks, lambda: _job_of(what)) as (executor, _),
@@ -88,18 +96,21 @@ def check_in_terminal(
             told: set[str] = set()
             several = False
 
-            def show_groups(count: int) -> None:
+            def show_count(count: int) -> None:
                 nonlocal several
                 several = True
-                bar.update(row, completed=count, total=groups)
+                bar.update(row, completed=count, total=items)
 
             def show(result: RuleResult) -> None:
                 done.add(result.rule)
                 if not several:
                     bar.update(row, completed=len(done))
-                # What a task raises leaves most rules undecided, for one reason.
-                news = {"broken": f"{result.rule}: broken", "failed": f"not decided: {result.why}"}
-                line = news.get(result.state, "")
+                line = ""
+                if result.state in ("broken", "failed"):
+                    line = f"{result.rule}: {result.state}"
+                elif result.problem is not None:
+                    # What a task raises leaves most rules undecided, for one reason.
+                    line = f"not known: {result.why}"
                 if line and not err.is_terminal and line not in told:
                     told.add(line)
                     # A bar in a file or a pipe is drawn once, at the end.
@@ -112,7 +123,7 @@ def check_in_terminal(
                     show,
                     executor=executor,
                     began=began,
-                    on_progress=show_groups,
+                    on_progress=show_count,
                 )
             except BaseException:
                 bar.update(row, visible=False)
@@ -209,7 +220,11 @@ def _print_finding(finding: Finding, root: Path, style: str) -> None:
 
 
 def _print_summary(report: CheckReport, root: Path) -> None:
-    _print_by_reason("[red]not decided[/]", report.of_state("failed"))
+    failed = report.of_state("failed")
+    for result in failed:
+        _print(f"[bold red]failed[/] {result.rule}: {_safe(result.why)}")
+    if crashed := [result.rule for result in failed if result.is_crash]:
+        _print(f"{', '.join(crashed)}: {REPORT_IT}")
     for result in report.results:
         for one in result.silenced:
             file = shown_path(one.finding.file or "", root)
@@ -217,7 +232,8 @@ def _print_summary(report: CheckReport, root: Path) -> None:
     for comment in report.comments:
         place = f"{shown_path(comment.file, root)}:{comment.line}"
         _print(f"[yellow]comment[/] {_safe(place)}: {_safe(comment.message)}")
-    _print_by_reason("[dim]skipped[/]", report.of_state("skipped"))
+    _print_by_reason("[yellow]not known[/]", report.of_state("not_known"))
+    _print_by_reason("[dim]not applicable[/]", report.of_state("not_applicable"))
     if report.ignored:
         _print_names(f"[dim]{len(report.ignored)} ignored[/]:", report.ignored)
     for result in report.results:
@@ -225,8 +241,8 @@ def _print_summary(report: CheckReport, root: Path) -> None:
             _print(f"[dim]note[/] {result.rule}: {_safe(note)}")
     counts = Counter(result.state for result in report.results)
     words = [f"{count_text(counts['kept'], 'rule')} kept", f"{counts['broken']} broken"]
-    words += [f"{counts[state]} {state}" for state in ("silenced", "skipped") if counts[state]]
-    words += [f"{counts['failed']} not decided"] if counts["failed"] else []
+    others = ("silenced", "not_applicable", "not_known", "failed")
+    words += [f"{counts[state]} {state_text(state)}" for state in others if counts[state]]
     words += [f"{len(report.ignored)} ignored"] if report.ignored else []
     said = f"{_safe(report.task.env_id)}: {', '.join(words)}."
     if report.seconds:

@@ -15,7 +15,7 @@ from urllib.parse import quote
 from xml.etree import ElementTree
 
 from workbench.authoring.problem import Problem, place_text
-from workbench.checks.results import RuleResult
+from workbench.checks.results import RuleResult, State, state_text
 from workbench.checks.rules import RULES
 from workbench.core.rules import FailOn, Finding, fails
 from workbench.jobs.check.plan import CheckOptions
@@ -26,8 +26,12 @@ DISTRIBUTION = "maniskill-workbench"
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 LEVELS = {"stop": "error", "warn": "warning", "off": "none"}
 """Degree to SARIF's level."""
+REPORT_IT = (
+    "an error of the workbench, not of the task; please report it, with the traceback that --json-file writes"
+)
 CANNOT_CHECK = "cannot-check"
 """In a report the id of what ends a check before a rule is looked at; no rule has it."""
+_UNDECIDED: tuple[State, ...] = ("failed", "not_known")
 _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -109,15 +113,17 @@ def as_json(said: Reported) -> str:
 
 
 def _error(said: Reported) -> dict[str, Any] | None:
-    error = said.error
-    if error is None:
-        return None
+    return None if said.error is None else _problem(said.error, said.root)
+
+
+def _problem(problem: Problem, root: Path) -> dict[str, Any]:
     return {
-        "stage": error.stage,
-        "message": error.message,
-        "file": error.file and shown_path(error.file, said.root),
-        "line": error.line,
-        "code": error.code,
+        "stage": problem.stage,
+        "message": problem.message,
+        "file": problem.file and shown_path(problem.file, root),
+        "line": problem.line,
+        "code": problem.code,
+        "traceback": problem.traceback,
     }
 
 
@@ -144,6 +150,7 @@ def _rule(result: RuleResult, root: Path) -> dict[str, Any]:
         "rule": result.rule,
         "state": result.state,
         "why": result.why,
+        "error": None if result.problem is None else _problem(result.problem, root),
         "seconds": round(result.seconds, 3),
         "notes": list(result.notes),
         "silenced": silenced,
@@ -202,15 +209,16 @@ def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element
             case, "failure", type=result.rule, message=xml_text(failing[0].message)
         )
         failure.text = xml_text("\n\n".join(_text(finding, root) for finding in failing))
-    elif result.state == "failed" and said.fail_on == "never":
-        ElementTree.SubElement(
-            case, "skipped", type="workbench.undecided", message=xml_text(f"not decided: {result.why}")
-        )
-    elif result.state == "failed":
-        error = ElementTree.SubElement(case, "error", type="TaskError", message=xml_text(result.why))
-        error.text = xml_text(result.why)
-    elif result.state == "skipped":
-        ElementTree.SubElement(case, "skipped", type="workbench.skip", message=xml_text(result.why))
+    elif result.state in ("failed", "not_known", "not_applicable"):
+        message = xml_text(f"{state_text(result.state)}: {result.why}")
+        if result.problem is None or said.fail_on == "never":
+            kind = f"workbench.{result.state}"
+            ElementTree.SubElement(case, "skipped", type=kind, message=message)
+        else:
+            kind = "workbench.failed" if result.state == "failed" else "TaskError"
+            error = ElementTree.SubElement(case, "error", type=kind, message=message)
+            trace = result.problem.traceback
+            error.text = xml_text(f"{REPORT_IT}\n\n{trace}" if result.is_crash else result.why)
     lines = [_text(finding, root) for finding in result.findings if not said.fails(finding)]
     lines += [f"silenced: {_text(one.finding, root)}\nreason: {one.reason}" for one in result.silenced]
     lines += result.notes
@@ -275,9 +283,15 @@ def as_sarif(said: Reported) -> str:
         }
         for finding, reason in silenced
     ]
+    # A result would be an alert; what is not known is none.
     notes = [
-        {"level": "error", "message": {"text": f"{one.rule} is not decided: {one.why}"}}
-        for one in report.of_state("failed")
+        {
+            "level": "note" if one.problem is None else "error",
+            "message": {"text": f"{one.rule} {state_text(one.state)}: {one.why}"},
+            "associatedRule": {"id": one.rule, "index": ids.index(one.rule)},
+        }
+        for state in _UNDECIDED
+        for one in report.of_state(state)
     ]
     notes += [
         {
@@ -299,13 +313,13 @@ def as_sarif(said: Reported) -> str:
         "semanticVersion": version(DISTRIBUTION),
         "rules": rules,
     }
-    decided = said.error is None and not report.of_state("failed") and not report.stopped
+    ran = said.error is None and not report.stopped and all(one.problem is None for one in report.results)
     run = {
         "tool": {"driver": driver},
         "originalUriBaseIds": {"%SRCROOT%": {"uri": f"{root.as_uri()}/"}},
         "invocations": [
             {
-                "executionSuccessful": decided,
+                "executionSuccessful": ran,
                 "toolExecutionNotifications": notes,
                 **({"ruleConfigurationOverrides": off} if off else {}),
             }

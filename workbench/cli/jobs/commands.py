@@ -12,7 +12,6 @@ import tyro
 from workbench.cli.terminal.arguments import (
     CheckArguments,
     EpisodeArguments,
-    Imports,
     JobArguments,
     RescoreArguments,
     Task,
@@ -28,6 +27,7 @@ from workbench.machine.software_vulkan import use_private_driver
 from workbench.planning.options import PlanArguments
 
 _FEW = EpisodeArguments()
+_ONE = EpisodeArguments(num_envs=1)
 _HERE = JobArguments()
 _PLAN = PlanArguments()
 
@@ -145,16 +145,14 @@ def solve(
     /,
     *,
     plan: PlanArguments = _PLAN,
+    envs: EpisodeArguments = _ONE,
     run: JobArguments = _HERE,
     seeds: int = 32,
-    seed: int = 0,
     max_steps: int | None = None,
     seconds_per_seed: float | None = None,
     pictures: bool = False,
     out: Path = Path("recordings"),
     upload: str = "",
-    imports: Imports = (),
-    env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     fail_on: FailOn = "stop",
     json: bool = False,
     json_file: Path | None = None,
@@ -169,7 +167,6 @@ def solve(
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         seeds: how many seeds are tried. That no rule is broken says something from 8 on.
-        seed: the first of them; each further one counts up.
         max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
         seconds_per_seed: wall time after which a seed ends at its next step, solved or not. What that cuts off depends on
             the machine and on what else it does, so that a second run may come to another result.
@@ -177,10 +174,6 @@ def solve(
         out: folder for the recordings.
         upload: an address of fsspec, such as s3://bucket/folder: each episode goes there when it is over, and not into
             the folder.
-        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
-            repeatable.
-        env: further arguments of the task class, as name=value (value in JSON, or text), such as
-            control_mode=pd_ee_delta_pose; repeatable.
         fail_on: lowest degree of a broken rule that makes the exit code 1, as of workbench check; the rules of the reward
             are of the degree warn. never: nor does it where no seed is solved.
         json: print the result as JSON in place of text.
@@ -203,7 +196,7 @@ def solve(
     if (why := why_unwritable(json_file, csv_file, junit)) is not None:
         return refuse(why)
     try:
-        options = EpisodeArguments(1, "auto", None, imports, seed, env).options()
+        options = envs.options()
         planned = plan_options(plan)
         for name, number in (("seeds", seeds), ("workers", run.workers), ("max-steps", max_steps)):
             if number is not None and number < 1:
@@ -377,5 +370,5 @@ def rescore(
     except ValueError as error:
         return refuse(str(error))
     use_private_driver()
-    what = RescoreOptions(places, task, recorded_source, use_env_states, envs.envs_per_worker, base)
+    what = RescoreOptions(places, task, recorded_source, use_env_states, envs.num_envs, base)
     return rescore_in_terminal(what, RescoreOutput(csv, csv_file, json, json_file), trust, run)

@@ -106,7 +106,7 @@ class RescoreRequest:
     """A sum of the texts that rescore them."""
     use_env_states: bool
     recorded_source: bool
-    envs_per_worker: int
+    num_envs: int
     options: TaskOptions
 
 

@@ -99,7 +99,7 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
         with_given_actions(what.recording())
         recover_confined(what.out)
         left = (TextColumn("left"), TimeRemainingColumn())
-        chunk = chunk_of(what.seeds, 1)
+        chunk = chunk_of(what.seeds, what.options.num_envs)
         count = items_of(run, what.seeds, chunk)
         with (
             stdout_to_stderr(),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import tyro
 
 from workbench.core.rules import DEGREES, Degree
+from workbench.machine.files import real_path
 from workbench.planning.options import PlanArguments, PlanOptions
 
 if TYPE_CHECKING:
@@ -78,6 +79,21 @@ class JobArguments:
 
 
 ONE_WORKER = JobArguments(workers=1)
+_OLD_NAMES = {"--envs-per-worker": "--num-envs"}
+"""Options that have another name since this release; the next one drops them."""
+
+
+def with_new_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The arguments with the new names of options, and a sentence for each old one."""
+    given, told = list(arguments), dict[str, str]()
+    for place, one in enumerate(given):
+        name, equals, value = one.partition("=")
+        if one == "--":
+            break
+        if (new := _OLD_NAMES.get(name.replace("_", "-"))) is not None:
+            given[place] = f"{new}{equals}{value}"
+            told[name] = f"{name} is called {new} now; the next release drops the old name"
+    return given, list(told.values())
 
 
 @dataclass(frozen=True)
@@ -85,7 +101,7 @@ class EnvArguments:
     """How the envs of a task are made.
 
     Args:
-        num_envs: environments to run at once.
+        num_envs: environments that run at once.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
@@ -104,9 +120,7 @@ class EnvArguments:
 
     def options(self) -> TaskOptions:
         """Raises ValueError with a message that names the argument, as all functions here."""
-        return _options(
-            "num-envs", self.num_envs, self.backend, self.rules, self.imports, self.seed, self.env
-        )
+        return _options(self.num_envs, self.backend, self.rules, self.imports, self.seed, self.env)
 
 
 @dataclass(frozen=True)
@@ -114,8 +128,8 @@ class EpisodeArguments:
     """How the envs of each worker are made.
 
     Args:
-        envs_per_worker: environments that each worker runs at once. The numbers of a policy depend on it by their last
-            bits, and on nothing else of how the job runs.
+        num_envs: environments that run at once in each worker. The numbers of a policy depend on it by their last bits,
+            and on nothing else of how the job runs.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
@@ -125,7 +139,7 @@ class EpisodeArguments:
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
 
-    envs_per_worker: int = 4
+    num_envs: int = 4
     backend: Backend = "auto"
     rules: Rules = None
     imports: Imports = ()
@@ -133,8 +147,7 @@ class EpisodeArguments:
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
 
     def options(self) -> TaskOptions:
-        count = self.envs_per_worker
-        return _options("envs-per-worker", count, self.backend, self.rules, self.imports, self.seed, self.env)
+        return _options(self.num_envs, self.backend, self.rules, self.imports, self.seed, self.env)
 
 
 @dataclass(frozen=True)
@@ -142,7 +155,7 @@ class RescoreArguments:
     """How the envs of each worker are made.
 
     Args:
-        envs_per_worker: environments that each worker runs at once.
+        num_envs: environments that run at once in each worker.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
@@ -150,13 +163,13 @@ class RescoreArguments:
             repeatable.
     """
 
-    envs_per_worker: int = 16
+    num_envs: int = 16
     backend: Backend = "auto"
     rules: Rules = None
     imports: Imports = ()
 
     def options(self) -> TaskOptions:
-        return _options("envs-per-worker", self.envs_per_worker, self.backend, self.rules, self.imports)
+        return _options(self.num_envs, self.backend, self.rules, self.imports)
 
 
 @dataclass(frozen=True)
@@ -164,7 +177,7 @@ class CheckArguments:
     """On what a task is checked.
 
     Args:
-        envs_per_worker: environments that each worker runs at once.
+        num_envs: environments that run at once in each worker.
         seeds: how many seeds are tried. What compares whole batches takes one for each env.
         seed: the first of them; each further one counts up.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
@@ -172,20 +185,18 @@ class CheckArguments:
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
 
-    envs_per_worker: int = 8
+    num_envs: int = 8
     seeds: int = 32
     seed: int = 0
     imports: Imports = ()
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
 
     def options(self) -> TaskOptions:
-        count = self.envs_per_worker
-        return _options("envs-per-worker", count, "cpu", None, self.imports, self.seed, self.env)
+        return _options(self.num_envs, "cpu", None, self.imports, self.seed, self.env)
 
 
 def _options(
-    name: str,
-    count: int,
+    num_envs: int,
     backend: Backend,
     rules: Rules,
     imports: Sequence[str],
@@ -194,12 +205,12 @@ def _options(
 ) -> TaskOptions:
     from workbench.jobs.task import TaskOptions
 
-    if not 1 <= count <= 4096:
-        raise ValueError(f"--{name} must be from 1 to 4096, not {count}")
+    if not 1 <= num_envs <= 4096:
+        raise ValueError(f"--num-envs must be from 1 to 4096, not {num_envs}")
     if not 0 <= seed < 2**31:
         raise ValueError(f"--seed must be from 0 to {2**31 - 1}, not {seed}")
     kwargs = dict(_env_argument(pair) for pair in env)
-    return TaskOptions(count, backend, seed, kwargs, rules=rules, imports=imported(imports))
+    return TaskOptions(num_envs, backend, seed, kwargs, rules=rules, imports=imported(imports))
 
 
 def plan_options(plan: PlanArguments) -> PlanOptions:
@@ -252,7 +263,7 @@ def why_unwritable(*files: Path | None) -> str | None:
     for file in files:
         if file is None:
             continue
-        folder = file.resolve().parent
+        folder = real_path(file).parent
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

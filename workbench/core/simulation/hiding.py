@@ -65,6 +65,7 @@ def why_not_hidden(thing: Any) -> str:
 def _where_it_is(stock: Any) -> Callable[..., Any]:
     """Stock's getter or setter, which in GPU simulation takes the pose of a hidden actor for one that is kept aside."""
 
+    @wraps(stock)
     def call(self: Any, *args: Any) -> Any:
         if not self.hidden or batched_system(self.scene) is None:
             return stock(self, *args)

@@ -1,4 +1,4 @@
-"""One process of a check: looks at the groups of rules that it gets, on an env of its own."""
+"""One process of a check: looks at the rules that it gets, on an env of its own."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import LoadedTask, undo_load
 from workbench.authoring.problem import Problem, TaskError
-from workbench.checks.by_hook.run import CORE_GROUP, RULES_OVER_SEEDS, RuleGroup, run_core, run_group
-from workbench.checks.evidence.checkup import Checkup
-from workbench.checks.results import RuleResult
+from workbench.checks.by_hook.run import CORE, check_core, check_rule, findings_of
+from workbench.checks.evidence.checkup import CheckEnded, Checkup
 from workbench.checks.rules import degree_of_each
 from workbench.core.backends import find_renderer, keep_render_device
 from workbench.core.broken_rule import NeedsOneEnv
@@ -25,18 +24,14 @@ from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv, given_arguments
 from workbench.jobs.actions import STEPS_WITHOUT_LIMIT, RecordActionChooser, find_actions, plain_chooser
-from workbench.jobs.check.plan import CheckedTask, CheckOptions, CheckUpdate, GroupOutcome, plan_of
+from workbench.jobs.check.plan import CheckedTask, CheckOptions, CheckUpdate, Item, Outcome, plan_of
 from workbench.jobs.open_task import Opening, import_task
 from workbench.jobs.pool.deal import Chunk, ItemQueue
 from workbench.jobs.replay import begin_run
 from workbench.machine.folders import CurrentFolder
 
 
-class _Stopped(Exception):
-    """No result is needed any more."""
-
-
-def check_groups(what: CheckOptions, queue: ItemQueue) -> None:
+def check_items(what: CheckOptions, queue: ItemQueue) -> None:
     """Check the chunks that one process gets. Raises as `jobs.check.run.check`."""
     torch.set_num_threads(1)  # see workbench.session.worker.loop.work
     here = CurrentFolder()  # the task may change it
@@ -52,13 +47,13 @@ def check_groups(what: CheckOptions, queue: ItemQueue) -> None:
         worker = _Worker(what, loaded, runs, here, queue)
         queue.send_update(CheckUpdate(task=worker.task))
         stack.callback(worker.close)
-        with suppress(_Stopped):
+        with suppress(CheckEnded):
             while (chunk := queue.next()) is not None:
                 worker.check(chunk)
 
 
 class _Worker:
-    """Checks groups of rules, with one `Checkup` for each part of the seeds."""
+    """Checks rules, with one `Checkup` for each part of the seeds."""
 
     def __init__(
         self,
@@ -87,29 +82,27 @@ class _Worker:
             self._checkup.close()
 
     def check(self, chunk: Chunk) -> None:
+        first = min(chunk.wanted)
         for number in sorted(chunk.wanted):
             self._number = number
             self._keep_going()
-            part, group = self._plan.of(number)
-            checkup = self._checkup_of(part)
-            count = self._plan.parts
-            self._queue.send_update(
-                CheckUpdate(
-                    activity=group.name if count == 1 else f"seeds, part {part + 1} of {count}: {group.name}"
-                )
-            )
-            task = self.task if number == chunk.numbers[0] else None
-            outcome = self._checked(group, checkup, task)
+            item = self._plan.items[number]
+            checkup = self._checkup_of(item.part)
+            name, count = item.group.name, self._plan.parts
+            activity = name if count == 1 else f"seeds, part {item.part + 1} of {count}: {name}"
+            self._queue.send_update(CheckUpdate(activity=activity))
+            task = self.task if number == first else None
+            outcome = self._checked(item, checkup, task)
             if self._num_envs > 1 and any(_needs_one_env(error) for error in checkup.failed.values()):
                 self._num_envs = 1
                 self.close()
                 self._checkup = None
-                outcome = self._checked(group, self._checkup_of(part), task)
+                outcome = self._checked(item, self._checkup_of(item.part), task)
             self._queue.send_result(number, outcome)
 
     def _keep_going(self) -> None:
         if self._queue.limit() <= self._number:
-            raise _Stopped
+            raise CheckEnded
 
     def _checkup_of(self, part: int) -> Checkup:
         if self._checkup is not None and part == self._part:
@@ -135,26 +128,23 @@ class _Worker:
         )
         return self._checkup
 
-    def _checked(self, group: RuleGroup, checkup: Checkup, task: CheckedTask | None) -> GroupOutcome:
+    def _checked(self, item: Item, checkup: Checkup, task: CheckedTask | None) -> Outcome:
         known, silenced = len(checkup.findings), len(checkup.silenced)
-        if self._part > 0:
-            checks = {rule: check for rule, check in group.checks.items() if rule in RULES_OVER_SEEDS}
-            group = replace(group, checks=checks)
-        run = run_core if group.name == CORE_GROUP else run_group
-        results: list[RuleResult] = []
-        for result in run(group, checkup, self._degrees):
-            results.append(result)
-            self._queue.send_update(CheckUpdate(result=replace(result, seen=())))
-        return GroupOutcome(
+        if item.group is CORE:
+            results = check_core(checkup, self._degrees)
+        else:
+            (rule,) = item.rules
+            results = check_rule(rule, item.group.checks[rule], checkup, self._degrees)
+        return Outcome(
             tuple(results),
-            tuple(checkup.findings[known:]),
+            findings_of(checkup, known),
             tuple(checkup.silenced[silenced:]),
             checkup.picture_seconds,
             task,
         )
 
 
-def _needs_one_env(error: TaskError) -> bool:
+def _needs_one_env(error: Exception) -> bool:
     return isinstance(error.__cause__, NeedsOneEnv)
 
 

@@ -1,13 +1,13 @@
-"""What a check is, and how it is cut into items: groups of rules on parts of the seeds."""
+"""What a check is, and how it is cut into items: rules on parts of the seeds."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from workbench.checks.by_hook.run import CORE_GROUP, GROUPS, RULES_OVER_SEEDS, RuleGroup
+from workbench.checks.by_hook.run import CORE, GROUPS, RULES_OVER_SEEDS, RuleGroup
 from workbench.checks.results import RuleResult, Silenced
-from workbench.checks.rules import CHECK_RULES, RULES, degree_of_each
+from workbench.checks.rules import core_rules_of, degree_of_each
 from workbench.core.rules import Degree, Finding
 from workbench.jobs.actions import SOLVE
 from workbench.jobs.task import TaskOptions
@@ -57,13 +57,11 @@ class CheckUpdate:
     """It is imported, and the checks begin."""
     activity: str = ""
     """What is being looked at."""
-    result: RuleResult | None = None
-    """To be shown as it comes: it comes again with its group."""
 
 
 @dataclass(frozen=True)
-class GroupOutcome:
-    """What a group of rules came to for one part of the seeds."""
+class Outcome:
+    """What an item came to: a rule for one part of the seeds, or all rules of GPU simulation."""
 
     results: tuple[RuleResult, ...]
     findings: tuple[Finding, ...] = ()
@@ -73,22 +71,23 @@ class GroupOutcome:
     picture_seconds: float = 0.0
     """For the first pictures of a process."""
     task: CheckedTask | None = None
-    """With the first group of each chunk."""
+    """With the first item of each chunk."""
 
 
 def groups_of(degrees: Mapping[str, Degree]) -> list[RuleGroup]:
-    """The groups with a rule that is not off; the last one lets the rules of GPU simulation look, and checks none itself."""
-    groups = [group for group in GROUPS if any(degrees[rule] != "off" for rule in group.checks)]
-    core = any(degrees[rule] != "off" for rule in RULES if rule not in CHECK_RULES)
-    # Whether the task runs is known from there too.
-    return [*groups, RuleGroup(CORE_GROUP, {})] if core or degrees["runs"] != "off" else groups
+    """The groups with a rule that is not off, without the rules that are; `CORE` last."""
+    groups = [
+        RuleGroup(group.name, {rule: check for rule, check in group.checks.items() if degrees[rule] != "off"})
+        for group in GROUPS
+    ]
+    # Whether the task runs is known from the last one too.
+    core = [CORE] if core_rules_of(degrees) or degrees["runs"] != "off" else []
+    return [*(group for group in groups if group.checks), *core]
 
 
 def count_rules(degrees: Mapping[str, Degree]) -> int:
     """How many rules a check gives a result of."""
-    in_groups = {rule for group in groups_of(degrees) for rule in group.checks if degrees[rule] != "off"}
-    core = {rule for rule in RULES if rule not in CHECK_RULES and degrees[rule] != "off"}
-    return len(in_groups | core)
+    return sum(degree != "off" for degree in degrees.values())
 
 
 def degrees_of_request(what: CheckOptions) -> dict[str, Degree]:
@@ -105,37 +104,31 @@ def degrees_of_request(what: CheckOptions) -> dict[str, Degree]:
 
 
 @dataclass(frozen=True)
+class Item:
+    """What is looked at at once."""
+
+    part: int
+    group: RuleGroup
+    rules: tuple[str, ...]
+    """One of the group, or all of GPU simulation for `CORE`."""
+
+
+@dataclass(frozen=True)
 class CheckPlan:
-    """The items of a check: groups of rules on parts of the seeds. Those that do not depend on the seeds are looked at in the
+    """The items of a check, by number. A chunk has the rules of one group, which look at the same evidence; of several parts of
+    the seeds all rules of a part, which look at the same episodes. Rules that do not depend on the seeds are looked at in the
     first part alone."""
 
-    groups: list[RuleGroup]
-    over_seeds: frozenset[str]
-    """Rules that are checked in every part."""
+    items: Mapping[int, Item]
+    chunk: int
+    """Numbers of a chunk; not each stands for an item."""
     part: int
     """Seeds of a part. What compares whole batches takes one for each env."""
     parts: int
 
     @property
-    def numbers(self) -> list[int]:
-        """Group g of part k is item ``k * len(groups) + g``."""
-        count = len(self.groups)
-        further = [g for g, group in enumerate(self.groups) if not self.over_seeds.isdisjoint(group.checks)]
-        return [*range(count), *(k * count + g for k in range(1, self.parts) for g in further)]
-
-    @property
-    def chunk(self) -> int:
-        """Items of a chunk. Of one part each group is one; of several all groups of a part, which look at the same episodes."""
-        return 1 if self.parts == 1 else len(self.groups)
-
-    @property
     def chunks(self) -> int:
-        return len(self.groups) if self.parts == 1 else self.parts
-
-    def of(self, number: int) -> tuple[int, RuleGroup]:
-        """Part and group of an item."""
-        part, group = divmod(number, len(self.groups))
-        return part, self.groups[group]
+        return len({number // self.chunk for number in self.items})
 
     def episodes(self, part: int, seeds: int) -> range:
         """Which of so many seeds are in a part, from 0 on."""
@@ -144,8 +137,19 @@ class CheckPlan:
 
 def plan_of(what: CheckOptions, degrees: Mapping[str, Degree]) -> CheckPlan:
     part = max(SEEDS_OF_PART, what.options.num_envs)
-    over_seeds = frozenset(rule for rule in RULES_OVER_SEEDS if degrees[rule] != "off")
-    return CheckPlan(groups_of(degrees), over_seeds, part, -(-what.seeds // part))
+    parts = -(-what.seeds // part)
+    groups = groups_of(degrees)
+    width = max(len(group.checks) for group in GROUPS)
+    items: dict[int, Item] = {}
+    for k in range(parts):
+        for g, group in enumerate(groups):
+            first = (k * len(groups) + g) * width
+            if group is CORE and k == 0:
+                items[first] = Item(k, group, tuple(core_rules_of(degrees)))
+            for r, rule in enumerate(group.checks):
+                if k == 0 or rule in RULES_OVER_SEEDS:
+                    items[first + r] = Item(k, group, (rule,))
+    return CheckPlan(items, width if parts == 1 else width * len(groups), part, parts)
 
 
 def count_chunks(what: CheckOptions) -> int:
@@ -153,7 +157,7 @@ def count_chunks(what: CheckOptions) -> int:
     return plan_of(what, degrees_of_request(what)).chunks
 
 
-def count_groups(what: CheckOptions, chunks: range) -> int:
-    """Groups of rules in these chunks, counted for each part of the seeds."""
+def count_items(what: CheckOptions, chunks: range) -> int:
+    """Items in these chunks."""
     plan = plan_of(what, degrees_of_request(what))
-    return sum(number // plan.chunk in chunks for number in plan.numbers)
+    return sum(number // plan.chunk in chunks for number in plan.items)

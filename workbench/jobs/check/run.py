@@ -4,31 +4,30 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from workbench.authoring.problem import TaskError
 from workbench.checks.by_hook.run import RULES_OVER_SEEDS, core_results, over_seeds
 from workbench.checks.comments import Comment, comments_without_effect
-from workbench.checks.results import RuleResult, State
+from workbench.checks.results import RuleResult, State, by_rule, failed, merged
 from workbench.checks.rules import RULES
 from workbench.core.rules import DEGREES, FailOn, Finding, fails
 from workbench.jobs.actions import find_actions, needed_by
-from workbench.jobs.check.groups import check_groups
+from workbench.jobs.check.groups import check_items
 from workbench.jobs.check.plan import (
     CheckedTask,
     CheckOptions,
     CheckUpdate,
-    GroupOutcome,
+    Outcome,
     degrees_of_request,
     plan_of,
 )
-from workbench.jobs.pool.deal import Deal, Executor, ThisProcess, Work
+from workbench.jobs.pool.deal import Deal, Executor, Failure, ThisProcess, Work
 from workbench.jobs.pool.processes import Processes
 
 _TRIES = 3
-"""How often groups of rules are begun whose workers die."""
-_ORDER: tuple[State, ...] = ("broken", "silenced", "failed", "kept", "skipped")
-"""Of the states that one rule has in several groups or parts of the seeds, the first counts."""
+"""How often rules are begun whose workers die."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class CheckReport:
     comments: tuple[Comment, ...] = ()
     """Silencing comments that silence nothing."""
     missing: int = 0
-    """Groups of rules, counted for each part of the seeds, that were not looked at."""
+    """Rules, counted for each part of the seeds, that were not looked at."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -61,14 +60,14 @@ class CheckReport:
         return tuple(result for result in self.results if result.state == state)
 
     def fails(self, fail_on: FailOn) -> bool:
-        """Whether a finding has this degree or a higher one, or a rule is undecided because the task raised. Never for
-        ``never``."""
+        """Whether a finding has this degree or a higher one, the check of a rule failed, or a rule is not known because the
+        author's code raised. Never for ``never``."""
         if fail_on == "never":
             return False
-        if any(fails(finding.degree, fail_on) for finding in self.findings):
+        if self.of_state("failed") or any(fails(finding.degree, fail_on) for finding in self.findings):
             return True
         accepted = any(result.rule == "runs" for result in self.of_state("silenced"))
-        return bool(self.of_state("failed")) and not accepted
+        return not accepted and any(result.problem is not None for result in self.results)
 
 
 def check(
@@ -84,12 +83,12 @@ def check(
 
     Args:
         on_activity: gets what is being looked at, for a status line.
-        on_result: gets the result of each rule as it comes; of a rule that several processes look at, several. Of several
-            parts of the seeds, only those that no further part changes.
+        on_result: gets the result of each rule as it comes; of a rule that several report, several. Of several parts of the
+            seeds, only those that no further part changes.
         stop: called between steps; after True the rules that are not done are missing in the report.
         executor: None for this process, or for spawned processes with several workers.
         began: when the work began, by ``time.monotonic()``; None for now.
-        on_progress: where there are several parts of the seeds, gets how many groups of rules are done.
+        on_progress: where there are several parts of the seeds, gets how many rules are done, counted for each part.
 
     Raises:
         TaskError: the task or the policy cannot be imported, or the task lacks assets.
@@ -107,24 +106,25 @@ def check(
         workers = min(cores if what.workers is None else what.workers, plan.chunks)
         executor = ThisProcess() if workers == 1 else Processes(workers)
     found = _Results(what, on_activity, on_result, on_progress)
-    deal: Deal[GroupOutcome, CheckUpdate] = Deal(
-        plan.numbers, found.take, found.hear, stop, chunk=plan.chunk, tries=_TRIES
+    deal: Deal[Outcome, CheckUpdate] = Deal(
+        plan.items, found.take, found.hear, stop, chunk=plan.chunk, tries=_TRIES, on_failure=found.fail
     )
     needed = needed_by(what.task, what.actions, what.options.imports)
     work = Work(
-        check_groups,
+        check_items,
         what,
-        result=GroupOutcome,
+        result=Outcome,
         update=CheckUpdate,
         name="that checks",
         folders=needed.folders,
         files=needed.files,
     )
     executor.run(work, deal)
+    deal.require_results()
     return found.report(began, stop())
 
 
-def report_of(what: CheckOptions, known: Mapping[int, GroupOutcome]) -> CheckReport:
+def report_of(what: CheckOptions, known: Mapping[int, Outcome]) -> CheckReport:
     """The report of a check of which these items are known. Runs nothing. Raises ValueError as `degrees_of_request`."""
     found = _Results(what)
     for number in sorted(known):
@@ -147,52 +147,51 @@ class _Results:
         self._on_activity, self._on_result, self._on_progress = on_activity, on_result, on_progress
         self._task: CheckedTask | None = None
         self._started = 0.0
-        self._shown: set[tuple[str, float]] = set()
-        """Results that were told already, by rule and seconds."""
-        self._groups: dict[int, GroupOutcome] = {}
+        self._outcomes: dict[int, Outcome] = {}
 
     def hear(self, update: CheckUpdate) -> None:
         if update.task is not None:
             self._see_task(update.task)
         if update.activity:
             self._on_activity(update.activity)
-        if update.result is not None:
-            self._show(update.result)
 
-    def take(self, number: int, group: GroupOutcome) -> None:
-        if group.task is not None:
-            self._see_task(group.task)
-        self._groups[number] = group
-        for result in group.results:
-            self._show(result)
+    def take(self, number: int, outcome: Outcome) -> None:
+        if outcome.task is not None:
+            self._see_task(outcome.task)
+        self._outcomes[number] = outcome
+        for result in outcome.results:
+            if self._plan.parts == 1 or result.rule not in RULES_OVER_SEEDS:
+                self._on_result(result)
         if self._plan.parts > 1:
-            self._on_progress(len(self._groups))
+            self._on_progress(len(self._outcomes))
+
+    def fail(self, failure: Failure) -> None:
+        """Take rules that gave no result: their process died. Raises TaskError for a policy that cannot be imported, which is no
+        matter of one rule."""
+        if failure.problem.stage != "worker":
+            raise TaskError(failure.problem)
+        for number in failure.numbers:
+            rules = self._plan.items[number].rules
+            self.take(number, Outcome(tuple(failed(rule, failure.problem) for rule in rules)))
 
     def _see_task(self, task: CheckedTask) -> None:
         if self._task is None:
             self._task, self._started = task, time.monotonic()
 
-    def _show(self, result: RuleResult) -> None:
-        known = result.rule, result.seconds
-        if known in self._shown or (self._plan.parts > 1 and result.rule in RULES_OVER_SEEDS):
-            return
-        self._shown.add(known)
-        self._on_result(result)
-
     def report(self, began: float | None, stopped: bool) -> CheckReport:
         # Stopped before the task was imported: nothing is known of it.
         task = self._task or CheckedTask("", "", None)
-        by_part: dict[int, list[GroupOutcome]] = {}
-        for number in sorted(self._groups):
-            by_part.setdefault(self._plan.of(number)[0], []).append(self._groups[number])
-        by_rule: dict[str, list[RuleResult]] = {}
-        for groups in by_part.values():
-            for rule, result in self._of_part(groups).items():
-                by_rule.setdefault(rule, []).append(result)
-        ordered = tuple(self._over_parts(by_rule[rule]) for rule in RULES if rule in by_rule)
+        by_part: dict[int, list[Outcome]] = {}
+        for number in sorted(self._outcomes):
+            by_part.setdefault(self._plan.items[number].part, []).append(self._outcomes[number])
+        of_rule: dict[str, list[RuleResult]] = {}
+        for outcomes in by_part.values():
+            for rule, result in self._of_part(outcomes).items():
+                of_rule.setdefault(rule, []).append(result)
+        ordered = tuple(self._over_parts(of_rule[rule]) for rule in RULES if rule in of_rule)
         now = time.monotonic()
         seconds, started = (0.0, 0.0) if began is None else (now - began, (self._started or now) - began)
-        missing = len(self._plan.numbers) - len(self._groups)
+        missing = len(self._plan.items) - len(self._outcomes)
         # Of what is not looked at yet nobody knows what it silences.
         decided = () if missing else ordered
         return CheckReport(
@@ -200,7 +199,7 @@ class _Results:
             ordered,
             seconds,
             started,
-            max((group.picture_seconds for group in self._groups.values()), default=0.0),
+            max((outcome.picture_seconds for outcome in self._outcomes.values()), default=0.0),
             stopped,
             self._ignored,
             tuple(comments_without_effect(task.source, decided, task.class_name, task.others)),
@@ -214,23 +213,22 @@ class _Results:
             rule for rule in RULES if rule in what.ignore and (not what.select or rule in what.select)
         )
 
-    def _of_part(self, groups: Sequence[GroupOutcome]) -> dict[str, RuleResult]:
+    def _of_part(self, outcomes: Sequence[Outcome]) -> dict[str, RuleResult]:
         """The result of each rule for one part of the seeds."""
         earliest: dict[object, Finding] = {}
-        for finding in (finding for group in groups for finding in group.findings):
+        for finding in (finding for outcome in outcomes for finding in outcome.findings):
             known = earliest.setdefault(finding.key, finding)
             # Which one each process meets first depends on what it does.
             if (finding.first_step, finding.message) < (known.first_step, known.message):
                 earliest[finding.key] = finding
         found = sorted(earliest.values(), key=lambda one: (one.file or "", one.line or 0, one.message))
-        silenced = [one for group in groups for one in group.silenced]
-        by_rule: dict[str, list[RuleResult]] = {}
-        for result in (
-            *(result for group in groups for result in group.results),
-            *core_results(found, silenced, self._degrees),
-        ):
-            by_rule.setdefault(result.rule, []).append(result)
-        return {rule: merged(results) for rule, results in by_rule.items()}
+        silenced = [one for outcome in outcomes for one in outcome.silenced]
+        return by_rule(
+            (
+                *(result for outcome in outcomes for result in outcome.results),
+                *core_results(found, silenced, self._degrees),
+            )
+        )
 
     def _over_parts(self, results: Sequence[RuleResult]) -> RuleResult:
         rule = results[0].rule
@@ -241,30 +239,3 @@ class _Results:
         else:
             whole = merged(results, other_seeds=True)
         return replace(whole, seen=())
-
-
-def merged(results: Iterable[RuleResult], other_seeds: bool = False) -> RuleResult:
-    """One result of those that one rule has.
-
-    Args:
-        other_seeds: each is of other seeds: the breaches of all are counted. Else they are of several groups, which look at
-            the same seeds, and the same breach counts once.
-    """
-    results = sorted(results, key=lambda result: _ORDER.index(result.state))
-    first = results[0]
-    findings: dict[object, Finding] = {}
-    for finding in (finding for result in results for finding in result.findings):
-        known = findings.setdefault(finding.key, finding)
-        if known is not finding and other_seeds:
-            findings[finding.key] = replace(known, count=known.count + finding.count)
-        elif finding.count > known.count:
-            findings[finding.key] = finding
-    silenced = {(one.finding.key, one.line): one for result in results for one in result.silenced}
-    return replace(
-        first,
-        findings=tuple(findings.values()),
-        silenced=tuple(silenced.values()),
-        notes=tuple(dict.fromkeys(note for result in results for note in result.notes)),
-        seconds=sum(result.seconds for result in results),
-        seen=tuple(row for result in results for row in result.seen),
-    )

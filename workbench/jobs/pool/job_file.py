@@ -32,8 +32,6 @@ CREATE TABLE about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE kept (name TEXT PRIMARY KEY, value BLOB NOT NULL);
 CREATE TABLE result (number INTEGER PRIMARY KEY, value BLOB NOT NULL);
 """
-_OPTIONS = {"num_envs": "envs per worker"}
-"""Fields that have another name on the command line."""
 _DIFFERENT = 5
 """Differences that are named."""
 
@@ -98,7 +96,7 @@ def _flat(name: str, value: Any, leaves_out: Iterable[str] = ()) -> Iterator[tup
         for key, one in sorted(value.items()):
             yield from _flat(f"{name} {key}", one)
     else:
-        yield _OPTIONS.get(name, name.replace("_", " ")), json.dumps(value, default=str)
+        yield name.replace("_", " "), json.dumps(value, default=str)
 
 
 class JobFile:

@@ -38,8 +38,8 @@ class SolveOptions:
     max_steps: int | None = None
     """As `RecordArguments.max_steps`."""
     plan: PlanOptions = PlanOptions()
-    options: TaskOptions = field(default_factory=TaskOptions)
-    """Its number of envs counts for nothing: each process has one."""
+    options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=1))
+    """Its number of envs is that of the seeds which each process is at; a seed comes to the same with any."""
     seconds_per_seed: float | None = None
     """As `RecordArguments.seconds_per_seed`."""
     upload: str = ""
@@ -57,7 +57,7 @@ class SolveOptions:
             seconds_per_seed=self.seconds_per_seed,
             upload=self.upload,
             workers=self.workers,
-            options=replace(self.options, num_envs=1),
+            options=self.options,
             plan=self.plan,
             after_success=_AFTER_SUCCESS,
         )

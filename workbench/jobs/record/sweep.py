@@ -79,7 +79,7 @@ class SweepOptions:
     @property
     def chunk(self) -> int:
         """Episodes that a worker runs together. It depends on nothing of how the job runs."""
-        envs = 1 if self.actions == SOLVE else self.options.num_envs
+        envs = self.options.num_envs
         points = math.prod(len(one.values) for one in self.settings)
         enough = -(-self.seeds * points // (_CHUNKS * envs)) * envs
         return min(max(chunk_of(self.seeds, envs), enough), -(-self.seeds // envs) * envs)
@@ -169,7 +169,7 @@ def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
             actions=what.actions,
             pictures=what.pictures,
             max_steps=what.max_steps,
-            options=replace(options, num_envs=1) if planned else options,
+            options=options,
             plan=what.plan,
             after_success=_AFTER_SUCCESS if planned else 0,
             source=source,

@@ -9,18 +9,20 @@ from functools import partial
 from typing import Literal
 
 from workbench.authoring.problem import Problem
-from workbench.checks.results import RuleResult, by_rule
-from workbench.checks.rules import degree_of_each
+from workbench.checks.results import RuleResult, by_rule, failed
+from workbench.checks.rules import core_rules_of, degree_of_each
 from workbench.core.rules import Finding
 from workbench.session.process.askers import WAITING, Background, Priority
 from workbench.session.process.held_view import HeldView
-from workbench.session.process.job_lane import Job, JobFailed, JobLane
+from workbench.session.process.job_lane import Job, JobFailed, JobLane, ProcessDied
 from workbench.session.protocol.messages import Load
-from workbench.session.protocol.questions import CheckedGroup, CheckGroup
+from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.session.rescore.background import StoppedBy
 
 AHEAD = 2.0
 """Seconds of checking before the history is rescored, which a person waits for more than for the last rule."""
+MOST_DEATHS = 5
+"""Processes that may die in one check, each of another rule."""
 ChecksState = Literal["none", "off", "loading", "checking", "done", "stopped", "failed"]
 RUNNING: tuple[ChecksState, ...] = ("loading", "checking")
 
@@ -135,29 +137,51 @@ class Checks:
     def _check(self, job: Job, load: Load) -> None:
         degrees = degree_of_each(choice=load.options.rules)
         began: float | None = None
+        done: set[str] = set()
+        under_way: str | None = None
+        deaths = 0
 
         def ask(group: int) -> CheckedGroup:
             nonlocal began
             load_version(self._process, job, load)
             began = began or time.monotonic()
             self._held.update(job, state="checking")
-            known = tuple(result.rule for result in self._held.now.results)
-            question = CheckGroup(group, degrees, known)
-            return self._process.ask(job.check, question, partial(self._take, job, began))
+            return self._process.ask(job.check, CheckGroup(group, degrees, tuple(done)), hear)
+
+        def hear(count: int, total: int, now: RuleProgress) -> None:
+            nonlocal under_way
+            under_way = now.rule if now.result is None else None
+            if now.result is not None:
+                done.add(now.rule)
+                self._take(job, began, total, now.result)
 
         group, groups = 0, 1
         while group < groups:
             ahead = began is None or time.monotonic() - began < AHEAD
             priority: Priority = "low" if ahead else "lowest"
-            answer = self._process.in_turns(job, partial(ask, group), priority)
+            try:
+                answer = self._process.in_turns(job, partial(ask, group), priority)
+            except ProcessDied as died:
+                deaths += 1
+                if began is None or deaths > MOST_DEATHS:
+                    raise
+                # What it was at fails, and the rest is asked of another process.
+                problem = Problem("worker", str(died), None, None, None, "")
+                rules = core_rules_of(degrees) if under_way == "" else filter(None, [under_way])
+                for rule in rules:
+                    done.add(rule)
+                    self._take(job, began, self._held.now.total, failed(rule, problem))
+                group += under_way == ""  # that is the last one
+                under_way = None
+                continue
             group, groups = group + 1, answer.groups
             self._held.update(job, total=answer.rules, looks_at=answer.next)
         self._held.update(job, state="done", before=(), looks_at="")
 
-    def _take(self, job: Job, began: float, done: int, total: int, result: RuleResult) -> None:
+    def _take(self, job: Job, began: float | None, total: int, result: RuleResult) -> None:
         results = by_rule((*self._held.now.results, result))
         before = tuple(finding for finding in self._held.now.before if finding.rule != result.rule)
-        seconds = time.monotonic() - began
+        seconds = time.monotonic() - (began or time.monotonic())
         self._held.update(job, results=tuple(results.values()), before=before, total=total, seconds=seconds)
 
     def _failed(self, job: Job, failure: JobFailed) -> None:
@@ -173,11 +197,12 @@ class Checks:
     def _put_begun(self, load: Load, state: ChecksState) -> None:
         """Nothing is known of this version yet."""
         self._of, view = _version(load), self._held.now
-        before = {finding.key: finding for finding in (*view.before, *view.findings)}
+        newer = {finding.key for finding in view.findings}
+        before = (*(finding for finding in view.before if finding.key not in newer), *view.findings)
         self._held.put(
             ChecksView(
                 state,
-                before=() if state == "off" else tuple(before.values()),
+                before=() if state == "off" else before,
                 total=view.total,
                 after_each_save=view.after_each_save,
             )

@@ -175,9 +175,9 @@ def _run(setup: _Setup, queue: ItemQueue) -> None:
     if queue.next() is None:
         return
     os.nice(_NICENESS)
-    what = SolveOptions(
-        setup.task, setup.out, setup.seeds, setup.workers, plan=setup.plan, options=setup.options
-    )
+    # One seed at a time: a person looks at each as it is done.
+    options = replace(setup.options, num_envs=1)
+    what = SolveOptions(setup.task, setup.out, setup.seeds, setup.workers, plan=setup.plan, options=options)
     report = solve(
         what,
         on_activity=lambda activity: queue.send_update(_Update(activity)),

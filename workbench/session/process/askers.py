@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 from workbench.core.camera_data import CameraKey
 from workbench.machine.processes.family import describe_exit
 from workbench.machine.processes.wire import Call, Question, Unpacker, Unreadable, value_type
-from workbench.session.process.job_lane import Job, JobFailed
+from workbench.session.process.job_lane import Job, JobFailed, ProcessDied
 from workbench.session.process.worker_process import WorkerProcess
 from workbench.session.protocol.messages import Answer, Cancel, Load, PlaceCamera, Progress, Request
 
@@ -267,7 +267,8 @@ class Background(Asker):
         """As `Asker.ask`.
 
         Raises:
-            JobFailed: there is no answer, or the process died.
+            JobFailed: there is no answer.
+            ProcessDied: for that reason.
             GaveWay: a job of higher priority waits. A load is finished first: that job most likely needs it too.
         """
 
@@ -289,7 +290,7 @@ class Background(Asker):
             check()
             if (code or 0) > 0 and (last := self._said.decode(errors="replace").strip().rpartition("\n")[2]):
                 why += f": {last}"
-            raise JobFailed(f"the process in the background {why}") from None
+            raise ProcessDied(f"the process in the background {why}") from None
 
     def end(self) -> None:
         """End the process, if there is one. `pid` stays its own until it has ended."""

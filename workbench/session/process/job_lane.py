@@ -32,6 +32,10 @@ class JobFailed(Exception):
         self.problem = problem
 
 
+class ProcessDied(JobFailed):
+    """The process that worked on it is gone; the next question starts another."""
+
+
 class Job:
     """One piece of work. It calls `check` often, which raises once the job is stopped: a thread cannot be ended."""
 

@@ -96,10 +96,20 @@ class CheckedGroup:
 
 
 @dataclass(frozen=True)
+class RuleProgress:
+    """How far the rules of a group are."""
+
+    rule: str
+    """The one that is looked at; empty for those of GPU simulation, which are looked at together."""
+    result: RuleResult | None = None
+    """What a rule came to; None where it is begun."""
+
+
+@dataclass(frozen=True)
 class CheckGroup(Question[CheckedGroup]):
     """Check the rules of one group on the loaded version. Any request behind it ends it."""
 
-    part: ClassVar[Any] = RuleResult
+    part: ClassVar[Any] = RuleProgress
     group: int
     """From 0, in the order of what people meet most."""
     degrees: Mapping[str, Degree]

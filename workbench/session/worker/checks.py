@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from workbench.checks.results import StepProfile
@@ -10,20 +10,17 @@ from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.watched_thread import on_free_cores
 from workbench.session.protocol.messages import CannotAnswer
-from workbench.session.protocol.questions import CheckedGroup, CheckGroup, ProfileStep
+from workbench.session.protocol.questions import CheckedGroup, CheckGroup, ProfileStep, RuleProgress
 
 if TYPE_CHECKING:
     from workbench.authoring.loading.load import LoadedTask
     from workbench.checks.evidence.checkup import Checkup
     from workbench.checks.results import RuleResult
 
-OnResult = Callable[[int, int, "RuleResult"], None]
-"""Gets the number of results so far in this group, the number of rules in all, and a result."""
+OnProgress = Callable[[int, int, RuleProgress], None]
+"""Gets the number of results so far in this group, the number of rules in all, and what is begun or done."""
 NUM_ENVS, SEEDS = 8, 32
-
-
-class _Ended(Exception):
-    """A request waits: nobody needs the answer, or a job of higher priority needs the process."""
+"""Envs of a check; one where the page has one."""
 
 
 class WorkerChecks:
@@ -43,7 +40,7 @@ class WorkerChecks:
         opened: OpenedTask,
         options: TaskOptions,
         question: CheckGroup | ProfileStep,
-        on_result: OnResult,
+        on_progress: OnProgress,
     ) -> CheckedGroup | StepProfile:
         """
         Args:
@@ -53,15 +50,16 @@ class WorkerChecks:
             CannotAnswer: a request came, or a step of this task cannot be timed.
             TaskError: it raised while a step was timed.
         """
+        from workbench.checks.evidence.checkup import CheckEnded
+        from workbench.checks.evidence.step_profile import profile_step
+
         checkup = self._checkup_of(opened.loaded, options)
         try:
             if isinstance(question, CheckGroup):
                 with on_free_cores(self._waits):
-                    return self._check(checkup, question, on_result)
-            from workbench.checks.evidence.step_profile import profile_step
-
+                    return self._check(checkup, question, on_progress)
             return profile_step(checkup)
-        except _Ended:
+        except CheckEnded:
             raise CannotAnswer("another request came") from None
 
     def close(self) -> None:
@@ -70,28 +68,41 @@ class WorkerChecks:
             self._checkup.close()
         self._checkup = self._of = None
 
-    def _check(self, checkup: Checkup, question: CheckGroup, on_result: OnResult) -> CheckedGroup:
-        from workbench.checks.by_hook.run import CORE_GROUP, GROUPS, core_results, run_group
+    def _check(self, checkup: Checkup, question: CheckGroup, on_progress: OnProgress) -> CheckedGroup:
+        from workbench.checks.by_hook.run import (
+            CORE,
+            GROUPS,
+            check_core,
+            check_rule,
+            core_results,
+            findings_of,
+        )
 
-        degrees = question.degrees
-        checked = {rule for group in GROUPS for rule in group.checks} | _core_rules()
-        total = sum(degrees[rule] != "off" for rule in checked)
-        names = [*(group.name for group in GROUPS), CORE_GROUP]
-        if question.group < len(GROUPS):
-            # A rule that other checks report too may be known and not have been checked itself.
-            left = {
-                rule: "off" if rule in question.known and rule != "runs" else of
-                for rule, of in degrees.items()
-            }
-            results = run_group(GROUPS[question.group], checkup, left)  # type: ignore[arg-type]
-        else:
-            results = core_results(checkup.findings, checkup.silenced, degrees)
-        for done, result in enumerate(results, 1):
-            on_result(done, total, result)
-        if question.group >= len(GROUPS):
+        degrees, groups = question.degrees, (*GROUPS, CORE)
+        total = sum(degree != "off" for degree in degrees.values())
+        done = 0
+
+        def begin(rule: str) -> None:
+            on_progress(done, total, RuleProgress(rule))
+
+        def tell(rule: str, results: Iterable[RuleResult]) -> None:
+            nonlocal done
+            for result in results:
+                done += 1
+                on_progress(done, total, RuleProgress(rule, result))
+
+        group = groups[question.group]
+        for rule, check in group.checks.items():
+            if degrees[rule] != "off" and rule not in question.known:
+                begin(rule)
+                tell(rule, check_rule(rule, check, checkup, degrees))
+        if group is CORE:
+            begin("")
+            tell("", check_core(checkup, degrees))
+            tell("", core_results(findings_of(checkup), checkup.silenced, degrees))
             self.close()  # the memory is wanted elsewhere
         following = question.group + 1
-        return CheckedGroup(len(names), total, names[following] if following < len(names) else "")
+        return CheckedGroup(len(groups), total, groups[following].name if following < len(groups) else "")
 
     def _checkup_of(self, loaded: LoadedTask, options: TaskOptions) -> Checkup:
         from workbench.checks.evidence.checkup import Checkup  # late: the worker that plays checks nothing
@@ -100,18 +111,18 @@ class WorkerChecks:
             self.close()
             self._checkup, self._of = (
                 Checkup(
-                    loaded, options.env_kwargs, num_envs=NUM_ENVS, seeds=SEEDS, keep_going=self._keep_going
+                    loaded,
+                    options.env_kwargs,
+                    num_envs=1 if options.num_envs == 1 else NUM_ENVS,
+                    seeds=SEEDS,
+                    keep_going=self._keep_going,
                 ),
                 loaded,
             )
         return self._checkup
 
     def _keep_going(self) -> None:
+        from workbench.checks.evidence.checkup import CheckEnded
+
         if self._waits():
-            raise _Ended
-
-
-def _core_rules() -> set[str]:
-    from workbench.core.rules import RULES
-
-    return set(RULES)
+            raise CheckEnded

@@ -19,7 +19,15 @@ from workbench.core.scene.scene_index import scene_index
 from workbench.core.snapshots.snapshot import Snapshot
 from workbench.jobs.open_task import OpenedTask
 from workbench.planning.options import PlanOptions
-from workbench.planning.rollouts import NotAlike, Plan, RolloutPlanner, bodies_of, make_rollout_env
+from workbench.planning.rollouts import (
+    NotAlike,
+    NothingToPlan,
+    Plan,
+    RolloutPlanner,
+    bodies_of,
+    make_rollout_env,
+    require_plannable,
+)
 from workbench.session.protocol.messages import (
     SCENE_KEPT,
     CannotAnswer,
@@ -203,17 +211,18 @@ class WorkerPlans:
         if self._rolled is not None and self._rolled.num_envs != options.rollouts:
             self.close()
         if self._rolled is None:
+            try:
+                require_plannable(opened.env.env)
+            except NothingToPlan as error:
+                raise CannotAnswer(str(error)) from None
             loaded = opened.loaded
             made_with = given_arguments(loaded.cls, env_kwargs, loaded.default_kwargs)
             with blamed("build", loaded):
                 self._rolled = TaskEnv(make_rollout_env(opened.env.env, made_with, options.rollouts))
         if self._planner is None or self._options != options:
             self._next = {}
-            try:
-                # Quickly restored: a person who waits sees no difference in the last bit of a contact.
-                self._planner, self._options = RolloutPlanner(self._rolled.env, options, exact=False), options
-            except ValueError as error:
-                raise CannotAnswer(str(error)) from None
+            # Quickly restored: a person who waits sees no difference in the last bit of a contact.
+            self._planner, self._options = RolloutPlanner(self._rolled.env, options, exact=False), options
         return self._rolled, self._planner
 
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from workbench.checks.results import RuleResult, counts
+from workbench.checks.results import RuleResult, State, counts, state_text
 from workbench.checks.rules import RULES
 from workbench.core.capture.outliers import OUTLIER_RULES
 from workbench.core.rules import DEGREES, Degree, Finding, Rule
 from workbench.session.checks.checks import ChecksView
 from workbench.ui.checks.rule_pages import RulePage, rule_page
 
-_Key = tuple[str, str | None, str, str]
-"""As `Finding.key`."""
+_SUMMED: tuple[State, ...] = ("kept", "silenced", "not_known", "not_applicable", "failed")
+_UNDECIDED: tuple[State, ...] = ("not_known", "not_applicable")
 MOST_SHOWN = 5
 """Findings of one rule."""
 
@@ -58,29 +58,32 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
     Args:
         played: what was found while playing.
     """
-    rows = {finding.key: Row(finding) for finding in checks.findings}
+    rows = [Row(finding) for finding in checks.findings]
     for finding in played:
-        key = _same(finding, rows)
-        known = rows.get(key)
-        told = _played(finding) if key == finding.key else f"{_played(finding)}: {finding.message}"
-        rows[key] = Row(finding if known is None else known.finding, told)
-    for finding in checks.before:
-        # Rules of GPU simulation are checked last, and seen while playing at once.
-        rows.setdefault(_same(finding, rows), Row(finding, old=True))
+        place = _same(finding, rows)
+        if place is None:
+            rows.append(Row(finding, _played(finding)))
+            continue
+        known = rows[place].finding
+        same = known.key == finding.key
+        rows[place] = Row(known, _played(finding) if same else f"{_played(finding)}: {finding.message}")
+    # Rules of GPU simulation are checked last, and seen while playing at once.
+    rows += [Row(finding, old=True) for finding in checks.before if _same(finding, rows) is None]
     together: dict[str, list[Row]] = {}
-    for row in rows.values():
+    for row in rows:
         if row.finding.rule in RULES:
             together.setdefault(row.finding.rule, []).append(row)
     found = [Card(RULES[rule], _worst(row.finding for row in of), tuple(of)) for rule, of in together.items()]
     return sorted(found, key=lambda card: (card.old, DEGREES.index(card.degree)))
 
 
-def _same(finding: Finding, rows: Mapping[_Key, Row]) -> _Key:
-    """The key of the row that tells the same: an outlier is seen at its hook while playing, and at its line by the checks."""
-    if finding.key in rows or finding.rule not in OUTLIER_RULES:
-        return finding.key
-    told = (key for key, row in rows.items() if row.finding.rule == finding.rule and not row.old)
-    return next(told, finding.key)
+def _same(finding: Finding, rows: Sequence[Row]) -> int | None:
+    """The row that tells the same: an outlier is seen at its hook while playing, and at its line by the checks."""
+    of_rule = [place for place, row in enumerate(rows) if row.finding.rule == finding.rule]
+    alike = [place for place in of_rule if rows[place].finding.key == finding.key]
+    if not alike and finding.rule in OUTLIER_RULES:
+        alike = of_rule
+    return next(iter(alike), None)
 
 
 def count(shown: Iterable[Card]) -> int:
@@ -94,8 +97,28 @@ def without_finding(checks: ChecksView, shown: list[Card]) -> list[RuleResult]:
     return [result for result in checks.results if result.rule not in broken]
 
 
+@dataclass(frozen=True)
+class Undecided:
+    """Rules that came to the same for the same reason."""
+
+    state: str
+    """As `state_text`."""
+    why: str
+    rules: tuple[str, ...]
+
+
+def undecided(results: Iterable[RuleResult]) -> list[Undecided]:
+    """What is not known, then what is not applicable, by reason."""
+    found: dict[tuple[State, str], list[str]] = {}
+    for state in _UNDECIDED:
+        for result in results:
+            if result.state == state:
+                found.setdefault((state, result.why), []).append(result.rule)
+    return [Undecided(state_text(state), why, tuple(rules)) for (state, why), rules in found.items()]
+
+
 def summary(checks: ChecksView, shown: list[Card]) -> str:
-    """``2 stop, 3 warn, 50 kept, 3 not applicable``: findings by degree, then rules."""
+    """``2 stop, 3 warn, 50 kept, 3 not known``: findings by degree, then rules."""
     by_degree = dict.fromkeys(DEGREES, 0)
     for card in shown:
         for row in card.rows:
@@ -104,10 +127,7 @@ def summary(checks: ChecksView, shown: list[Card]) -> str:
     old = sum(row.old for card in shown for row in card.rows)
     told = (
         *((by_degree[degree], degree) for degree in DEGREES),
-        (states["kept"], "kept"),
-        (states["silenced"], "silenced"),
-        (states["skipped"], "not applicable"),
-        (states["failed"], "not known"),
+        *((states[state], state_text(state)) for state in _SUMMED),
         (old, "of the version before"),
     )
     return ", ".join(f"{number} {what}" for number, what in told if number)

@@ -12,7 +12,7 @@ from workbench.machine.kept_choices import keep_check_after_save
 from workbench.session.checks.checks import RUNNING, ChecksView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.checks.findings import MOST_SHOWN, Card, cards, count, summary, without_finding
+from workbench.ui.checks.findings import MOST_SHOWN, Card, cards, count, summary, undecided, without_finding
 from workbench.ui.server.viser_private import set_tab_label
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.editor import LinkTo, no_links
@@ -173,8 +173,18 @@ def list_html(
     """
     known = {"found": found, "more": more, "opened": opened, "id_of": press, "link": link, "most": MOST_SHOWN}
     rest = without_finding(checks, found)
-    kept = [result.rule for result in rest if result.state == "kept" and not result.notes]
-    told = [result for result in rest if result.rule not in kept]
+    failed = [result for result in rest if result.state == "failed"]
+    kept = [result.rule for result in rest if result.state == "kept"]
+    told = [result for result in rest if result.silenced or result.notes]
     return render(
-        "checks", **known, rest=len(rest), told=told, kept=kept, comments=comments, REST=REST, RULES=RULES
+        "checks",
+        **known,
+        rest=len(rest) - len(failed),
+        failed=failed,
+        undecided=undecided(rest),
+        told=told,
+        kept=kept,
+        comments=comments,
+        REST=REST,
+        RULES=RULES,
     )

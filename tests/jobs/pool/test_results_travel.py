@@ -1,0 +1,85 @@
+"""What workers send arrives where the chunks are dealt: every type of result and progress, through a real socket."""
+
+from __future__ import annotations
+
+import dataclasses
+import socket
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from msgspec import convert, inspect
+
+from tests.machine.processes.test_wire import of_schema, same
+from workbench.checks.by_hook.run import as_sent
+from workbench.checks.results import RuleResult, Seen
+from workbench.jobs.check.plan import CheckUpdate, Outcome
+from workbench.jobs.pool.deal import Deal, Work
+from workbench.jobs.pool.worker import MESSAGES, Listener, Message, WorkerQueue
+from workbench.jobs.record.episodes import RecordUpdate, Written
+from workbench.jobs.rescore.job import RescoredRecording, RescoreUpdate
+from workbench.machine.processes.wire import MessageSocket, Unreadable
+from workbench.planning.report import SolveReport
+
+KINDS = (
+    Outcome,
+    CheckUpdate,
+    RuleResult,
+    Written,
+    RecordUpdate,
+    RescoredRecording,
+    RescoreUpdate,
+    SolveReport,
+)
+
+
+class SocketQueue(WorkerQueue):
+    """Of a worker at the other end of a socket."""
+
+    def __init__(self, line: MessageSocket) -> None:
+        self._line = line
+
+    def next(self) -> None: ...
+
+    def limit(self) -> int:
+        return 1
+
+    def send(self, message: Message) -> None:
+        self._line.send(message)
+
+
+def sent(kind: Any, value: Any) -> list[Any]:
+    """What the deal gets of a result and an update."""
+    ours, theirs = (MessageSocket(end, MESSAGES) for end in socket.socketpair())
+    came: list[Any] = []
+    deal: Deal[Any, Any] = Deal([0], lambda number, result: came.append(result), came.append)
+    listener = Listener("a worker", Work(print, None, kind, kind, "x"), deal, print)
+    deal.next("worker")
+    queue = SocketQueue(theirs)
+    with ours.end, theirs.end:
+        for send in (queue.send_update, lambda value: queue.send_result(0, value)):
+            send(value)
+            message = ours.receive(5)
+            assert message is not None and listener.take("worker", message) == "goes on"
+    return came
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
+@settings(max_examples=20, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@given(st.data())
+def test_each_result_arrives_as_it_was_sent(kind: type, data: st.DataObject) -> None:
+    made = data.draw(of_schema(inspect.type_info(kind), 0.0))
+    value = convert(made, kind, strict=False, dec_hook=lambda to, of: to(of.decode("latin1")) if isinstance(of, bytes) else of)  # fmt: skip
+    for one in sent(kind, value):
+        assert same(one, value)
+
+
+def test_a_number_of_numpy_s_is_a_number_and_what_is_of_another_type_is_refused_where_it_is_made() -> None:
+    seen = Seen(tried=np.int64(3), size=np.float32(0.5), numbers=(np.float64(2.0),))  # type: ignore[arg-type]
+    (row,) = as_sent(RuleResult("runs", "kept", seen=(seen,))).seen
+    assert (row.tried, row.size, row.numbers) == (3, 0.5, (2.0,)) and type(row.tried) is int
+    for wrong in (dataclasses.replace(seen, count=True), dataclasses.replace(seen, texts=(1,))):
+        with pytest.raises(Unreadable):
+            as_sent(RuleResult("runs", "kept", seen=(wrong,)))
