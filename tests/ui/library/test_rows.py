@@ -131,7 +131,7 @@ def test_another_version_of_the_source_than_the_open_tasks_is_marked() -> None:
 
 
 def test_cells_say_what_there_is_and_nothing_where_nothing_is_known() -> None:
-    said = [cells(one, {}, NOW) for one in ROWS]
+    said = [cells(one, None, NOW) for one in ROWS]
     assert [one["outcome"] for one in said] == ["success", "once", "fail", "no", ""]
     assert said[0]["total"] == "1"
     assert [said[4][name] for name in ("task", "date", "when", "total", "remark")] == ["?", "", "", "", ""]
@@ -148,7 +148,7 @@ def test_cells_say_what_there_is_and_nothing_where_nothing_is_known() -> None:
     ],
 )
 def test_an_episode_that_was_cut_off_is_not_said_to_have_failed(facts: dict[str, Any], said: str) -> None:
-    assert cells(row("a", success=False, **facts), {}, NOW)["outcome"] == said
+    assert cells(row("a", success=False, **facts), None, NOW)["outcome"] == said
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_an_episode_that_was_cut_off_is_not_said_to_have_failed(facts: dict[str,
     ],
 )
 def test_dates_are_as_long_as_they_must_be(written: datetime.datetime, said: str) -> None:
-    assert cells(row("a", written=written.timestamp()), {}, NOW)["date"] == said
+    assert cells(row("a", written=written.timestamp()), None, NOW)["date"] == said
 
 
 def test_files_of_several_trajectories_are_counted_once() -> None:
@@ -180,7 +180,7 @@ def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted(
     kept = clean_facts(row("n", total_reward=float("nan")))
     lost = row("n", total_reward=kept.total_reward)
     assert kept == clean_facts(replace(kept, total_reward=float("nan")))
-    assert cells(lost, {}, NOW)["total"] == "NaN"
+    assert cells(lost, None, NOW)["total"] == "NaN"
     assert {ids(ordered((*ROWS[:2], lost), "return", down))[-1] for down in (True, False)} == {"n"}
 
 

@@ -124,6 +124,11 @@ class LibraryRow(Facts):
         return None if written is None else datetime.datetime.fromtimestamp(written, datetime.timezone.utc)
 
 
+def is_stopped(length: int | None, max_episode_steps: int | None) -> bool:
+    """Whether an episode without success was ended before the task's time limit: what would have come is unknown."""
+    return length is not None and max_episode_steps is not None and length < max_episode_steps
+
+
 def clean_facts(facts: Facts) -> Facts:
     """`facts` with valid types and bounded lengths: they come from a confined reader or from an older index."""
     texts = ("task", "uid", "copy_of", "control_mode", "acted_by", "source_hash")

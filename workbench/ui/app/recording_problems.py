@@ -52,11 +52,12 @@ class RecordingProblems:
 
     def _tell(self, now: RecordingStatus) -> None:
         before, self._before = self._before, now
-        if now.problem is not None and now.problem != before.problem:
+        # By identity: the same may happen again between two looks.
+        if now.problem is not None and now.problem is not before.problem:
             self._on_notice(now.problem)
             tell_all(self._server, "Not recorded", now.problem, "red")
         saving = now.saving
-        if not saving.failed or saving == before.saving:
+        if not saving.failed or saving.message is before.saving.message:
             return
         if saving.refused:
             tell_all(self._server, "Nothing was saved", saving.message, seconds=REFUSED_SECONDS)

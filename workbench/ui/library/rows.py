@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from workbench.machine.text import number_text
-from workbench.recording.episode.row import LibraryRow
+from workbench.recording.episode.row import LibraryRow, is_stopped
 from workbench.recording.library.jobs import JobStatus
 from workbench.ui.widgets.templates import counted, size
 
@@ -43,7 +43,7 @@ Outcome = Literal["all", "success", "no success", "broken"]
 MEANS: dict[Outcome, str] = {
     "all": "Every recording. An export counts with the recording that it was made of",
     "success": "Success at the last step",
-    "no success": "No success at the last step",
+    "no success": "No success at the last step, also where it was stopped before its end",
     "broken": "Something is wrong with the files",
 }
 HASH = 7
@@ -186,10 +186,7 @@ def _outcome(row: LibraryRow) -> str:
         return ""
     if row.success_once:
         return "once"
-    # By hand, or by --max-steps: it says nothing of what would have come.
-    if row.length is None or row.max_episode_steps is None or row.length >= row.max_episode_steps:
-        return "no"
-    return "stopped"
+    return "stopped" if is_stopped(row.length, row.max_episode_steps) else "no"
 
 
 def _short_date(when: datetime.datetime, now: datetime.datetime) -> str:
