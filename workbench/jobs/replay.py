@@ -79,9 +79,7 @@ def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]
         if options.pop("reconfigure", False):
             missed[i]["reset option reconfigure"] = "the scene is not built again for one env of a batch"
         if run.seed < 0:
-            missed[i]["the seed"] = (
-                "this recording has none, so anything random that the task keeps outside of the bodies is drawn again"
-            )
+            missed[i]["what is random beside the states"] = "the recording has no seed, so it is drawn again"
         seed = [run.seed] if run.seed >= 0 else None
         # One by one: envs that are reset together draw other numbers than each alone.
         with blamed("reset", loaded, task):

@@ -187,3 +187,42 @@ def test_ctrl_c_keeps_what_is_over_and_ends_the_cluster(tmp_path: Path, ray_fold
     assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])
     _, alive = psutil.wait_procs(family, timeout=20)
     assert not alive
+
+
+def named(process: psutil.Process) -> str:
+    try:
+        return process.name()
+    except psutil.NoSuchProcess:
+        return ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("daemon", ["raylet", "gcs_server"])
+def test_a_cluster_that_dies_ends_the_command_with_a_sentence_and_keeps_what_is_recorded(
+    daemon: str, tmp_path: Path, ray_folder: str
+) -> None:
+    out = tmp_path / "out"
+    command = (
+        *("-m", "workbench.cli.main", "record", "PushCube-v1", "--episodes", "5000", "--no-pictures"),
+        *("--env", "render_backend=none", "--envs-per-worker", "2", "--workers", "1", "--cluster", "local"),
+        *("--out", str(out), "--job", str(tmp_path / "the.job")),
+    )
+    started = subprocess.Popen(
+        [sys.executable, *command],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        env={**os.environ, "RAY_TMPDIR": ray_folder},
+    )
+    until(lambda: started.poll() is not None or any(out.glob("*.json")), "an episode", 120)
+    family = psutil.Process(started.pid).children(recursive=True)
+    (victim,) = [process for process in family if named(process) == daemon]
+    victim.kill()
+    _, said = started.communicate(timeout=55)  # after 60 s Ray would end it from native code
+    assert started.returncode == 1 and "Traceback" not in said and "core_worker" not in said, said
+    assert "Ray" in said and "--job" in said, said
+    kept = [path.stem for path in out.glob("*.json")]
+    assert kept and all((out / f"{stem}{suffix}").exists() for stem in kept for suffix in (".rrd", ".h5"))
+    # Its agents look for it a while.
+    _, alive = psutil.wait_procs(family, timeout=100)
+    assert not alive

@@ -14,10 +14,10 @@ from workbench.ui.library.rows import (
     COLUMNS,
     SECOND_LINE,
     Column,
+    Running,
     cells,
     chosen,
     in_words,
-    newest_sources,
     none_like_that,
     ordered,
 )
@@ -113,23 +113,25 @@ def test_no_row_is_lost_by_sorting(facts: list[dict[str, Any]], column: Column, 
     rows = [row(str(k), **values) for k, values in enumerate(facts)]
     assert sorted(ids(ordered(rows, column, descending))) == sorted(ids(rows))
     for one in rows:
-        cells(one, newest_sources(rows), NOW)
+        cells(one, Running(one.task, "aa"), NOW)
 
 
-def test_another_version_of_the_source_than_the_newest_recordings_is_marked() -> None:
+def test_another_version_of_the_source_than_the_open_tasks_is_marked() -> None:
     rows = [
         row("a", source_hash="old0123456789", written=1.0),
-        row("b", source_hash="new", written=2.0),
-        row("c", source_hash="older", written=0.5, task="Pick-v1"),
-        row("d"),
+        row("b", source_hash="of a bug, and newest", written=3.0),
+        row("c", source_hash="as it is now", written=2.0),
+        row("d", source_hash="older", written=0.5, task="Pick-v1"),
+        row("e"),
     ]
-    said = [cells(one, newest_sources(rows), NOW) for one in rows]
-    assert [one["other_version"] for one in said] == [True, False, False, False]
-    assert [one["version"] for one in said] == ["old0123", "new", "older", ""]
+    said = [cells(one, Running(rows[0].task, "as it is now"), NOW) for one in rows]
+    assert [one["other_version"] for one in said] == [True, True, False, False, False]
+    assert [one["version"] for one in said] == ["old0123", "of a bu", "as it i", "older", ""]
+    assert not any(cells(one, None, NOW)["other_version"] for one in rows)
 
 
 def test_cells_say_what_there_is_and_nothing_where_nothing_is_known() -> None:
-    said = [cells(one, {}, NOW) for one in ROWS]
+    said = [cells(one, None, NOW) for one in ROWS]
     assert [one["outcome"] for one in said] == ["success", "once", "fail", "no", ""]
     assert said[0]["total"] == "1"
     assert [said[4][name] for name in ("task", "date", "when", "total", "remark")] == ["?", "", "", "", ""]
@@ -146,7 +148,7 @@ def test_cells_say_what_there_is_and_nothing_where_nothing_is_known() -> None:
     ],
 )
 def test_an_episode_that_was_cut_off_is_not_said_to_have_failed(facts: dict[str, Any], said: str) -> None:
-    assert cells(row("a", success=False, **facts), {}, NOW)["outcome"] == said
+    assert cells(row("a", success=False, **facts), None, NOW)["outcome"] == said
 
 
 @pytest.mark.parametrize(
@@ -158,7 +160,7 @@ def test_an_episode_that_was_cut_off_is_not_said_to_have_failed(facts: dict[str,
     ],
 )
 def test_dates_are_as_long_as_they_must_be(written: datetime.datetime, said: str) -> None:
-    assert cells(row("a", written=written.timestamp()), {}, NOW)["date"] == said
+    assert cells(row("a", written=written.timestamp()), None, NOW)["date"] == said
 
 
 def test_files_of_several_trajectories_are_counted_once() -> None:
@@ -178,7 +180,7 @@ def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted(
     kept = clean_facts(row("n", total_reward=float("nan")))
     lost = row("n", total_reward=kept.total_reward)
     assert kept == clean_facts(replace(kept, total_reward=float("nan")))
-    assert cells(lost, {}, NOW)["total"] == "NaN"
+    assert cells(lost, None, NOW)["total"] == "NaN"
     assert {ids(ordered((*ROWS[:2], lost), "return", down))[-1] for down in (True, False)} == {"n"}
 
 

@@ -39,7 +39,10 @@ def exit_after(error: BaseException, kept: str = EPISODES_KEPT) -> int:
     if isinstance(error, TaskError):
         print_problem(error.problem)
         return Exit.FAILED
-    return interrupted(kept) if isinstance(error, KeyboardInterrupt) else refuse(str(error))
+    if isinstance(error, KeyboardInterrupt):
+        return interrupted(kept)
+    refused = refuse(str(error))
+    return Exit.FAILED if isinstance(error, PoolError) else refused
 
 
 def require_job(arguments: JobArguments) -> None:

@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from typing import Any
 import psutil
 
 from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
-from workbench.jobs.pool.connect import AUTO, BREAKPOINT, NoCluster, connected
+from workbench.jobs.pool.connect import AUTO, BREAKPOINT, ClusterLost, NoCluster, Pulse, connected
 from workbench.jobs.pool.deal import NO_LIMIT, Chunk, Deal, PoolError, Result, Setup, Update, Work
 from workbench.jobs.pool.travel import Baggage, pack_baggage, relocated
 from workbench.jobs.pool.worker import MESSAGES, Asks, Listener, Message, WorkerQueue, work_on
@@ -33,6 +34,8 @@ from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
 from workbench.machine.versions import package_versions
 
 _LOOK_SECONDS = 0.1
+_ANSWER_SECONDS = 1.0
+"""How long to wait for the post before the cluster is looked at: of one that ended no answer comes."""
 _SAY_SECONDS = 1.0
 """How often a worker says what it has made: the post takes some thousand messages a second from all of them."""
 _END_SECONDS = 120.0
@@ -64,16 +67,25 @@ class Cluster:
 
         Raises:
             NoCluster: as `connected`; or the cluster has no room for a worker.
-            PoolError: a machine has other versions of the packages; or as `Executor.run`.
+            PoolError: a machine has other versions of the packages; the cluster ended; or as `Executor.run`.
             TooMuch: as `pack_baggage`.
         """
         baggage = pack_baggage(work.folders, work.files)
         with connected(self.address) as ray:
-            pool = _ActorPool(ray, self, work, deal, baggage)
             try:
-                pool.serve()
-            finally:
-                pool.end()
+                with closing(Pulse()) as pulse:
+                    pool = _ActorPool(ray, self, work, deal, baggage, pulse)
+                    try:
+                        pool.serve()
+                    finally:
+                        pool.end()
+            except (ray.exceptions.RayError, ClusterLost) as error:
+                # The text of Ray's is a traceback of its own.
+                why = str(error) if isinstance(error, ClusterLost) else f"Ray raised {type(error).__name__}"
+                raise PoolError(
+                    f"the Ray cluster ended before the job: {why}. What is done is kept. Start the cluster again, and then "
+                    "this command; a job with --job FILE goes on after what is done"
+                ) from error
 
 
 def versions_here() -> dict[str, str]:
@@ -107,8 +119,9 @@ class _ActorPool:
         work: Work[Any, Any, Any],
         deal: Deal[Any, Any],
         baggage: Baggage,
+        pulse: Pulse,
     ) -> None:
-        self._ray, self._how, self._work, self._deal = ray, how, work, deal
+        self._ray, self._how, self._work, self._deal, self._pulse = ray, how, work, deal, pulse
         self._listener = Listener("a worker", work, deal, how.on_death)
         self._read = Unpacker(MESSAGES).message
         self._post = ray.remote(num_cpus=0)(Post).remote()
@@ -128,6 +141,7 @@ class _ActorPool:
         sent_limit, stopped = self._deal.limit(), 0.0
         failure: TaskError | PoolError | None = None
         while self._busy:
+            self._pulse.check()
             if (limit := self._deal.limit()) != sent_limit:
                 sent_limit = limit
                 self._post.set_limit.remote(limit)
@@ -135,7 +149,7 @@ class _ActorPool:
                 stopped = stopped or time.monotonic()
                 if time.monotonic() - stopped > _END_SECONDS:
                     raise failure or PoolError(f"a worker {self._work.name} did not end in time")
-            for number, raw in self._ray.get(self._post.take.remote(_LOOK_SECONDS)):
+            for number, raw in self._said(_LOOK_SECONDS):
                 failure = self._guarded(
                     number, failure, lambda raw=raw, number=number: self._take(number, raw)
                 )
@@ -155,6 +169,13 @@ class _ActorPool:
         for actor in (*self._busy.values(), *self._ending):
             self._ray.kill(actor.handle)
         self._ray.kill(self._post)
+
+    def _said(self, seconds: float) -> list[tuple[int, bytes]]:
+        """What the workers have said, as of `Post.take`. Raises ClusterLost."""
+        said = self._post.take.remote(seconds)
+        while not self._ray.wait([said], timeout=_ANSWER_SECONDS)[0]:
+            self._pulse.check()
+        return self._ray.get(said)
 
     def _reap(self) -> None:
         """End the actors that have put their folders away: as long as they live they keep their cores."""
@@ -230,7 +251,7 @@ class _ActorPool:
         Raises:
             TaskError, PoolError: the job is over.
         """
-        for one, raw in self._ray.get(self._post.take.remote(0.0)):
+        for one, raw in self._said(0.0):
             self._take(one, raw)
         actor = self._busy.get(number)
         if actor is None:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import os
 import secrets
+import select
 import socket
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -16,12 +18,57 @@ AUTO, LOCAL = "auto", "local"
 BREAKPOINT = "PYTHONBREAKPOINT"
 """Ray writes it, for its workers and whoever connects."""
 _DEAF_SECONDS = 5.0
+_PROBE_SECONDS = 2.0
+_GONE_SECONDS = 20.0
+"""For which the head may refuse connections: it may be restarted. After 60 s Ray ends this process by itself."""
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
 _AUTH_MODE = "RAY_AUTH_MODE"
 
 
 class NoCluster(OSError):
     """There is no such cluster, or it cannot run a worker; the text says what to do."""
+
+
+class ClusterLost(OSError):
+    """The cluster ended while it was used; the text says what of it."""
+
+
+class Pulse:
+    """Notices that the daemons of the cluster that is connected to are gone.
+
+    Ray itself goes on for seconds, then ends this process from native code, without an exception.
+    """
+
+    def __init__(self) -> None:
+        from ray._private.worker import _global_node
+
+        self._raylet: socket.socket | None = None
+        self._head = ""
+        self._probed_at = self._answered_at = time.monotonic()
+        if _global_node is None:  # a ray:// address: its own errors tell
+            return
+        self._head = _global_node.gcs_address
+        self._raylet = socket.socket(socket.AF_UNIX)
+        self._raylet.connect(_global_node.raylet_socket_name)
+
+    def check(self) -> None:
+        """Raise ClusterLost if they are gone. Takes microseconds, and a connection now and then."""
+        # It says nothing to a connection that says nothing: readable means closed.
+        if self._raylet is not None and select.select([self._raylet], (), (), 0)[0]:
+            raise ClusterLost("Ray's daemon of this machine (raylet) has ended")
+        now = time.monotonic()
+        if not self._head or now - self._probed_at < _PROBE_SECONDS:
+            return
+        self._probed_at = now
+        why = _why_deaf(self._head)
+        if why is None:
+            self._answered_at = now
+        elif now - self._answered_at > _GONE_SECONDS:
+            raise ClusterLost(f"the head of the cluster, {self._head}, does not answer any more ({why})")
+
+    def close(self) -> None:
+        if self._raylet is not None:
+            self._raylet.close()
 
 
 @contextmanager

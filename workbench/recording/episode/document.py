@@ -223,6 +223,8 @@ class EpisodeJson(Struct, frozen=True):
     reset_kwargs: ResetJson | None = None
     success: bool | list[bool] | None = None
     fail: bool | list[bool] | None = None
+    workbench_id: Name | None = None
+    """Of the recording that it was exported from."""
 
     @property
     def seed(self) -> int | None:

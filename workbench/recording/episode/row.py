@@ -61,6 +61,8 @@ class Facts:
     """Which recording of a file with several (ManiSkill's), or of a LeRobot dataset."""
     uid: str = ""
     """The recording's own id; empty if it has none."""
+    copy_of: str = ""
+    """Id of the recording that it was exported from; empty if unknown, and for what was recorded."""
     written: float | None = None
     """Unix seconds."""
     seed: int | None = None
@@ -122,12 +124,19 @@ class LibraryRow(Facts):
         return None if written is None else datetime.datetime.fromtimestamp(written, datetime.timezone.utc)
 
 
+def is_stopped(length: int | None, max_episode_steps: int | None) -> bool:
+    """Whether an episode without success was ended before the task's time limit: what would have come is unknown."""
+    return length is not None and max_episode_steps is not None and length < max_episode_steps
+
+
 def clean_facts(facts: Facts) -> Facts:
     """`facts` with valid types and bounded lengths: they come from a confined reader or from an older index."""
-    texts = ("task", "uid", "control_mode", "acted_by", "source_hash")
-    wholes = ("seed", "env_index", "length")
+    texts = ("task", "uid", "copy_of", "control_mode", "acted_by", "source_hash")
+    wholes = ("env_index", "length")
+    seed = integer(facts.seed)
     return replace(
         facts,
+        seed=None if seed is None or seed < 0 else seed,  # written for an unknown one
         **{name: clean_text(getattr(facts, name)) for name in texts},
         **{name: integer(getattr(facts, name)) for name in wholes},
         trajectory=None if facts.trajectory is None else clean_text(facts.trajectory),

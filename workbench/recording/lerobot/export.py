@@ -126,7 +126,12 @@ class _Films:
     def add(self, frames: Frames, camera: str) -> tuple[dict[str, Any], form.Stats]:
         """Append an episode; returns its fields in ``meta/episodes`` and its statistics."""
         sampled, samples = set(form.sampled(len(frames.states)).tolist()), []
-        if self._film is not None and self._path.stat().st_size >= form.VIDEO_MB * 2**20:
+        # ffmpeg makes the file when it has some frames.
+        if (
+            self._film is not None
+            and self._path.exists()
+            and self._path.stat().st_size >= form.VIDEO_MB * 2**20
+        ):
             self.close()
             self._chunk, self._file = form.next_file(self._chunk, self._file)
         begin = 0 if self._film is None else len(self._film)

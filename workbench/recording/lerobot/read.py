@@ -48,12 +48,13 @@ def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
         rows = []
         for entry in _entries(folder):
             index = int(entry["episode_index"])
-            seed = ours[index].get("seed") if 0 <= index < len(ours) else None
+            of = ours[index] if 0 <= index < len(ours) else {}
             facts = Facts(
                 "lerobot",
                 task=clean_text(_task(entry)),
                 trajectory=str(index),
-                seed=integer(seed),
+                copy_of=clean_text(of.get("id")),
+                seed=integer(of.get("seed")),
                 length=int(entry["length"]),
                 total_reward=None if totals is None else totals.get(index, 0.0),
                 success=None if successes is None else successes.get(index, 0.0) > 0,

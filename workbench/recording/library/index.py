@@ -21,7 +21,7 @@ from workbench.recording.reader.scan import RecordingFiles
 
 log = logging.getLogger(__name__)
 
-VERSION = 5
+VERSION = 6
 """Increase it when the content or the format of rows changes; each version has its own file."""
 LOCKED_SECONDS = 3.0
 MOST_INDICES = 200

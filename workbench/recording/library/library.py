@@ -109,11 +109,16 @@ class Library:
         return self._by_id.get(id)
 
     def thumbnails(self, ids: Sequence[str]) -> dict[str, bytes]:
-        """JPEGs by id; recordings without one are left out."""
+        """JPEGs by id; recordings without one are left out. An export without pictures has that of its recording."""
         by_id, index = self._by_id, self._index
-        rows = [by_id[id] for id in ids if id in by_id]
-        jpegs = {} if index is None else index.thumbnails([row.place for row in rows])
-        return {row.id: jpegs[row.place] for row in rows if row.place in jpegs}
+        wanted = {id: [by_id[id], by_id.get(by_id[id].copy_of)] for id in ids if id in by_id}
+        places = [row.place for rows in wanted.values() for row in rows if row is not None]
+        jpegs = {} if index is None else index.thumbnails(places)
+        found = {
+            id: next((jpegs[row.place] for row in rows if row is not None and row.place in jpegs), None)
+            for id, rows in wanted.items()
+        }
+        return {id: jpeg for id, jpeg in found.items() if jpeg is not None}
 
     # --- keeping up with the folder ------------------------------------------------------------------
 

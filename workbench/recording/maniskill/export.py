@@ -19,6 +19,8 @@ from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.maniskill.sensors import missing_pictures, observed_pictures, put_pictures
 from workbench.recording.maniskill.write import maniskill_json, put_columns
 
+WORKBENCH_ID = "workbench_id"
+"""Key of an episode in the ``.json``: the id of its recording."""
 _FLAT = "state"
 """The observation mode in which ManiSkill gives one vector."""
 
@@ -117,7 +119,8 @@ def export_maniskill(
                     made.incomplete.append(
                         f"{name}: its observations had more than its recording keeps: {missing}."
                     )
-                document["episodes"].append({**entry["episodes"][0], "episode_id": made.episodes})
+                numbered = {"episode_id": made.episodes, WORKBENCH_ID: episode.info.id}
+                document["episodes"].append({**entry["episodes"][0], **numbered})
                 made.episodes, made.steps = made.episodes + 1, made.steps + episode.length
         if document is None:
             raise ValueError("\n".join(made.not_fitting) or "There is no episode to write.")

@@ -124,13 +124,12 @@ def _workbench_entry(found: RecordingFiles, document: Document) -> LibraryEntry:
 
 def _episode(kind: RecordingKind, data: dict[str, Any], if_undated: float) -> Facts:
     """Facts of a workbench episode; its ``.json`` and ``.rrd`` use the same names."""
-    seed = integer(data.get("seed"))
     return Facts(
         kind,
         task=clean_text(data.get("task")),
         uid=clean_text(data.get("id"), 64),
         written=unix_seconds(data.get("written_at")) or if_undated,
-        seed=None if seed is None or seed < 0 else seed,
+        seed=integer(data.get("seed")),
         env_index=integer(data.get("env_index")),
         length=integer(data.get("length")),
         max_episode_steps=integer(data.get("max_episode_steps")),
@@ -207,6 +206,7 @@ def _maniskill_entries(
             "maniskill",
             task=task,
             trajectory=trajectory,
+            copy_of=one.workbench_id or "",
             written=written,
             seed=one.seed,
             length=integer(one.elapsed_steps),

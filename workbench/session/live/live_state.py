@@ -459,7 +459,7 @@ class LiveState:
         )
         if not episodes:
             env, why = next(iter(found.items()))
-            return f"nothing was kept of env {env}: {why}"
+            return f"nothing was saved of env {env}: {why}"
         return SaveRequest(self.now.task, load, placed, episodes)
 
     def _version_of(self, serial: int) -> TaskDescription | None:

@@ -304,6 +304,7 @@ class Session:
         if task is None:
             return
         envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
+        self.past_saver.drop_message()
         self._recorder.start(task, envs, one_each=next_episode)
         self._send(SetCapture(envs, from_reset=True))
         if not next_episode:
@@ -512,6 +513,7 @@ class Session:
             self.versions.stepped(event)
             planned = self._state.now.settings.action_source == "solve"
         self.solver.stepped(event, planned)
+        self.past_saver.time_passes()
         self._recorder.take(event)
 
     def _on_plan_wanted(self, event: PlanWanted) -> None:

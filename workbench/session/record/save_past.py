@@ -29,6 +29,8 @@ class SaveStatus:
     """Result of the last job that ended."""
     failed: bool = False
     """`message` is an error."""
+    refused: bool = False
+    """It says why nothing can be saved at the shown moment."""
     progress: JobProgress | None = None
     """In moments; None while no job runs."""
 
@@ -86,11 +88,7 @@ def find_episode(history: History, env: int, serial: int | None, before: bool = 
     if before and isinstance(found, PastEpisode):
         found = _episode_before(history, env, found) or "there is no episode before it in memory"
     if isinstance(found, PastEpisode) and found.steps == 0:
-        return (
-            "the episode before has no step: it was reset at once"
-            if before
-            else "its episode has no step yet"
-        )
+        return "the previous episode has no step: it was reset at once" if before else "it has no step yet"
     return found
 
 
@@ -159,8 +157,18 @@ class PastSaver:
         self._report("stopped; nothing was saved")
 
     def refuse(self, why: str) -> None:
-        """Report why nothing can be recorded."""
-        self._report(why, failed=True)
+        """Report why nothing can be recorded, until `time_passes`."""
+        self._status = SaveStatus(why, failed=True, refused=True)
+        self._on_change()
+
+    def time_passes(self) -> None:
+        """Drop a refusal: it was of that moment."""
+        if self._status.refused:
+            self._status = SaveStatus()
+
+    def drop_message(self) -> None:
+        """Drop the result of the last job: another recording begins."""
+        self._status = SaveStatus()
 
     def status(self) -> SaveStatus:
         return replace(self._status, progress=self._job_lane.progress)
@@ -270,12 +278,8 @@ def _unfinished_text(count: int, kept: int) -> str:
 def _lost_seed_text(count: int, kept: int) -> str:
     if not count:
         return ""
-    what = "it" if kept == 1 else "they" if count == kept else f"{count} of them"
-    one = count == 1
-    return (
-        f"; {what} {'comes' if one else 'come'} from a reset of several envs, so {'it has' if one else 'they have'} no seed and "
-        f"{'replays from its' if one else 'replay from their'} first state"
-    )
+    what = "" if count == kept else f"{count} "
+    return f"; {what}without a seed (the start came from a reset of many envs): replayed from the first state"
 
 
 def _earlier_text(count: int, kept: int) -> str:

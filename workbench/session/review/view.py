@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraInfo, CameraKey, Picture, PictureDegree
 from workbench.recording.episode.episode import CameraTrack, Episode
+from workbench.recording.episode.row import is_stopped
 from workbench.recording.reader.processes import ReaderBusy
 from workbench.session.history.curves import PREFIX
 from workbench.session.protocol.messages import CameraRequest
@@ -195,8 +196,11 @@ def outcome_text(episode: Episode) -> tuple[str, str]:
         return "no success defined", ""
     if success[-1]:
         return "success", "good"
-    once = np.flatnonzero(success)
-    return (f"success lost (it was there at step {once[0]})", "warn") if len(once) else ("no success", "bad")
+    if len(once := np.flatnonzero(success)):
+        return f"success lost (it was there at step {once[0]})", "warn"
+    if is_stopped(episode.length, episode.info.max_episode_steps):
+        return "stopped, no success yet", ""
+    return "no success", "bad"
 
 
 def _lines(name: str, values: NDArray, states: NDArray) -> Iterator[tuple[str, tuple[NDArray, NDArray]]]:

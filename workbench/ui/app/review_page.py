@@ -20,6 +20,7 @@ from workbench.ui.app.go_live import GoLivePart
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.library.listing import Action
 from workbench.ui.library.panel import LibraryPanel
+from workbench.ui.library.rows import Running
 from workbench.ui.live.timeline import (
     LAST_EVENT,
     LAST_STEP,
@@ -153,12 +154,17 @@ class ReviewPage:
             self._view_panel = ViewPanel(server, dark)
         return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
 
+    def _running(self) -> Running | None:
+        session = self._place.session
+        task = None if session is None else session.view().task
+        return None if task is None else Running(task.env_id, task.source_hash)
+
     def _add_library(self, library: Library) -> None:
         """The table of recordings, in a panel of its own."""
         self._library_window = self._server.gui.add_panel(order=5.0)
         self._sweep = self._sweep_of(library)
         with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
-            self._library = LibraryPanel(self._server, library, self._review.open, clock=self._clock)
+            self._library = LibraryPanel(self._server, library, self._review.open, self._clock, self._running)
             Presses(self._server).when_unfolded(self._library_unfolded)
         self._library.add_action(
             Action(

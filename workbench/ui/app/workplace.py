@@ -27,6 +27,7 @@ from workbench.session.tasks.registered import RegisteredTasks
 from workbench.ui.app import help_pages
 from workbench.ui.app.go_live import GoLive, MakeSession
 from workbench.ui.app.open_task import Choices, OpenTask
+from workbench.ui.app.recording_problems import RecordingProblems
 from workbench.ui.app.review_page import ReviewPage
 from workbench.ui.app.start_page import StartPage
 from workbench.ui.app.trust_dialog import TrustDialog
@@ -111,6 +112,7 @@ class Workplace:
         gated_server.add_route(help_pages.ADDRESS, help_pages.reply, help_pages.HEADERS)
         self.stage = Stage(self.server)
         self.pages = Pages(self.server, self.stage, self._page)
+        self._problems = RecordingProblems(self.server, lambda: self.session, on_notice)
         if choices is None:
             open_session = lambda task, options, kept: make_session(task, options)  # noqa: E731
             choices = Choices(RecentTasks(), open_session, base)
@@ -168,6 +170,7 @@ class Workplace:
     def close(self) -> None:
         """Stop the pages and their readers, and close the open session. The caller closes the server."""
         self.pages.stop()
+        self._problems.close()
         self.open_task.close()
         with self._lock:
             if self._shelf is not None:

@@ -22,11 +22,12 @@ from workbench.ui.library.rows import (
     MEANS,
     SECOND_LINE,
     Column,
+    Running,
     cells,
     chosen,
+    count_recordings,
     has_outcome,
     job_text,
-    newest_sources,
     none_like_that,
 )
 from workbench.ui.widgets.click_targets import Presses
@@ -65,8 +66,9 @@ class LibraryPanel(PagePart[object]):
         library: Library,
         on_open: Callable[[tuple[str, ...]], None],
         clock: Clock = time.monotonic,
+        running: Callable[[], Running | None] = lambda: None,
     ) -> None:
-        self._server, self._library = server, library
+        self._server, self._library, self._running = server, library, running
         self._folder = os.fsencode(library.folder).decode(errors="replace")
         self._list = LibraryList(library)
         self._edits = LibraryEdits(server, library, self.leave_keys)
@@ -207,7 +209,7 @@ class LibraryPanel(PagePart[object]):
         with self._lock, self._list.lock:
             self._find.show(self._list.words)
             self._draw_jobs(view)
-            wanted = (view.serial, self._list.state(), len(self._actions))
+            wanted = (view.serial, self._list.state(), len(self._actions), self._running())
             if wanted == self._drawn:
                 return
             self._drawn = wanted
@@ -248,7 +250,10 @@ class LibraryPanel(PagePart[object]):
         self._tasks.visible = len(tasks) > 1
         self._find.handle.visible = bool(view.rows)
         others = chosen(view.rows, listed.words, "all", listed.task)
-        counts = {outcome: sum(has_outcome(row, outcome) for row in others) for outcome in MEANS}
+        counts = {
+            outcome: count_recordings(row for row in others if has_outcome(row, outcome)) for outcome in MEANS
+        }
+        everything = count_recordings(view.rows)
         self._filters.content = render(
             "library_filters",
             view=view,
@@ -256,8 +261,8 @@ class LibraryPanel(PagePart[object]):
                 {
                     "name": outcome,
                     "hint": means,
-                    "count": f"{len(others)} of {len(view.rows)}"
-                    if outcome == "all" and len(others) < len(view.rows)
+                    "count": f"{counts['all']} of {everything}"
+                    if outcome == "all" and counts["all"] < everything
                     else counts[outcome],
                     "on": outcome == listed.outcome,
                     "press": self._press(
@@ -273,11 +278,10 @@ class LibraryPanel(PagePart[object]):
 
     def _draw_table(self, view: LibraryView, page: Sequence[LibraryRow]) -> None:
         now = datetime.datetime.now().astimezone()
-        newest = newest_sources(view.rows)
-        here = {row.task: newest.get(row.task) for row in page}
+        running = self._running()
         wanted = (
             page,
-            here,
+            running,
             bool(view.rows),
             self._none_so(view),
             self._list.column,
@@ -300,7 +304,7 @@ class LibraryPanel(PagePart[object]):
                 {
                     "number": self._number(row.id),
                     "of": row,
-                    "cells": cells(row, newest, now),
+                    "cells": cells(row, running, now),
                     "picture": address_of_jpeg(pictures[row.id]) if row.id in pictures else "",
                 }
                 for row in page

@@ -5,10 +5,11 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from workbench.machine.text import number_text
-from workbench.recording.episode.row import LibraryRow
+from workbench.recording.episode.row import LibraryRow, is_stopped
 from workbench.recording.library.jobs import JobStatus
 from workbench.ui.widgets.templates import counted, size
 
@@ -23,16 +24,26 @@ HINTS: dict[Column, str] = {
     "steps": "Control steps",
     "return": "Sum of the rewards",
     "success": "At the last step; 'once' if only at an earlier step, 'stopped' if it was cut off before its end",
-    "version": "Hash of the task's source; orange where it differs from the newest recording of the task",
+    "version": "Hash of the task's source; orange where the open task runs another one",
     "tags": "Tags",
     "note": "Note",
     "name": "Name of its files",
 }
+
+
+@dataclass(frozen=True)
+class Running:
+    """The version of the open task."""
+
+    task: str
+    source_hash: str
+
+
 Outcome = Literal["all", "success", "no success", "broken"]
 MEANS: dict[Outcome, str] = {
-    "all": "Every recording",
+    "all": "Every recording. An export counts with the recording that it was made of",
     "success": "Success at the last step",
-    "no success": "No success at the last step",
+    "no success": "No success at the last step, also where it was stopped before its end",
     "broken": "Something is wrong with the files",
 }
 HASH = 7
@@ -40,13 +51,9 @@ HASH = 7
 _DESCENDING_FIRST: tuple[Column, ...] = ("date", "steps", "return", "success")
 
 
-def newest_sources(rows: Iterable[LibraryRow]) -> dict[str, str]:
-    """Source hash of the newest recording of each task that has one."""
-    newest: dict[str, tuple[float, str]] = {}
-    for row in rows:
-        if row.source_hash and row.written is not None:
-            newest[row.task] = max(newest.get(row.task, (-1.0, "")), (row.written, row.source_hash))
-    return {task: source for task, (_, source) in newest.items()}
+def count_recordings(rows: Iterable[LibraryRow]) -> int:
+    """How many recordings these rows are: an export or a copy counts with the one that it was made of."""
+    return len({row.copy_of or row.uid or row.id for row in rows})
 
 
 def has_outcome(row: LibraryRow, outcome: Outcome) -> bool:
@@ -134,11 +141,11 @@ def _key(row: LibraryRow, column: Column) -> float | str | None:
     return text.lower() or None
 
 
-def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> dict[str, Any]:
+def cells(row: LibraryRow, running: Running | None, now: datetime.datetime) -> dict[str, Any]:
     """The texts of a row's cells.
 
     Args:
-        newest: of `newest_sources`.
+        running: None if no task is open.
         now: in the time zone of the shown dates.
     """
     when = None if row.date is None else row.date.astimezone(now.tzinfo)
@@ -152,7 +159,10 @@ def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> di
         "total": "" if row.total_reward is None else number_text(row.total_reward),
         "outcome": _outcome(row),
         "version": row.source_hash[:HASH],
-        "other_version": bool(row.source_hash) and newest.get(row.task, row.source_hash) != row.source_hash,
+        "other_version": running is not None
+        and bool(row.source_hash)
+        and row.task == running.task
+        and row.source_hash != running.source_hash,
         "about": ", ".join(part for part in about if part),
         "remark": _remark(row),
     }
@@ -163,7 +173,8 @@ def _remark(row: LibraryRow) -> str:
         return "cut short"
     if row.kind == "workbench" or row.problem:
         return ""
-    return {"maniskill": "ManiSkill", "rrd only": ".rrd only", "lerobot": "LeRobot"}.get(row.kind, row.kind)
+    kind = {"maniskill": "ManiSkill", "rrd only": ".rrd only", "lerobot": "LeRobot"}.get(row.kind, row.kind)
+    return f"{kind} export" if row.copy_of else kind
 
 
 def _outcome(row: LibraryRow) -> str:
@@ -175,10 +186,7 @@ def _outcome(row: LibraryRow) -> str:
         return ""
     if row.success_once:
         return "once"
-    # By hand, or by --max-steps: it says nothing of what would have come.
-    if row.length is None or row.max_episode_steps is None or row.length >= row.max_episode_steps:
-        return "no"
-    return "stopped"
+    return "stopped" if is_stopped(row.length, row.max_episode_steps) else "no"
 
 
 def _short_date(when: datetime.datetime, now: datetime.datetime) -> str:

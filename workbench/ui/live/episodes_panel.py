@@ -132,12 +132,13 @@ def what_saving_means(view: SessionView, all_envs: bool) -> str:
     if steps is None or view.task is None:
         return ""
     if view.timeline.shown is not None:
-        return f"{SAVE} saves the whole episode around the shown moment."
-    count = f"{counted(steps, 'step')} so far"
-    if all_envs and view.task.num_envs > 1:
-        return f"{SAVE} saves the running episodes, ended or not (env {view.selected_env}: {count})."
-    which = "episode" if view.task.num_envs == 1 else f"episode of env {view.selected_env}"
-    return f"{SAVE} saves the running {which}: {count}, not ended."
+        return f"{SAVE}: the whole episode around the shown moment."
+    count = counted(steps, "step")
+    if view.task.num_envs == 1:
+        return f"{SAVE}: this episode, {count}."
+    if all_envs:
+        return f"{SAVE}: all envs, their running episodes (env {view.selected_env}: {count})."
+    return f"{SAVE}: env {view.selected_env}, this episode, {count}."
 
 
 def recording_html(recording: RecordingStatus) -> str:

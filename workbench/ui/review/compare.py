@@ -5,6 +5,7 @@ from __future__ import annotations
 import viser
 
 from workbench.machine.text import length
+from workbench.recording.episode.episode import NO_SEED
 from workbench.session.history.curves import PREFIX
 from workbench.session.review.compare import (
     TOLERANCES,
@@ -130,8 +131,10 @@ def notes(a: Opened, b: Opened, found: Difference) -> list[str]:
     said = []
     if a.episode.info.task != b.episode.info.task:
         said.append("They are from different tasks.")
+    elif without := [name for name, one in (("A", a), ("B", b)) if one.episode.info.seed <= NO_SEED]:
+        said.append(f"{' and '.join(without)} {'has' if len(without) == 1 else 'have'} no seed.")
     elif not found.same_seed:
-        said.append("They have different seeds, so they differ from the start.")
+        said.append("They have different seeds.")
     if a.length != b.length:
         said.append(f"{a.length} and {b.length} steps; {found.compared} states are compared.")
     of_batch = dict.fromkeys(name for each in (a, b) for name in (*each.episode.batch, *each.episode.texts))

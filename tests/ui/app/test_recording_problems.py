@@ -1,0 +1,63 @@
+"""What could not be recorded is told on whichever page is open, and in the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import websockets.sync.client
+
+from tests.drive.scripted import scripted
+from tests.drive.session import wait_until
+from tests.drive.waiting import until
+from tests.ui.tabs import camera_message, handshake, messages_in
+from workbench.jobs.task import TaskOptions
+from workbench.session.live.session import Session
+from workbench.ui.app.workplace import Which, Workplace
+from workbench.ui.server.gated_server import GatedServer
+
+
+@pytest.mark.usefixtures("child_process")
+@pytest.mark.parametrize("page", ["live", "review"])
+def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServer) -> None:
+    folder = tmp_path / "no folder"
+    folder.write_text("a file")
+    told: list[str] = []
+    session = Session(
+        str(tmp_path / "push.py"), TaskOptions(num_envs=2), recordings=folder, make_worker=scripted(2)
+    )
+    wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
+
+    def no_other(*_: object) -> Session:
+        raise AssertionError("no other task is opened")
+
+    place = Workplace(gated_server, folder, no_other, TaskOptions(), session, on_notice=told.append)
+    place.open_task.catalogue.registered.close()
+    place.pages.start(page)
+    address, how = handshake(gated_server.url)
+    with websockets.sync.client.connect(address, **how) as connection:
+        connection.send(camera_message())
+        until(lambda: gated_server.server.get_clients(), "the client")
+
+        def tells(number: int) -> bool:
+            frame = connection.recv(timeout=30)
+            assert isinstance(frame, bytes)
+            texts = [
+                message["props"]["body"]
+                for message in messages_in(frame)
+                if message["type"] == "NotificationShowMessage"
+            ]
+            return any(str(folder) in text for text in texts) and len(told) == number
+
+        for number in (1, 2):
+            session.start_recording()
+            until(lambda number=number: tells(number), "the notice")
+        # What is refused at a moment is told too, and not kept for the moments after it.
+        session.reset()
+        session.save_past(before=True)
+        assert session.view().recording.saving.failed
+        session.step()
+        wait_until(session, lambda view: not view.recording.saving.message, "the message's end")
+    assert len(told) == 2
+    place.close()
+    session.close()
