@@ -31,7 +31,7 @@ def opened(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
 def desk(opened: Desk) -> Desk:
     """Live, eight steps into an episode of seed 0, no input with the focus."""
     opened.leave_inputs()
-    opened.press("End", "r")
+    opened.press("End", "Shift+R")
     opened.comes_to(0)
     for step in range(1, STEPS + 1):
         opened.press("s")
@@ -93,7 +93,7 @@ def test_keys_work_after_a_click_on_a_tab_a_checkbox_or_a_dropdown_but_not_in_a_
     expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
     reward = page.get_by_role("tab", name="Reward")
     reward.click()
-    page.keyboard.press("r")
+    page.keyboard.press("Shift+R")
     desk.comes_to(0)
     page.keyboard.press("s")
     desk.comes_to(1)
@@ -106,7 +106,7 @@ def test_keys_work_after_a_click_on_a_tab_a_checkbox_or_a_dropdown_but_not_in_a_
     page.locator("input[aria-haspopup=listbox]:visible").first.click()
     page.get_by_role("option", name="contacts", exact=True).click()
     page.get_by_role("checkbox").locator("visible=true").first.click()
-    page.keyboard.press("r")
+    page.keyboard.press("Shift+R")
     expect(page.get_by_text("known after the next step")).to_be_visible()
     field = page.locator("input[inputmode]:visible").last
     field.click()
@@ -209,14 +209,14 @@ def test_going_on_from_a_moment_leaves_the_old_future_in_reach(desk: Desk) -> No
     desk.timeline_says("went back")
     assert arcs.count() == before + 1
     desk.leave_inputs()
-    desk.press("u")
+    desk.press("Shift+U")
     desk.comes_to(STEPS)
 
 
 def test_a_reset_is_undone_by_a_key(desk: Desk) -> None:
-    desk.page.keyboard.press("r")
+    desk.page.keyboard.press("Shift+R")
     desk.comes_to(0)
-    desk.press("u")
+    desk.press("Shift+U")
     desk.comes_to(STEPS)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from workbench.recording.episode.document import json_text
+from workbench.recording.episode.document import as_json, json_text
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.maniskill.write import maniskill_json, put_columns
@@ -98,7 +98,14 @@ def export_maniskill(
                     document, first = {**entry, "episodes": []}, shape
                 trajectory = written.create_group(f"traj_{made.episodes}", track_order=True)
                 put_columns(_flat(episode), trajectory)
-                document["episodes"].append({**entry["episodes"][0], "episode_id": made.episodes})
+                moved = episode.info.moved_cameras
+                document["episodes"].append(
+                    {
+                        **entry["episodes"][0],
+                        "episode_id": made.episodes,
+                        **({"moved_cameras": as_json(moved)} if moved else {}),
+                    }
+                )
                 made.episodes, made.steps = made.episodes + 1, made.steps + episode.length
         if document is None:
             raise ValueError("\n".join(made.not_fitting) or "There is no episode to write.")

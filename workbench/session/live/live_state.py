@@ -212,6 +212,8 @@ class LiveState:
                 playing=event.playing,
                 steps_per_second=event.steps_per_second,
                 real_time_factor=event.real_time_factor,
+                recorded_share=event.recorded_share,
+                watched_share=event.watched_share,
             )
             if event.activity:
                 self.set(state="loading", activity=event.activity)

@@ -291,18 +291,21 @@ class Session:
         if (before == 0) != (count == 0):
             self._send_settings()
 
-    def start_recording(self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False) -> None:
+    def start_recording(
+        self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False, goes_on: bool = False
+    ) -> None:
         """Reset these envs (all if None) and record them until `stop_recording`.
 
         Args:
             next_episode: do not reset; record only the episode of each env that begins with its next reset.
+            goes_on: as `LiveRecorder.start` has it.
         """
         with self._lock:
             task = self._state.now.task
         if task is None:
             return
         envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
-        self._recorder.start(task, envs, one_each=next_episode)
+        self._recorder.start(task, envs, one_each=next_episode, goes_on=goes_on)
         self._send(SetCapture(envs, from_reset=True))
         if not next_episode:
             self.reset(None if env_idx is None else envs)
@@ -486,13 +489,13 @@ class Session:
     def _continue_recording(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
         """Continue recording these envs after a version came in."""
         if not scene_kept(event):
-            self.start_recording(env_idx, next_episode=one_each)
+            self.start_recording(env_idx, next_episode=one_each, goes_on=True)
         elif not self._recorder.recording:
             # No reset, which would lose the present moment: recording continues with each env's next episode.
             with self._lock:
                 task = self._state.now.task
             if task is not None:
-                self._recorder.start(task, env_idx, one_each)
+                self._recorder.start(task, env_idx, one_each, goes_on=True)
 
     def _on_stepped(self, event: Stepped) -> None:
         with self._lock:

@@ -110,6 +110,9 @@ class SessionView:
     playing: bool = False
     steps_per_second: float = 0.0
     real_time_factor: float = 0.0
+    recorded_share: float = 0.0
+    watched_share: float = 0.0
+    """As `Status` has them."""
     timeline: TimelineView = TimelineView()
     """The history. While one of its moments is shown, `step` and `pictures` are of that moment."""
     busy: Busy | None = None

@@ -425,6 +425,9 @@ class Status:
     """Simulated seconds per wall second; below the chosen speed the machine is the limit."""
     activity: str = ""
     """Long work that delays requests, if any."""
+    recorded_share: float = 0.0
+    watched_share: float = 0.0
+    """0..1 of the time while playing that went into what is recorded with every step, and into pictures for the page."""
 
 
 @dataclass(frozen=True)

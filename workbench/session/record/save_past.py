@@ -192,6 +192,7 @@ class PastSaver:
                         else:
                             seed, task = seeds[episode.env], _as_played(what.task, episode)
                             writer = GatheredEpisode.of(self._folder, task, episode.env, seed)
+                            writer.set_placed({p.key: p.settings for p in what.placed if p.settings})
                             writers[episode.env] = writer
                         writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
 

@@ -85,7 +85,7 @@ from workbench.session.worker.go_back import (
 )
 from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
 from workbench.session.worker.make_scene import SceneEnv, draw_task, registered_ids
-from workbench.session.worker.pacing import Pacer, Rate, throttled
+from workbench.session.worker.pacing import Pacer, Rate, Shares, throttled
 from workbench.session.worker.plans import FollowedPlan, WorkerPlans, envs_to_plan, succeeded
 from workbench.session.worker.reload import Running, load_version
 from workbench.session.worker.step_events import StepEvents
@@ -124,6 +124,7 @@ class Worker:
         self._settings = Settings()
         self._pacer = Pacer(0.05)
         self._rate = Rate()
+        self._shares = Shares()
         self._status_sent = 0.0
         self._rules_sent = 0.0
         self._rules_reported = RulesBroken(())
@@ -165,7 +166,9 @@ class Worker:
                 self._task.run("stepping", partial(self._task.guarded, self._step_once))
             if self._cameras.placing_due:
                 self._task.run("stepping", self._cameras.place_waiting)
+            began = time.monotonic()
             self._cameras.make(may_block=not self._playing)
+            self._shares.add("watched", time.monotonic() - began, time.monotonic())
             self._send_status(time.monotonic())
             if time.monotonic() - self._rules_sent > _STATUS_PERIOD:
                 self._send_rules()
@@ -330,6 +333,7 @@ class Worker:
         self._followed.forget()
         self._pacer.start(time.monotonic())
         self._rate.clear()
+        self._shares.clear(time.monotonic())
         self._send_status(None)
 
     def _reset(self, request: Reset) -> None:
@@ -527,7 +531,10 @@ class Worker:
         if self._steps.pictures_due(step, reset_mask):
             self._cameras.settle()  # the same scene is about to be drawn
         acted_by = "" if restored else self._chooser.name
-        event = self._steps.event(self._task.opened, step, reset_mask, seeds, restored, acted_by, resumed)
+        event = self._steps.event(
+            self._task.opened, step, reset_mask, seeds, restored, acted_by, resumed, self._cameras.placed
+        )
+        self._shares.add("recorded", self._steps.recording_took, time.monotonic())
         self._cameras.scene_changed()
         self._line.send(event)
 
@@ -552,7 +559,8 @@ class Worker:
             return
         self._status_sent = moment
         steps = self._rate.per_second(moment) if self._playing else 0.0
-        self._line.send(Status(self._playing, steps, steps * self._pacer.control_dt, activity))
+        shares = [self._shares.of(what, moment) if self._playing else 0.0 for what in ("recorded", "watched")]
+        self._line.send(Status(self._playing, steps, steps * self._pacer.control_dt, activity, *shares))
 
     def _send_rules(self) -> None:
         """Send the rules that the task breaks, if they changed."""

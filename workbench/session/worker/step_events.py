@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+import time
 
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import Picture
+from workbench.core.camera_data import CameraKey, CameraSettings, Picture
 from workbench.core.cameras.render import recorded_pictures, step_pictures
 from workbench.core.capture.state_columns import read_state_columns
 from workbench.core.env.step_result import StepResult
@@ -31,6 +32,8 @@ class StepEvents:
         self.moment: Snapshot | None = None
         """The batch at the newest event, to restore after a step that was cut short; None if it cannot be copied."""
         self.number = 0
+        self.recording_took = 0.0
+        """Seconds that the newest event took for what is recorded: pictures, states, observations."""
         self._packer: SnapshotPacker | None = SnapshotPacker()
 
     def new_scene(self) -> None:
@@ -65,15 +68,18 @@ class StepEvents:
         restored: Restored | None,
         acted_by: str,
         resumed: bool,
+        placed: dict[CameraKey, CameraSettings],
     ) -> Stepped:
         """The next event; see `Stepped` for the arguments."""
         self.number += 1
         captured: tuple[Picture, ...] = ()
         columns: dict[str, NDArray] = {}
+        began = time.monotonic()
         if self.pictures_due(step, reset_mask):
             columns = self._state_columns(opened)
             wanted = recorded_pictures(opened.description.cameras)
             captured = tuple(step_pictures(opened.env, sorted(self._recording), wanted))
+        self.recording_took = time.monotonic() - began
         packed = self._packed_snapshot(opened)
         return Stepped(
             step,
@@ -87,6 +93,7 @@ class StepEvents:
             restored,
             columns,
             acted_by,
+            placed if columns or captured else {},
             resumed,
         )
 

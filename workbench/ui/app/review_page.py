@@ -100,7 +100,7 @@ class ReviewPage:
             server, place.open_task, lambda asking: self._library.leave_keys(asking), clock
         )
         self._opening.add_button()
-        server.gui.add_html(render("which", which="review", anew=place.wanted is not None))
+        server.gui.add_html(render("which", which="review", anew=place.wanted is not None, says=""))
         place.stage.in_software.ask()
         self._add_way_back()
         review_tab, in_tabs = self._add_tabs(dark)
@@ -395,7 +395,7 @@ class ReviewPage:
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
             Command("Switch between the dark and the light theme", self._view_panel.toggle_dark, "D"),
             Command("Rescore the selected recordings, or the open ones", self._rescore_chosen, "J"),
-            Command("Continue live from here", self._panel.enter_recording, "G", buttons=(GO_LIVE,)),
+            Command("Continue live from here", self._panel.enter_recording, "G", "shift", (GO_LIVE,)),
         ]
         if self._place.session is not None:
             commands.append(Command(BACK, self._go_back, "V", buttons=(BACK,)))

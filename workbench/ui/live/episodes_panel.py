@@ -33,7 +33,7 @@ class RecordPanel(PagePart[SessionView]):
         self._button = server.gui.add_button(
             RECORD,
             icon=viser.Icon.PLAYER_RECORD,
-            hint="Reset and record every episode until it is stopped (C)",
+            hint="Reset and record every episode until it is stopped (Shift+C)",
         )
         self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
         self._next = server.gui.add_button(
@@ -46,7 +46,7 @@ class RecordPanel(PagePart[SessionView]):
             SAVE,
             icon=viser.Icon.HISTORY,
             color="gray",
-            hint="Record after the fact: the episode at the shown moment (shift+C)",
+            hint="Record after the fact: the episode at the shown moment (Shift+K)",
         )
         self._before = server.gui.add_button(
             SAVE_BEFORE,
@@ -144,13 +144,14 @@ def recording_html(recording: RecordingStatus) -> str:
     return render(
         "recording",
         recording=recording,
-        envs=_envs_in_words(recording.env_idx),
+        envs=envs_in_words(recording.env_idx),
         recovered=recovered_text(recording.recovered),
         command=recording.last_file and f"workbench view {shlex.quote(recording.last_file)}",
     )
 
 
-def _envs_in_words(env_idx: tuple[int, ...]) -> str:
-    numbers = ", ".join(str(env) for env in env_idx[:6])
-    more = f" and {len(env_idx) - 6} more" if len(env_idx) > 6 else ""
+def envs_in_words(env_idx: tuple[int, ...], most: int = 6) -> str:
+    """``envs 0, 3 and 5 more``."""
+    numbers = ", ".join(str(env) for env in env_idx[:most])
+    more = f" and {len(env_idx) - most} more" if len(env_idx) > most else ""
     return f"env{'s' if len(env_idx) != 1 else ''} {numbers}{more}"

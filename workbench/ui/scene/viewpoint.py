@@ -234,6 +234,8 @@ class Stage:
         # Callbacks first: a click that comes now has no page to answer it.
         self._server.scene.remove_click_callback("all")
         remove_nodes_but(self._server, (*BODIES, "/lights"))
+        for client in self._server.get_clients().values():
+            remove_nodes_but(client, ())
 
 
 # --- The View panel: all envs or one, detail, dark or light ------------------------------------

@@ -107,7 +107,11 @@ class Presses:
         Args:
             pressed: called with the number that was pressed, below `NUMBERS`, on a thread, in turn.
         """
-        return self._typed(key, lambda sent: pressed(sent % NUMBERS))
+        return self._typed(key, lambda sent, _: pressed(sent % NUMBERS))
+
+    def number_of_page_id(self, key: Hashable, pressed: Callable[[viser.ClientHandle, int], None]) -> str:
+        """As `number_id`; `pressed` gets the page, too."""
+        return self._typed(key, lambda sent, client: pressed(client, sent % NUMBERS))
 
     def place_id(self, key: Hashable, pressed: Callable[[float, float], None]) -> str:
         """The id to put into ``data-place``; the same key always gives the same input.
@@ -116,9 +120,9 @@ class Presses:
             pressed: called with column and row in the picture, (0, 0) at its upper left corner and (1, 1) at its
                 lower right one, on a thread, in turn.
         """
-        return self._typed(key, lambda sent: pressed(*place_of(sent)))
+        return self._typed(key, lambda sent, _: pressed(*place_of(sent)))
 
-    def _typed(self, key: Hashable, take: Callable[[int], None]) -> str:
+    def _typed(self, key: Hashable, take: Callable[[int, viser.ClientHandle], None]) -> str:
         """The id of a hidden number input; `take` gets what is written into it."""
         if key not in self._ids:
             with self._folder:
@@ -129,7 +133,7 @@ class Presses:
                 # Read now, before the next message changes it: a double click on a recording sends three.
                 sent, client = event.target.value, event.client
                 if client is not None:
-                    await in_turn(client, lambda: take(sent))
+                    await in_turn(client, lambda: take(sent, client))
 
             number.on_update(typed)
             self._ids[key] = element_id(number)
