@@ -49,6 +49,17 @@
       type(input, (Date.now() % 89) * 1e8 + place);
     },
 
+    // A place on a timeline's strip, or the event whose mark is pressed.
+    pick(event) {
+      const strip = event.target.closest("[data-pick]");
+      const input = strip && event.button === 0 && document.getElementById(strip.dataset.pick);
+      if (!input) return;
+      const [low, high] = [Number(strip.dataset.low), Number(strip.dataset.high)];
+      const box = strip.getBoundingClientRect();
+      const part = Math.max(0, Math.min(1, (event.clientX - box.left) / box.width));
+      wb.send(input, Number(event.target.closest("[data-at]")?.dataset.at ?? Math.round(low + part * (high - low))) - low);
+    },
+
     copy(event) {
       const from = event.target.closest("[data-copy]");
       if (!from || event.button !== 0) return;

@@ -194,9 +194,10 @@ class Session:
         return replace(view, studio=self.studio.view(view.step, env), solve=self.solver.view(env))
 
     def env_rows(self) -> EnvRows | None:
-        """The table of envs; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
+        """The table of envs at the shown moment; None before a task is loaded. Copies some 100 kB for 256 envs: not for
+        every frame."""
         with self._lock:
-            return None if self._state.timeline is None else self._state.timeline.history.env_rows()
+            return None if self._state.timeline is None else self._state.timeline.env_rows()
 
     def wait(self, seen: int, timeout: float) -> int:
         """Block until the counter of changes differs from `seen`; returns the counter."""

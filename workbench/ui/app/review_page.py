@@ -433,6 +433,8 @@ class ReviewTimeline(TimeBar[ReviewView]):
         super().__init__(server, review, "step of the timeline", does, clock)
         self._drawn: tuple[object, ...] = ()
         self._fixed: dict[str, object] = {}
+        self._fixed_from = 0
+        """The position of the strip's left end, as it was drawn."""
 
     def draw(self, view: ReviewView) -> None:
         if not self._draw_panel(bool(view.opened), view.position):
@@ -445,10 +447,15 @@ class ReviewTimeline(TimeBar[ReviewView]):
             return
         # Only the cursor and the texts follow the position.
         if wanted[1:] != self._drawn[1:]:
-            self._fixed = fixed_values(view)
+            self._fixed, self._fixed_from = fixed_values(view), view.first
         self._drawn = wanted
         one, state = view.opened[view.selected], view.states[view.selected]
-        self._strip.content = render("review_timeline", view=view, one=one, state=state, **self._fixed)
+        self._strip.content = render(
+            "review_timeline", view=view, one=one, state=state, pick=self._pick, **self._fixed
+        )
+
+    def _on_pick(self, offset: int) -> None:
+        self._seeks.seek(self._fixed_from + offset)
 
 
 def walk(playing: bool) -> tuple[str, ...]:

@@ -10,9 +10,10 @@ import viser
 from workbench.jobs.task import TaskDescription
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
-from workbench.ui.live.timeline import step_in_words
+from workbench.ui.live.moment import MomentPart
+from workbench.ui.live.timeline import ago_in_words, step_in_words
 from workbench.ui.live.version_panel import took
-from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.parts import Clock
 from workbench.ui.widgets.templates import counted, place, render
 
 NEWS = 6.0
@@ -32,11 +33,8 @@ STATE_WORDS = {
 }
 
 
-class StatusLine(PagePart[SessionView]):
-    """State, task, activity and speed of the session."""
-
-    every = 0.25
-    """Rates that change faster cannot be read."""
+class StatusLine(MomentPart):
+    """State, task, activity and speed of the session, and the selected env's step."""
 
     def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         self._handle = server.gui.add_html("")
@@ -46,8 +44,14 @@ class StatusLine(PagePart[SessionView]):
 
     def urgent(self, view: SessionView) -> object:
         busy = view.busy and (view.busy.doing, f"{view.busy.seconds:.0f}")
-        at = view.task_serial, view.problem_serial, view.timeline.shown is None
-        return busy, view.state, view.stale, view.activity, self._is_fresh(view), *at
+        return (
+            super().urgent(view),
+            busy,
+            view.stale,
+            view.activity,
+            self._is_fresh(view),
+            view.problem_serial,
+        )
 
     def _is_fresh(self, view: SessionView) -> bool:
         """Whether a new version came less than `NEWS` seconds ago."""
@@ -83,6 +87,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "activity": (view.solve.activity if starting else view.activity) if busy is None else _doing(busy),
         "news": _news(view) if fresh else "",
         "at": step_in_words(view),
+        "ago": ago_in_words(view.timeline),
         "moving": moving and not planning,
         "plan": view.solve.plan if planning and not starting else None,
         "behind": moving and slow,

@@ -235,6 +235,7 @@ HANDLERS = (
     "wb.press(event)",
     "wb.choose(event,this)",
     "wb.place(event)",
+    "wb.pick(event)",
     "wb.copy(event)",
     "wb.intoSight(this)",
     "wb.follow(this)",
