@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.observations import CameraObsTextures
@@ -21,10 +22,13 @@ from workbench.authoring.loading.load import LoadedTask, class_of_module, load_t
 from workbench.authoring.loading.reference import split_reference
 from workbench.authoring.problem import definition_line
 from workbench.core.backends import BackendUnavailable, find_renderer
-from workbench.core.broken_rule import class_is_installed, is_installed
+from workbench.core.broken_rule import class_is_installed, warn_of
 from workbench.core.camera_data import PictureDegree
+from workbench.core.cameras.render import findings_of_shaders, list_cameras
+from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.task_env import Backend, EnvOptions, build_env, default_reward_mode
 from workbench.core.rules import Degree
+from workbench.machine.library_files import is_installed
 
 _STATE_MODES = {"state", "state_dict", "none"}
 """The parts of an ``obs_mode`` for which nothing is drawn."""
@@ -159,11 +163,16 @@ def _built(
                 "`workbench doctor` says which one to install."
             )
     # gym.make(env.spec, num_envs=2) may change the number.
-    return build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
+    env = build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
+    if isinstance(env, BatchedCpuMixin):
+        for finding in findings_of_shaders(list_cameras(env)):
+            warn_of(finding)
+    return env
 
 
 def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
-    if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
+    whole = isinstance(num_envs, (int, float, np.integer)) and not isinstance(num_envs, bool)
+    if not whole or num_envs != num_envs // 1 or num_envs < 1:
         raise ValueError(f"num_envs must be a whole number from 1 on, not {num_envs!r}")
     if "sim_backend" in kwargs:
         raise ValueError(

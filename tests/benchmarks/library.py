@@ -96,7 +96,8 @@ def make(folder: Path, count: int) -> None:
             "source_hash": f"{k * 5 // count:012}",
             "tags": ["good"] if k % 7 == 0 else [],
         }
-        stem.with_suffix(".json").write_text(json.dumps({**whole, "workbench": whole["workbench"] | changed}))
+        document = {**whole, "workbench": whole["workbench"] | changed, "workbench_checksum": None}
+        stem.with_suffix(".json").write_text(json.dumps(document))
         for suffix in (".h5", ".rrd"):
             os.link(first.with_suffix(suffix), stem.with_suffix(suffix))
 

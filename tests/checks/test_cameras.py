@@ -7,6 +7,7 @@ import pytest
 from tests.checks.checked import Checked, check_rule, the_finding
 
 EYE = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])"
+HUMAN_EYE = "pose = sapien_utils.look_at(eye=[0.7, 0.7, 0.6], target=[0.0, 0.0, 0.2])"
 CAMERA = '[CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]'
 
 
@@ -51,6 +52,8 @@ def test_a_camera_that_looks_straight_down(checked: Checked) -> None:
     finding = the_finding(checked("camera-pose", (EYE, down)))
     assert "length 0.707" in finding.message and finding.code.startswith("return [CameraConfig")
     assert checked("camera-pose").state == "kept"
+    finding = the_finding(checked("camera-pose", (HUMAN_EYE, down)))
+    assert finding.function == "_default_human_render_camera_configs"
 
 
 @pytest.mark.parametrize("robot", ["panda", "panda_wristcam"])

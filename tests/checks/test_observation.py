@@ -73,5 +73,19 @@ def test_a_hidden_goal_that_the_policy_is_not_told(checked: Checked, renderer: N
     assert checked("hidden-goal", hide).state == "kept"
 
 
+MERGED_GOAL = """self.goal = builder.build_kinematic(name="one")
+        self.remove_from_state_dict_registry(self.goal)
+        self._hidden_objects.append(self.goal)
+        from mani_skill.utils.structs import Actor
+        self.goal = Actor.merge([self.goal], "goal")
+        self.add_to_state_dict_registry(self.goal)
+"""
+
+
+def test_a_goal_whose_parts_are_hidden_is_hidden(checked: Checked, renderer: None) -> None:
+    finding = the_finding(checked("hidden-goal", (HIDDEN_GOAL[0], MERGED_GOAL), (GOAL, "")))
+    assert finding.function == "_get_obs_extra"
+
+
 def test_without_hidden_bodies_there_is_no_hidden_goal(checked: Checked, renderer: None) -> None:
     assert checked("hidden-goal", (GOAL, "")).state == "skipped"

@@ -37,7 +37,7 @@ def boxes(merge: str, size: str = "0.02") -> tuple[str, str]:
     return added(PER_ENV.format(size=size, merge=merge))
 
 
-@pytest.mark.parametrize("rule", CHECKS)
+@pytest.mark.parametrize("rule", sorted({*CHECKS} - {"hidden-objects"}))
 def test_the_example_keeps_each(checked: Checked, rule: str) -> None:
     assert checked(rule, seeds=4).state == "kept"
 
@@ -193,6 +193,52 @@ def test_a_merged_body_that_is_in_no_state(checked: Checked) -> None:
     merge = "from mani_skill.utils.structs import Actor\n        self.merged = Actor.merge(parts, name='box')"
     removed = f"{merge}\n        {REGISTERED}".rsplit("\n", 1)[0]
     assert "is not in the state" in the_finding(checked("merged-actors", boxes(removed), seeds=4)).message
+
+
+MARKERS = """markers = []
+        for i in range(self.num_envs):
+            each = self.scene.create_actor_builder()
+            each.add_sphere_visual(radius=0.02)
+            each.initial_pose = sapien.Pose(p=[0.3, 0.3, 0.2])
+            each.set_scene_idxs([i])
+            marker = each.build_kinematic(name=f"marker_{{i}}")
+            self.remove_from_state_dict_registry(marker)
+            {of_each}
+            markers.append(marker)
+        from mani_skill.utils.structs import Actor
+        self.marker = Actor.merge(markers, "marker")
+        {after}
+        self.add_to_state_dict_registry(self.marker)
+"""
+HIDE = "self._hidden_objects.append({})"
+NO_COLLISION = "self.marker.has_collision_shapes = False"
+
+
+def markers(of_each: str = "pass", after: str = "pass") -> tuple[str, str]:
+    """An edit that builds a marker for each env, and merges them."""
+    return added(MARKERS.format(of_each=of_each, after=after))
+
+
+def test_hidden_parts_of_an_actor_that_is_not_hidden(checked: Checked) -> None:
+    finding = the_finding(checked("hidden-objects", markers(HIDE.format("marker")), seeds=4))
+    assert finding.code == HIDE.format("marker") and finding.count == 4 and finding.function == "_load_scene"
+    assert NO_COLLISION in finding.message and HIDE.format("self.marker") in finding.message
+
+
+def test_what_cannot_be_hidden(checked: Checked) -> None:
+    hide = HIDE.format("self.marker")
+    for edit, line in (
+        (markers(after=hide), hide),
+        (added(HIDE.format("self.cube")), HIDE.format("self.cube")),
+        (added(HIDE.format("self.agent.robot")), HIDE.format("self.agent.robot")),
+    ):
+        assert the_finding(checked("hidden-objects", edit, seeds=4)).code == line
+
+
+def test_a_merged_actor_that_is_hidden_as_advised(checked: Checked) -> None:
+    advised = f"{NO_COLLISION}\n        {HIDE.format('self.marker')}"
+    assert checked("hidden-objects", markers(after=advised), seeds=4).state == "kept"
+    assert checked("hidden-objects", seeds=4).state == "skipped"
 
 
 def test_one_env_with_the_same_objects_for_ever(checked: Checked) -> None:

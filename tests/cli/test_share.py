@@ -1,4 +1,4 @@
-"""``workbench share`` and ``workbench export`` say in one sentence what is wrong, and exit with 2."""
+"""``workbench share`` and ``workbench export`` say in one sentence what is wrong: 1 for a damaged recording, 2 for a wrong request."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def share(paths: list[Path], out: Path, **what: Any) -> int:
 def test_what_cannot_be_shared_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "broken.json").write_text('{"workbench": {}}')
     (tmp_path / "broken.rrd").write_bytes(b"no recording")
-    for path, what, says in (
-        ("none", {"sheet": True}, "nothing at"),
-        ("broken.rrd", {}, "--mp4"),
-        ("broken.rrd", {"sheet": True}, "broken"),
+    for path, what, says, code in (
+        ("none", {"sheet": True}, "nothing at", 2),
+        ("broken.rrd", {}, "--mp4", 2),
+        ("broken.rrd", {"sheet": True}, "broken", 1),
     ):
-        assert share([tmp_path / path], tmp_path, **what) == 2
+        assert share([tmp_path / path], tmp_path, **what) == code
         assert says in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.json", "broken.rrd"]
 
@@ -39,7 +39,7 @@ def test_one_that_is_broken_takes_no_other_along(
     whole = write(tmp_path, made(5))
     (tmp_path / "broken.json").write_text('{"workbench": {}}')
     (tmp_path / "broken.rrd").write_bytes(b"no recording")
-    assert share([tmp_path], tmp_path / "out", sheet=True) == 2
+    assert share([tmp_path], tmp_path / "out", sheet=True) == 1
     assert [path.name for path in (tmp_path / "out").iterdir()] == [f"{whole.stem}.sheet.png"]
     said = [line for line in capsys.readouterr().err.splitlines() if line and "━" not in line]
     assert len(said) == 1 and said[0].startswith("broken")
@@ -47,7 +47,7 @@ def test_one_that_is_broken_takes_no_other_along(
 
 def test_what_cannot_be_exported_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "broken.json").write_text('{"workbench": {}}')
-    assert export_in_terminal([tmp_path], tmp_path / "set", ExportOptions()) == 2
+    assert export_in_terminal([tmp_path], tmp_path / "set", ExportOptions()) == 1
     said = capsys.readouterr()
     assert said.err and not said.out and not (tmp_path / "set").exists()
     with pytest.raises(SystemExit) as ended:

@@ -345,12 +345,16 @@ def stock_hides_again(stock: Any) -> bool:
     return bool(stock.goal_site.hidden)
 
 
-def test_a_window_is_refused_with_what_to_do_instead(rendered: tuple[Any, Any]) -> None:
+def test_a_window_without_a_display_is_refused_with_what_to_do_instead(
+    rendered: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     batch, _ = rendered
-    with pytest.raises(RuntimeError, match="workbench open"):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ValueError, match="workbench open"):
         batch.render_human()
     batch.render_mode = "human"
-    with pytest.raises(RuntimeError, match="workbench open"):
+    with pytest.raises(ValueError, match="workbench open"):
         batch.render()
     batch.render_mode = None
     with pytest.raises(RuntimeError, match="render_mode is not set"):

@@ -27,8 +27,6 @@ def test_what_overwrites_other_envs_and_a_success_without_rows_stop_by_themselve
     stops = {rule for rule, degree in degrees_of(None).items() if degree == "stop"}
     assert stops == {
         "other-env-written",
-        "stepped-in-reset",
-        "apply-before-fetch",
         "rows-lost",
         "evaluate-rows",
     }
@@ -207,10 +205,10 @@ def test_make_stops_and_warns_by_rule_unless_told_otherwise() -> None:
         def _before_control_step(self) -> None:
             lifts(self)
 
-    class Steps(PICK_CUBE):
+    class Writes(PICK_CUBE):
         def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
             super()._initialize_episode(env_idx, options)
-            steps_all(self, env_idx, options)
+            writes_all(self, env_idx, options)
 
     env = workbench.make(Lifts, 2, **CPU)
     env.reset(seed=0)
@@ -218,13 +216,13 @@ def test_make_stops_and_warns_by_rule_unless_told_otherwise() -> None:
         env.step(env.action_space.sample())
     assert [warning.filename for warning in told if warning.category is RuleWarning] == [__file__]
     env.close()
-    env = workbench.make(Steps, 2, **CPU)
+    env = workbench.make(Writes, 2, **CPU)
     env.reset(seed=0)
     with pytest.raises(BrokenRule, match="--rules warn"):
         env.reset(options={"env_idx": torch.tensor([1])})
     env.close()
     for rules, caught in (("warn", 1), ("off", 0)):
-        env = workbench.make(Steps, 2, rules=cast(Any, rules), **CPU)
+        env = workbench.make(Writes, 2, rules=cast(Any, rules), **CPU)
         env.reset(seed=0)
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")

@@ -36,7 +36,7 @@ def test_a_task_that_is_written_for_one_env_is_told_the_option(tmp_path: Path) -
         with pytest.raises(TaskError) as caught:
             several()
         problem = caught.value.problem
-        assert "it fails with 4 envs and runs with one: --num-envs 1" in problem.message
+        assert "--num-envs 1" in problem.message
         assert (problem.file, problem.code) == (str(file), FOR_ONE.strip())
     open_task(str(file), TaskOptions(1, env_kwargs=KWARGS)).env.close()
 
@@ -58,7 +58,7 @@ def test_a_save_that_works_with_one_env_alone_is_told_the_option_too(tmp_path: P
             with pytest.raises(TaskError) as caught:
                 load_version(request, running)
             problem = caught.value.problem
-            assert ("it fails with 4 envs and runs with one: --num-envs 1" in problem.message) is told
+            assert ("--num-envs 1" in problem.message) is told
             assert (problem.file, problem.code) == (str(file), line.strip())
             assert opened.env.step(None if not opened.env.parts else opened.first.action) is not None
         written(tmp_path, GOOD + "        lifted = lifted & True\n")

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import unicodedata
 
 import pytest
@@ -149,3 +151,15 @@ def test_a_style_goes_on_over_lines_and_text_that_is_hidden_is_not_hidden() -> N
     assert first == [Run("one", Style(color="color(1)"))]
     assert second == [Run("two", Style(color="color(1)")), Run(" three", PLAIN)]
     assert only_colours("\x1b[31;8msecret\x1b[0m") == "\\x1b[31;8msecret\x1b[0m"
+
+
+def test_a_logged_traceback_is_some_lines_of_bounded_length() -> None:
+    program = (
+        "import logging\nfrom workbench.machine.text import guard_terminal\nguard_terminal()\n"
+        "def deeper(n):\n    other(n)\ndef other(n):\n    if not n: raise ValueError('z' * 100_000)\n    deeper(n - 1)\n"
+        "try:\n    deeper(150)\nexcept ValueError:\n    logging.getLogger('x').exception('failed')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    lines = done.stderr.splitlines()
+    assert lines[0] == "failed" and "ValueError: zzz" in done.stderr
+    assert len(lines) <= 100 and max(map(len, lines)) <= 600

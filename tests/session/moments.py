@@ -9,10 +9,10 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.jobs.task import Restored, Stepped
 from workbench.session.history.env_table import EnvTable
-from workbench.session.process.supervisor import Death
+from workbench.session.process.supervisor import Death, End
 
 N, BODIES = 3, 4
-DEATH = Death("was killed by SIGSEGV", False, False, "stepping", "", False)
+DEATH = Death("was killed by SIGSEGV", End.DIED, "stepping", "", False)
 
 
 def stepped(

@@ -96,7 +96,7 @@ def asked(wanted: CodeToRun, answer: Consent = Consent.NO) -> list[TrustQuestion
 
 
 def edit(recording: Path, **values: Any) -> None:
-    document = json.loads(recording.read_bytes())
+    document = json.loads(recording.read_bytes()) | {"workbench_checksum": None}
     document["workbench"].update(values)
     recording.write_text(json.dumps(document))
 

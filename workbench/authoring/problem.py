@@ -5,13 +5,16 @@ from __future__ import annotations
 import difflib
 import inspect
 import linecache
-import re
 import traceback as tracebacks
 from bdb import BdbQuit
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import TypeGuard
+
+from workbench.core.error_notes import CoreRefusal, Note, chain_of, notes_of
+from workbench.machine.library_files import is_installed
 
 HOOK_STAGES: dict[str, str] = {
     "_load_agent": "build",
@@ -58,7 +61,6 @@ TRACEBACK_LINE_LIMIT = 1000
 TRACEBACK_HEAD_LINES = 60
 TRACEBACK_TAIL_LINES = 140
 
-_LOCATION_IN_TEXT = re.compile(r" \([^()]*, line \d+\)$")
 _MACHINERY = ("workbench", "importlib", "_frozen_importlib", "_frozen_importlib_external")
 """Packages whose frames are left out at the start of a traceback: they only run the author's code."""
 
@@ -114,8 +116,12 @@ class TaskError(Exception):
         self.problem, self.classes = problem, classes
 
     def __str__(self) -> str:
-        place = "" if self.problem.file is None else f"{self.problem.file}:{self.problem.line or 1}: "
-        return place + self.problem.message
+        return place_text(self.problem.file, self.problem.line) + self.problem.message
+
+
+def place_text(file: str | None, line: int | None) -> str:
+    """``push.py:88: ``, as it begins a message; without a line where none is known, and empty without a file."""
+    return "" if file is None else f"{file}: " if line is None else f"{file}:{line}: "
 
 
 def task_error(message: str, file: Path | None = None) -> TaskError:
@@ -124,40 +130,52 @@ def task_error(message: str, file: Path | None = None) -> TaskError:
 
 
 def problem_from_exception(
-    exc: BaseException, stage: str, own_files: Collection[Path], cls: type | None = None
+    exc: BaseException,
+    stage: str,
+    own_files: Collection[Path],
+    cls: type | None = None,
+    otherwise: tuple[str, int] | None = None,
 ) -> Problem:
     """The problem that `exc` is for the author of `own_files`.
 
-    Its line is the innermost frame in `own_files`, of `exc` or else of the exceptions that caused it. A hook of
-    `HOOK_STAGES` on the traceback replaces `stage`, except while importing. If no frame is the author's but a hook is
-    known, and `cls` (the task's class) is given, the line is that hook's ``def``.
+    Its line is the innermost frame in `own_files`, or in a file called from there that no package has installed; of `exc`,
+    or else of the exceptions that caused it. A hook of `HOOK_STAGES` on the traceback replaces `stage`, except while
+    importing. If no frame is the author's but a note names a place, it is that; else, if a hook is known and `cls` (the
+    task's class) is given, that hook's ``def``; else the file and line `otherwise`. The message begins with the first exception of the chain, and with what the
+    core's notes say came before.
     """
     own = {str(path) for path in own_files}
-    if isinstance(exc, SyntaxError) and exc.filename in own and exc.lineno is not None:
+    chain = [*chain_of(exc)]
+    if _is_authors_syntax(exc, own):
         return _syntax_problem(exc)
 
-    stage_found = stage if stage in ("import", "syntax", "policy", "worker") else _stage_of(exc, stage)
-    message = _message(exc)
-    for link in _chain(exc):
-        if isinstance(link, SyntaxError) and link.filename in own and link.lineno is not None:
-            place: tuple[str, int] | None = (str(link.filename), link.lineno)
-        else:
-            place = _innermost(link, own)
-        if place is not None:
-            if link is not exc:
-                message = shorten(f"{message} (from {_message(link)})")
-            break
-    else:
+    stage_found = stage if stage in ("import", "syntax", "policy", "worker") else _stage_of(chain, stage)
+    places = [(link, place) for link in chain if (place := _place_in(link, own)) is not None]
+    source, place = places[0] if places else (exc, None)
+    notes = [note if isinstance(note, Note) else Note(note) for note in notes_of(exc)]
+    noted = next((n.place for n in notes if n.place and not n.before and _is_authors(n.place[0], own)), None)
+    if noted is not None and not _is_raised_at(source, place):
+        place = noted[:2]
+    if place is None:
         hooks = () if stage_found in ("build", "step") else hooks_of(stage_found)
         found = None if cls is None else hook_definition(cls, hooks, own_files)
-        place = None if found is None else found[1]
+        place = otherwise if found is None else found[1]
     file, line = place if place is not None else (None, None)
     code = None
     if file is not None and line is not None:
         linecache.checkcache(file)  # the file may have been edited since linecache read it
         code = linecache.getline(file, line).strip()
+    message = _message(exc)
     if isinstance(exc, AssertionError) and not str(exc) and code:
         message = shorten(f"{message}: {code}")
+    if place is None and not isinstance(exc, CoreRefusal):
+        message += _raised_at(exc)
+    elif file not in own and (called := _innermost(source, own.__contains__)) is not None:
+        message += f" (called at {Path(called[0]).name}:{called[1]})"
+    before = [shorten(note).rstrip(".") for note in notes if note.before]
+    before += [_with_place(one, own) for one in dict.fromkeys((chain[-1], source)) if one is not exc]
+    about = [shorten(note) for note in notes if not note.before]
+    message = ". ".join(part.rstrip(".") for part in ("; then ".join([*before, message]), *about))
     stopped = isinstance(exc, Interrupted)
     return Problem(stage_found, message, file, line, code or None, format_traceback(exc), stopped)
 
@@ -278,17 +296,16 @@ def problem_from_return(cls: type, hook: str, message: str, source_files: Collec
 def _syntax_problem(exc: SyntaxError) -> Problem:
     assert exc.filename is not None
     text = exc.text or linecache.getline(exc.filename, exc.lineno or 1)
-    # Python's own text for a SyntaxError ends in "(file.py, line 3)".
-    message = _LOCATION_IN_TEXT.sub("", _message(exc))
     # Only the exception itself: the frames are those of the compiler's caller.
     lines = "".join(tracebacks.format_exception_only(type(exc), exc)).rstrip("\n")
-    return Problem("syntax", message, exc.filename, exc.lineno, shorten(text) or None, lines)
+    return Problem("syntax", _message(exc), exc.filename, exc.lineno, shorten(text) or None, lines)
 
 
 def _message(exc: BaseException) -> str:
     name = type(exc).__qualname__
     try:
-        text = str(exc)
+        # Python's own text of a SyntaxError ends in "(file.py, line 3)", of a parsed text in "(<string>, line 3)".
+        text = str(exc.msg if isinstance(exc, SyntaxError) else exc)
     except Exception as failure:  # the author's own __str__ may raise
         text = f"<its __str__ raised {type(failure).__qualname__}>"
     if isinstance(exc, BdbQuit) and not text:
@@ -313,25 +330,73 @@ def _suggestion(exc: BaseException) -> str:
     return f". Did you mean {close[0]!r}?" if close and "Did you mean" not in str(exc) else ""
 
 
-def _chain(exc: BaseException) -> Iterator[BaseException]:
-    seen: set[int] = set()
-    link: BaseException | None = exc
-    while link is not None and id(link) not in seen:
-        seen.add(id(link))
-        yield link
-        if link.__cause__ is not None:
-            link = link.__cause__
-        else:
-            link = None if link.__suppress_context__ else link.__context__
+_Line = tuple[str, int]
+"""File and line."""
 
 
-def _innermost(exc: BaseException, own: Collection[str]) -> tuple[str, int] | None:
-    places = [(frame.f_code.co_filename, line) for frame, line in tracebacks.walk_tb(exc.__traceback__)]
-    return next((place for place in reversed(places) if place[0] in own), None)
+def _place_in(exc: BaseException, own: Collection[str]) -> _Line | None:
+    """The author's innermost line; None if there is none, or it only hands on to the constructor of a base class."""
+    if _is_authors_syntax(exc, own):
+        return str(exc.filename), exc.lineno or 1
+    if isinstance(exc, CoreRefusal) and exc.place is not None and _is_authors(exc.place[0], own):
+        return exc.place[:2]
+    frames = [*tracebacks.walk_tb(exc.__traceback__)]
+    for i in reversed(range(len(frames))):
+        frame, line = frames[i]
+        if _is_authors(frame.f_code.co_filename, own):
+            below = [inner for inner, _ in frames[i + 1 :]]
+            return None if _hands_on(frame, below) else (frame.f_code.co_filename, line)
+    return None
 
 
-def _stage_of(exc: BaseException, stage: str) -> str:
-    for link in _chain(exc):
+def _innermost(exc: BaseException, fits: Callable[[str], bool]) -> _Line | None:
+    frames = [(frame.f_code.co_filename, line) for frame, line in tracebacks.walk_tb(exc.__traceback__)]
+    return next((place for place in reversed(frames) if fits(place[0])), None)
+
+
+def _is_raised_at(exc: BaseException, place: _Line | None) -> bool:
+    return place is not None and place == _innermost(exc, lambda file: True)
+
+
+def _hands_on(frame: FrameType, below: list[FrameType]) -> bool:
+    """Whether a constructor's frame is in its ``super().__init__()``, and this called a method of the object that failed.
+
+    ``BaseEnv.__init__`` builds the scene and resets: its call says nothing about where they fail.
+    """
+    same = [
+        one.f_code.co_name == "__init__"
+        for one in below
+        if one.f_locals.get("self") is frame.f_locals.get("self")
+    ]
+    return frame.f_code.co_name == "__init__" and same[:1] == [True] and not all(same)
+
+
+def _is_authors(file: str, own: Collection[str]) -> bool:
+    return file in own or not is_installed(file)
+
+
+def _is_authors_syntax(exc: BaseException, own: Collection[str]) -> TypeGuard[SyntaxError]:
+    """Whether a file of the author's is not Python. Not a text that is parsed."""
+    known = isinstance(exc, SyntaxError) and exc.filename and exc.lineno is not None
+    return bool(known) and _is_authors(exc.filename, own)  # type: ignore[union-attr]
+
+
+def _with_place(exc: BaseException, own: Collection[str]) -> str:
+    place = _place_in(exc, own)
+    return (
+        f"{_message(exc)} ({Path(place[0]).name}:{place[1]})"
+        if place
+        else f"{_message(exc)}{_raised_at(exc)}"
+    )
+
+
+def _raised_at(exc: BaseException) -> str:
+    place = _innermost(exc, lambda file: True)
+    return "" if place is None else f" (raised at {place[0]}:{place[1]})"
+
+
+def _stage_of(chain: Iterable[BaseException], stage: str) -> str:
+    for link in chain:
         names = [frame.f_code.co_name for frame, _ in tracebacks.walk_tb(link.__traceback__)]
         hooks = [name for name in names if name in HOOK_STAGES]
         if hooks:

@@ -159,6 +159,13 @@ _TABLE = (
         "_load_scene",
     ),
     Rule(
+        "hidden-objects",
+        "warn",
+        "_hidden_objects has actors without collision shapes, and the merged actor in place of its parts.",
+        "Poses are wrong and sensors see what is hidden; or every picture fails.",
+        "_load_scene",
+    ),
+    Rule(
         "reconfigures",
         "warn",
         "A scene that is built at random is rebuilt now and then (reconfiguration_freq), at one env at each reset.",
@@ -404,7 +411,7 @@ _TABLE = (
         "camera-pose",
         "warn",
         "A camera's quaternion has length 1.",
-        "Extrinsics come out scaled: look_at straight down or up does this (tilt the view a little).",
+        "The picture is turned and zoomed, and extrinsics are scaled: look_at straight down or up does this (tilt the view a little).",
         "_default_sensor_configs",
     ),
     Rule(
@@ -420,6 +427,13 @@ _TABLE = (
         "A sensor camera has at most 512 x 512 pixels.",
         "Thousands of envs do not fit the GPU's memory.",
         "_default_sensor_configs",
+    ),
+    Rule(
+        "ray-traced",
+        "warn",
+        "No camera is ray traced: shader_pack is minimal or default.",
+        'render() of several envs raises "ray tracing shaders do not work with parallel rendering".',
+        "_default_human_render_camera_configs",
     ),
     # --- solved by planning (--solve) ------------------------------------------------------------------------
     Rule(

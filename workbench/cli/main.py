@@ -25,6 +25,7 @@ from workbench.cli.terminal.arguments import (
 )
 from workbench.cli.terminal.output import Exit, end_quietly, interrupted, lacks_maniskill, refuse
 from workbench.jobs.task import ShownPictures
+from workbench.machine.processes.time_limit import end_after, end_limit
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.machine.text import guard_terminal
 
@@ -340,6 +341,7 @@ def show_help(topic: Annotated[str, tyro.conf.Positional] = "", /) -> int:
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point of the ``workbench`` command."""
     guard_terminal()
+    end_after()
     given = list(sys.argv[1:] if args is None else args)
     if not given or (given[0].startswith("-") and given[0] not in ("-h", "--help")):
         given = ["start", *given]
@@ -353,6 +355,7 @@ def main(args: Sequence[str] | None = None) -> None:
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )
         finally:
+            end_limit()
             if sys.stdout is not None:
                 sys.stdout.flush()
     except KeyboardInterrupt:  # during the imports of a command: torch takes seconds

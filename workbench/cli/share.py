@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING
 
 from rich.progress import TimeRemainingColumn
 
-from workbench.cli.terminal.output import interrupted, print_addresses, print_text, progress_bar, refuse, warn
+from workbench.cli.terminal.output import (
+    Exit,
+    interrupted,
+    print_addresses,
+    print_text,
+    progress_bar,
+    refuse,
+    warn,
+)
 
 if TYPE_CHECKING:
     from workbench.recording.episode.row import Source
@@ -68,6 +76,7 @@ def demonstrations_in_terminal(
 
 
 def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]], list[MakeRequest]]) -> int:
+    from workbench.recording.episode.row import UnreadableRecording
     from workbench.recording.lerobot.export import DoesNotFit
     from workbench.recording.maniskill.export import OtherDemonstration
     from workbench.recording.reader.reading import find_all_sources
@@ -77,8 +86,9 @@ def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]],
         requests = requests_of(find_all_sources(files))
     except (OSError, ValueError) as error:
         return refuse(str(error))
-    made: list[Made] = []
-    not_made: list[str] = []
+    made: list[tuple[MakeRequest, Made]] = []
+    refused: list[str] = []
+    damaged = False
     try:
         with progress_bar(TimeRemainingColumn()) as bar:
             row = bar.add_task("reading", total=len(requests))
@@ -88,23 +98,33 @@ def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]],
                     bar.update(row, completed=number + done, description=doing)
 
                 try:
-                    made.append(make(request, on_progress))
-                    not_made += made[-1].not_made
-                except (DoesNotFit, OtherDemonstration) as error:
-                    not_made.append(f"{error} With --only-fitting such recordings are left out.")
+                    made.append((request, make(request, on_progress)))
+                except (DoesNotFit, OtherDemonstration, UnreadableRecording) as error:
+                    damaged = damaged or isinstance(error, UnreadableRecording)
+                    advice = (
+                        " With --only-fitting such recordings are left out." if request.is_dataset else ""
+                    )
+                    refused.append(f"{error}{advice}")
                 except ValueError as error:
-                    not_made.append(str(error))
+                    refused.append(str(error))
     except (OSError, RuntimeError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
         return interrupted("what was finished is kept")
     finally:
-        for one in made:
+        for request, one in made:
             for path in one.paths:
-                print_text(path if path.is_file() else f"{path}: {one.words}")
-    for why in not_made:
-        refuse(why)
-    return 2 if not_made else 0
+                print_text(f"{path}: {one.words}" if request.is_dataset else path)
+    for why in refused:
+        for line in why.split("\n"):
+            refuse(line)
+    fewer = damaged or (bool(made) and bool(refused))
+    for request, one in made:
+        for why in (*one.damaged, *one.left_out, *one.incomplete):
+            warn(why)
+        # From a dataset they were left out because that was asked for.
+        fewer = fewer or bool(one.damaged) or (bool(one.left_out) and not request.is_dataset)
+    return Exit.FAILED if fewer else Exit.REFUSED if refused else Exit.DONE
 
 
 def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:

@@ -13,6 +13,8 @@ import sapien.physx as physx
 import sapien.render
 import torch
 
+from workbench.machine.software_vulkan import known_render_device
+
 Backend = Literal["auto", "cpu", "gpu"]
 
 
@@ -67,6 +69,12 @@ def find_renderer() -> Renderer | None:
             continue
         return Renderer("gpu" if device == "cuda" else "cpu", _device_summary())
     return None
+
+
+@lru_cache(maxsize=1)
+def why_no_ray_tracing() -> str | None:
+    """Why this machine cannot draw ray traced pictures, as a clause; None if it can."""
+    return known_render_device(install=False).why_no_ray_tracing
 
 
 def _device_summary() -> str:

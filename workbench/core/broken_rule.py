@@ -12,15 +12,14 @@ import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Literal
 
-import mani_skill
 from mani_skill.envs.sapien_env import BaseEnv
 
+from workbench.core.error_notes import CoreRefusal, Place
 from workbench.core.rules import Degree, Finding, Silence, silence_of
+from workbench.machine.library_files import is_installed
 from workbench.machine.parse_python import parse_python
 
 MOST_ROWS = 64
@@ -36,16 +35,16 @@ Frame = tuple[FrameType, int, int]
 Occasion = Literal["step", "reset"]
 _Key = tuple[str, Hashable]
 """A rule, and the line or thing at which it was broken."""
-Place = tuple[str, int, str]
-"""File, line, and the name of the function."""
 
 
-class BrokenRule(RuntimeError):
+class BrokenRule(CoreRefusal, RuntimeError):
     """The task broke a rule of GPU simulation that stops."""
 
     def __init__(self, message: str, rule: str, place: Place | None = None) -> None:
-        super().__init__(f"{message} (Rule {rule}; with --rules warn, or rules='warn', the task continues.)")
-        self.rule, self.place = rule, place
+        super().__init__(
+            f"{message} (Rule {rule}; with --rules warn, or rules='warn', the task continues.)", place=place
+        )
+        self.rule = rule
 
 
 class WrongReturn(BrokenRule):
@@ -54,6 +53,23 @@ class WrongReturn(BrokenRule):
     def __init__(self, problem: str, hook: str, rule: str, place: Place | None) -> None:
         super().__init__(f"{hook}() {problem}{in_brackets(place)}.", rule, place)
         self.problem, self.hook = problem, hook
+
+
+class NeedsOneEnv(CoreRefusal, RuntimeError):
+    """The task does what exists for one env only: the tools open it with one."""
+
+    def __init__(self, reason: str, instead: str, place: Place | None) -> None:
+        """
+        Args:
+            reason: a sentence without its full stop.
+            instead: further sentences, which begin with a space; or empty.
+            place: the author's line.
+        """
+        super().__init__(
+            f"{reason}{in_brackets(place)}. With one env it runs: num_envs=1, or --num-envs 1.{instead}",
+            place=place,
+        )
+        self.reason = reason
 
 
 class RuleWarning(UserWarning):
@@ -205,15 +221,6 @@ class BrokenRules:
             self._rows = kept
             self.serial += 1
 
-    def copy(self) -> tuple[Any, ...]:
-        """The present rows, for `put_back`."""
-        return dict(self._rows), dict(self._silenced), self.more
-
-    def put_back(self, kept: tuple[Any, ...]) -> None:
-        """Restore rows: another version was tried and not taken."""
-        self._rows, self._silenced, self.more = kept
-        self.serial += 1
-
     def edited(self, place_now: Callable[[Finding], tuple[str, int] | None]) -> None:
         """Continue with another version of the file: drop rows whose function changed, mark the others unconfirmed.
 
@@ -265,6 +272,14 @@ def place_of_hook(task: type, hook: str) -> Place | None:
     return None if code is None else (code.co_filename, code.co_firstlineno, hook)
 
 
+def place_of_class(cls: type) -> Place | None:
+    """Where a class is defined; None for one without a file."""
+    try:
+        return inspect.getfile(cls), inspect.getsourcelines(cls)[1], cls.__name__
+    except (TypeError, OSError):
+        return None
+
+
 def place_of(frames: Sequence[Frame]) -> Place | None:
     """The first line outside installed packages; else the first outside ManiSkill's general code."""
     general = None
@@ -288,20 +303,6 @@ def class_is_installed(cls: type) -> bool:
         return is_installed(inspect.getfile(cls))
     except (TypeError, OSError):  # made in a notebook, or by type()
         return False
-
-
-@cache
-def is_installed(file: str) -> bool:
-    """Whether a source file belongs to Python, to an installed package or to the workbench."""
-    if file.startswith(("<", *_OWN_FOLDERS)):
-        return True
-    return not {"site-packages", "dist-packages"}.isdisjoint(Path(file).parts)
-
-
-_OWN_FOLDERS = tuple(
-    f"{Path(file).parent}/" for file in (inspect.__file__, mani_skill.__file__, str(Path(__file__).parent))
-)
-"""Of Python, ManiSkill and the workbench."""
 
 
 # --- the line that assigns ---------------------------------------------------------------------------
@@ -329,6 +330,16 @@ def find_assignment(task: type, path: str) -> Place | None:
     return min(found, default=(0, None))[1]
 
 
+def find_entry(task: type, hook: str, name: str) -> Place | None:
+    """The line where a hook makes the entry `name` of what it returns, as a key or a keyword; else its ``def``."""
+    function = inspect.unwrap(getattr(task, hook))
+    for node, line in _nodes(function):
+        key = getattr(node, "value", None) if isinstance(node, ast.Constant) else getattr(node, "arg", None)
+        if key == name and isinstance(node, ast.Constant | ast.keyword):
+            return function.__code__.co_filename, line, hook
+    return place_of_hook(task, hook)
+
+
 def files_of_task(task: type) -> set[str]:
     """Source files of its methods, and of those that it inherits from classes below BaseEnv."""
     return {function.__code__.co_filename for _, function in _methods(task)}
@@ -346,12 +357,7 @@ def _methods(task: type) -> Iterator[tuple[str, Any]]:
 
 
 def _lines_that_assign(function: Any, wanted: str) -> Iterator[int]:
-    try:
-        lines, first = inspect.getsourcelines(function)
-        tree = parse_python(textwrap.dedent("".join(lines)))
-    except (OSError, SyntaxError):  # made without a text, or a lambda in the middle of a line
-        return
-    for node in ast.walk(tree):
+    for node, line in _nodes(function):
         if isinstance(node, ast.Assign):
             targets = node.targets
         elif isinstance(node, (ast.AugAssign, ast.AnnAssign)):
@@ -359,7 +365,19 @@ def _lines_that_assign(function: Any, wanted: str) -> Iterator[int]:
         else:
             continue
         if any(_names(target, wanted) for target in targets):
-            yield first + node.lineno - 1
+            yield line
+
+
+def _nodes(function: Any) -> Iterator[tuple[ast.AST, int]]:
+    """The nodes of a function's text that have a line, with it."""
+    try:
+        lines, first = inspect.getsourcelines(function)
+        tree = parse_python(textwrap.dedent("".join(lines)))
+    except (OSError, SyntaxError):  # made without a text, or a lambda in the middle of a line
+        return
+    for node in ast.walk(tree):
+        if (line := getattr(node, "lineno", None)) is not None:
+            yield node, first + line - 1
 
 
 def _names(target: ast.expr, wanted: str) -> bool:

@@ -187,6 +187,9 @@ class CameraInfo:
     """Its pose differs between envs or from its config: the task's code moves it."""
     site: CallSite | None = None
     """Where the config was made; None if not noted."""
+    replaced_shader: str = ""
+    """The shader pack of its config where another one draws its pictures, since this machine does not trace rays; else
+    empty."""
 
     @property
     def key(self) -> CameraKey:

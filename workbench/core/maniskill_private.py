@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import cache, cached_property, wraps
+from functools import cache, wraps
 from itertools import islice
 from types import FrameType
 from typing import Any
@@ -20,12 +21,13 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.sensors import camera as camera_module
-from mani_skill.sensors.camera import CameraConfig
+from mani_skill.sensors.camera import Camera, CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.articulation_joint import ArticulationJoint
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
+from mani_skill.utils.structs.decorators import before_gpu_init
 from mani_skill.utils.structs.link import Link
 from mani_skill.utils.structs.pose import Pose
 from mani_skill.utils.structs.render_camera import RenderCamera
@@ -136,6 +138,9 @@ parse_cameras: Callable[[Any], dict[str, Any]] = (
 """What a camera hook returns as a dict: 3.0.1 has the first name, the nightly builds of 2026 the second."""
 
 
+_TARGETS_OF = "_workbench_targets_of"
+
+
 @cache
 def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     """Let ManiSkill's structs find their rows in a batched CPU system: `batched_system(scene)`, None for any other scene.
@@ -148,6 +153,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     stock_set_ee_action = PDEEPosController.set_action
     stock_get_contacts = ManiSkillScene.get_contacts
 
+    @wraps(stock_body_data)
     def link_data(self: Any) -> torch.Tensor:
         # Only velocities are read this way (`Link.pose` reads the tensor itself), and a root's are fetched with
         # every step: reading a root alone must not fetch all links.
@@ -156,6 +162,7 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
             system.fetch_link_velocities()
         return stock_body_data(self)
 
+    @wraps(stock_set_ee_action)
     def set_ee_action(self: Any, action: torch.Tensor) -> None:
         if batched_system(self.scene) is None:
             stock_set_ee_action(self, action)
@@ -165,12 +172,14 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
     def check_frame(stock: Callable[[Any], None]) -> Callable[[Any], None]:
         """Nightly builds refuse the frames that GPU simulation lacks by ``scene.gpu_sim_enabled``, 3.0.1 by the device."""
 
+        @wraps(stock)
         def check(self: Any) -> None:
             if batched_system(self.scene) is None:
                 stock(self)
 
         return check
 
+    @wraps(stock_get_contacts)
     def get_contacts(self: Any) -> Any:
         # Nightly builds raise before they ask the system, whose message says what to call instead.
         system = batched_system(self)
@@ -180,19 +189,39 @@ def install_row_lookups(batched_system: Callable[[Any], Any]) -> None:
         """Replace the cached property `name`: in a batched CPU scene it gives the row of each of the struct's `things`."""
         stock = owner.__dict__[name].func
 
+        @wraps(stock)
         def rows(self: Any) -> torch.Tensor:
+            known = self.__dict__.get(name)
             system = batched_system(self.scene)
+            if known is not None and (system is None or known[0] == system.layout_version):
+                return known[1]
             if system is None:
-                return stock(self)
-            place = system.row_of if find == "row" else system.index_of
-            return torch.tensor(
-                [place(thing) for thing in getattr(self, things)], device=self.device, dtype=dtype
-            )
+                found = 0, stock(self)
+            else:
+                place = system.row_of if find == "row" else system.index_of
+                version = system.layout_version
+                each = [place(thing) for thing in getattr(self, things)]
+                if (
+                    version != system.layout_version
+                ):  # a body that was not known made it lay out the scene again
+                    each = [place(thing) for thing in getattr(self, things)]
+                found = system.layout_version, torch.tensor(each, device=self.device, dtype=dtype)
+            self.__dict__[name] = found
+            return found[1]
 
-        value = cached_property(rows)
-        # Without this a cached_property that is assigned after the class body raises at its first read.
-        value.__set_name__(owner, name)
-        setattr(owner, name, value)
+        setattr(owner, name, property(rows, doc=stock.__doc__))
+
+    stock_targets = Articulation.get_joint_target_indices
+
+    @wraps(stock_targets)
+    def get_joint_target_indices(self: Any, joint_indices: Any) -> Any:
+        system = batched_system(self.scene)
+        if system is not None and self.__dict__.get(_TARGETS_OF) != system.layout_version:
+            self.__dict__[_TARGETS_OF] = system.layout_version
+            self._cached_joint_target_indices.clear()
+        return stock_targets(self, joint_indices)
+
+    Articulation.get_joint_target_indices = get_joint_target_indices
 
     find_rows(PhysxRigidBodyComponentStruct, "_body_data_index", "_bodies", "row", torch.int64)
     find_rows(Articulation, "_data_index", "_objs", "index", torch.int32)
@@ -238,8 +267,7 @@ def substeps_are_unwatched(env: Any, task: type) -> bool:
     """Whether only ManiSkill's own code runs between the substeps of a control step.
 
     Those hooks do not touch the simulation: ``BaseEnv``'s are empty, and its controllers' ``before_simulation_step``
-    at most writes drive targets, which are not applied before the next control step. A hook of the task, its robot or its
-    controllers may read state.
+    writes drive targets only where it interpolates. A hook of the task, its robot or its controllers may read state.
 
     Args:
         task: the class of `env` without our mixin.
@@ -253,9 +281,95 @@ def substeps_are_unwatched(env: Any, task: type) -> bool:
     return all(
         "before_simulation_step" not in vars(part)
         and type(part).before_simulation_step.__module__.startswith("mani_skill.agents.controllers.")
+        and not getattr(getattr(part, "config", None), "interpolate", False)
         for robot in agents(env)
         for part in (robot.controller, *getattr(robot.controller, "controllers", {}).values())
     )
+
+
+@cache
+def install_base_env_hooks() -> None:
+    """Let ``BaseEnv``'s own constructor and ``_setup_scene`` ask an env of the batched CPU simulation, once a process.
+
+    Not by overriding them in a subclass: a task's own ones call these, and would be left out or given arguments that they do
+    not take.
+    """
+    stock_init, stock_setup = BaseEnv.__init__, BaseEnv._setup_scene
+
+    @wraps(stock_init)
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        defaults, fixed = self.__dict__.pop(_BASE_ARGUMENTS, ({}, {}))
+        stock_init(self, *args, **{**defaults, **kwargs, **fixed})
+
+    @wraps(stock_setup)
+    def setup_scene(self: Any) -> None:
+        make = getattr(self, "_make_scene", None)
+        stock_setup(self) if make is None else make()
+
+    BaseEnv.__init__ = init  # type: ignore[method-assign]
+    BaseEnv._setup_scene = setup_scene  # type: ignore[method-assign]
+
+
+_BASE_ARGUMENTS = "_workbench_base_arguments"
+_TECHNICAL = ("num_envs", "render_backend", "reward_mode")
+"""Arguments that the workbench gives on its own."""
+
+
+@contextmanager
+def base_arguments(env: Any, task: type, kwargs: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Within this ``BaseEnv``'s constructor takes the CPU as its simulation, whatever the task's constructor hands on.
+
+    Yields the arguments for the task's constructor: those of `kwargs` but for what the workbench gave and it does not take.
+    """
+    taken = inspect.signature(task.__init__).parameters
+    any_name = any(each.kind is each.VAR_KEYWORD for each in taken.values())
+    left = (
+        {}
+        if any_name
+        else {name: kwargs[name] for name in _TECHNICAL if name in kwargs.keys() - taken.keys()}
+    )
+    defaults = {name: value for name, value in left.items() if name != "render_backend"}
+    fixed = {"sim_backend": "physx_cpu", **{k: v for k, v in left.items() if k == "render_backend"}}
+    vars(env)[_BASE_ARGUMENTS] = defaults, fixed
+    try:
+        yield {name: value for name, value in kwargs.items() if name not in left}
+    finally:
+        vars(env).pop(_BASE_ARGUMENTS, None)
+
+
+def clears_scene(caller: FrameType) -> bool:
+    """Whether the caller is ``BaseEnv._clear`` or its constructor, which may set ``self.scene`` to None."""
+    return caller.f_code in (BaseEnv._clear.__code__, inspect.unwrap(BaseEnv.__init__).__code__)
+
+
+def hook_of_base_env(env: Any, caller: FrameType) -> str:
+    """The outermost method of ``BaseEnv`` but ``close`` that is under way for `env`; empty if none is."""
+    found, frame = "", caller
+    while frame is not None:
+        code = frame.f_code
+        of_base = frame.f_globals.get("__name__") == BaseEnv.__module__ and code.co_name != "close"
+        if of_base and frame.f_locals.get("self") is env:
+            found = code.co_name
+        frame = frame.f_back
+    return found
+
+
+def allowed_on_the_cpu(caller: FrameType, laid_out: bool) -> bool:
+    """Whether to answer ManiSkill's question for an initialised GPU simulation by no.
+
+    ``before_gpu_init`` refuses setters by it, which a stock CPU env has at any time; meshes of articulations need link poses,
+    which are there at any time.
+    """
+    if caller.f_code in _NEED_LINK_POSES:
+        return False
+    return not laid_out or caller.f_code is _BEFORE_GPU_INIT
+
+
+_BEFORE_GPU_INIT = before_gpu_init(lambda self: None).__code__
+_NEED_LINK_POSES = {
+    inspect.unwrap(method).__code__
+    for method in (Articulation.get_collision_meshes, Articulation.get_visual_meshes)
+}
 
 
 def asks_for_a_gpu(caller: FrameType) -> bool:
@@ -399,6 +513,15 @@ def agents(env: Any) -> list[Any]:
     return agent.agents if isinstance(agent, MultiAgent) else [] if agent is None else [agent]
 
 
+def tool_of(agent: Any) -> Link | None:
+    """The link of a robot's tool centre point, ``tcp``; None if its class has none, or one that is no link."""
+    try:
+        tool = getattr(agent, "tcp", None)
+    except Exception:  # a property of the author's, which nothing of ManiSkill's reads
+        return None
+    return tool if isinstance(tool, Link) else None
+
+
 def data_rows_of_articulation(articulation: Any) -> torch.Tensor:
     """Its row of each env in the joint tensors, such as ``px.cuda_articulation_qpos``: ``_data_index``."""
     return articulation._data_index
@@ -409,20 +532,23 @@ def joints_of(struct: Any) -> int:
     return int(getattr(struct, "max_dof", 0))
 
 
-def hidden_objects(env: Any) -> list[Any]:
-    """Actors (merged ones too) that the task hides from its sensors: ``_hidden_objects``; none if `why_not` of `HIDDEN`."""
+def named_to_hide(env: Any) -> list[Any]:
+    """``_hidden_objects``; none if `why_not` of `HIDDEN`."""
     return [] if why_not(HIDDEN) else env._hidden_objects
 
 
-def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
-    """True pose of an actor that is hidden now, (M, 7) or (7,); None if it is not hidden.
+def hidden_objects(env: Any) -> list[Any]:
+    """The actors that the task hides from its sensors. ManiSkill cannot hide an Articulation, which has no ``hide_visual``."""
+    return [each for each in named_to_hide(env) if isinstance(each, Actor)]
 
-    ``Actor.hide_visual`` cannot switch off drawing in GPU simulation: it keeps the pose in
-    ``before_hide_pose`` and moves the actor 99999 m away. On a stock CPU env nothing moves.
+
+def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
+    """(M, 7) true pose of an actor that was moved away to hide it; None if it was not.
+
+    In GPU simulation ``Actor.hide_visual`` keeps the pose in ``before_hide_pose`` and moves the actor 99999 m away. On the
+    CPU, stock or batched (`simulation.hiding`), nothing moves.
     """
-    if not actor.hidden or not actor.scene.gpu_sim_enabled:
-        return None
-    return actor.before_hide_pose  # type: ignore[attr-defined]
+    return getattr(actor, "before_hide_pose", None) if actor.hidden else None
 
 
 def unflattened_state(env: BaseEnv, info: dict[str, Any]) -> dict[str, Any]:
@@ -461,10 +587,10 @@ def flatten_observation(env: Any, obs: Any) -> Any:
 def camera_components(camera: Any) -> list[Any]:
     """The ``RenderCameraComponent`` of every env behind a ManiSkill camera: ``camera._render_cameras``.
 
-    Empty for other sensors: tactile ones, or the stereo depth camera (which ManiSkill 3.0.1 cannot build: its
+    Empty for other sensors: of a task's own class, or the stereo depth camera (which ManiSkill 3.0.1 cannot build: its
     constructor needs an argument that BaseEnv does not pass).
     """
-    inner = getattr(camera, "camera", None)
+    inner = camera.camera if isinstance(camera, Camera) else None
     return inner._render_cameras if isinstance(inner, RenderCamera) else []
 
 

@@ -50,25 +50,47 @@ _TABLE = (
         "The episodes of other envs change.",
     ),
     Rule(
-        "stepped-in-reset",
-        "stop",
-        "_initialize_episode does not call scene.step() while other envs are in the middle of an episode.",
-        "The episodes of other envs advance.",
-    ),
-    Rule(
-        "apply-before-fetch",
-        "stop",
-        "After a step, state is fetched before it is written and applied.",
-        "Every body of every env is put back to before the step.",
-        "step",
-    ),
-    Rule(
         "rows-lost",
         "stop",
         "What a task keeps on itself has a row for each env after a partial reset too.",
         "What was kept of other envs is lost; the next use of it fails, or takes the wrong row.",
     ),
     # --- the rest -------------------------------------------------------------------------------------
+    Rule(
+        "stepped-in-reset",
+        "warn",
+        "_initialize_episode does not call scene.step() while other envs are in the middle of an episode.",
+        "The episodes of other envs advance.",
+    ),
+    Rule(
+        "apply-before-fetch",
+        "warn",
+        "After a step, state is fetched before it is written and applied.",
+        "Every body of every env is put back to before the step.",
+        "step",
+    ),
+    Rule(
+        "state-while-built",
+        "warn",
+        "State (poses, velocities, qpos, drive targets) is read and set once the scene is complete: in _after_reconfigure or "
+        "_initialize_episode.",
+        "The build fails: there are no tensors of state yet.",
+        "_load_scene",
+    ),
+    Rule(
+        "refused-by-gpu",
+        "warn",
+        "Mass, limits, damping and drives of joints are set and bodies removed while the scene is built; static actors are not "
+        "moved; values have a row for each env that is written.",
+        "The call raises.",
+    ),
+    Rule(
+        "one-env-only",
+        "warn",
+        "Nothing is used that exists for one env only, such as scene.get_contacts() or scene.px.raycast().",
+        "It does not exist in GPU simulation; here one env is opened.",
+        "evaluate",
+    ),
     Rule(
         "rows-rewritten",
         "warn",
@@ -119,10 +141,24 @@ _TABLE = (
         "step",
     ),
     Rule(
+        "controller-targets",
+        "warn",
+        "A controller says in sets_target_qpos and sets_target_qvel which drive targets it sets.",
+        "Each step raises AttributeError.",
+        "step",
+    ),
+    Rule(
         "evaluate-rows",
         "stop",
         "evaluate() returns a row for each env.",
         "It is broadcast over the envs, or an error comes up somewhere else.",
+        "evaluate",
+    ),
+    Rule(
+        "evaluate-flags",
+        "warn",
+        "The entries success and fail of evaluate() are bool tensors.",
+        "ManiSkill's wrappers fail on them, as ManiSkillVectorEnv with record_metrics does.",
         "evaluate",
     ),
     Rule(

@@ -30,8 +30,7 @@ from workbench.machine.folders import CurrentFolder
 from workbench.planning.episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.options import PlanOptions
 from workbench.planning.planner import Planner
-from workbench.recording.episode.row import Source
-from workbench.recording.reader.reading import find_trajectories, read_recording
+from workbench.recording.reader.reading import find_sources, read_recording
 
 
 class ActionChooser:
@@ -96,8 +95,7 @@ class ActionChooser:
         if self._source == "policy":
             # Never another action instead: the page says that the policy acts.
             with self._imported() as policy:
-                whose = f"what {self._policy_name} returned"
-                return actions.to_flat_action(task.env, task.parts, policy(task.obs), whose)
+                return actions.to_flat_action(task.env, task.parts, policy(task.obs))
         low, high = actions.bounds(task.parts)
         if self._source == "zero":
             return _same_for_all(np.clip(0.0, low, high), task)
@@ -419,12 +417,16 @@ def _array(file: IO[bytes], size: int) -> NDArray:
 
 def _demonstrations(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
     runs, kwargs = list[RecordedRun](), dict[str, Any]()
-    for name in find_trajectories(path):
-        episode = read_recording(Source(path, name))
+    for source in find_sources(path):
+        episode = read_recording(source)
         if episode.length == 0:
             continue
         run = run_of(episode)
-        runs.append(replace(run, name=f"file {path.name}, {name}", action=_finite(path, run.action)))
+        runs.append(
+            replace(
+                run, name=f"file {path.name}, {source.part or source.name}", action=_finite(path, run.action)
+            )
+        )
         given: Mapping[str, Any] = episode.info.env_kwargs
         kwargs = {key: given[key] for key in ("robot_uids", "control_mode") if given.get(key) is not None}
         if episode.info.control_mode is not None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import ast
+import os
 import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -21,6 +21,7 @@ from workbench.authoring.loading.task_content import CannotRead, read_text, sour
 from workbench.authoring.reload.call_graph import TwoVersions
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN, RecordedRun
 from workbench.jobs.task import TaskDescription, TaskOptions
+from workbench.machine.library_files import is_installed
 from workbench.machine.parse_python import parse_python
 from workbench.recording.episode.episode import Episode, EpisodeInfo
 from workbench.recording.episode.side_files import folder_of, side_file_path
@@ -101,7 +102,7 @@ def changed_since(
 def changed_on_disk(info: EpisodeInfo) -> str:
     """`changed_since` for the recording's file and modules as they are on disk now."""
     file = None if info.source_file is None else Path(info.source_file)
-    if file is None or not file.is_absolute() or not file.is_file():
+    if file is None or not file.is_absolute() or not os.path.isfile(file):
         return ""
     try:
         _, then = relative_sources(info.source_file or "", info.source)
@@ -110,7 +111,8 @@ def changed_on_disk(info: EpisodeInfo) -> str:
     now = {}
     for name in then:
         path = file.parent / name
-        if path.is_file():
+        # Not `Path.is_file`, which raises for a name that no file can have.
+        if os.path.isfile(path):
             try:
                 now[str(path)] = read_source(path)
             except (OSError, SyntaxError):
@@ -188,8 +190,8 @@ def reference_of(info: EpisodeInfo) -> RecordedTask:
         file is None
         or not file.is_absolute()
         or file.suffix != ".py"
-        or not file.is_file()
-        or _is_installed(file)
+        or not os.path.isfile(file)
+        or is_installed(str(file))
     ):
         return RecordedTask(info.task)
     try:
@@ -255,7 +257,7 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
         _link_side_files(info, folder)
-    except OSError as error:
+    except (OSError, ValueError) as error:  # a null byte in a name
         shutil.rmtree(folder, ignore_errors=True)
         raise CannotEnterRecording(f"the recorded text cannot be written: {error}") from error
     name = _class_of(texts[main], info.task)
@@ -268,7 +270,7 @@ def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
         if name.endswith(_IMPORTED):
             continue  # importable, and none of the texts that the person has trusted
         there, here = side_file_path(folder_of(info.source_file), name), side_file_path(folder, name)
-        if there is not None and here is not None and there.is_file() and not here.exists():
+        if there is not None and here is not None and os.path.isfile(there) and not os.path.lexists(here):
             here.parent.mkdir(parents=True, exist_ok=True)
             here.symlink_to(there)
 
@@ -285,12 +287,3 @@ def _class_of(text: str, env_id: str) -> str | None:
     return (
         env_id if any(isinstance(node, ast.ClassDef) and node.name == env_id for node in tree.body) else None
     )
-
-
-def _is_installed(file: Path) -> bool:
-    """Whether it is a file of ManiSkill or another installed package, which is opened by its id."""
-    if {"site-packages", "dist-packages"} & set(file.parts):
-        return True
-    spec = find_spec("mani_skill")  # does not import it
-    folders = [] if spec is None else list(spec.submodule_search_locations or [])
-    return any(file.is_relative_to(folder) for folder in folders)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,23 +19,29 @@ from workbench.authoring.loading.load import (
 )
 from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import (
-    MESSAGE_LIMIT,
     Interrupted,
     TaskError,
     shorten,
 )
 from workbench.checks.evidence.places import rules_of_outliers
 from workbench.core.backends import BackendUnavailable, find_renderer, unused_gpu_text
-from workbench.core.broken_rule import BrokenRule, class_is_installed, warn_of
-from workbench.core.cameras.render import list_cameras, recorded_pictures, segmentation_names, take_pictures
+from workbench.core.broken_rule import NeedsOneEnv, class_is_installed, in_brackets, warn_of
+from workbench.core.camera_data import CameraInfo
+from workbench.core.cameras.render import (
+    findings_of_shaders,
+    list_cameras,
+    recorded_pictures,
+    segmentation_names,
+    take_pictures,
+)
 from workbench.core.cameras.visibility import objects_to_see
 from workbench.core.capture.recorded_run import env_kwargs
 from workbench.core.env import actions
-from workbench.core.env.assets import MissingAssets
 from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.keywords import constructor_arguments, control_mode_of, describe_keywords
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.error_notes import CoreRefusal
 from workbench.core.maniskill_private import parse_cameras, version_notice
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene.read_scene import read_geometry
@@ -97,15 +103,13 @@ def with_advice(
         knows_others: give no advice about the other tasks of the file.
     """
     advice: list[str] = []
-    if (
-        options.num_envs > 1
-        and not isinstance(error.__cause__, _NOT_OF_THE_BATCH)
-        and _runs_alone(again, options)
-    ):
-        advice.append(
-            f"it fails with {options.num_envs} envs and runs with one: --num-envs 1, or --envs-per-worker 1. "
-            "Or it fails in some states alone: a task is reset once while it is built, each env to another state"
-        )
+    if options.num_envs > 1 and _may_be_of_the_batch(error):
+        tried = min(options.num_envs, _MOST_TRIED)
+        if _runs_alone(again, options, tried):
+            advice.append(
+                f"with {options.num_envs} envs it fails, with one it runs, from each of {tried} seeds: --num-envs 1, or "
+                "--envs-per-worker 1"
+            )
     if loaded.others and loaded.file is not None and not knows_others:
         file = loaded.file.name
         advice.append(
@@ -114,24 +118,39 @@ def with_advice(
         )
     if not advice:
         return error
-    more = shorten("; ".join(advice), MESSAGE_LIMIT // 2)
-    message = f"{shorten(error.problem.message, MESSAGE_LIMIT - len(more) - 3)} ({more})"
+    message = f"{error.problem.message} ({shorten('; '.join(advice))})"
     classes = (loaded.chosen, *loaded.others) if loaded.others else ()
     return TaskError(replace(error.problem, message=message), classes)
 
 
-_NOT_OF_THE_BATCH = (Interrupted, BrokenRule, MissingAssets, BackendUnavailable)
-"""Causes that already say what to do, or that do not depend on the number of envs."""
+_MOST_TRIED = 8
+"""Seeds with which one env is tried: an error of 16 envs may be of the state of one of them."""
 
 
-def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions) -> bool:
-    """Whether the task opens with one env: it may be written for one."""
+def _may_be_of_the_batch(error: TaskError) -> bool:
+    """Whether it is what torch, numpy or a check says of a wrong shape, and does not already say what to do."""
+    cause = error.__cause__
+    if isinstance(cause, CoreRefusal | BackendUnavailable):
+        return False
+    return error.problem.stage == "returns" or isinstance(
+        cause, RuntimeError | ValueError | TypeError | IndexError
+    )
+
+
+def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions, tried: int) -> bool:
+    """Whether the task opens with one env, and resets and steps it from each of `tried` seeds."""
     try:
         loaded = again()
     except TaskError:
         return False
     try:
-        build_task(loaded, replace(options, num_envs=1), Opening(on_finding=lambda finding: None)).env.close()
+        quietly = Opening(on_finding=lambda finding: None)
+        opened = build_task(loaded, replace(options, num_envs=1), quietly)
+        try:
+            for seed in range(options.seed, options.seed + tried):
+                rehearse(opened.env, loaded, seed)
+        finally:
+            opened.env.close()
     except TaskError as error:
         if isinstance(error.__cause__, Interrupted):
             raise
@@ -181,7 +200,26 @@ def import_task(
 
 
 def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
-    """Build, rehearse and reset an imported task. On TaskError the caller undoes the import (`undo_load`)."""
+    """Build, rehearse and reset an imported task: with one env if it does what exists for one only, and a notice says so.
+
+    On TaskError the caller undoes the import (`undo_load`).
+    """
+    try:
+        return _built(loaded, options, opening)
+    except TaskError as error:
+        needs = error.__cause__
+        if options.num_envs == 1 or not isinstance(needs, NeedsOneEnv):
+            raise
+    opened = _built(loaded, replace(options, num_envs=1), opening)
+    notice = f"One env is open, not {options.num_envs}: {needs.reason}"
+    if opened.env.broken_rules is not None:
+        opened.env.broken_rules.report_breach("one-env-only", f"{notice}.", None, needs.place, needs)
+    description = opened.description
+    notice = f"{notice}{in_brackets(needs.place)}."
+    return replace(opened, description=replace(description, notices=(*description.notices, notice)))
+
+
+def _built(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
     on_activity, clock = opening.on_activity, opening.clock
     on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
     with blamed("build", loaded):
@@ -217,7 +255,7 @@ def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Op
         description = describe(loaded, task, options.env_kwargs, loaded.max_episode_steps)
         description = replace(
             description,
-            notices=notices_of(loaded, options),
+            notices=notices_of(loaded, options, description.cameras),
             outlier_rules=rules_of_outliers(loaded, options.rules),
         )
         clock.lap("geometry")
@@ -289,11 +327,12 @@ def describe(
     )
 
 
-def notices_of(loaded: LoadedTask, options: TaskOptions) -> tuple[str, ...]:
+def notices_of(loaded: LoadedTask, options: TaskOptions, cameras: Iterable[CameraInfo]) -> tuple[str, ...]:
     """Notices about a task that works, as sentences."""
     own = loaded.notices if loaded.followed else ()
+    of_cameras = [f"{each.file}:{each.line}: {each.message}" for each in findings_of_shaders(cameras)]
     of_machine = (unused_gpu_text(options.backend), version_notice(), _rerun_notice())
-    return (*own, *(text for text in of_machine if text))
+    return (*own, *of_cameras, *(text for text in of_machine if text))
 
 
 def _rerun_notice() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import difflib
 import importlib
 import importlib.machinery
 import importlib.util
@@ -22,6 +23,7 @@ from workbench.authoring.loading.library_names import (
 )
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem, definition_line, problem_from_exception
+from workbench.core.error_notes import WrongAction
 from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file
 from workbench.machine.parse_python import parse_python
 
@@ -88,7 +90,10 @@ def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
         module = importlib.import_module(name)
     function = getattr(module, attribute, None)
     if not callable(function):
-        raise NoPolicy(f"{name} has no function {attribute}{_hint(name, attribute, task_folder)}")
+        callables = [each for each, value in vars(module).items() if callable(value)]
+        close = difflib.get_close_matches(attribute, callables, n=1)
+        hint = f"; did you mean {close[0]}?" if close else _hint(name, attribute, task_folder)
+        raise NoPolicy(f"{named} has no function {attribute}{hint}")
     return function
 
 
@@ -125,16 +130,15 @@ def policy_problem(
     if isinstance(error, NoPolicy):
         return Problem("policy", str(error), None, None, None, "")
     linecache.checkcache()  # the file may have changed since a line of it was last shown
+    defined = None if policy is None else definition_line(policy)
+    if isinstance(error, WrongAction):
+        file, line = defined or (None, None)
+        code = None if defined is None else linecache.getline(*defined).strip() or None
+        return Problem("policy", f"what {reference} returned {error.problem}", file, line, code, "")
     files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
-    if isinstance(error, SyntaxError) and error.filename is not None:
-        files.append(Path(error.filename))
-    folders = {file.parent for file in files if _is_module_of(file, reference, task_folder)}
-    problem = problem_from_exception(error, "policy", [file for file in files if file.parent in folders])
-    if problem.file is None and policy is not None and (place := definition_line(policy)) is not None:
-        file, line = place
-        problem = replace(problem, file=file, line=line, code=linecache.getline(file, line).strip() or None)
+    own = [file for file in files if _is_module_of(file, reference, task_folder)]
     # Also for a syntax error: the fault is the policy's and not the task's.
-    return replace(problem, stage="policy")
+    return replace(problem_from_exception(error, "policy", own, otherwise=defined), stage="policy")
 
 
 def _is_module_of(file: Path, reference: str, task_folder: Path | None) -> bool:

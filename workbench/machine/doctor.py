@@ -208,6 +208,8 @@ def _render_device() -> list[DoctorFinding]:
         what += f", from {probe.env.get('VK_DRIVER_FILES')}"
     if "llvmpipe" in (probe.name or ""):
         what += "; in software: a camera picture of 128 x 128 takes some 50 ms"
+    if probe.why_no_ray_tracing is not None:
+        what += "; no ray tracing: cameras with shader_pack rt are drawn with default"
     return [DoctorFinding(topic, True, what)]
 
 

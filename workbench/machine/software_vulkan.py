@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import msgspec
@@ -252,7 +252,7 @@ def known_render_device(install: bool) -> RenderProbe:
 
 
 def _what_decides() -> list[str]:
-    """Versions, the environment's variables, driver files with their age, and the devices of this machine."""
+    """Versions, the environment's variables, driver files with their age, the devices of this machine, and what is asked."""
     named = (*DRIVER_VARIABLES, "LD_LIBRARY_PATH", "SAPIEN_VULKAN_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES")
     files = [*driver_files(), *_manifests(private_mesa_folder())]
     devices = [*Path("/dev").glob("nvidia*"), *Path("/dev/dri").glob("*")]
@@ -263,6 +263,7 @@ def _what_decides() -> list[str]:
         *(f"{file} {file.stat().st_mtime_ns}" for file in files if file.exists()),
         *sorted(map(str, devices)),
         *(f"{name} {installed(name)}" for name in ("sapien", "torch")),
+        *(field.name for field in fields(RenderProbe)),
     ]
 
 

@@ -158,6 +158,11 @@ def guard_terminal() -> None:
         logging.lastResort.setFormatter(_OneLine())
 
 
+MOST_LINES = 80
+"""Of a traceback."""
+LONGEST_LINE = 500
+
+
 class _OneLine(logging.Formatter):
     """Formats a log record as one line, followed by its traceback."""
 
@@ -165,7 +170,11 @@ class _OneLine(logging.Formatter):
         return plain_text(super().formatMessage(record))
 
     def formatException(self, ei: Any) -> str:
-        return plain_text(super().formatException(ei), "\n\t")
+        # An error's text may be as long as what a recording or a page sent.
+        lines = [line[:LONGEST_LINE] for line in super().formatException(ei).splitlines()]
+        if len(lines) > MOST_LINES:
+            lines = [*lines[: MOST_LINES // 2], "    ...", *lines[-MOST_LINES // 2 :]]
+        return plain_text("\n".join(lines), "\n\t")
 
 
 def of(count: int, total: int, what: str) -> str:

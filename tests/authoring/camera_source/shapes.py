@@ -521,7 +521,7 @@ REFUSED: dict[str, tuple[str, str]] = {
             """,
             members="def __init__(self):\n    self.eye = [0.3, 0, 0.7]\n",
         ),
-        "set again",
+        "Task.__init__",
     ),
     "a matrix": (
         _hook(

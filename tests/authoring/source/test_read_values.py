@@ -253,19 +253,53 @@ task.hook()
         ("self.made()", "0.5 < cls.near"),
         ("note(self.half)", "`self.half` cannot be read in the file: it is the file's own half"),
         ("note(more)", "`more` cannot be read in the file: it is a parameter of hook"),
-        (
-            "self.own = 4.5; note(self.own)",
-            "`self.own` cannot be read in the file: it is set again at line 17",
-        ),
-        (
-            "self.far = 4.5; note(self.far)",
-            "`self.far` cannot be read in the file: it is set again at line 19",
-        ),
         ("vars(self)['x'] = 1; note(self.x)", "the assignment of `self.x` is not found in the file"),
     ],
 )
 def test_attributes_are_those_of_the_running_object(call: str, what: str) -> None:
     assert told(TASK.format(call)) == what
+
+
+@pytest.mark.parametrize(
+    ("call", "places"),
+    [
+        ("self.own = 4.5; note(self.own)", ["task.py:17 in Task.__init__", "task.py:19 in Task.hook"]),
+        ("self.far = 4.5; note(self.far)", ["task.py:11 in Parent", "task.py:19 in Task.hook"]),
+    ],
+)
+def test_an_attribute_that_is_set_twice_is_refused_with_each_file_line_and_class(
+    call: str, places: list[str]
+) -> None:
+    refused = told(TASK.format(call))
+    assert all(place in refused for place in places), refused
+
+
+OTHER = """
+class Other:
+    def __init__(self):
+        self.own = 7.5
+    def look(self):
+        return self.own
+    @staticmethod
+    def move(task):
+        {}
+"""
+
+
+def test_an_attribute_of_a_class_that_the_object_is_none_of_is_another() -> None:
+    note = TASK.format("note(self.own)")
+    assert told(OTHER.format("pass") + note) == "3.5 < self.own"
+    assert told(f"import places\n{note}", {PLACES: OTHER.format("pass")}) == "3.5 < self.own"
+    # A parameter may be any object, and a class that inherits both has the attribute from either.
+    assert "places.py:9 in Other.move" in told(
+        f"import places\n{note}", {PLACES: OTHER.format("task.own = 1.0")}
+    )
+    both = OTHER.format("pass") + note.replace("class Task(Parent)", "class Task(Parent, Other)")
+    assert "in Other.__init__" in told(both) and "in Task.__init__" in told(both)
+    child = note.replace(
+        "task = Task()", "class Child(Task):\n    def look(self): return self.own\n\ntask = Task()"
+    )
+    assert told(child).startswith("3.5 < self.own (line "), "editing the line would change the child's too"
 
 
 def test_a_call_whose_owner_is_made_anew_is_not_made_again() -> None:

@@ -36,8 +36,6 @@ def test_pictures_are_those_of_a_stock_env_before_and_after_the_mounts_moved(env
         stock = single(Watched, first_env=number, **RENDERED)
         stock.reset(seed=number)
         env.reset(seed=[0, 1, 2])
-        # Hidden, the marker is 99999 m away in the batch: a packed state would take it there in the stock env.
-        env.marker.show_visual()
         put_in_same_state(stock, env, number)
         for _ in range(4):
             ours = pictures(env.step(None)[0])

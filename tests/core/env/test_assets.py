@@ -115,7 +115,7 @@ def test_a_robot_of_the_authors_own_with_a_wrong_path_is_told_so(tmp_path: Path)
             robot: Any = Arm
             super().__init__(*args, robot_uids=robot, **kwargs)
 
-    with pytest.raises(MissingAssets, match=r"arm\.urdf does not exist.*urdf_path"):
+    with pytest.raises(MissingAssets, match=r"arm\.urdf.*test_assets\.py:\d+"):
         batched(Task)
 
 

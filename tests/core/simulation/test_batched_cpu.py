@@ -187,16 +187,6 @@ def test_every_number_of_the_first_body_of_all_is_read() -> None:
     env.close()
 
 
-def test_state_may_not_be_read_while_the_scene_is_loaded() -> None:
-    class ReadsTooEarly(REGISTERED_ENVS["PickCube-v1"].cls):
-        def _load_scene(self, options: dict) -> None:
-            super()._load_scene(options)
-            self.cube.pose  # noqa: B018
-
-    with pytest.raises(RuntimeError, match="_initialize_episode"):
-        batched_class(ReadsTooEarly)(num_envs=2, **STATE_ONLY)
-
-
 def test_every_env_has_its_own_ground() -> None:
     class DropsACube(REGISTERED_ENVS["PickCube-v1"].cls):
         """The cube falls beside the table, onto the floor that the table scene builds 0.92 m below."""

@@ -14,6 +14,7 @@ import sapien
 import sapien.physx as physx
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.building import actors
 from mani_skill.utils.structs.pose import Pose
 
@@ -146,6 +147,48 @@ def test_pictures_and_segmentation_are_the_same_after_it(renderer: None) -> None
     again = env.get_obs()["sensor_data"]["base_camera"]
     assert len(torch.unique(pictures["segmentation"])) > 3
     for name, picture in pictures.items():
+        assert torch.equal(again[name], picture), name
+    env.close()
+
+
+class ManyShaders(PICK_CUBE):
+    """A minimal and a default camera on one link, and a default one for people, which is made last."""
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        hand = self.agent.robot.links_map["panda_hand"]
+        pose = sapien.Pose([0.1, 0, 0], [0.70710678, 0, -0.70710678, 0])
+        on_hand = [
+            CameraConfig(f"hand_{pack}", pose, 32, 32, 1.5, 0.01, 10, mount=hand, shader_pack=pack)
+            for pack in ("default", "minimal")
+        ]
+        return [*super()._default_sensor_configs, *on_hand]
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        config = super()._default_human_render_camera_configs
+        return CameraConfig("render_camera", config.pose, 64, 64, 1, 0.01, 10, shader_pack="default")
+
+
+def test_each_camera_keeps_its_shader(renderer: None) -> None:
+    env: Any = batched(
+        ManyShaders, 2, render=True, obs_mode="rgb+depth+segmentation", render_mode="rgb_array"
+    )
+    env.reset(seed=[0, 1])
+    restore_snapshot(env, take_snapshot(env))
+
+    def pictures() -> dict[str, torch.Tensor]:
+        data = env.get_obs()["sensor_data"]
+        seen = {f"{camera}/{name}": rows for camera, of in data.items() for name, rows in of.items()}
+        return {**seen, "human": env.render()}
+
+    before = {name: picture.clone() for name, picture in pictures().items()}
+    assert {"hand_default/rgb", "hand_minimal/depth"} <= before.keys()
+    assert not torch.equal(before["hand_default/rgb"], before["hand_minimal/rgb"]), "else nothing is proved"
+    renew_physics(env.scene, [0, 1])
+    env.scene._gpu_fetch_all()
+    again = pictures()
+    for name, picture in before.items():
         assert torch.equal(again[name], picture), name
     env.close()
 

@@ -501,7 +501,6 @@ def test_a_hidden_object_keeps_its_true_pose(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(50, 50 + N)))
     restore_snapshot(pick, hidden)
     assert torch.equal(pick.goal_site.pose.raw_pose, goals)
-    assert min(entity.pose.p.min() for entity in pick.goal_site._objs) > 90_000, "out of sight"
     pick.goal_site.show_visual()
     torch.testing.assert_close(pick.goal_site.pose.raw_pose, goals)
     pick.reset(seed=list(range(50, 50 + N)))

@@ -212,6 +212,30 @@ def test_half_a_character_is_sent_so_that_it_can_be_written() -> None:
     assert Unpacker().unpack(pack(message), Finding).message == "a\\ud800b"
 
 
+class Named(msgspec.Struct):
+    """A message with a text, and what msgpack does not know by itself beside it."""
+
+    text: str
+    path: Path
+    numbers: np.ndarray
+    by_name: dict[str, float]
+    inner: list[Source]
+
+
+@given(
+    st.text(st.characters(exclude_categories=())), st.binary(min_size=1, max_size=20), ARRAYS, st.floats(0, 1)
+)
+def test_whatever_its_texts_are_a_message_arrives_and_its_paths_are_the_same(
+    text: str, name: bytes, numbers: np.ndarray, one: float
+) -> None:
+    path = Path(os.fsdecode(name))
+    sent = Named(text, path, numbers, {text: one}, [Source(path, text, text, text)])
+    got = Unpacker().unpack(pack(sent), Named)
+    shown = text.encode(errors="backslashreplace").decode()
+    assert (got.text, got.path, got.by_name) == (shown, path, {shown: one})
+    assert same(got.numbers, numbers) and got.inner == [Source(path, shown, shown, shown)]
+
+
 @pytest.mark.parametrize("value", [object(), np.array([object()]), np.zeros(2, [("a", "<i4")]), lambda: None])
 def test_what_is_no_data_is_not_sent(value: object) -> None:
     with pytest.raises(TypeError, match="cannot be sent"):

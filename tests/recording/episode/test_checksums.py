@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import random
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xxhash
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.drive.episodes import Made
 from workbench.recording.episode.document import Checksum, check, checksum, write_into_description
@@ -17,6 +18,7 @@ from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.scan import scan_folder
+from workbench.recording.writing.finish import EpisodeFiles
 
 Maker = Callable[..., Made]
 
@@ -36,24 +38,51 @@ def episode(make_episode: Maker) -> Made:
     )
 
 
-@pytest.mark.parametrize("suffix", [".rrd", ".h5"])
-def test_any_changed_byte_is_said_and_the_other_file_is_read(
-    episode: Made, tmp_path: Path, suffix: str
+@pytest.fixture(scope="module")
+def whole(make_episode: Maker, tmp_path_factory: pytest.TempPathFactory) -> EpisodeFiles:
+    made = make_episode(3, env_states={"actors/cube": np.arange(4 * 13, dtype=np.float32).reshape(4, 13)})
+    return made.write(tmp_path_factory.mktemp("whole"))
+
+
+@settings(max_examples=150)
+@given(
+    suffix=st.sampled_from([".json", ".json", ".h5", ".rrd"]),
+    places=st.sets(st.floats(0, 1, exclude_max=True), min_size=1, max_size=5),
+    bit=st.integers(0, 7),
+)
+def test_changed_bits_are_told_wherever_they_are(
+    whole: EpisodeFiles, suffix: str, places: set[float], bit: int
 ) -> None:
+    file = whole.json.with_suffix(suffix)
+    content = file.read_bytes()
+    changed = bytearray(content)
+    for place in {int(place * len(content)) for place in places}:
+        changed[place] ^= 1 << bit
+    file.write_bytes(changed)
+    try:
+        said = [broken.file for broken in read_episode(whole.json).broken_files]
+    except UnreadableRecording as error:
+        said = [file.name for _ in [0] if file.name in str(error) or file.stem in str(error)]
+    try:
+        assert said == [file.name]
+        if suffix == ".json":
+            (row,) = scan_folder(file.parent).found.values()
+            assert all(facts.problem is not None for facts, _ in read_found(file.parent, row))
+    finally:
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize("suffix", [".rrd", ".h5", ".json"])
+def test_of_a_changed_file_the_others_are_read(episode: Made, tmp_path: Path, suffix: str) -> None:
     path = episode.write(tmp_path).json
     file = path.with_suffix(suffix)
-    chance = random.Random(0)
-    size = file.stat().st_size
-    for at in [0, size - 1, *(chance.randrange(size) for _ in range(30))]:
-        flip(file, at)
-        found = read_episode(path)
-        (said,) = found.broken_files
-        assert said.sentence.startswith(f"{file.name} was cut short or changed (its checksum differs"), at
-        assert (found.poses is None) == (suffix == ".rrd")
-        assert (found.env_states == {}) == (suffix == ".h5")
-        np.testing.assert_array_equal(found.action, episode.action)
-        flip(file, at)
-    assert read_episode(path).broken_files == ()
+    flip(file, file.stat().st_size - 30)
+    found = read_episode(path)
+    (said,) = found.broken_files
+    assert said.file == file.name
+    assert (found.poses is None) == (suffix == ".rrd")
+    assert (found.env_states == {}) == (suffix == ".h5")
+    np.testing.assert_array_equal(found.action, episode.action)
 
 
 def test_where_both_are_changed_there_is_no_recording(episode: Made, tmp_path: Path) -> None:
@@ -80,7 +109,31 @@ def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, t
     said = json.loads(files.json.read_bytes())
     del said["workbench"]["files"][".h5"]
     files.json.write_text(json.dumps(said))
+    assert [broken.file for broken in read_episode(files.json).broken_files] == [files.json.name]
+    files.json.write_text(json.dumps({**said, "workbench_checksum": None}))
     assert read_episode(files.json).broken_files == ()
+    write_into_description(files.json, ("better",), "")
+    assert read_episode(files.json).broken_files == ()
+
+
+def test_a_changed_document_gets_no_new_checksum_by_a_tag(episode: Made, tmp_path: Path) -> None:
+    files = episode.write(tmp_path)
+    content = files.json.read_bytes().replace(b'"task": "Made-v1"', b'"task": "Fade-v1"')
+    files.json.write_bytes(content)
+    with pytest.raises(ValueError, match="changed"):
+        write_into_description(files.json, ("good",), "")
+    assert files.json.read_bytes() == content
+
+
+def test_a_recording_of_before_opens_and_takes_tags(episode: Made, tmp_path: Path) -> None:
+    files = episode.write(tmp_path)
+    said = json.loads(files.json.read_bytes())
+    del said["workbench_checksum"]
+    said["workbench"]["format"] = 1
+    files.json.write_text(json.dumps(said))
+    for _ in range(2):
+        assert read_episode(files.json).broken_files == ()
+        write_into_description(files.json, ("good",), "")
 
 
 @pytest.mark.parametrize("size", [0, 1, 1 << 20, (1 << 20) + 1, 3_000_000])

@@ -216,6 +216,7 @@ def test_a_camera_comes_back_from_its_words() -> None:
         far=7.0,
         mount="panda/hand",
         intrinsic=np.arange(9, dtype=np.float32).reshape(3, 3),
+        replaced_shader="rt",
     )
     words = CameraJson.of(info)
     assert as_json(words) == {
@@ -229,6 +230,7 @@ def test_a_camera_comes_back_from_its_words() -> None:
         "intrinsic": [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0], [6.0, 7.0, 8.0]],
         "mount": "panda/hand",
         "modalities": ["rgb", "depth", "segmentation"],
+        "replaced_shader": "rt",
     }
     again = words.info()
     assert isinstance(again, CameraInfo) and again.intrinsic.dtype == np.float32

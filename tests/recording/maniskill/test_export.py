@@ -15,6 +15,7 @@ import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
 from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
+from mani_skill.utils.wrappers.record import RecordEpisode
 
 from workbench.cli.main import main
 from workbench.jobs.record.episodes import RecordOptions
@@ -94,7 +95,8 @@ def test_an_episode_of_another_kind_is_refused_or_left_out(
     ).written
     both = (recordings[0], joint.path)
     assert export(*both, "--maniskill", tmp_path / "demos.h5") == 2
-    assert "control mode is 'pd_joint_delta_pos'" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "control mode" in said and "pd_joint_delta_pos" in said
     assert not (tmp_path / "demos.h5").exists()
     assert export(*both, "--maniskill", tmp_path / "demos.h5", "--only-fitting") == 0
     assert len(json.loads((tmp_path / "demos.json").read_text())["episodes"]) == 1
@@ -121,3 +123,63 @@ def test_nothing_that_is_there_is_written_over(
     ):
         assert words in said
     assert [path.name for path in tmp_path.glob("*.*")] == ["demos.json"]
+
+
+OBSERVED = "PickCube-v1", 7
+"""Task and seed."""
+
+
+@pytest.mark.parametrize("obs_mode", ["rgb+depth+segmentation", "state+rgb"])
+def test_pictures_that_were_observed_are_as_maniskills_recorder_writes_them(
+    renderer: None, tmp_path: Path, obs_mode: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    task, seed = OBSERVED
+    actions = np.random.default_rng(0).uniform(-1, 1, (4, 8)).astype(np.float32)
+    np.save(tmp_path / "actions.npy", actions)
+    for name, pictures in (("seen", True), ("blind", False)):
+        options = TaskOptions(num_envs=1, seed=seed, env_kwargs={"obs_mode": obs_mode})
+        given = str(tmp_path / "actions.npy")
+        record(RecordOptions(task, tmp_path / name, 1, actions=given, pictures=pictures, options=options))
+    stock: Any = gym.make(task, obs_mode=obs_mode, render_backend="cpu")
+    stock = RecordEpisode(stock, str(tmp_path), trajectory_name="theirs", save_video=False)
+    stock.reset(seed=seed)
+    for action in actions:
+        stock.step(action)
+    stock.close()
+    assert export(tmp_path / "seen", "--maniskill", tmp_path / "ours.h5") == 0
+    ours, theirs = (obs_of(tmp_path / f"{name}.h5") for name in ("ours", "theirs"))
+    assert {name: (one.shape, one.dtype) for name, one in ours.items()} == {
+        name: (one.shape, one.dtype) for name, one in theirs.items()
+    }
+    assert any(name.startswith("sensor_data") for name in ours)
+    for name, values in theirs.items():
+        apart = np.abs(ours[name].astype(float) - values.astype(float))
+        # JPEG, and whole millimetres of one that rounds and one that cuts.
+        if name.endswith("rgb"):
+            assert apart.mean() < 6
+        else:
+            assert apart.max() <= (1 if name.endswith("depth") else 1e-4), name
+    data: Any = ManiSkillTrajectoryDataset(str(tmp_path / "ours.h5"))
+    assert data.obs["sensor_data"]["base_camera"]["rgb"].shape == (4, 128, 128, 3)
+
+    # ManiSkill's own file comes out as it went in.
+    assert export(tmp_path / "theirs.h5", "--maniskill", tmp_path / "again.h5") == 0
+    for name, values in obs_of(tmp_path / "again.h5").items():
+        np.testing.assert_allclose(values, theirs[name], atol=1e-6, err_msg=name)
+
+    capsys.readouterr()
+    assert export(tmp_path / "blind", "--maniskill", tmp_path / "blind.h5") == 0
+    (blind,) = (tmp_path / "blind").glob("*.json")
+    assert blind.stem in capsys.readouterr().err
+    assert not any(name.startswith("sensor_data") for name in obs_of(tmp_path / "blind.h5"))
+
+
+def obs_of(file: Path) -> dict[str, Any]:
+    """Observations of the first trajectory by their paths."""
+    found: dict[str, Any] = {}
+    with h5py.File(file) as opened:
+        obs: Any = opened["traj_0/obs"]
+        obs.visititems(
+            lambda name, node: found.update({name: node[()]}) if isinstance(node, h5py.Dataset) else None
+        )
+    return found

@@ -21,7 +21,7 @@ from tests.drive.episodes import Made
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.reader.read_episode import read_episode, read_maniskill, trajectories
+from workbench.recording.reader.read_episode import read_episode, read_maniskill
 
 STEPS = 6
 SEED = 4
@@ -151,7 +151,6 @@ def test_long_columns_are_packed_and_read_the_same(make_episode: Callable[..., M
 
 def test_theirs_is_read_as_ours_is(child_process: None, tmp_path: Path) -> None:
     theirs, ours = record_both("PickCube-v1", tmp_path, obs_mode="state_dict")
-    assert trajectories(theirs) == trajectories(ours) == ("traj_0",)
     found, expected = read_maniskill(theirs, "traj_0"), read_episode(ours)
     assert found.geometry is None and found.poses is None and found.cameras == []
     for name in ("action", "reward", "terminated", "truncated"):
@@ -209,7 +208,7 @@ def test_a_file_that_was_cut_takes_only_its_own_with_it(
     file.write_bytes(file.read_bytes()[:-100])
     read = read_episode(path)
     (said,) = read.broken_files
-    assert said.sentence.startswith(f"{file.name} was cut short or changed (")
+    assert said.file == file.name
     np.testing.assert_array_equal(read.reward, made.reward)
     assert read.info == made.info
     assert (read.poses is None, not read.env_states) == (lost == "poses", lost == "env_states")
@@ -221,7 +220,6 @@ def test_what_is_no_recording_is_said(child_process: None, tmp_path: Path) -> No
         (lambda: read_episode(tmp_path / "none.rrd"), "none.rrd is not there"),
         (lambda: read_episode(theirs), "theirs.json is not from the workbench"),
         (lambda: read_maniskill(theirs, "traj_7"), "has no entry for traj_7"),
-        (lambda: trajectories(ours.with_suffix(".json")), "cannot be read as .h5"),
     ):
         with pytest.raises(UnreadableRecording, match=why):
             reading()

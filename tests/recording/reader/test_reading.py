@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,16 @@ def test_what_takes_too_long_is_given_up_and_the_others_are_read(
     assert not psutil.pid_exists(first)
     (tmp_path / "b.json").unlink()
     assert sorted(rows(tmp_path)) == ["a", "c", "d"]
+
+
+def test_reading_that_is_not_needed_any_more_is_given_up(tmp_path: Path) -> None:
+    whole = describe(tmp_path, "a")
+    slow_json(tmp_path / "b.json")
+    began = time.monotonic()
+    with pytest.raises(UnreadableRecording, match="b"):
+        reading.read_recording(Source(tmp_path / "b.json"), stopped=lambda: time.monotonic() - began > 0.3)
+    assert time.monotonic() - began < reading.OPEN_SECONDS / 2
+    assert rows(tmp_path)["a"].problem is None and whole.exists()
 
 
 def test_a_reader_that_crashes_is_a_row_and_another_one_reads_on(tmp_path: Path) -> None:
@@ -219,7 +230,7 @@ def test_an_episode_that_claims_more_memory_than_there_may_be_is_refused(
     recorded: Any, tmp_path: Path
 ) -> None:
     path = recorded.episode.write(tmp_path).json
-    whole = json.loads(path.read_text())
+    whole = json.loads(path.read_text()) | {"workbench_checksum": None}
     for length, says in ((10**15, "steps"), (9_000_000, "numbers"), (-5, "steps"), ("many", "broken")):
         whole["workbench"]["length"] = length
         path.write_text(json.dumps(whole))

@@ -77,6 +77,7 @@ def description(path: Path) -> object:
     data = json.loads(path.read_text())
     for name in ("files", "made_here"):
         del data["workbench"][name]
+    del data["workbench_checksum"]
     return data
 
 

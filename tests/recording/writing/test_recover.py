@@ -7,11 +7,14 @@ import errno
 import json
 import os
 import random
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from tests.drive.episodes import Made, entries_of, header_of, journal_of
 from tests.drive.rows import append
@@ -79,6 +82,44 @@ def test_garbage_at_the_end_is_left_out(make_episode: Maker, tmp_path: Path) -> 
         file.write(bytes(1000) + os.urandom(5000))
     (files,) = recover(tmp_path)
     assert read_episode(files.rrd).length == 4
+
+
+SCHEMA = 200
+"""Bytes with which a journal begins and that hold no data."""
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_a_damaged_journal_is_never_deleted_with_steps_in_it(
+    make_episode: Maker, tmp_path: Path, data: st.DataObject
+) -> None:
+    folder = Path(tempfile.mkdtemp(dir=tmp_path))
+    episode = make_episode(6)
+    writer = episode.writer(folder)
+    for row in episode.rows():
+        append(writer, row)
+        journal_of(writer).write()
+    writer.close()
+    path = folder / FOLDER / f"{episode.info.id}.arrow"
+    content = bytearray(path.read_bytes())
+    beginning = st.integers(0, SCHEMA - 1)
+    place = data.draw(st.none() | beginning | st.integers(0, len(content) - 1), "byte")
+    if place is not None:
+        content[place] ^= 1 << data.draw(st.integers(0, 7), "bit")
+    path.write_bytes(content)
+    try:
+        recover(folder)
+    except RecordingError:
+        assert place is not None and place >= SCHEMA
+        left_over = [one for one in (folder / FOLDER).iterdir() if one.suffix in (".arrow", ".damaged")]
+        assert [one.read_bytes() for one in left_over] == [bytes(content)]
+        if left_over[0].suffix == ".damaged":
+            recover(folder)  # it was said once
+            assert left_over[0].exists()
+    else:
+        # All of it is there, or all but what stands last and cannot be told from what was being written.
+        (length,) = lengths(folder).values()
+        assert length == 6 or (length == 5 and place is not None and place >= SCHEMA)
 
 
 @pytest.mark.parametrize("linked", [0, 1, 2, 3])

@@ -19,7 +19,7 @@ from workbench.jobs.task import Stepped, TaskOptions
 from workbench.session.live.live_state import LiveState
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.process.supervisor import Supervisor
+from workbench.session.process.supervisor import End, Supervisor
 from workbench.session.protocol.messages import (
     CameraRequest,
     Loaded,
@@ -191,7 +191,7 @@ def test_a_worker_that_could_load_nothing_waits_with_the_problem() -> None:
     state.died(DEATH, while_loading=True, printed="")
     state.wait_for_file()
     assert (view(state).state, state.wants_play) == ("error", False)
-    assert state.died(replace(DEATH, asked=True, gives_up=True), while_loading=True, printed="") is None
+    assert state.died(replace(DEATH, end=End.ASKED, gives_up=True), while_loading=True, printed="") is None
     state.wait_for_file()
     assert view(state).state == "stopped" and view(state).problem is not None
 
@@ -228,7 +228,7 @@ def test_a_load_asks_for_the_class_and_the_seed_that_the_page_chose() -> None:
     state.set(task=replace(task, others=("Other",)), choices=("PushEnv", "Other"))
     assert state.choose_class("Other")
     state.set(seed=7)
-    load = state.load_request(None, b"moment", "rebuilt")
+    load = state.load_request(None, b"moment", level="rebuilt")
     assert str(load.task).endswith("push.py:Other") and load.options == TaskOptions(seed=7)
     assert (load.source, load.level, load.snapshot) == (None, "rebuilt", b"moment")
 

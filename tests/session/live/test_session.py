@@ -13,6 +13,7 @@ import pytest
 
 from tests.drive.session import start_over, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
+from workbench.jobs.task import TaskOptions
 from workbench.recording.rerun.read import read_properties
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
@@ -170,6 +171,52 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
     session.change(action_source="random")
     session.step()
     wait_until(session, lambda v: v.problem is None, "the problem's end")
+
+
+POLICIES = {
+    "half": ('{"panda_wristcam-0": torch.zeros(2, 8)}', ["panda_wristcam-1"]),
+    "other": ('{"panda": 0, "panda_wristcam-0": np.zeros(8), "panda_wristcam-1": np.zeros(8)}', ["panda,"]),
+    "narrow": (
+        '{"panda_wristcam-0": torch.zeros(2, 7), "panda_wristcam-1": np.zeros(8)}',
+        ["(2, 7)", "(2, 8)"],
+    ),
+    "one_row": ("np.zeros(8)", ["(8,)", "(2, 16)", "panda_wristcam-0 8"]),
+    "nan": ("torch.full((2, 16), torch.nan)", ["2 of 2 envs", "panda_wristcam-0/arm/panda_joint1", "env 0"]),
+    "nothing": ("None", ["None"]),
+    "text": ("'left'", ["str"]),
+    "pair": ("(torch.zeros(2, 16), {})", ["(2, 16)", "dict"]),
+    "raises": ("{}['grip']", ["KeyError", "grip"]),
+    "no_parameter": ("0", ["TypeError"]),
+}
+
+
+def test_what_a_policy_returns_for_several_robots_and_is_no_action_is_named(tmp_path: Path) -> None:
+    policy = tmp_path / "policy.py"
+    text = "import numpy as np, torch\n"
+    text += "".join(f"def {name}(obs): return {returned}\n" for name, (returned, _) in POLICIES.items())
+    text = text.replace("no_parameter(obs)", "no_parameter()")
+    text += "def works(obs): return {'panda_wristcam-1': torch.ones(2, 8), 'panda_wristcam-0': np.zeros(8)}\n"
+    policy.write_text(text)
+    options = TaskOptions(2, env_kwargs={"render_backend": "none"})
+    session = Session("TwoRobotPickCube-v1", options, recordings=tmp_path)
+    try:
+        wait_until(session, lambda v: v.task is not None, "the task")
+        for at, (name, (_, facts)) in enumerate(POLICIES.items()):
+            serial = session.view().problem_serial
+            session.change(action_source="policy", policy=f"{policy}:{name}")
+            session.step()
+            view = wait_until(
+                session, lambda v, n=serial: v.problem_serial > n and v.problem is not None, name
+            )
+            problem = view.problem
+            assert (problem.stage, problem.file, problem.line) == ("policy", str(policy), at + 2), problem
+            assert all(fact in problem.message for fact in facts), problem.message
+        session.change(action_source="policy", policy=f"{policy}:works")
+        session.step()
+        view = wait_until(session, lambda v: v.step.elapsed_steps.all(), "a step")
+        assert view.step.action.tolist() == [[0.0] * 8 + [1.0] * 8] * 2
+    finally:
+        session.close()
 
 
 def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(

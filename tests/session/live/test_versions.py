@@ -15,10 +15,12 @@ from tests.ui.scenes import description, problem, step_of, table_scene
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.session.live.live_state import LiveState, SharedState
 from workbench.session.live.versions import Versions
-from workbench.session.protocol.messages import Load, Loaded, LoadFailed, Play, Request
+from workbench.session.process.supervisor import End
+from workbench.session.protocol.messages import Load, Loaded, LoadFailed, Loading, Play, Request
 
 GOOD, NEW = "x = 1\n", "x = 2\n"
-FILE_WAITS = replace(DEATH, file_waits=True)
+FILE_WAITS = replace(DEATH, end=End.FILE_WAITS)
+HANDED_OVER = replace(DEATH, end=End.HANDED_OVER)
 
 
 class Open:
@@ -99,6 +101,7 @@ def test_each_worker_is_greeted_with_what_the_last_one_knew(one: Open) -> None:
     assert isinstance(load, Load) and (load.source, load.snapshot) == (None, None)
     one.runs()
     one.shared.state.wants_play = True
+    one.versions.reload()
     assert one.versions.died(FILE_WAITS, "")[1]
     (_, load, play) = one.versions.first_requests()
     assert play == Play(True)
@@ -107,9 +110,12 @@ def test_each_worker_is_greeted_with_what_the_last_one_knew(one: Open) -> None:
 
 def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Open) -> None:
     one.runs()
+    one.versions.reload()
     one.versions.died(FILE_WAITS, "")
     (asked,) = one.loads()
     assert asked.source is None
+    one.sent.clear()
+    one.versions.began(Loading("", asked.number))
     one.versions.failed(LoadFailed(problem(), kept=False))
     (load,) = one.sent
     assert isinstance(load, Load) and load.source == {str(one.file): GOOD} and load.snapshot is not None
@@ -127,7 +133,22 @@ def test_the_end_of_a_worker_says_whether_there_is_a_version_to_come_back(one: O
     told, comes_back = one.versions.died(DEATH, "")
     assert told is not None and comes_back and one.shared.state.problem_at_run
     one.versions.restart_worker()
-    assert one.replaced == 1 and one.loads()[0].source == {str(one.file): GOOD}
+    assert one.replaced == 1 and one.loads()[0].source is None, "the file as it is now"
+
+
+def test_a_worker_that_ran_a_refused_version_is_followed_by_one_with_the_last_good_version(one: Open) -> None:
+    one.runs()
+    one.shared.state.wants_play = True
+    one.versions.reload()
+    (asked,) = one.sent
+    assert isinstance(asked, Load)
+    one.versions.began(Loading("", asked.number))
+    one.versions.failed(LoadFailed(problem(), kept=True, spoiled=True))
+    told, comes_back = one.versions.died(HANDED_OVER, "")
+    assert told is None and comes_back
+    _, load, play = one.versions.first_requests()
+    assert isinstance(load, Load) and load.source == {str(one.file): GOOD} and load.snapshot is not None
+    assert play == Play(True)
 
 
 def test_after_too_many_deaths_a_reload_starts_another_worker(one: Open) -> None:

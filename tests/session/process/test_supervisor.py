@@ -21,7 +21,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import Call
 from workbench.session.process import supervisor, worker_process, worker_start
 from workbench.session.process.heartbeat import Busy
-from workbench.session.process.supervisor import Death, SpareWorker, Supervisor, WorkerOptions
+from workbench.session.process.supervisor import Death, End, SpareWorker, Supervisor, WorkerOptions
 from workbench.session.protocol.messages import Event, Load, Loading, Request, WarmUp
 from workbench.session.protocol.questions import RunCameras
 
@@ -128,12 +128,7 @@ def test_each_worker_is_greeted_and_what_it_says_arrives_in_order() -> None:
         first = one.worker.pid
         one.worker.replace()
         death = one.until_dead()
-        assert (death.why, death.asked, death.file_waits, death.gives_up) == (
-            "was stopped by hand",
-            True,
-            False,
-            False,
-        )
+        assert (death.end, death.gives_up) == (End.ASKED, False)
         one.until_greeted(2)
         assert one.worker.pid not in (first, None)
     assert one.worker.pid is None or not Path(f"/proc/{one.worker.pid}/task").exists()
@@ -145,9 +140,9 @@ def test_what_was_sent_before_a_sudden_end_is_taken_first() -> None:
         one.worker.send(do("last_steps 300"))
         death = one.until_dead()
         assert one.said[1:301] == [f"step {number}" for number in range(300)]
-        assert (death.why, death.asked, death.doing, death.stack) == (
+        assert (death.why, death.end, death.doing, death.stack) == (
             "was killed by SIGKILL",
-            False,
+            End.DIED,
             None,
             "",
         )
@@ -173,7 +168,7 @@ def test_the_third_death_in_a_row_is_the_last_until_somebody_asks() -> None:
         one.until_greeted(4)
         one.worker.send(do("leave 1"))
         fourth = one.until_dead(4)
-        assert (fourth.asked, fourth.gives_up) == (False, False), "it waited to be asked, and begins anew"
+        assert (fourth.end, fourth.gives_up) == (End.DIED, False), "it waited to be asked, and begins anew"
 
 
 @pytest.mark.slow
@@ -256,7 +251,7 @@ def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
             one.until(lambda: one.busy and one.busy[-1] is not None, "that it is busy")
             one.worker.send(load("mended"))
             death = one.until_dead(times)
-            assert death.file_waits and not death.asked
+            assert death.end is End.FILE_WAITS
             # Not before the interrupt was given its time: 0.3 s until it was sent and 1.2 s after it.
             waited = re.fullmatch(r"did not answer for (\d+) s", death.why)
             assert waited is not None and int(waited[1]) >= 2, death.why
@@ -407,7 +402,7 @@ def test_memory_beyond_the_limit_ends_the_worker_and_what_it_holds_is_told() -> 
         one.worker.send(do("fill_memory 700"))
         death = one.until_dead()
         assert death.why.startswith("was ended because it and what it started had ")
-        assert "--memory-limit" in death.why and not death.asked
+        assert "--memory-limit" in death.why and death.end is End.DIED
 
 
 @pytest.mark.slow

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -388,3 +391,54 @@ def test_of_too_many_recordings_only_the_selected_one_is_named(shown: Shown, fol
     shown.review.close_one(MOST_NAMED)
     shown.draw()
     assert len(shown.panels.labels()) == MOST_NAMED
+
+
+LONG, PATH = "x" * 1000, "y/" * 2000
+HOSTILE: tuple[dict[str, Any], ...] = (
+    {"source_file": "x" * 5000},
+    {"source_file": PATH, "source_path": PATH, "source": {PATH: "x = 1\n", "../a.py": "\0"}, "side_files": {PATH: "0"}},
+    {"source_file": "a\0b.py", "source_path": "a\0b.py", "source": {"a\0b.py": ""}, "side_files": {"a\0b": ""}},
+    {"task": LONG, "id": LONG, "backend": LONG, "control_mode": LONG, "source_hash": LONG, "versions": {LONG: LONG}},
+    {"written_at": "9999-12-31T23:59:59+00:00", "control_dt": 1e-4, "env_index": 2**62, "max_episode_steps": -1, "seed": 2**62},
+    {"written_at": "<script>", "control_dt": 1e3, "acted_by": [[-(2**60), LONG]] * 1000},
+    {"env_kwargs": {LONG: [[[[LONG]]]], "control_mode": {}}, "reset_options": {"\u202e": [float("nan"), 10**15]}},
+    {"texts": {LONG: [[-5, ["a", LONG, True, True]], [10**9, None]], "": [[0, ["", "", False, False]]]}},
+    {"segmentation": {str(-(2**40)): LONG}, "action_names": [LONG, LONG], "evaluate": {"a/" * 400: ["<f8", []]}},
+    {"length": 10**7, "control_dt": 0},
+    {"env_kwargs": "no object"},
+)  # fmt: skip
+
+
+def test_a_foreign_recording_of_any_values_is_shown_or_named(
+    child_process: None, gated_server: GatedServer, panels: Panels, clock: Clock, tmp_path: Path
+) -> None:
+    path = write(tmp_path, made(6, success_from=3))
+    document = json.loads(path.read_text()) | {"workbench_checksum": None}
+    for number, change in enumerate(HOSTILE):
+        for suffix in (".rrd", ".h5"):
+            shutil.copy(path.with_suffix(suffix), tmp_path / f"{number}{suffix}")
+        values = {**document, "workbench": {**document["workbench"], "id": str(number), **change}}
+        (tmp_path / f"{number}.json").write_text(json.dumps(values))
+    path.unlink()
+    place = Workplace(gated_server, tmp_path, no_session, TaskOptions())
+    place.shelf.library.refresh()
+    page, review = ReviewPage(place, clock=clock), place.shelf.review
+    rows = {row.name: row.id for row in place.shelf.library.view().rows}
+    page.redraw()  # it opens the newest by itself, once
+    shown = []
+    for number in range(len(HOSTILE)):
+        review.open([rows[str(number)]])
+        until(lambda: not review.view().loading, "the end of the opening", seen=review.view)
+        for state in (0, 6):
+            review.seek(state)
+            clock.passes()
+            page.redraw()
+        view, html = review.view(), panels.part("Review").html()
+        if review.view().problems:
+            assert str(number) in " ".join(view.problems) and str(number) in html
+        else:
+            shown.append(number)
+            assert view.opened[0].id == rows[str(number)] and f">{number}<" in html
+        assert len(panels.html()) < 1 << 20
+    assert shown == [1, 2, 3, 4, 5, 6, 7, 8]
+    place.close()

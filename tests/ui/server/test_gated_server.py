@@ -263,7 +263,12 @@ def test_icons_are_those_of_viser_and_its_archive_is_not_searched_for_each(gated
 @pytest.mark.parametrize("name", viser_private.PRIVATE_NAMES)
 def test_a_name_that_viser_took_away_is_named(name, monkeypatch):
     *path, last = name.split(".")
-    roots = {"infra": viser.infra._infra, "messages": viser._messages, "gui": viser._gui_handles}
+    roots = {
+        "infra": viser.infra._infra,
+        "messages": viser._messages,
+        "gui": viser._gui_handles,
+        "callbacks": viser._threadpool_exceptions,
+    }
     here = roots[path[0]]
     for part in path[1:]:
         here = getattr(here, part)

@@ -34,6 +34,7 @@ from workbench.ui.server.responses import (
     request_parts,
     with_our_head,
 )
+from workbench.ui.server.strangers import RareLog
 
 AUTHORITY = "localhost:8080"
 PAGE = b"<html><head><title>viser</title></head><body></body></html>"
@@ -54,7 +55,8 @@ def answer(
 ) -> Response:
     request = Request(path, Headers({"Accept-Encoding": accepts} if accepts else {}))
     connection = cast(ServerConnection, None)  # only a file that is sent while it is read needs one
-    return asyncio.run(admitted_reply(routes or {}, viser_hook or of_viser(), connection, request, AUTHORITY))
+    hook = viser_hook or of_viser()
+    return asyncio.run(admitted_reply(routes or {}, hook, connection, request, AUTHORITY, RareLog()))
 
 
 def says(body: bytes, kind: str = "text/plain") -> Callable[[str], tuple[int, str, bytes]]:

@@ -7,14 +7,17 @@ import http.client
 import logging
 import re
 import socket
+import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.ui.knocking import ask, both, client, cookie_of, knock, token_of
+from tests.ui.knocking import PROTOCOL, ask, both, client, cookie_of, knock, token_of
 from workbench.ui.server import strangers
 from workbench.ui.server.access import cookie_name
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
@@ -183,6 +186,101 @@ def test_whatever_a_stranger_sends_for_long_is_refused(fuzzed, raw):
 
 
 # What is said ------------------------------------------------------------------------------------
+
+MOST_LINES = 20
+"""Of a terminal, whatever a few hundred connections do in some seconds."""
+
+
+def reset(sock: socket.socket) -> None:
+    """Hang up so that what the other end still writes fails."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    sock.close()
+
+
+def page_of(gated_server: GatedServer, protocol: str) -> socket.socket:
+    """A connection with the token after its handshake, to send any bytes on."""
+    sock, host = connected(gated_server), f"127.0.0.1:{gated_server.port}"
+    head = f"GET / HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\nCookie: {cookie_of(gated_server)}\r\n"
+    head += "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+    sock.sendall(f"{head}Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {protocol}\r\n\r\n".encode())
+    assert b" 101 " in sock.recv(1 << 12)
+    return sock
+
+
+def zeros(gated_server: GatedServer) -> None:
+    with connected(gated_server) as sock, contextlib.suppress(OSError):
+        sock.sendall(bytes(70_000))
+        is_closed(sock)
+
+
+def long_protocol(gated_server: GatedServer) -> None:
+    with page_of(gated_server, f"viser-v{'x' * 3000}") as sock:
+        is_closed(sock)
+
+
+def pings(gated_server: GatedServer) -> None:
+    sock = page_of(gated_server, PROTOCOL)
+    with contextlib.suppress(OSError):
+        for _ in range(50):
+            sock.sendall(b"\x89\x81\0\0\0\0x" * 200)
+    reset(sock)
+
+
+def broken_frames(gated_server: GatedServer) -> None:
+    for frame in (
+        b"\xff" * 300,
+        b"\x82\xfe\x01\x00" + bytes(260),
+        b"\x81\x81\0\0\0\0\xff",
+        b"\x82\x81\0\0\0\0\xc0",
+    ):
+        sock = page_of(gated_server, PROTOCOL)
+        sock.sendall(frame)
+        reset(sock)
+
+
+def fails(gated_server: GatedServer) -> None:
+    assert ask(gated_server, "/fails/" + "y" * 200)[0] == 500
+
+
+def presses(gated_server: GatedServer) -> None:
+    (button,) = gated_server.server.gui._gui_input_handle_from_uuid
+    message = {"type": "GuiUpdateMessage", "uuid": button, "updates": {"value": True}}
+    with client(gated_server) as page:
+        page.send(msgspec.msgpack.encode(message))
+
+
+@pytest.mark.parametrize(
+    ("attack", "times"),
+    [(zeros, 60), (long_protocol, 30), (pings, 5), (broken_frames, 30), (fails, 60), (presses, 60)],
+)
+def test_whatever_is_sent_prints_a_few_short_lines(
+    gated_server: GatedServer,
+    attack: Callable[[GatedServer], None],
+    times: int,
+    caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    def fail(what: object) -> Any:
+        raise RuntimeError("z" * 100_000)
+
+    gated_server.add_route("/fails/", fail)
+    gated_server.server.gui.add_button("Fails").on_click(fail)
+    for _ in range(times):
+        attack(gated_server)
+    assert both(gated_server) == (200, 101)
+    time.sleep(0.5)  # what fails in threads
+    gated_server.close()
+    said = [
+        logging.lastResort.format(record) for record in caplog.records if record.levelno >= logging.WARNING
+    ]
+    printed = capfd.readouterr()
+    lines = "\n".join((*said, printed.out, printed.err)).strip().splitlines()
+    assert len(lines) <= MOST_LINES * (4 if attack in (fails, presses) else 1), lines[:100]
+    if attack not in (
+        fails,
+        presses,
+    ):  # a terminal cuts the lines of a traceback (tests/machine/test_terminal_text.py)
+        assert all(len(line) <= 600 for line in lines)
 
 
 def test_what_is_turned_away_is_counted_and_told_once_of_each_kind(gated_server, caplog):

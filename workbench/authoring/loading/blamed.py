@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import linecache
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
+
+from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.authoring.loading.load import LoadedTask
 from workbench.authoring.problem import (
@@ -19,9 +18,9 @@ from workbench.authoring.problem import (
     problem_from_exception,
     problem_from_return,
 )
-from workbench.core.broken_rule import BrokenRule, WrongReturn
-from workbench.core.env.cpu_scene import ForgottenInit
+from workbench.core.broken_rule import WrongReturn
 from workbench.core.env.task_env import TaskEnv
+from workbench.core.error_notes import AuthorCall
 
 
 class blamed:
@@ -29,11 +28,13 @@ class blamed:
 
     def __init__(self, stage: str, loaded: LoadedTask, task: TaskEnv | None = None) -> None:
         self._stage, self._loaded, self._task = stage, loaded, task
+        self._call = AuthorCall()
 
     def __enter__(self) -> None:
-        pass
+        self._call.__enter__()
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        self._call.__exit__(kind, error, trace)
         if isinstance(error, Interrupted):
             # Call no more of the author's code to explain the error: it may be what does not end.
             files, cls = self._loaded.source_files, self._loaded.cls
@@ -55,22 +56,20 @@ class blamed:
         loaded = self._loaded
         if isinstance(error, WrongReturn):
             return problem_from_return(loaded.cls, error.hook, error.problem, loaded.source_files)
-        env = self._task.env if self._task is not None else _env_on_traceback(error, loaded.cls)
-        if isinstance(error, (BrokenRule, ForgottenInit)):
-            return _problem_at_its_place(error, self._stage, loaded)
-        known = _raised_in(error, loaded.source_files)
-        if env is not None and not known:
-            # Raised in ManiSkill's own code, most often because of what evaluate() returned; the author's last line on
-            # the traceback is then only their call of super().__init__().
-            try:
-                returned = env.evaluate()
-            except Exception:
-                # evaluate() fails too, as without a scene after an unknown keyword: that would hide the first error.
-                return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
-            blamed = check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
-            if blamed is not None:
-                return blamed
-        return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
+        return self._wrong_return(error) or problem_from_exception(
+            error, self._stage, loaded.source_files, loaded.cls
+        )
+
+    def _wrong_return(self, error: BaseException) -> Problem | None:
+        """What ``evaluate`` returns and ManiSkill cannot use, if `error` comes from ManiSkill's use of it."""
+        loaded, env = self._loaded, _env_that_reads(error)
+        if env is None:
+            return None
+        try:
+            returned = env.evaluate()
+        except Exception:
+            return None  # the first error is the one to tell
+        return check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
 
 
 def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
@@ -84,26 +83,11 @@ def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, A
     return check
 
 
-def _problem_at_its_place(error: BrokenRule | ForgottenInit, stage: str, loaded: LoadedTask) -> Problem:
-    """The problem at the line at fault, which may have ended earlier and be on no traceback."""
-    problem = problem_from_exception(error, stage, loaded.source_files, loaded.cls)
-    if error.place is None or Path(error.place[0]) not in loaded.source_files:
-        return problem
-    file, line, _ = error.place
-    return replace(problem, file=file, line=line, code=linecache.getline(file, line).strip() or None)
+_READERS = tuple(getattr(BaseEnv, name).__code__ for name in ("step", "get_info", "compute_sparse_reward"))
+"""ManiSkill's functions that use what ``evaluate`` returned, and check nothing of it."""
 
 
-def _raised_in(error: BaseException, files: Sequence[Path]) -> bool:
-    frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and Path(frames[-1].filename) in files
-
-
-def _env_on_traceback(error: BaseException, cls: type) -> Any:
-    """The env whose constructor raised: ``BaseEnv.__init__`` resets, so hooks run before it returns."""
-    trace = error.__traceback__
-    while trace is not None:
-        owner = trace.tb_frame.f_locals.get("self")
-        if isinstance(owner, cls):
-            return owner
-        trace = trace.tb_next
-    return None
+def _env_that_reads(error: BaseException) -> BaseEnv | None:
+    """The env whose ManiSkill code failed while it used what ``evaluate`` returned; None for any other error."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return frames[-1].f_locals.get("self") if frames and frames[-1].f_code in _READERS else None

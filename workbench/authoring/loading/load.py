@@ -7,7 +7,6 @@ import difflib
 import importlib
 import inspect
 import sys
-import traceback
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 from workbench.authoring.loading import registry
 from workbench.authoring.loading.library_names import (
     files_named_like_libraries,
-    is_own_file,
     named_like_library_text,
     remove_library_finder,
     search_first,
@@ -498,12 +496,7 @@ def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
 
 def _named_module_problem(exc: BaseException, module: NamedModule) -> Problem:
     """The problem of a named module that is imported as Python does."""
-    folder = module.own_folder or module.file.parent
-    files = [Path(frame.filename) for frame in traceback.extract_tb(exc.__traceback__)]
-    if isinstance(exc, SyntaxError) and exc.filename is not None:
-        files.append(Path(exc.filename))
-    own = [file for file in files if file == module.file or is_own_file(str(file), folder)]
-    problem = problem_from_exception(exc, "import", own)
+    problem = problem_from_exception(exc, "import", [module.file])
     message = f"{module.name} cannot be imported: {problem.message}"
     return dataclasses.replace(problem, message=message, file=problem.file or str(module.file))
 

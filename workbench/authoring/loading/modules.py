@@ -189,6 +189,9 @@ class AuthorFinder(MetaPathFinder):
 class _AuthorLoader(importlib.machinery.SourceFileLoader):
     """Executes one text. Reads and writes no bytecode files."""
 
+    executed = 0
+    """By all loaders of this process."""
+
     def __init__(self, finder: AuthorFinder, name: str, path: str) -> None:
         super().__init__(name, path)
         self.finder = finder
@@ -218,7 +221,14 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
             # would register its ids twice.
             sys.modules[stem] = module
             self.finder.names.append(stem)
-        exec(self.get_code(name), module.__dict__)
+        code = self.get_code(name)
+        _AuthorLoader.executed += 1
+        exec(code, module.__dict__)
+
+
+def executed_modules() -> int:
+    """How many modules of authors this process has begun to execute, over all loads."""
+    return _AuthorLoader.executed
 
 
 def read_source(path: str | Path) -> str:

@@ -68,7 +68,7 @@ class SourceWatcher:
                 are not in it and not followed yet are read now.
         """
         texts = texts or {}
-        followed = [Path(path).expanduser().resolve() for path in paths]
+        followed = [_real(Path(path).expanduser()) for path in paths]
         with self._lock:
             self._known = {
                 path: texts[str(path)]
@@ -148,6 +148,12 @@ class SourceWatcher:
                     return changed
             self._stopped.wait(QUIET_S)
         return set()
+
+
+def _real(path: Path) -> Path:
+    """The file behind links. A link to something else (a device, by mistake) is watched itself, until it is a file again."""
+    real = path.resolve()
+    return real if real.is_file() else path.parent.resolve() / path.name
 
 
 def _status(path: Path) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ from types import CodeType, FunctionType
 from typing import Any, Literal
 
 from workbench.authoring.problem import hooks_of
-from workbench.authoring.reload.call_graph import STATEMENTS, Key, TwoVersions
+from workbench.authoring.reload.call_graph import STATEMENTS, Key, TwoVersions, read_symbols
 from workbench.authoring.reload.kept_state import (
     changed_while_running,
     memoizing_statement,
@@ -337,6 +337,42 @@ def _joined(names: list[str]) -> str:
     if len(names) > 4:
         return f"{', '.join(names[:3])} and {len(names) - 3} more"
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+# --- what the import did ------------------------------------------------------------------------------
+
+
+def removed_effects(old: Mapping[str, str], new: Mapping[str, str]) -> str:
+    """A statement that the old version ran when it was imported, for what it does (a call, an assignment to something of
+    another module), and that the new version does not have: ``push.py:7 (torch.set_num_threads(8))``. Empty if there is none.
+    """
+    changed = [path for path in old if old[path] != new.get(path)]
+    ran = [(path, *effect) for path in changed for effect in _effects(path, old[path])]
+    kept = {dump for path, text in new.items() if ran for dump, _ in _effects(path, text)}
+    for path, dump, statement in ran:
+        if dump not in kept:
+            code = ast.unparse(statement).partition("\n")[0]
+            return f"{PurePath(path).name}:{statement.lineno} ({code})"
+    return ""
+
+
+def _effects(path: str, text: str) -> Iterator[tuple[str, ast.stmt]]:
+    try:
+        symbols = read_symbols(path, text)
+    except (SyntaxError, ValueError, RecursionError):  # the new version, which is about to be refused
+        return
+    for symbol in symbols.values():
+        for node in symbol.nodes if symbol.kind == "statements" else ():
+            if isinstance(node, ast.stmt) and any(map(_has_effect, ast.walk(node))):
+                yield ast.dump(node), node
+
+
+def _has_effect(node: ast.AST) -> bool:
+    if isinstance(node, ast.Expr):
+        return isinstance(node.value, ast.Call)
+    if isinstance(node, (ast.Assign, ast.Delete)):
+        return any(isinstance(target, (ast.Attribute, ast.Subscript)) for target in node.targets)
+    return isinstance(node, ast.AugAssign) and isinstance(node.target, (ast.Attribute, ast.Subscript))
 
 
 # --- names of library classes ---------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 from workbench.authoring.source.text import FUNCTIONS, LOOPS, RefusedEdit, Scope, SourceFile, parse_file, walk
@@ -89,10 +89,18 @@ class Project:
 
     # --- readers ------------------------------------------------------------------------------------
 
-    def readers(self, binding: Binding, reader: SourceFile, read: ast.AST) -> str | None:
+    def readers(
+        self,
+        binding: Binding,
+        reader: SourceFile,
+        read: ast.AST,
+        concerns: Callable[[str, str], bool] = lambda path, owner: True,
+    ) -> str | None:
         """The place of another reader of a binding than `read` in the file `reader`, as text; None if there is none.
 
-        An attribute counts on any object.
+        Args:
+            concerns: whether an object of a class (its file, and its name) may have the binding as an attribute. On other
+                objects than ``self`` every attribute counts.
         """
         home, name = binding.file, binding.name
         scope = home.scopes(binding.node)[0]
@@ -109,18 +117,42 @@ class Project:
                     found = not attribute and file not in (home, reader)
                 else:
                     found = attribute and isinstance(node, ast.Constant) and node.value == name
+                owner = class_of_self(file, node)
+                found = found and (owner is None or not attribute or concerns(file.path, owner))
                 if found and node is not read and not _other_element(file, node, read):
                     return _location(file, node, reader)
         return None
 
-    def attribute_stores(self, name: str) -> list[Binding]:
-        """All assignments to an attribute of that name, on any object."""
-        return [
-            _stored(file, node)
-            for file in self.files_with_word(name)
-            for node in file.nodes
-            if isinstance(node, ast.Attribute) and node.attr == name and _is_set(file, node)
-        ]
+    def attribute_stores(self, name: str, classes: Collection[tuple[str, str]]) -> list[Binding]:
+        """The assignments to an attribute of that name, on any object that may be of these classes.
+
+        Args:
+            classes: file and name of the object's class and of those that it inherits.
+        """
+        found: list[Binding] = []
+        for file in self.files_with_word(name):
+            for node in file.nodes:
+                if isinstance(node, ast.Attribute) and node.attr == name and _is_set(file, node):
+                    owner = class_of_self(file, node)
+                    if owner is None or (file.path, owner) in classes:
+                        found.append(_stored(file, node))
+        return found
+
+
+def class_of_self(file: SourceFile, node: ast.AST) -> str | None:
+    """The name of the class in whose method `node` is an attribute of ``self``; None for any other node."""
+    if not isinstance(node, ast.Attribute) or not isinstance(node.value, ast.Name):
+        return None
+    scopes = file.scopes(node)
+    for scope, outer in zip(scopes, scopes[1:], strict=False):
+        given = [*scope.args.posonlyargs, *scope.args.args] if isinstance(scope, FUNCTIONS) else []
+        if node.value.id in [argument.arg for argument in given]:
+            static = any(
+                getattr(one, "id", "") == "staticmethod" for one in getattr(scope, "decorator_list", ())
+            )
+            is_first = isinstance(outer, ast.ClassDef) and given[0].arg == node.value.id
+            return file.qualname(outer) if is_first and not static else None
+    return None
 
 
 def _bound_in(file: SourceFile, scope: Scope) -> Iterator[Binding]:

@@ -340,13 +340,13 @@ class ValueReader:
             )
             if not inside:
                 raise Unknown(f"`{code}` comes from {binding.dotted}, which is not one of your files")
-            others = self._project.readers(binding, file, node)
+            others = self._project.readers(binding, file, node, _concerned_by(binding))
             where, value, more = self._follow_bindings(file, node, inside)
             return where, value, others or more
         if binding.value is None:
             home = "the file" if binding.file is file else binding.file.name
             raise Unknown(f"`{code}` cannot be read in {home}: {binding.why}")
-        others = self._project.readers(binding, file, node)
+        others = self._project.readers(binding, file, node, _concerned_by(binding))
         if isinstance(binding.node, ast.Assign) and len(binding.node.targets) > 1:
             others = others or f"line {binding.file.line(binding.node)} gives it to several names"
         return binding.file, binding.value, others
@@ -377,9 +377,10 @@ class ValueReader:
         if not _is_named(node.value):
             raise self.computed(file, node)  # evaluating it again may have effects
         owner = self._run(file, node.value)
-        stores = self._project.attribute_stores(node.attr)
+        kind = owner if isinstance(owner, type) else type(owner)
+        stores = self._project.attribute_stores(node.attr, classes_of(kind))
         own: list[Binding] = []
-        for cls in (owner if isinstance(owner, type) else type(owner)).__mro__:
+        for cls in kind.__mro__:
             if node.attr in vars(cls):
                 own = self._class_bindings(cls, node.attr)
                 break
@@ -387,9 +388,9 @@ class ValueReader:
             return own
         if len(stores) == 1 and not own:
             return stores
-        first = stores[0]
-        why = f"it is set again at line {first.file.line(first.node)}"
-        return [Binding(first.file, node.attr, first.node, None, why)]
+        every = [*own, *stores]
+        why = f"it is set at {' and at '.join(_place_text(binding) for binding in every)}"
+        return [Binding(every[0].file, node.attr, every[0].node, None, why)]
 
     def _class_bindings(self, cls: type, name: str) -> list[Binding]:
         path = str(getattr(sys.modules.get(cls.__module__), "__file__", None))
@@ -416,6 +417,47 @@ class ValueReader:
         if found is None:
             raise Unknown(f"`{code}` is computed when the task runs")
         return where, found, others
+
+
+def classes_of(cls: type) -> set[tuple[str, str]]:
+    """File and name of a class, and of those that it inherits."""
+    modules = [(sys.modules.get(base.__module__), base.__qualname__) for base in cls.__mro__]
+    return {(str(getattr(module, "__file__", None)), name) for module, name in modules}
+
+
+def _concerned_by(binding: Binding) -> Callable[[str, str], bool]:
+    """Whether an object of a class may have an attribute's binding, see `Project.readers`."""
+    file = binding.file
+    around = next((scope for scope in file.scopes(binding.node) if isinstance(scope, ast.ClassDef)), None)
+    home = None if around is None else _class_named(file.path, file.qualname(around))
+    if home is None:
+        return lambda path, owner: True
+
+    def concerns(path: str, owner: str) -> bool:
+        # A class that inherits both has the attribute in the methods of either.
+        return any((path, owner) in classes_of(cls) for cls in (home, *_subclasses(home)))
+
+    return concerns
+
+
+def _class_named(path: str, name: str) -> type | None:
+    try:
+        found = operator.attrgetter(name)(module_of(path))
+    except (LookupError, AttributeError):  # a class within a function
+        return None
+    return found if isinstance(found, type) else None
+
+
+def _subclasses(cls: type) -> Iterator[type]:
+    for each in type.__subclasses__(cls):
+        yield each
+        yield from _subclasses(each)
+
+
+def _place_text(binding: Binding) -> str:
+    """``push.py:12 in PushEnv.__init__``."""
+    file = binding.file
+    return f"{file.name}:{file.line(binding.node)} in {file.qualname(binding.node)}"
 
 
 def _entry(file: SourceFile, base: ast.expr, key: Plain) -> ast.expr | None:

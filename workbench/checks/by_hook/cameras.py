@@ -12,9 +12,10 @@ from workbench.authoring.loading.blamed import blamed
 from workbench.checks.evidence.checkup import CannotCheck, Check, Checkup, Found, Note
 from workbench.core import maniskill_private
 from workbench.core.broken_rule import Place
-from workbench.core.camera_data import CameraKey
+from workbench.core.camera_data import CameraKey, CameraKind
+from workbench.core.camera_shader import is_ray_traced
 from workbench.core.cameras.place import rows_of_pose
-from workbench.core.cameras.render import cameras_of, mount_of
+from workbench.core.cameras.render import cameras_of, here_without_ray_tracing, mount_of
 from workbench.core.cameras.report import CameraReport, join_reports
 from workbench.core.cameras.temporary import temporary_camera
 from workbench.core.cameras.visibility import (
@@ -38,6 +39,10 @@ MISSED_SHARE = 0.25
 """Of the pictures in which an object may be out of view."""
 BACKGROUND_SHARE = 0.5
 MOST_PIXELS = 512 * 512
+HOOKS: Mapping[CameraKind, str] = {
+    "sensor": "_default_sensor_configs",
+    "human": "_default_human_render_camera_configs",
+}
 UNIT = 1e-3
 """Largest difference of a quaternion's length from 1."""
 
@@ -97,14 +102,20 @@ def camera_background(checkup: Checkup) -> Iterator[Found | Note]:
 
 
 def camera_pose(checkup: Checkup) -> Iterator[Found | Note]:
-    """The poses that the hooks return."""
-    for config in _own_configs(checkup):
+    """The poses that the hooks return, for sensors of the task and for people."""
+    configs = checkup.look(hook_configs)
+    robots = {config.uid for config in checkup.look(sensor_configs)[1]}
+    own = {key: config for key, config in configs.items() if key[0] == "human" or key[1] not in robots}
+    if not own:
+        raise CannotCheck("it has no camera of its own")
+    for (kind, _), config in own.items():
         lengths = np.linalg.norm(rows_of_pose(config)[:, 3:], axis=1)
         if np.abs(lengths - 1).max() > UNIT:
             yield Found(
-                f"the quaternion of camera {config.uid!r} has length {lengths[0]:.3g}: its extrinsics are scaled. Give a "
-                "unit quaternion; if look_at() looks straight up or down, move the eye aside by 0.001 m.",
-                _site(checkup, config),
+                f"the quaternion of camera {config.uid!r} has length {lengths[0]:.3g}: its picture is turned and zoomed, and "
+                "its extrinsics are scaled. Give a unit quaternion; if look_at() looks straight up or down, move the eye "
+                "aside by 0.001 m.",
+                _site(checkup, config, HOOKS[kind]),
             )
 
 
@@ -134,6 +145,18 @@ def camera_size(checkup: Checkup) -> Iterator[Found | Note]:
             )
 
 
+def ray_traced(checkup: Checkup) -> Iterator[Found | Note]:
+    """The configs that the hooks return, for sensors and for people."""
+    for (kind, name), config in checkup.look(hook_configs).items():
+        if is_ray_traced(str(config.shader_pack)):
+            yield Found(
+                f"camera {name!r} is ray traced (shader_pack {config.shader_pack!r}), which ManiSkill refuses for several "
+                f"envs on a GPU. {here_without_ray_tracing()} For films, give shader_pack to gym.make of one env in "
+                "human_render_camera_configs.".replace("  ", " "),
+                _site(checkup, config, HOOKS[kind]),
+            )
+
+
 # --- evidence ------------------------------------------------------------------------------------------------
 
 
@@ -144,6 +167,15 @@ def sensor_configs(checkup: Checkup) -> tuple[list[Any], list[Any]]:
     with blamed("cameras", checkup.loaded, checkup.task):
         of_task, of_robot = maniskill_private.sensor_configs_of_hooks(checkup.task.env)
     return [c for c in of_task if hasattr(c, "width")], [c for c in of_robot if hasattr(c, "width")]
+
+
+def hook_configs(checkup: Checkup) -> dict[CameraKey, Any]:
+    """Evidence for `Checkup.look`: configs of all plain cameras, as the hooks return them. Needs no renderer."""
+    maniskill_private.mark_camera_configs()
+    checkup.reset(checkup.task, checkup.seeds[0])
+    with blamed("cameras", checkup.loaded, checkup.task):
+        configs = maniskill_private.camera_configs(checkup.task.env)
+    return {key: config for key, config in configs.items() if hasattr(config, "shader_pack")}
 
 
 def sensor_reports(checkup: Checkup) -> dict[CameraKey, CameraReport]:
@@ -197,11 +229,11 @@ def _place(checkup: Checkup, key: CameraKey) -> Place | None:
     return checkup.places.hook("_default_sensor_configs")
 
 
-def _site(checkup: Checkup, config: Any) -> Place | None:
+def _site(checkup: Checkup, config: Any, hook: str = "_default_sensor_configs") -> Place | None:
     """Where the author's code makes a config; else the hook."""
     site = maniskill_private.camera_site(config)
     if site is None or site.file not in map(str, checkup.loaded.source_files):
-        return checkup.places.hook("_default_sensor_configs")
+        return checkup.places.hook(hook)
     return site.file, site.line, site.function.rpartition(".")[2]
 
 
@@ -211,4 +243,5 @@ CHECKS: Mapping[str, Check] = {
     "camera-pose": camera_pose,
     "camera-names": camera_names,
     "camera-size": camera_size,
+    "ray-traced": ray_traced,
 }

@@ -220,13 +220,14 @@ def followers(checkup: Checkup) -> dict[str, Followers]:
     env: Any = task.env
     begun = read_states(env)
     robots = {agent.robot.name for agent in maniskill_private.agents(env)}
-    hidden = {actor.name for actor in maniskill_private.hidden_objects(env)}
+    index = scene_index(env)
+    hidden = {name for name, is_hidden in zip(index.names, index.hidden, strict=True) if is_hidden}
     found: dict[str, Followers] = {}
     with blamed("observation", checkup.loaded, task):
         before = _ask(checkup, task)
         again = _ask(checkup, task)
         restless = _changed(before, again)
-        for name, struct in [*scene_index(env).states.items()][:MOST_BODIES]:
+        for name, struct in [*index.states.items()][:MOST_BODIES]:
             kind, _, body = name.partition("/")
             free = body not in robots if kind == "articulations" else struct.px_body_type == "dynamic"
             if not (free or body in hidden) or np.isnan(begun[name]).any():

@@ -19,7 +19,7 @@ from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
 from workbench.checks.results import Seen
 from workbench.core.broken_rule import Place
 from workbench.core.env.actions import random_action
-from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of
+from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of, tool_of
 from workbench.core.scene.scene_index import SceneIndex, joints_of_scene, present_states, scene_index
 from workbench.machine.text import listed, of
 
@@ -233,9 +233,10 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
     """Over all seeds: how far each body is."""
     task = checkup.task
     robots = agents(task.env)
-    if len(robots) != 1 or not _is_fixed(robots[0].robot) or not hasattr(robots[0], "tcp"):
+    tool = tool_of(robots[0]) if len(robots) == 1 and _is_fixed(robots[0].robot) else None
+    if tool is None:
         raise CannotCheck("it has no single robot with a fixed base and a tcp")
-    base, reach = _reach(checkup, robots[0])
+    base, reach = _reach(checkup, robots[0].robot, tool)
     index, poses = scene_index(task.env), checkup.starts.poses[0]
     for body, name in enumerate(index.names):
         if index.kinds[body] != "dynamic":
@@ -264,11 +265,10 @@ def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
             )
 
 
-def _reach(checkup: Checkup, robot: Any) -> tuple[NDArray[np.float32], float]:
+def _reach(checkup: Checkup, articulation: Any, tool: Any) -> tuple[NDArray[np.float32], float]:
     """(3,) the base, and how far the tcp comes from it, from random postures within the joints' limits."""
     task = checkup.task
     checkup.reset(task, next(checkup.batches()))
-    articulation = robot.robot
     limits = articulation.get_qlimits()
     if not torch.isfinite(limits).all():
         limits = limits.clamp(-np.pi, np.pi)
@@ -282,7 +282,7 @@ def _reach(checkup: Checkup, robot: Any) -> tuple[NDArray[np.float32], float]:
         part = torch.rand(limits.shape[:2], generator=generator, device=limits.device)
         articulation.set_qpos(limits[..., 0] + part * (limits[..., 1] - limits[..., 0]))
         apply_and_fetch(task.env)
-        reach = max(reach, float(np.linalg.norm(robot.tcp.pose.p.cpu().numpy() - base, axis=1).max()))
+        reach = max(reach, float(np.linalg.norm(tool.pose.p.cpu().numpy() - base, axis=1).max()))
     return base[0], reach
 
 

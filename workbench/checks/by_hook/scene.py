@@ -6,8 +6,10 @@ import ast
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from mani_skill.utils.structs.actor import Actor
 
 from workbench.checks.by_hook.placement import immovable
 from workbench.checks.evidence.builds import Built
@@ -16,8 +18,9 @@ from workbench.checks.evidence.meshes import is_hollow, triangles_in
 from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
 from workbench.checks.results import Seen
 from workbench.core.broken_rule import Place
-from workbench.core.maniskill_private import envs_of, objects_of
+from workbench.core.maniskill_private import envs_of, named_to_hide, objects_of
 from workbench.core.scene.scene_index import scene_index
+from workbench.core.simulation.hiding import why_not_hidden
 from workbench.machine.text import listed
 
 DEEP_AT_LOAD = 0.005
@@ -249,6 +252,59 @@ def merged_actors(checkup: Checkup) -> Iterator[Found | Note]:
             return
 
 
+def hidden_objects(checkup: Checkup) -> Iterator[Found | Note]:
+    """Of ``_hidden_objects``, and of the actors that those are merged into."""
+    env: Any = checkup.task.env
+    hidden = named_to_hide(env)
+    if not hidden:
+        raise CannotCheck("it hides nothing from pictures")
+    for thing in hidden:
+        if why := why_not_hidden(thing):
+            yield Found(
+                f"ManiSkill cannot hide {thing.name}: {why}. Every picture of a sensor fails.",
+                _hiding_line(checkup, thing),
+            )
+    known = {id(thing) for thing in hidden}
+    for merged in env.scene.actor_views.values():
+        of_view = {id(thing) for thing in objects_of(merged)}
+        parts = [
+            each
+            for each in hidden
+            if isinstance(each, Actor) and not of_view.isdisjoint(map(id, objects_of(each)))
+        ]
+        if parts and id(merged) not in known:
+            name = _name_on(env, merged) or merged.name
+            yield Found(
+                f"{_several([part.name for part in parts], 'is', 'are')} hidden, and {merged.name}, which "
+                f"{'it is' if len(parts) == 1 else 'they are'} merged into, is not: on a GPU hiding moves a body 99999 m away, "
+                f"so the pose of {merged.name} is wrong, and sensors see it again once that is set. Hide the merged actor "
+                f"instead: {name}.has_collision_shapes = False, then self._hidden_objects.append({name}).",
+                _hiding_line(checkup, parts[0]),
+                len(parts),
+            )
+
+
+def _name_on(env: Any, thing: Any) -> str:
+    """``self.goal`` of what the task keeps as that; empty if it does not."""
+    return next((f"self.{name}" for name, value in vars(env).items() if value is thing), "")
+
+
+def _hiding_line(checkup: Checkup, thing: Any) -> Place | None:
+    """The line that puts it into ``_hidden_objects``: one that names it, else the first."""
+    name = _name_on(checkup.task.env, thing)
+    lines = [
+        (name != "" and name in ast.unparse(statement), module.place(statement))
+        for module, function in checkup.places.functions()
+        for statement in ast.walk(function)
+        if isinstance(statement, ast.Expr | ast.Assign | ast.AugAssign)
+        and any(
+            isinstance(node, ast.Attribute) and node.attr == "_hidden_objects" for node in ast.walk(statement)
+        )
+    ]
+    lines.sort(key=lambda line: not line[0])
+    return lines[0][1] if lines else checkup.places.hook("_load_scene")
+
+
 def reconfigures(checkup: Checkup) -> Iterator[Found | Note]:
     """With one env, built for several seeds."""
     alone = checkup.alone
@@ -356,6 +412,7 @@ CHECKS: Mapping[str, Check] = {
     "decomposition-at-load": decomposition_at_load,
     "heavy-mesh": heavy_mesh,
     "merged-actors": merged_actors,
+    "hidden-objects": hidden_objects,
     "reconfigures": reconfigures,
     "env-spacing": OverSeeds(see_env_spacing, env_spacing),
 }

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -81,6 +83,7 @@ def noting_builds(built: list[Built], merged: list[Merged], files: Collection[st
     """
 
     def note(stock: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(stock)
         def build(builder: Any, *args: Any, **kwargs: Any) -> Any:
             # Building replaces a pose that is missing.
             pose = builder.initial_pose
@@ -91,9 +94,16 @@ def noting_builds(built: list[Built], merged: list[Merged], files: Collection[st
         return build
 
     def note_merge(stock: Any) -> Any:
-        def merge(cls: Any, structs: Any, name: Any = None) -> Any:
-            made = stock.__func__(cls, structs, name)
-            merged.append(Merged(name, frozenset(str(part.name) for part in structs), author_place(files)))
+        stock = stock.__func__
+        takes = inspect.signature(stock)
+
+        @wraps(stock)
+        def merge(*args: Any, **kwargs: Any) -> Any:
+            made = stock(*args, **kwargs)
+            given = takes.bind(*args, **kwargs).arguments
+            _, structs = list(given.values())[:2]
+            parts = frozenset(str(part.name) for part in structs)
+            merged.append(Merged(given.get("name"), parts, author_place(files)))
             return made
 
         return classmethod(merge)
@@ -111,6 +121,7 @@ def noting_poses(placed: list[PoseSet], files: Collection[str]) -> Iterator[None
     """Within this, add to `placed` each pose that is set on an actor or a root link."""
 
     def note(stock: Any) -> Any:
+        @wraps(stock.fset)
         def set_pose(struct: Any, pose: Any) -> None:
             name = struct.name if isinstance(struct, Actor) else struct.articulation.name
             placed.append(PoseSet(str(name), _quaternions(pose), author_place(files)))

@@ -498,7 +498,8 @@ def put_where_built(task: TaskEnv) -> None:
 def raised(error: TaskError) -> Found:
     """What the task raised, as a breach of the rule `runs`."""
     problem = error.problem
-    place = None if problem.file is None else (problem.file, problem.line or 1, problem.stage)
+    file, line = problem.file, problem.line
+    place = None if file is None or line is None else (file, line, problem.stage)
     return Found(f"{problem.stage}: {problem.message}", place)
 
 

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, TimeElapsedColumn
 
 from workbench.authoring.loading.reference import named_file
-from workbench.authoring.problem import Problem, TaskError
+from workbench.authoring.problem import Problem, TaskError, place_text
 from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
 from workbench.cli.jobs.check_reports import Reported, as_json, as_junit, as_sarif, count_text, shown_path
@@ -198,7 +198,7 @@ def print_report(said: Reported) -> None:
 
 
 def _print_finding(finding: Finding, root: Path, style: str) -> None:
-    place = "" if finding.file is None else f"{shown_path(finding.file, root)}:{finding.line or 1}: "
+    place = place_text(finding.file and shown_path(finding.file, root), finding.line)
     times = f", {finding.count} times" if finding.count > 1 else ""
     _print(f"{_safe(place)}[{style}]{finding.rule}[/] ({finding.degree}{times})")
     _print(f"  {_safe(finding.message)}")

@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import quote
 from xml.etree import ElementTree
 
-from workbench.authoring.problem import Problem
+from workbench.authoring.problem import Problem, place_text
 from workbench.checks.results import RuleResult
 from workbench.checks.rules import RULES
 from workbench.core.rules import FailOn, Finding, fails
@@ -47,12 +47,12 @@ class Reported:
         return fails(finding.degree, self.fail_on)
 
     @property
-    def place_of_error(self) -> tuple[str, int] | None:
-        """File and line of the error; of one that no line is at fault for, the first of the task's file."""
+    def place_of_error(self) -> tuple[str, int | None] | None:
+        """File and line of the error; without a line where none is known, and then of the task's file at least."""
         error, file = self.error, self.report.task.file
         if error is not None and error.file is not None:
-            return error.file, error.line or 1
-        return None if file is None else (file, 1)
+            return error.file, error.line
+        return None if file is None else (file, None)
 
 
 def count_text(count: int, what: str) -> str:
@@ -109,14 +109,14 @@ def as_json(said: Reported) -> str:
 
 
 def _error(said: Reported) -> dict[str, Any] | None:
-    error, place = said.error, said.place_of_error
+    error = said.error
     if error is None:
         return None
     return {
         "stage": error.stage,
         "message": error.message,
-        "file": None if place is None else shown_path(place[0], said.root),
-        "line": None if place is None else place[1],
+        "file": error.file and shown_path(error.file, said.root),
+        "line": error.line,
         "code": error.code,
     }
 
@@ -194,7 +194,8 @@ def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element
     case = _test_case(task.env_id, result.rule, result.seconds)
     if file is not None:
         case.set("file", xml_text(shown_path(file, root)))
-        case.set("line", str(1 if place is None else place.line or 1))
+        if place is not None and place.line is not None:
+            case.set("line", str(place.line))
     failing = [finding for finding in result.findings if said.fails(finding)]
     if failing:
         failure = ElementTree.SubElement(
@@ -230,8 +231,9 @@ def _error_case(said: Reported, error: Problem, root: Path) -> ElementTree.Eleme
     if (place := said.place_of_error) is not None:
         file, line = shown_path(place[0], root), place[1]
         case.set("file", xml_text(file))
-        case.set("line", str(line))
-        where = f"{file}:{line}: "
+        if line is not None:
+            case.set("line", str(line))
+        where = place_text(file, line)
     found = ElementTree.SubElement(case, "error", type=xml_text(error.stage), message=xml_text(error.message))
     code = f"\n    {error.code}" if error.code else ""
     found.text = xml_text(f"{where}{error.stage} failed\n{error.message}{code}\n{error.traceback}".rstrip())
@@ -244,7 +246,7 @@ def _test_case(env_id: str, name: str, seconds: float) -> ElementTree.Element:
 
 
 def _text(finding: Finding, root: Path) -> str:
-    place = "" if finding.file is None else f"{shown_path(finding.file, root)}:{finding.line or 1}: "
+    place = place_text(finding.file and shown_path(finding.file, root), finding.line)
     code = f"\n    {finding.code}" if finding.code else ""
     otherwise = RULES[finding.rule].otherwise
     return f"{place}{finding.rule} ({finding.degree})\n{finding.message}{code}\nOtherwise: {otherwise}"
@@ -362,7 +364,7 @@ def _result(finding: Finding, ids: list[str], said: Reported, root: Path) -> dic
         "ruleIndex": ids.index(finding.rule),
         "level": LEVELS[finding.degree],
         "message": {"text": finding.message},
-        "locations": [] if file is None else [_location(file, finding.line or 1, root)],
+        "locations": [] if file is None else [_location(file, finding.line, root)],
         "partialFingerprints": {"primaryLocationLineHash": _fingerprint(key)},
     }
 
@@ -371,10 +373,11 @@ def _fingerprint(key: list[str]) -> str:
     return f"{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]}:1"
 
 
-def _location(file: str, line: int, root: Path) -> dict[str, Any]:
+def _location(file: str, line: int | None, root: Path) -> dict[str, Any]:
+    """Without a known line it is the first: code scanning shows no result without one."""
     path = Path(file)
     if path.is_relative_to(root):
         place = {"uri": quote(path.relative_to(root).as_posix()), "uriBaseId": "%SRCROOT%"}
     else:
         place = {"uri": path.as_uri()}
-    return {"physicalLocation": {"artifactLocation": place, "region": {"startLine": line}}}
+    return {"physicalLocation": {"artifactLocation": place, "region": {"startLine": line or 1}}}

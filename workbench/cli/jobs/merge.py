@@ -15,6 +15,7 @@ from workbench.cli.jobs.record import print_recorded
 from workbench.cli.jobs.rescore import (
     RescoreOutput,
     RescoreRequest,
+    code_of,
     print_verdicts,
     warn_of_verdicts,
     write_tables,
@@ -187,4 +188,4 @@ def _print_rescore(merged: JobParts, output: MergeOutput) -> int:
     write_tables(verdicts, RescoreOutput(json_file=output.json_file, csv_file=output.csv_file))
     print_verdicts(verdicts, out_console)
     warn_of_verdicts(verdicts, dict.fromkeys(result.note for result in ordered if result.note))
-    return _with_missing(Exit.DONE, what.recordings - len(results), "recordings")
+    return _with_missing(code_of(verdicts), what.recordings - len(results), "recordings")

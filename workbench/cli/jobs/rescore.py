@@ -172,12 +172,15 @@ def _setup_of(
     place = {file.id: number for number, file in enumerate(files)}
 
     def recording(
-        file: Source, task: str, note: str = "", why_not: str = "", refused: bool = False
+        file: Source,
+        task: str,
+        note: str = "",
+        why_not: str = "",
+        refused: bool = False,
+        damaged: bool = False,
     ) -> Recording:
-        path = os.fsencode(file.path)
-        return Recording(
-            place[file.id], path, None, file.part, file.id, file.name, task, note, why_not, refused
-        )
+        where = os.fsencode(file.path), None, file.part, file.id, file.name
+        return Recording(place[file.id], *where, task, note, why_not, refused, damaged)
 
     found: list[tuple[RescoredBy | None, list[Recording]]] = []
     for group, task in zip(groups, cleared, strict=True):
@@ -190,7 +193,8 @@ def _setup_of(
         of = [recording(file, group.info.task, group.note, why_not, code is None) for file in group.files]
         found.append((code, of))
     if unreadable:
-        found.append((None, [recording(one.of, one.task, why_not=one.why_not) for one in unreadable]))
+        of = [recording(one.of, one.task, why_not=one.why_not, damaged=one.damaged) for one in unreadable]
+        found.append((None, of))
     return setup_of(found, chunk_of(len(files), what.num_envs), what.use_env_states)
 
 
@@ -259,7 +263,7 @@ def _cleared(groups: list[RescoreGroup], clearances: Clearances) -> list[TaskNam
 def rescore_in_terminal(what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments) -> int:
     """Rescore, print, and write the requested tables; returns the exit code."""
     try:
-        _rescore(what, output, trust, run)
+        return _rescore(what, output, trust, run)
     except NotTrusted as error:
         for line in not_trusted_lines(error):
             refuse(line)
@@ -268,11 +272,10 @@ def rescore_in_terminal(what: RescoreOptions, output: RescoreOutput, trust: bool
         if isinstance(error, KeyboardInterrupt):
             print_part(run, "rescore", stopped=True)
         return exit_after(error, kept="")
-    return Exit.DONE
 
 
-def _rescore(what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments) -> None:
-    """Raises as `rescore_all`, and OSError for a table."""
+def _rescore(what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments) -> int:
+    """The exit code. Raises as `rescore_all`, and OSError for a table."""
     here = CurrentFolder()  # a task may change it
     if (left_alone := unused_gpu_text(what.base.backend)) is not None:
         warn(left_alone)
@@ -310,13 +313,20 @@ def _rescore(what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobA
         print_verdicts(verdicts, out)
         print_part(run, "rescore", stopped=False)
     warn_of_verdicts(verdicts, notes)
+    return code_of(verdicts)
+
+
+def code_of(verdicts: Iterable[Verdict[Source]]) -> Exit:
+    """The exit code of a rescoring."""
+    return Exit.FAILED if any(verdict.damaged for verdict in verdicts) else Exit.DONE
 
 
 def write_tables(verdicts: list[Verdict[Source]], output: RescoreOutput) -> None:
     """Write the files that are asked for. Raises OSError."""
     for path, text in ((output.csv_file, verdict_text.as_csv), (output.json_file, verdict_text.as_json)):
         if path is not None:
-            replace_file(path, text(verdicts).encode())
+            # Names of files may not be UTF-8.
+            replace_file(path, text(verdicts).encode(errors="backslashreplace"))
 
 
 def warn_of_verdicts(verdicts: list[Verdict[Source]], notes: Iterable[str]) -> None:

@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
 from rich.segment import Segment
 from rich.text import Text
 
+from workbench.authoring.problem import place_text
 from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
 from workbench.machine.text import SafeStream, listed, plain_text
 from workbench.session.clearance import CodeFile, Consent, NotTrusted, Since, TrustQuestion, question_text
@@ -158,7 +159,7 @@ def lacks_maniskill(command: str) -> bool:
 
 def print_problem(problem: Problem) -> None:
     """Print an error in the author's code, with its line."""
-    place = "" if problem.file is None else f"{problem.file}:{problem.line or 1}: "
+    place = place_text(problem.file, problem.line)
     message = escape(plain_text(f"{place}{problem.message}"))
     err.print(f"[red]{escape(problem.stage)} failed[/] {message}", soft_wrap=True)
     if problem.code:
@@ -183,7 +184,7 @@ def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> 
 
 def print_finding(finding: Finding) -> None:
     """Print a rule of GPU simulation that the author's code broke, with its line."""
-    place = "" if finding.file is None else f"{finding.file}:{finding.line or 1}: "
+    place = place_text(finding.file, finding.line)
     err.print(
         f"[yellow]warning[/] {escape(place)}{escape(finding.message)} [dim](rule {finding.rule})[/]",
         soft_wrap=True,

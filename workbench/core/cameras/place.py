@@ -11,12 +11,13 @@ import numpy as np
 import sapien
 import sapien.render
 import torch
-from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
+from mani_skill.render import PREBUILT_SHADER_CONFIGS
 from mani_skill.utils.structs.pose import Pose
 
 from workbench.core import maniskill_private
 from workbench.core.backends import give_brdf_table
 from workbench.core.camera_data import NOT_ON_THE_GPU, CameraKey, CameraSettings, why_no_camera
+from workbench.core.camera_shader import drawable, note_shader, selected
 from workbench.core.cameras.conventions import matrix3, triple
 from workbench.core.simulation.cpu_system import batched_system
 
@@ -132,7 +133,7 @@ def _config(config: Any, settings: CameraSettings) -> Any:
     placed.width, placed.height = settings.width, settings.height
     if settings.shader_pack != config.shader_pack:
         placed.shader_pack, placed.shader_config = settings.shader_pack, shaders[settings.shader_pack]
-    return placed
+    return drawable(placed)
 
 
 def _set(env: Any, key: CameraKey, camera: Any, config: Any, poses: list[sapien.Pose]) -> bool:
@@ -149,16 +150,17 @@ def _set(env: Any, key: CameraKey, camera: Any, config: Any, poses: list[sapien.
 
 
 def _exchanged(config: Any, old: list[Any]) -> list[Any]:
-    set_shader_pack(config.shader_config)
     made = []
-    for component in old:
-        new = sapien.render.RenderCameraComponent(config.width, config.height)
-        new.name = component.name
-        entity = component.entity
-        entity.remove_component(component)
-        entity.add_component(new)
-        give_brdf_table(new)
-        made.append(new)
+    with selected(config.shader_config):
+        for component in old:
+            new = sapien.render.RenderCameraComponent(config.width, config.height)
+            new.name = component.name
+            entity = component.entity
+            entity.remove_component(component)
+            entity.add_component(new)
+            note_shader(new)
+            give_brdf_table(new)
+            made.append(new)
     return made
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import linecache
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,14 +15,18 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import maniskill_private
+from workbench.core.backends import why_no_ray_tracing
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture, PictureDegree
+from workbench.core.camera_shader import replaced_shader
 from workbench.core.cameras.place import rows_of_pose, settings_of
+from workbench.core.drawing import drawing, read_texture
 from workbench.core.env.cpu_scene import BatchedCpuScene
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.env_numbers import require_env
+from workbench.core.rules import Finding
 from workbench.core.scene.scene_index import hidden_poses, scene_index
-from workbench.core.simulation.cpu_system import batched_system
-from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, camera_pose, drawn_at, temporarily
+from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, drawn_at, temporarily
+from workbench.core.simulation.hiding import shown_visibility
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
 _INT16_END = 32.767
@@ -57,9 +62,36 @@ def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
                 settings=settings_of(camera.config),
                 varies=_varies(camera.config, components),
                 site=maniskill_private.camera_site(camera.config),
+                replaced_shader=replaced_shader(camera.config),
             )
         )
     return tuple(infos)
+
+
+def findings_of_shaders(cameras: Iterable[CameraInfo]) -> list[Finding]:
+    """For each camera whose shader is replaced, where its config is made."""
+    found = []
+    for camera in cameras:
+        if not camera.replaced_shader:
+            continue
+        message = f"camera {camera.name!r} is ray traced (shader_pack {camera.replaced_shader!r}). {here_without_ray_tracing()}"
+        site = camera.site
+        at = (None, None, "", "")
+        if site is not None:
+            code = linecache.getline(site.file, site.line).strip()
+            at = (site.file, site.line, code, site.function.rpartition(".")[2])
+        found.append(Finding("ray-traced", "warn", message, *at, 1, 0))
+    return found
+
+
+def here_without_ray_tracing() -> str:
+    """What this machine does with ray traced cameras, as a sentence; empty where it traces rays."""
+    why = why_no_ray_tracing()
+    if why is None:
+        return ""
+    return (
+        f"That needs a GPU driver with ray tracing, and {why}: here its pictures have shader_pack 'default'."
+    )
 
 
 def segmentation_names(env: Any) -> dict[int, str]:
@@ -92,15 +124,15 @@ def take_pictures(
     ones are rendered, from the env's own sub-scene, with ManiSkill's shaders and texture transforms.
 
     Args:
-        poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where the
-            tensors have them, applied or not (`drawn_poses`). Only what is drawn moves, so a past moment can be
+        poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where they
+            are. Only what is drawn moves, so a past moment can be
             rendered without changing the simulation. A camera moves with its mount; colours and lights are today's.
         degree: None for the one that the env was made with. Only a batch on the CPU has fast ones, others are exact.
 
     Raises:
         IndexError: there is no such env.
         ValueError: there is no such camera, or it cannot give the requested modalities.
-        RuntimeError: the renderer failed.
+        CannotDraw: the renderer failed, a RuntimeError.
     """
     pictures: dict[int, Picture] = {}
     for kind in KINDS:
@@ -168,29 +200,31 @@ def begin_pictures(
     ):
         batched = scene if isinstance(scene, BatchedCpuScene) else None
         needed = [_textures(cameras[kind, name], modalities) for name, kind, modalities in requests]
-        drawn = _degree_of(scene, degree)
-        if batched is not None and drawn == "fast":
-            for (name, kind, _), textures in zip(requests, needed, strict=True):
+        degrees = [_degree_of(scene, component, degree) for component in components]
+        for (name, kind, _), textures, drawn in zip(requests, needed, degrees, strict=True):
+            if batched is not None and drawn == "fast":
                 batched.prepare_fast(env_index, (kind, name), textures, places)
         sub_scene.update_render()
         move_bodies()
-        for (name, kind, modalities), component, textures in zip(requests, components, needed, strict=True):
-            drawing = component
-            if batched is None:
-                component.take_picture()
-            else:
-                drawing = batched.take_picture(env_index, (kind, name), component, textures, degree)
+        each = zip(requests, components, needed, degrees, strict=True)
+        for (name, kind, modalities), component, textures, drawn in each:
+            drawn_by = component
+            with drawing((kind, name), maniskill_private.camera_site(cameras[kind, name].config)):
+                if batched is None:
+                    component.take_picture()
+                else:
+                    drawn_by = batched.take_picture(env_index, (kind, name), component, textures, degree)
             pose = component.get_global_pose()
             where = np.array([*pose.p, *pose.q], dtype=np.float32)
             taken.append(
-                (cameras[kind, name], drawing, name, kind, env_index, tuple(modalities), where, drawn)
+                (cameras[kind, name], drawn_by, name, kind, env_index, tuple(modalities), where, drawn)
             )
     return PendingPictures(tuple(taken))
 
 
-def _degree_of(scene: Any, asked: PictureDegree | None = None) -> PictureDegree:
-    """What a picture of the scene is, if this is asked for: only a batch on the CPU has fast ones."""
-    return (asked or scene.pictures) if isinstance(scene, BatchedCpuScene) else "exact"
+def _degree_of(scene: Any, component: Any, asked: PictureDegree | None = None) -> PictureDegree:
+    """What a picture of a camera is, if this is asked for: only a batch on the CPU has fast ones."""
+    return scene.degree_of(component, asked) if isinstance(scene, BatchedCpuScene) else "exact"
 
 
 def _textures(camera: Any, modalities: Sequence[str]) -> set[str]:
@@ -205,11 +239,10 @@ def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) 
     Args:
         poses: as in `take_pictures`.
     """
-    if poses is not None:
-        each = zip(scene_index(env).entities[env_index], poses, strict=True)
-        return {id(entity): (entity, pose) for entity, pose in each if np.isfinite(pose).all()}
-    px = batched_system(env.scene)
-    return NOWHERE_ELSE if px is None else px.elsewhere([env_index]).get(env_index, NOWHERE_ELSE)
+    if poses is None:
+        return NOWHERE_ELSE
+    each = zip(scene_index(env).entities[env_index], poses, strict=True)
+    return {id(entity): (entity, pose) for entity, pose in each if np.isfinite(pose).all()}
 
 
 def cameras_of(env: Any) -> dict[CameraKey, Any]:
@@ -252,24 +285,29 @@ def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[Camera
 def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
     """Within this, draw the task's hidden objects in this env, or do not.
 
-    ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on a stock CPU env by visibility,
-    in batched simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away
-    is put back while human cameras look. Both are undone, so a picture leaves no trace in the simulation.
+    ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by visibility, in GPU
+    simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back
+    while human cameras look. One that something else has moved back meanwhile stays in sight of sensors, as for the policy.
+    Both are undone, so a picture leaves no trace in the simulation.
     """
     slot_of = scene_index(env).slot_of
     true = (
         {slot: pose for rows in hidden_poses(env) for slot, pose in zip(*rows, strict=True)} if shown else {}
     )
     changes: list[tuple[Any, str, Any]] = []
-    for actor in maniskill_private.hidden_objects(env):
+    actors = maniskill_private.hidden_objects(env)
+    for actor in actors:
+        moved_away = maniskill_private.pose_before_hiding(actor) is not None
         for entity, env_of in zip(
             maniskill_private.objects_of(actor), maniskill_private.envs_of(actor), strict=True
         ):
             body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
             if env_of != env_index or body is None:
                 continue
-            # A ghost of visibility 0.3 stays one; only what is switched off is switched on.
-            changes.append((body, "visibility", (body.visibility or 1.0) if shown else 0.0))
+            if shown:
+                changes.append((body, "visibility", shown_visibility(actors, body)))
+            elif not moved_away:
+                changes.append((body, "visibility", 0.0))
             pose = true.get(slot_of[id(entity)]) if id(entity) in slot_of else None
             if pose is not None:
                 changes.append((entity, "pose", sapien.Pose(pose[:3], pose[3:])))
@@ -293,7 +331,7 @@ def _read(
     for texture, gives in config.texture_names.items():
         if not set(gives) & set(modalities):
             continue
-        data = component.get_picture(texture)
+        data = read_texture(component, texture, (kind, name), maniskill_private.camera_site(camera.config))
         transformed = config.texture_transforms[texture](torch.from_numpy(data)[None])
         made.update({m: image[0] for m, image in transformed.items() if m in modalities})
         if "depth" in gives and "depth" in modalities:
@@ -388,11 +426,9 @@ def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[P
     scene: Any = task.env.scene
     if scene.gpu_sim_enabled:
         scene.px.sync_poses_gpu_to_cpu()
-    px = batched_system(scene)
-    elsewhere = {} if px is None else px.elsewhere(env_idx)
     found = []
     for at, env in enumerate(env_idx):
-        pose = camera_pose(components[env], elsewhere.get(env, NOWHERE_ELSE))
+        pose = components[env].get_global_pose()
         found.append(
             Picture(
                 camera=name,
@@ -402,7 +438,7 @@ def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[P
                 rgb=None if "rgb" not in rows else rows["rgb"][at],
                 depth=None if depth is None else depth[at, ..., 0],
                 segmentation=None if segmentation is None else segmentation[at, ..., 0],
-                degree=_degree_of(scene),
+                degree=_degree_of(scene, components[env]),
             )
         )
     return found

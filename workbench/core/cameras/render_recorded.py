@@ -10,6 +10,8 @@ import sapien.render
 from numpy.typing import NDArray
 
 from workbench.core.backends import find_renderer, give_brdf_table, keep_render_device
+from workbench.core.camera_shader import DEFAULT, selected
+from workbench.core.drawing import drawing
 from workbench.core.scene.normals import with_normals
 from workbench.core.scene.shapes import Material, SceneGeometry, Visual
 
@@ -50,12 +52,12 @@ class RecordedScene:
             entity.add_component(shapes)
             self._scene.add_entity(entity)
         self._eye = sapien.Entity()
-        sapien.render.set_camera_shader_dir("default")
         camera: Any = sapien.render.RenderCameraComponent(width, height)
         camera.set_fovy(fovy)
         camera.near, camera.far = NEAR, FAR
         self._eye.add_component(camera)
-        self._scene.add_entity(self._eye)
+        with selected(DEFAULT):
+            self._scene.add_entity(self._eye)
         give_brdf_table(camera)
         self._camera = camera
 
@@ -73,9 +75,10 @@ class RecordedScene:
                 sapien.Pose(pose[:3].tolist(), pose[3:].tolist()) if there else sapien.Pose([0, 0, -1000])
             )
         self._eye.pose = sapien.Pose(eye[:3].tolist(), eye[3:].tolist())
-        self._scene.update_render()
-        self._camera.take_picture()
-        colour = np.asarray(self._camera.get_picture("Color"))[..., :3]
+        with drawing(("human", "film")):
+            self._scene.update_render()
+            self._camera.take_picture()
+            colour = np.asarray(self._camera.get_picture("Color"))[..., :3]
         if colour.dtype != np.uint8:
             colour = np.rint(np.clip(colour, 0.0, 1.0) * 255).astype(np.uint8)
         return np.ascontiguousarray(colour)

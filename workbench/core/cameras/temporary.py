@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import sapien
 import sapien.render
-from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from numpy.typing import ArrayLike, NDArray
 
 from workbench.core.backends import give_brdf_table
-from workbench.core.camera_data import CameraKind, CameraSettings
+from workbench.core.camera_data import CameraKey, CameraKind, CameraSettings
+from workbench.core.camera_shader import MINIMAL, selected
 from workbench.core.cameras.conventions import intrinsic_of, scaled_intrinsic
-from workbench.core.cameras.render import cameras_of, depth_in_metres, places_to_draw, show_hidden_objects
+from workbench.core.cameras.render import depth_in_metres, places_to_draw, show_hidden_objects
+from workbench.core.drawing import drawing
 from workbench.core.env_numbers import require_env
 from workbench.core.simulation.drawn_poses import drawn_at, temporarily
 
-_SHADER = PREBUILT_SHADER_CONFIGS["minimal"]
 _TEXTURE = "PositionSegmentation"
 
 
@@ -28,6 +28,7 @@ _TEXTURE = "PositionSegmentation"
 class TemporaryCamera:
     """A camera that gives depth and segmentation, of what its kind of camera sees."""
 
+    _key: CameraKey
     _sub_scene: Any
     _component: Any
     _move_bodies: Any
@@ -39,14 +40,16 @@ class TemporaryCamera:
         # A camera renders from where its entity was at the last update.
         self._sub_scene.update_render()
         self._move_bodies()
-        self._component.take_picture()
-        data = self._component.get_picture(_TEXTURE)
+        with drawing(self._key):
+            self._component.take_picture()
+            data = self._component.get_picture(_TEXTURE)
         depth = depth_in_metres(_TEXTURE, data, -data[..., 2], self._component)
         return data[..., 3].astype(np.int32), depth
 
     def colours(self) -> NDArray[np.uint8]:
         """(H, W, 3) RGB of the last picture."""
-        return np.ascontiguousarray(self._component.get_picture("Color")[..., :3])
+        with drawing(self._key):
+            return np.ascontiguousarray(self._component.get_picture("Color")[..., :3])
 
 
 @contextmanager
@@ -68,7 +71,7 @@ def temporary_camera(
         kind: sensors do not see what the task hides from them.
         settings: its lens; `look` takes the pose.
         size: width and height of the pictures, which show the same view; None for its own.
-        poses: (B, 7) where to draw the env's bodies; None for where the tensors have them.
+        poses: (B, 7) where to draw the env's bodies; None for where they are.
 
     Raises:
         IndexError: there is no such env.
@@ -94,7 +97,7 @@ def temporary_camera(
         move_bodies = after.enter_context(drawn_at(places))
         second_scene = sapien.Scene([render_system])
         entity = sapien.Entity()
-        with _minimal_shader(env):
+        with selected(MINIMAL):
             component = sapien.render.RenderCameraComponent(size[0], size[1])
             entity.add_component(component)
             second_scene.add_entity(entity)
@@ -103,19 +106,7 @@ def temporary_camera(
         component.near, component.far = near, far
         component.set_focal_lengths(k[0, 0], k[1, 1])
         component.set_principal_point(k[0, 2], k[1, 2])
-        yield TemporaryCamera(sub_scene, component, move_bodies)
-
-
-@contextmanager
-def _minimal_shader(env: Any) -> Iterator[None]:
-    """Select the minimal shader: SAPIEN makes every camera with the shader selected last in the process."""
-    last = [*cameras_of(env).values()][-1:]
-    set_shader_pack(_SHADER)
-    try:
-        yield
-    finally:
-        for camera in last:
-            set_shader_pack(camera.config.shader_config)
+        yield TemporaryCamera((kind, "temporary"), sub_scene, component, move_bodies)
 
 
 @contextmanager

@@ -104,11 +104,8 @@ def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
     """
     names, entities = scene_index(env).names, scene_index(env).entities[0]
     drawn = [body for body in reversed(robot.bodies) if is_drawn(entities[body])]
-    tools = [
-        getattr(agent, "tcp", None)
-        for agent in maniskill_private.agents(env)
-        if agent.robot.name == robot.name
-    ]
+    agents = [agent for agent in maniskill_private.agents(env) if agent.robot.name == robot.name]
+    tools = [maniskill_private.tool_of(agent) for agent in agents]
     name = f"{robot.name}/{getattr(tools[0], 'name', '')}" if tools else ""
     if name in names:
         places = read_poses(env)[0, :, :3]
@@ -222,7 +219,8 @@ def placement_pose(
 ) -> NDArray[np.float64]:
     """(7,) of a placement in the env's frame, with bodies at `bodies` (B, 7)."""
     if placement.mount is None:
-        return pose_of(placement.settings)
+        # As it is: a quaternion that is not of unit length gives another picture.
+        return np.array([*placement.settings.position, *placement.settings.quaternion])
     mount = bodies[mount_column(index, placement.mount)]
     if not np.isfinite(mount).all():
         raise ValueError(f"this env has no body {placement.mount!r} to mount a camera on")

@@ -9,13 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from mani_skill.agents.controllers.base_controller import CombinedController
 from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
+from workbench.core.broken_rule import place_of_class
+from workbench.core.env.evaluate_entries import describe, type_text
+from workbench.core.error_notes import RefusedCall, WrongAction
 from workbench.core.scene.scene_index import once_a_scene
+from workbench.machine.text import listed
 
 _EE_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -31,11 +36,17 @@ class ActionPart:
     names: tuple[str, ...]
     low: NDArray[np.float32]
     high: NDArray[np.float32]
+    shape: tuple[int, ...]
+    """Of the controller's action of one env, which has a row of the flat one."""
 
 
 @once_a_scene
 def action_parts(env: BaseEnv) -> tuple[ActionPart, ...]:
-    """Parts in the order of the flat action; empty without a robot."""
+    """Parts in the order of the flat action; empty without a robot.
+
+    Raises:
+        RefusedCall: a controller's action is not an array of numbers.
+    """
     if env.agent is None:
         return ()
     controllers: Any = env.agent.controller
@@ -46,10 +57,15 @@ def action_parts(env: BaseEnv) -> tuple[ActionPart, ...]:
         named = controller.controllers.items() if combined else [(None, controller)]
         for name, part in named:
             space: Any = part.single_action_space
+            if not isinstance(space, spaces.Box):
+                raise RefusedCall(
+                    f"The action space of {type(part).__name__} is {space}: the workbench acts in a Box only.",
+                    place=place_of_class(type(part)),
+                )
             prefix = "/".join(str(p) for p in (robot, name) if p is not None)
             dimensions = [f"{prefix}/{d}" if prefix else d for d in _dimension_names(part)]
-            low, high = np.asarray(space.low, np.float32), np.asarray(space.high, np.float32)
-            parts.append(ActionPart(robot, part, tuple(dimensions), low, high))
+            low, high = (np.asarray(bound, np.float32).ravel() for bound in (space.low, space.high))
+            parts.append(ActionPart(robot, part, tuple(dimensions), low, high, space.shape))
     return tuple(parts)
 
 
@@ -108,62 +124,111 @@ def by_robot(parts: tuple[ActionPart, ...], action: torch.Tensor) -> Any:
     """The argument of ``env.step`` of a flat action (N, A): itself, a dict of parts for several robots, None without a robot."""
     if not parts:
         return None
-    if parts[0].robot is None:
-        return action
     split = torch.split(action, [len(p.names) for p in parts], dim=1)
-    robots = dict.fromkeys(p.robot for p in parts)
-    return {r: torch.cat([s for p, s in zip(parts, split, strict=True) if p.robot == r], 1) for r in robots}
+    of_robots: dict[str | None, list[torch.Tensor]] = {}
+    for part, columns in zip(parts, split, strict=True):
+        # Several controllers of one robot share a flat action.
+        of_robots.setdefault(part.robot, []).append(columns.reshape(len(columns), *part.shape))
+    made = {robot: each[0] if len(each) == 1 else torch.cat(each, 1) for robot, each in of_robots.items()}
+    return made[None] if None in made else made
 
 
-def to_flat_action(
-    env: BaseEnv, parts: tuple[ActionPart, ...], action: Any, whose: str = "the action"
-) -> NDArray[np.float32]:
-    """(N, A) from a policy's action: array or tensor, (A,) or (N, A), or a dict of robots.
-
-    Args:
-        whose: subject of error messages.
+def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> NDArray[np.float32]:
+    """(N, A) from a policy's action: array or tensor, (A,) or (N, A), or a dict of the robots with one such for each.
 
     Raises:
-        ValueError: the shape does not fit, or a value is not finite.
+        WrongAction: it is something else, its shape does not fit, or a value is not finite.
     """
-    if isinstance(action, dict):
-        robots = dict.fromkeys(p.robot for p in parts)
-        action = np.concatenate([_numpy(action[robot]) for robot in robots], axis=-1)
-    flat = _numpy(action)
-    expected = (env.num_envs, width(parts))
-    if flat.shape == expected[1:]:
-        flat = np.broadcast_to(flat, expected)
-    if flat.shape != expected:
-        raise ValueError(_wrong_shape(whose, flat.shape, expected, env.control_mode))
+    count, of_robots = env.num_envs, _columns_of_robots(parts)
+    if isinstance(action, Mapping):
+        _refuse_other_robots(action, of_robots)
+        each = [_rows(action[robot], count, at, f" for {robot}") for robot, at in of_robots.items()]
+        flat = np.concatenate(each, axis=1)
+    else:
+        flat = _rows(action, count, sum(of_robots.values()), "", of_robots, env.control_mode)
     # The sum is quick, but may overflow.
-    if not math.isfinite(np.add.reduce(flat, axis=None)) and not np.isfinite(flat).all():
-        raise ValueError(f"{whose} holds NaN or infinity")
+    if not math.isfinite(np.add.reduce(flat, axis=None)) and not (finite := np.isfinite(flat)).all():
+        row, column = np.argwhere(~finite)[0].tolist()
+        name = [name for part in parts for name in part.names][column]
+        raise WrongAction(
+            f"holds NaN or infinity in {np.count_nonzero(~finite.all(axis=1))} of {count} envs: {flat[row, column]} for {name} "
+            f"of env {row}"
+        )
     return np.array(flat)
 
 
-def _wrong_shape(whose: str, shape: tuple[int, ...], expected: tuple[int, int], mode: Any) -> str:
-    problem = f"{whose} has shape {shape}, expected {expected} (envs, dimensions)"
-    if not shape or shape[-1] == expected[1]:
-        return problem
-    # Several robots have one mode each.
-    modes = ", ".join(f"{one}" for one in mode.values()) if isinstance(mode, dict) else str(mode)
-    return (
-        f"{problem}: it is {shape[-1]} wide, and the control mode {modes} takes {expected[1]}. Name the one that it is written "
-        "for with --env control_mode=..., or return as many"
-    )
+def _columns_of_robots(parts: tuple[ActionPart, ...]) -> dict[str | None, int]:
+    """How wide the action of each robot is; of a single one under None."""
+    found: dict[str | None, int] = {}
+    for part in parts:
+        found[part.robot] = found.get(part.robot, 0) + len(part.names)
+    return found
 
 
-def _numpy(values: Any) -> NDArray[np.float32]:
-    values = values.numpy(force=True) if isinstance(values, torch.Tensor) else values
-    return np.asarray(values, dtype=np.float32)
+def _refuse_other_robots(action: Mapping[Any, Any], of_robots: Mapping[str | None, int]) -> None:
+    if None in of_robots or not of_robots:
+        what = f"an array ({of_robots[None]} wide)" if of_robots else "no action"
+        raise WrongAction(
+            f"is a dict of {listed([*action])}; this task has no several robots and takes {what}"
+        )
+    missing = [robot for robot in of_robots if robot not in action]
+    unknown = [name for name in action if name not in of_robots]
+    if not missing and not unknown:
+        return
+    robots = ", ".join(f"{robot} ({wide} wide)" for robot, wide in of_robots.items())
+    lacks = [f"has no action for {listed(missing)}"] if missing else []
+    lacks += [f"names {listed(unknown)}, which the task has not"] if unknown else []
+    raise WrongAction(f"{' and '.join(lacks)}; its robots are {robots}")
+
+
+def _rows(
+    given: Any,
+    count: int,
+    wide: int,
+    of: str,
+    of_robots: Mapping[str | None, int] | None = None,
+    mode: Any = None,
+) -> NDArray[np.float32]:
+    """(N, wide) of an array (wide,) or (N, wide)."""
+    values = _numpy(given, of)
+    if values.shape == (wide,):
+        return np.broadcast_to(values, (count, wide))
+    if values.shape == (count, wide):
+        return values
+    text = f"has shape {values.shape}{of}, expected {(count, wide)} (envs, dimensions)"
+    if values.ndim and values.shape[-1] != wide and of_robots is not None:
+        text += f": it is {values.shape[-1]} wide"
+        if None in of_robots:
+            text += (
+                f", and the control mode {mode} takes {wide}. Name the one that it is written for with "
+                "--env control_mode=..., or return as many"
+            )
+        else:
+            robots = ", ".join(f"{robot} {each}" for robot, each in of_robots.items())
+            text += f", and the robots take {robots}. Return a dict of them, or all of them side by side"
+    raise WrongAction(text)
+
+
+def _numpy(values: Any, of: str = "") -> NDArray[np.float32]:
+    try:
+        if values is None:
+            raise TypeError
+        values = values.float().numpy(force=True) if isinstance(values, torch.Tensor) else values
+        return np.asarray(values, dtype=np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:  # text, an object, rows of several lengths
+        # Some libraries' policies return the action with a state.
+        what = (
+            f"tuple of {', '.join(map(type_text, values))}" if isinstance(values, tuple) else describe(values)
+        )
+        raise WrongAction(f"is {what}{of}: an action is an array of numbers (envs, dimensions)") from error
 
 
 def _dimension_names(controller: Any) -> list[str]:
-    count = controller.single_action_space.shape[0]
+    count = math.prod(controller.single_action_space.shape)
     if isinstance(controller, PDEEPosController):
         names: list[str] = list(_EE_AXES)
     else:
-        names = [joint.name for joint in controller.joints]
+        names = [joint.name for joint in getattr(controller, "joints", ())]
         controlled = getattr(controller, "control_joint_indices", None)
         if controlled is not None:
             names = [names[i] for i in controlled.tolist()]

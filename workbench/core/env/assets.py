@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from traceback import walk_tb
 from types import TracebackType
@@ -17,15 +19,19 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils import assets, download_asset
 from mani_skill.utils.assets import data
 
+from workbench.core.broken_rule import in_brackets
+from workbench.core.env.robot_notes import place_of_robot_file
+from workbench.core.error_notes import CoreRefusal, Place
+
 _COMMAND = "python -m mani_skill.utils.download_asset"
 _A_PATH = re.compile(r"(?:/|[A-Za-z]:\\)[^\s'\"]+")
 
 
-class MissingAssets(RuntimeError):
+class MissingAssets(CoreRefusal, RuntimeError):
     """The task needs assets that are not downloaded."""
 
-    def __init__(self, message: str, names: Sequence[str] = ()) -> None:
-        super().__init__(message)
+    def __init__(self, message: str, names: Sequence[str] = (), place: Place | None = None) -> None:
+        super().__init__(message, place=place)
         self.names = tuple(names)
         """Arguments of ``python -m mani_skill.utils.download_asset``, one for each missing asset."""
 
@@ -79,14 +85,16 @@ def refuse_downloads(task: str) -> Iterator[None]:
     MissingAssets; other exceptions pass.
     """
 
+    @wraps(download_asset.prompt_yes_no)
     def ask(message: str) -> bool:
-        robot = re.search(r"Robot (\S+) has assets", message)
-        if robot is None:
-            raise _missing(task, [], message.split(" Would you")[0])
-        raise _robot_without_file(task, robot[1])
+        asking = sys._getframe(1)
+        if asking.f_code.co_filename == base_agent.__file__:
+            raise _robot_without_file(task, type(asking.f_locals["self"]))
+        raise _missing(task, [], message.split(" Would you")[0])
 
-    def download(source: data.DataSource, *args: object, **kwargs: object) -> None:
-        names = [name for name, known in assets.DATA_SOURCES.items() if known is source]
+    @wraps(download_asset.download)
+    def download(data_source: data.DataSource, *args: object, **kwargs: object) -> None:
+        names = [name for name, known in assets.DATA_SOURCES.items() if known is data_source]
         raise _missing(task, names)
 
     stock_ask, stock_download = download_asset.prompt_yes_no, download_asset.download
@@ -99,9 +107,9 @@ def refuse_downloads(task: str) -> Iterator[None]:
         names = _named_by(error)
         if names:
             raise _missing(task, names) from error
-        path = _robot_file(error.__traceback__)
-        if path is not None and not path.exists():
-            raise _no_robot_file(task, "the robot", path) from error
+        loaded = _robot_loaded(error.__traceback__)
+        if loaded is not None and not loaded[1].exists():
+            raise _no_robot_file(task, *loaded) from error
         raise
     finally:
         download_asset.prompt_yes_no, download_asset.download = stock_ask, stock_download
@@ -131,31 +139,29 @@ def _uids(robot_uids: Any) -> list[str]:
     return [uid for uid in uids if uid in REGISTERED_AGENTS]
 
 
-def _file_of(uid: str) -> Path | None:
-    agent: Any = REGISTERED_AGENTS[uid].agent_cls
+def _file_of(agent: Any) -> Path | None:
     path = getattr(agent, "urdf_path", None) or getattr(agent, "mjcf_path", None)
     return None if path is None else Path(str(path))
 
 
 def _missing_for_robot(uid: str) -> list[str]:
-    path = _file_of(uid)
+    path = _file_of(REGISTERED_AGENTS[uid].agent_cls)
     if path is None or path.exists():
         return []
     return assets_at(path) or list(REGISTERED_AGENTS[uid].asset_download_ids)
 
 
-def _robot_without_file(task: str, uid: str) -> MissingAssets:
-    names = _missing_for_robot(uid) if uid in REGISTERED_AGENTS else []
-    if names:
-        return _missing(task, names)
-    path = _file_of(uid) if uid in REGISTERED_AGENTS else None
-    return _no_robot_file(task, f"the robot {uid}", path)
+def _robot_without_file(task: str, robot: Any) -> MissingAssets:
+    names = _missing_for_robot(robot.uid) if robot.uid in REGISTERED_AGENTS else []
+    return _missing(task, names) if names else _no_robot_file(task, robot, _file_of(robot))
 
 
-def _no_robot_file(task: str, robot: str, path: Path | None) -> MissingAssets:
+def _no_robot_file(task: str, robot: type, path: Path | None) -> MissingAssets:
+    place = place_of_robot_file(robot)
     return MissingAssets(
-        f"{task}: {robot}'s file {path} does not exist, and ManiSkill has no download for it. "
-        "Correct urdf_path or mjcf_path of the robot's class."
+        f"{task}: the file of the robot {robot.__name__}, {path}, does not exist{in_brackets(place)}, and ManiSkill has no "
+        "download for it.",
+        place=place,
     )
 
 
@@ -176,12 +182,12 @@ def _named_by(error: Exception) -> list[str]:
     return []
 
 
-def _robot_file(trace: TracebackType | None) -> Path | None:
-    """The file that a robot's loader was reading when it failed.
+def _robot_loaded(trace: TracebackType | None) -> tuple[type, Path] | None:
+    """The class of the robot that was being loaded, and its file.
 
     For an agent class that was never registered, ManiSkill's look-up raises a bare KeyError with the robot's uid.
     """
     for frame, _ in walk_tb(trace):
         if frame.f_code.co_filename == base_agent.__file__ and "asset_path" in frame.f_locals:
-            return Path(str(frame.f_locals["asset_path"]))
+            return type(frame.f_locals["self"]), Path(str(frame.f_locals["asset_path"]))
     return None

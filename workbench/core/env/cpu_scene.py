@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
-from collections.abc import Callable, Collection
-from contextlib import nullcontext
+import threading
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import sapien
 import sapien.physx as physx
 import sapien.render
@@ -19,9 +23,11 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.render.utils import can_render
+from mani_skill.utils.structs import Articulation
 
 from workbench.core.backends import give_brdf_table
 from workbench.core.broken_rule import (
+    NeedsOneEnv,
     Place,
     frames_of_the_task,
     in_brackets,
@@ -29,41 +35,61 @@ from workbench.core.broken_rule import (
     place_of_hook,
     warn_of,
 )
-from workbench.core.camera_data import CameraKey, CameraKind, PictureDegree
+from workbench.core.camera_data import CallSite, CameraKey, CameraKind, PictureDegree
+from workbench.core.camera_shader import install_drawable_cameras, note_shader
+from workbench.core.drawing import drawing, read_texture
 from workbench.core.env.partial_reset import (
+    TARGET_FLAGS,
     KeptControllers,
-    explain_reset_errors,
     in_ascending_order,
+    note_what_was_reset,
     seeded,
     untouched_envs,
+    without_target_flags,
 )
+from workbench.core.env.robot_notes import note_robot_errors
 from workbench.core.env.strict import StrictMixin
+from workbench.core.error_notes import AuthorCall, CoreRefusal, RefusedCall, RefusedValue
 from workbench.core.maniskill_private import (
+    allowed_on_the_cpu,
     asks_for_a_gpu,
+    base_arguments,
     camera_components,
+    camera_site,
+    clears_scene,
+    envs_of,
+    hook_of_base_env,
+    install_base_env_hooks,
     install_row_lookups,
+    mark_camera_configs,
+    objects_of,
     scene_of,
     substeps_are_unwatched,
 )
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.scene.fast_shader import FastCameras
 from workbench.core.scene.fast_shapes import FastShapes, shown
-from workbench.core.simulation.accessors import install_struct_access
+from workbench.core.simulation.accessors import guard_scenes, install_struct_access
 from workbench.core.simulation.contact_queries import CpuArray
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
-from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places, drawn_at
+from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places
+from workbench.core.simulation.hiding import install_hiding
 from workbench.core.snapshots.snapshot import begin_anew
 from workbench.core.snapshots.task_state import note_constructed, note_scene
 
+_UNIT = 1e-3
+"""Largest difference of a quaternion's length from 1."""
 SIM_BACKEND = "physx_cpu_batched"
 """Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
 
 
 _NO_WINDOW = (
-    'render_mode="human" and render_human() open SAPIEN\'s viewer on one scene; batched on the CPU there are many, '
-    "and none is needed: `workbench open` with this task's file or id shows all envs in the browser. For pictures "
+    'render_mode="human" and render_human() open a window, and this process has no display (DISPLAY is not set). '
+    "`workbench open` with this task's file or id shows all envs in the browser. For pictures "
     'use render_mode="rgb_array", "sensors" or "all" and render().'
 )
+_MOST_NESTED = 16
+"""Calls of `step` or `reset` within each other; a hook that steps in each step would do so until Python's recursion ends."""
 
 
 class BatchedSimDevice:
@@ -83,9 +109,16 @@ class CpuCameraGroup:
     """One camera of every env, with the interface of SAPIEN's ``RenderCameraGroup``."""
 
     def __init__(
-        self, cameras: list[sapien.render.RenderCameraComponent], scene: BatchedCpuScene, key: CameraKey
+        self,
+        cameras: list[sapien.render.RenderCameraComponent],
+        scene: BatchedCpuScene,
+        key: CameraKey | None,
     ) -> None:
-        self._cameras, self._scene, self._key = cameras, scene, key
+        """
+        Args:
+            key: None for a camera that the task added to the scene: it is no sensor, and always exact.
+        """
+        self._cameras, self._scene, self.key = cameras, scene, key
 
         self.textures = {"Color"}
         """Those of a fast picture: what was ever read."""
@@ -94,22 +127,41 @@ class CpuCameraGroup:
         self._has: set[str] = set()
 
     def take_picture(self) -> None:
+        if self.key is None:
+            self._scene.px.refused_by_gpu(  # type: ignore[union-attr]
+                f"A picture is taken with '{self._cameras[0].name.partition('_')[2]}', which was added to the scene and is no "
+                "sensor: on the GPU this fails. Name it in _default_sensor_configs."
+            )
+            for camera in self._cameras:
+                camera.take_picture()
+            return
         self._has = {*self.textures}
-        self._drawn = [
-            self._scene.take_picture(env, self._key, camera, self._has)
-            for env, camera in enumerate(self._cameras)
-        ]
+        with self._drawing():
+            self._drawn = [
+                self._scene.take_picture(env, self.key, camera, self._has)
+                for env, camera in enumerate(self._cameras)
+            ]
 
     def get_picture_cuda(self, name: str) -> CpuArray:
         """(N, H, W, C) texture `name` of every env, on the CPU."""
         self.textures.add(name)
-        if name not in self._has and self._drawn != self._cameras:
+        if self.key is not None and name not in self._has and self._drawn != self._cameras:
             # For this once by the exact cameras, which the last `update_render` has moved too.
-            for env, camera in enumerate(self._cameras):
-                self._scene.take_picture(env, self._key, camera, None)
+            with self._drawing():
+                for env, camera in enumerate(self._cameras):
+                    self._scene.take_picture(env, self.key, camera, None)
             self._drawn = self._cameras
-        pictures = [torch.from_numpy(camera.get_picture(name)) for camera in self._drawn]
-        return CpuArray(torch.stack(pictures))
+        if self.key is None:
+            pictures = [camera.get_picture(name) for camera in self._cameras]
+        else:
+            pictures = [read_texture(camera, name, self.key, self._site()) for camera in self._drawn]
+        return CpuArray(torch.stack([torch.from_numpy(picture) for picture in pictures]))
+
+    def _drawing(self) -> AbstractContextManager[None]:
+        return nullcontext() if self.key is None else drawing(self.key, self._site())
+
+    def _site(self) -> CallSite | None:
+        return None if self.key is None else camera_site(self._scene.camera(self.key).config)
 
 
 class BatchedCpuScene(ManiSkillScene):
@@ -143,7 +195,7 @@ class BatchedCpuScene(ManiSkillScene):
             textures: those that a fast picture needs; None for all of `camera`'s own, by `camera` itself.
             degree: None for the scene's own. A fast one needs `prepare_fast` before ``update_render``.
         """
-        if (degree or self.pictures) == "exact":
+        if self.degree_of(camera, degree) == "exact":
             camera.take_picture()
             return camera
         shapes, cameras = self._fast_parts()
@@ -151,6 +203,18 @@ class BatchedCpuScene(ManiSkillScene):
         with shown(shapes.bodies(key, env)):
             drawing.take_picture()
         return drawing
+
+    def degree_of(
+        self, camera: sapien.render.RenderCameraComponent, asked: PictureDegree | None = None
+    ) -> PictureDegree:
+        """The degree of a picture for which this degree is asked, or the scene's own.
+
+        Always exact where the camera's quaternion is not of unit length (``look_at`` straight down): SAPIEN turns and zooms
+        its picture, and what is out of its view is not known.
+        """
+        if (asked or self.pictures) == "exact" or abs(float(np.linalg.norm(camera.local_pose.q)) - 1) > _UNIT:
+            return "exact"
+        return "fast"
 
     def prepare_fast(
         self, env: int, key: CameraKey, textures: Collection[str], places: Places = NOWHERE_ELSE
@@ -160,8 +224,10 @@ class BatchedCpuScene(ManiSkillScene):
         Args:
             places: where bodies of the env are drawn instead.
         """
-        sensor = self._sensor(key)
+        sensor = self.camera(key)
         components = camera_components(sensor)
+        if self.degree_of(components[env], "fast") == "exact":
+            return
         shapes, cameras = self._fast_parts()
         shapes.prepare(env, key, components, places)
         cameras.follow(env, sensor.config, components[env], textures)
@@ -177,7 +243,8 @@ class BatchedCpuScene(ManiSkillScene):
             self._fast = FastShapes(self.sub_scenes), FastCameras(self.sub_scenes)
         return self._fast
 
-    def _sensor(self, key: CameraKey) -> Any:
+    def camera(self, key: CameraKey) -> Any:
+        """ManiSkill's sensor or human camera of this key."""
         kind, name = key
         return (self.sensors if kind == "sensor" else self.human_render_cameras)[name]
 
@@ -194,7 +261,9 @@ class BatchedCpuScene(ManiSkillScene):
         finally:
             self.gpu_sim_enabled = True
         for component in camera._render_cameras:
+            note_shader(component)
             give_brdf_table(component)
+        camera.camera_group = CpuCameraGroup(camera._render_cameras, self, None)  # type: ignore[assignment]
         return camera
 
     def _sapien_update_render(
@@ -207,33 +276,72 @@ class BatchedCpuScene(ManiSkillScene):
             chosen.append(("human", self.human_render_cameras))
         for kind, cameras in chosen:
             for name, sensor in cameras.items():
-                if sensor.camera.camera_group is None:
-                    group = CpuCameraGroup(sensor.camera._render_cameras, self, (kind, name))
+                components = camera_components(sensor)  # none of a sensor that is no camera
+                if components and getattr(sensor.camera.camera_group, "key", None) is None:
+                    group = CpuCameraGroup(components, self, (kind, name))
                     sensor.camera.camera_group = self.camera_groups[name] = group  # type: ignore
-        px: BatchedCpuSystem = self.px  # type: ignore[assignment]
-        every = [*self.sensors.values(), *self.human_render_cameras.values()]
-        elsewhere = px.elsewhere(range(len(self.sub_scenes)))
+        self._system.catch_up()
         for env, sub_scene in enumerate(self.sub_scenes):
-            components = (sensor.camera._render_cameras[env] for sensor in every)
-            places = elsewhere.get(env, NOWHERE_ELSE)
-            with drawn_at(places, components) as move_bodies:
-                for kind, cameras in chosen if self.pictures == "fast" else ():
-                    for name, sensor in cameras.items():
-                        if isinstance(group := sensor.camera.camera_group, CpuCameraGroup):
-                            self.prepare_fast(env, (kind, name), group.textures, places)
-                sub_scene.update_render()
-                move_bodies()
+            for kind, cameras in chosen if self.pictures == "fast" else ():
+                for name, sensor in cameras.items():
+                    if camera_components(sensor) and isinstance(
+                        group := sensor.camera.camera_group, CpuCameraGroup
+                    ):
+                        self.prepare_fast(env, (kind, name), group.textures)
+            sub_scene.update_render()
+
+    @property
+    def _system(self) -> BatchedCpuSystem:
+        return self.px  # type: ignore[return-value]
+
+    @property
+    def _gpu_sim_initialized(self) -> bool:
+        """For ManiSkill's own code: what it allows before a GPU simulation runs is allowed here, see `allowed_on_the_cpu`."""
+        return not allowed_on_the_cpu(sys._getframe(1), self._system.laid_out)
+
+    @_gpu_sim_initialized.setter
+    def _gpu_sim_initialized(self, value: bool) -> None:
+        """ManiSkill's constructor sets it."""
+
+    def _setup(self, enable_gpu: bool) -> None:
+        # As on a stock CPU env, what was set while the scene was built stays, but for the poses.
+        self._system.gpu_init()
+        super()._setup(enable_gpu=False)
+        self._gpu_apply_all()
+        self._gpu_fetch_all()
+        self._system.keep_beginning()
+
+    def get_human_render_camera_images(self, camera_name: str | None = None) -> dict[str, torch.Tensor]:
+        # ManiSkill refuses ray tracing where one group draws the cameras of all envs. Here each is drawn alone.
+        images = {}
+        for name, camera in self.human_render_cameras.items():
+            if camera_name in (None, name):
+                camera.capture()
+                images[name] = camera.get_obs(rgb=True, depth=False, segmentation=False, position=False)[
+                    "rgb"
+                ]
+        return images
 
     def _gpu_apply_all(self) -> None:
         if self._needs_fetch:
-            raise RuntimeError(
-                "self.scene._gpu_apply_all() was called twice without self.scene._gpu_fetch_all() between: "
-                "on the GPU that is an error too. Fetch after every apply, and once before the end of "
-                f"_initialize_episode, after which ManiSkill applies. The first call{self._applied_at}."
+            self._system.refused_by_gpu(
+                "self.scene._gpu_apply_all() is called twice without self.scene._gpu_fetch_all() between: on the GPU this fails. "
+                "Fetch after every apply, and once before the end of _initialize_episode, after which ManiSkill applies. The "
+                f"first call{self._applied_at}."
             )
         self._applied_at = in_brackets(place_of(frames_of_the_task())) or " was ManiSkill's own"
-        self.px.apply_changes()  # type: ignore[union-attr]
+        self._system.apply_changes()
         self._needs_fetch = True
+
+    def remove_articulation(self, articulation: Articulation) -> None:
+        self._system.refused_by_gpu(
+            f"'{articulation.name}' is removed from the scene: on the GPU this fails. Move it out of sight."
+        )
+        for env, each in zip(envs_of(articulation).tolist(), objects_of(articulation), strict=True):
+            for entity in [link.entity for link in each.links]:
+                self.sub_scenes[env].remove_entity(entity)
+        self.articulations.pop(articulation.name)
+        self._system.note_structure()
 
     def step(self) -> None:
         self.px.step()
@@ -264,21 +372,54 @@ class BatchedCpuMixin:
     _sim_steps_per_control: int
     _set_scene_config: Any
     sim_config: Any
+    _elapsed_steps: torch.Tensor
     agent: Any
     device: torch.device
+    _is_closed = False
+    _nested = 0
+    """Steps and resets that are under way."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("parallel_in_single_scene"):
-            raise ValueError(
+            raise RefusedValue(
                 "parallel_in_single_scene is not possible with the batched CPU core: the page "
                 "shows all envs side by side without it."
             )
         if kwargs.get("render_mode") == "human":
-            raise ValueError(_NO_WINDOW)
-        kwargs["sim_backend"] = "physx_cpu"
-        super().__init__(*args, **kwargs)
-        refuse_unbuilt_env(self, self._workbench_task, kwargs.get("num_envs", 1))  # type: ignore[arg-type]
+            _require_display()
+        _refuse_frequencies(kwargs.get("sim_config"))
+        wanted = kwargs.get("num_envs", 1)
+        # Before ManiSkill makes generators for each.
+        require_scenes(wanted)
+        with base_arguments(self, self._workbench_task, kwargs) as passed_on, AuthorCall():
+            super().__init__(*args, **passed_on)
+        refuse_unbuilt_env(self, self._workbench_task, wanted)  # type: ignore[arg-type]
         note_constructed(self)  # type: ignore[arg-type]
+
+    @property
+    def scene(self) -> Any:
+        """
+        Raises:
+            EnvClosed: the env is closed.
+        """
+        made = self.__dict__.get("scene")
+        if made is None and self._is_closed:
+            raise EnvClosed("this env is closed: make another one")
+        return made
+
+    @scene.setter
+    def scene(self, value: Any) -> None:
+        if value is None and not clears_scene(sys._getframe(1)):
+            raise RefusedCall("self.scene is set to None: the env cannot go on without its scene.")
+        self.__dict__["scene"] = value
+
+    def close(self) -> None:
+        if hook := hook_of_base_env(self, sys._getframe(1)):
+            raise RefusedCall(
+                f"self.close() is called within {hook}(): the env cannot go on once it is closed."
+            )
+        super().close()  # type: ignore[misc]
+        self._is_closed = True
 
     @property
     def gpu_sim_enabled(self) -> bool:
@@ -286,7 +427,8 @@ class BatchedCpuMixin:
         return self.scene.gpu_sim_enabled and not asks_for_a_gpu(sys._getframe(1))
 
     def render_human(self) -> Any:
-        raise RuntimeError(_NO_WINDOW)
+        _require_display()
+        return super().render_human()  # type: ignore[misc]
 
     @property
     def backend(self) -> BackendInfo:
@@ -305,7 +447,34 @@ class BatchedCpuMixin:
     def _sim_device(self, value: sapien.Device) -> None:
         """BaseEnv sets the device that it parsed from the backend: the CPU, as asked in __init__."""
 
+    def step(self, action: Any) -> Any:
+        among = self.scene.px.resetting
+        before = self._elapsed_steps.clone()
+        with self._in_turn("step"), AuthorCall():
+            result = super().step(action)  # type: ignore[misc]
+        if among is not None:  # a hook of a reset steps the envs that are being reset
+            self._elapsed_steps[~among] = before[~among]
+        return result
+
+    @contextmanager
+    def _in_turn(self, what: str) -> Iterator[None]:
+        """Within this the env is stepped or reset."""
+        if self._nested >= _MOST_NESTED:
+            raise RefusedCall(
+                f"{what}() was called {_MOST_NESTED} times within itself: a hook that it runs calls it again."
+            )
+        self._nested += 1
+        try:
+            with drawing_alone():
+                yield
+        finally:
+            self._nested -= 1
+
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        with self._in_turn("reset"):
+            return self._reset_in_turn(seed, options)
+
+    def _reset_in_turn(self, seed: Any, options: dict[str, Any] | None) -> Any:
         untouched = untouched_envs(self, options)
         options, seeds = in_ascending_order(options or {}, seed, self)
         # ManiSkill takes a list of seeds for those of the whole batch.
@@ -315,19 +484,29 @@ class BatchedCpuMixin:
             given, seed = seeded(self, options["env_idx"].tolist(), seeds), None
         self._kept_controllers = KeptControllers(self, untouched) if untouched else None
         self._to_begin = [] if self.begins_anew else None
+        if untouched:
+            chosen = torch.ones(self.num_envs, dtype=torch.bool)
+            chosen[untouched] = False
+            self.scene.px.resetting = chosen
         try:
-            with explain_reset_errors(self, untouched), given:
+            with AuthorCall(), note_robot_errors(), note_what_was_reset(self, untouched), given:
                 return super().reset(seed=seed, options=options)  # type: ignore[misc]
         except BaseException:
             self.drop_writes()
             raise
         finally:
             self._kept_controllers = self._to_begin = None
+            if untouched and scene_of(self) is not None:
+                self.scene.px.resetting = None
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
         super()._initialize_episode(env_idx, options)  # type: ignore[misc]
         if self._to_begin is not None:
             self._to_begin = env_idx.tolist()
+
+    def _clear_sim_state(self) -> None:
+        self.scene.px.heal(torch.nonzero(self.scene._reset_mask)[:, 0].tolist())
+        super()._clear_sim_state()  # type: ignore[misc]
 
     def _load_agent(self, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(*args, **kwargs)  # type: ignore[misc]
@@ -351,6 +530,10 @@ class BatchedCpuMixin:
         # Substeps may be merged only if no code of the author's runs between them.
         px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
         unwatched = substeps_are_unwatched(self, self._workbench_task)
+        for controller in without_target_flags(self):
+            for flag in TARGET_FLAGS:
+                # Only what was changed is applied, so a controller that sets none loses nothing.
+                setattr(controller, flag, getattr(controller, flag, True))
         try:
             with px.merging(self._sim_steps_per_control if unwatched else 1):
                 return super()._step_action(action)  # type: ignore[misc]
@@ -362,12 +545,12 @@ class BatchedCpuMixin:
         """Discard writes to the simulation's tensors that were not applied."""
         # Else every later reset would apply what a hook that raised had written (a NaN, say), and what it had applied
         # and not fetched would make the next reset raise.
-        if scene_of(self) is not None and self.scene._gpu_sim_initialized:
-            px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
-            px.drop_writes()
+        if scene_of(self) is not None and self.scene.px.laid_out:
+            self.scene.px.drop_writes()
             self.scene._gpu_fetch_all()
 
-    def _setup_scene(self) -> None:
+    def _make_scene(self) -> None:
+        """What ``BaseEnv._setup_scene`` does for this env; a task may have its own, which calls that."""
         require_scenes(self.num_envs)
         self._set_scene_config()
         sub_scenes = []
@@ -386,6 +569,11 @@ class BatchedCpuMixin:
         )
         self.scene.pictures = self._workbench_pictures
         self.scene.px.timestep = 1.0 / self._sim_freq
+        guard_scenes(self.scene.px)  # type: ignore[arg-type]
+
+
+def _is_batched(scene: Any) -> bool:
+    return isinstance(scene, BatchedCpuScene)
 
 
 def batched_class(
@@ -404,6 +592,10 @@ def batched_class(
     """
     install_row_lookups(batched_system)
     install_struct_access()
+    install_base_env_hooks()
+    install_hiding()
+    install_drawable_cameras(_is_batched)
+    mark_camera_configs()
     namespace = {
         "__module__": task.__module__,
         "__doc__": task.__doc__,
@@ -433,7 +625,7 @@ def require_scenes(count: int) -> None:
     """
     free = free_thread_keys()
     if free is not None and count > free - _SPARE:
-        raise ValueError(
+        raise RefusedValue(
             f"num_envs={count} is more than this process has room for: PhysX takes one of Linux's 1024 thread-local "
             f"keys for each env, and {max(free - _SPARE, 0)} are left here. Use fewer envs, close envs that "
             "are not needed, or divide the envs among processes."
@@ -458,35 +650,79 @@ def free_thread_keys() -> int | None:
     return len(taken)
 
 
+# --- what cannot go on -------------------------------------------------------------------------------
+
+
+class EnvClosed(AttributeError):
+    """The env was closed: it has no scene."""
+
+
+def _require_display() -> None:
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise RefusedValue(_NO_WINDOW)
+
+
+def _refuse_frequencies(config: Any) -> None:
+    given = config if isinstance(config, Mapping) else vars(config) if config is not None else {}
+    for name in ("sim_freq", "control_freq"):
+        value = given.get(name, 1)
+        if not isinstance(value, (int, float)) or value <= 0:
+            raise RefusedValue(f"sim_config: {name} is a number of Hz above 0, not {value!r}")
+
+
+_drawing: dict[int, str] = {}
+"""Threads that step or reset an env now."""
+
+
+@contextmanager
+def drawing_alone() -> Iterator[None]:
+    """Within this, warn if another thread steps or resets an env at the same time."""
+    me, outermost = threading.get_ident(), threading.get_ident() not in _drawing
+    if _drawing.keys() - {me}:
+        warnings.warn(_SHARED_GENERATOR, RuntimeWarning, stacklevel=5)
+    if outermost:
+        _drawing[me] = threading.current_thread().name
+    try:
+        yield
+    finally:
+        if outermost:
+            del _drawing[me]
+
+
+_SHARED_GENERATOR = (
+    "Two threads step or reset envs at the same time: torch has one random generator for all of them, so the same seed does "
+    "not give the same episode twice. Use a process for each env, or one env with more envs in its batch."
+)
+
+
 # --- constructors ------------------------------------------------------------------------------------
 
 
-class ForgottenInit(RuntimeError):
+class ForgottenInit(CoreRefusal, RuntimeError):
     """A constructor did not call its parent's; the first use would fail far away ("weak reference to 'NoneType'")."""
-
-    def __init__(self, message: str, place: Place | None) -> None:
-        super().__init__(message)
-        self.place = place
 
 
 def refuse_unbuilt_env(env: BaseEnv, task: type[BaseEnv], num_envs: int) -> None:
     """After the constructor of `task`.
 
     Raises:
-        ForgottenInit: ``BaseEnv.__init__`` was not called, or not with the number of envs.
+        ForgottenInit: ``BaseEnv.__init__`` was not called.
+        NeedsOneEnv: it was not called with the number of envs.
     """
     if scene_of(env) is None:
         cls, place = _culprit(task, BaseEnv, silent=True)
         raise ForgottenInit(
             f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so nothing was built"
             f"{in_brackets(place)}. Call it there, after setting what the hooks need: ManiSkill builds the scene and resets in it.",
-            place,
+            place=place,
         )
     if env.num_envs != num_envs:
         cls, place = _culprit(task, BaseEnv, silent=False)
-        raise ForgottenInit(
-            f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not hand num_envs on"
-            f"{in_brackets(place)}. Give its keyword arguments to super().__init__(*args, **kwargs).",
+        raise NeedsOneEnv(
+            f"{num_envs} envs were asked for and {env.num_envs} built: {cls.__name__}.__init__ does not hand num_envs on",
+            " Or give its keyword arguments to super().__init__(*args, **kwargs).",
             place,
         )
 
@@ -503,7 +739,7 @@ def refuse_unbuilt_agent(agent: Any) -> None:
             raise ForgottenInit(
                 f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so the robot was not loaded"
                 f"{in_brackets(place)}. Call it there.",
-                place,
+                place=place,
             )
 
 

@@ -61,13 +61,14 @@ def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDA
             continue
         name = _name(path, columns, others)
         array = _array(value)
-        if array is None:
+        if name in FLAGS and array is not None:
+            # ManiSkill takes a single one for all envs, and numbers for bools; the page needs a row each.
+            one_each = array.reshape(-1) if array.size == num_envs else array
+            columns[name] = np.broadcast_to(one_each.astype(bool), (num_envs, *one_each.shape[1:])).copy()
+        elif array is None:
             others[name] = _other(value, num_envs)
         elif array.ndim and len(array) == num_envs:
             columns[name] = array
-        elif name in FLAGS:
-            # ManiSkill takes a single bool for all envs; the page needs a row each.
-            columns[name] = np.broadcast_to(array, (num_envs, *array.shape)).copy()
         else:
             others[name] = _numbers(value, array)
     if left_out:
@@ -232,18 +233,28 @@ def clean_text(text: str) -> str:
 
 
 def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
-    """What is wrong with ``evaluate()``'s return value, or None: a dict in which ``success`` and ``fail`` are bool tensors (N,).
+    """What is wrong with ``evaluate()``'s return value, or None: a dict in which ``success`` and ``fail`` are tensors (N,).
 
     Other entries may be anything, as in ManiSkill (`split_entries`).
     """
     if not isinstance(evaluate, Mapping):
-        return f"returned {_describe(evaluate)}; it must return a dict ({{}} where there is nothing to say)"
+        return f"returned {describe(evaluate)}; it must return a dict ({{}} where there is nothing to say)"
     for name in FLAGS:
         value = evaluate.get(name)
         if name in evaluate and not (
-            isinstance(value, torch.Tensor) and value.dtype == torch.bool and _a_row_each(value, num_envs)
+            isinstance(value, torch.Tensor) and not value.is_complex() and _a_row_each(value, num_envs)
         ):
-            return f"returned {name!r} as {_describe(value)}; expected a bool tensor of shape ({num_envs},)"
+            return f"returned {name!r} as {describe(value)}; expected a bool tensor of shape ({num_envs},)"
+    return None
+
+
+def wrong_flags(evaluate: object) -> str | None:
+    """Which of ``success`` and ``fail`` is a tensor of another type than bool, or None: ManiSkill's step takes it, and its
+    wrappers do not."""
+    for name in FLAGS:
+        value = evaluate.get(name) if isinstance(evaluate, Mapping) else None
+        if isinstance(value, torch.Tensor) and value.dtype != torch.bool:
+            return f"returned {name!r} as {describe(value)}; expected a bool tensor: append .bool()"
     return None
 
 
@@ -256,13 +267,13 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
     success = evaluate.get("success")
     if isinstance(success, torch.Tensor) and reward.dtype == torch.bool and torch.equal(reward, success):
         return None
-    return f"returned {_describe(reward)}; {_floating(num_envs)}: append .float()"
+    return f"returned {describe(reward)}; {_floating(num_envs)}: append .float()"
 
 
 def no_reward(reward: object, num_envs: int) -> str | None:
     """What is wrong with a reward that is no real number (or bool) for each env: it cannot be drawn or recorded."""
     if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs) or reward.dtype.is_complex:
-        return f"returned {_describe(reward)}; {_floating(num_envs)}"
+        return f"returned {describe(reward)}; {_floating(num_envs)}"
     return None
 
 
@@ -271,25 +282,34 @@ def _floating(num_envs: int) -> str:
 
 
 def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:
-    # Tasks written for one env return shape (), which ManiSkill and its wrappers take.
-    return value.shape == (num_envs,) or (num_envs == 1 and value.ndim == 0)
+    # Tasks written for one env return other shapes of one number, which ManiSkill's step takes.
+    return value.shape == (num_envs,) or num_envs == value.numel() == 1
 
 
 def wrong_observation(obs: object, num_envs: int) -> str | None:
     """What is wrong with an observation hook's return value, or None: a dict of arrays (N, ...)."""
     if not isinstance(obs, Mapping):
-        return f"returned {_describe(obs)}; it must return a dict ({{}} where there is nothing to observe)"
+        return f"returned {describe(obs)}; it must return a dict ({{}} where there is nothing to observe)"
     for name, value in flat_entries(obs):
         shape = getattr(value, "shape", None)
         if shape is None or len(shape) == 0 or shape[0] != num_envs:
             return (
-                f"returned {name!r} as {_describe(value)}; "
+                f"returned {name!r} as {describe(value)}; "
                 f"expected shape ({num_envs}, ...), a row for each env"
             )
     return None
 
 
-def _describe(value: object) -> str:
+def without_rows(value: object, num_envs: int) -> Iterator[tuple[str, str]]:
+    """Name and description of each tensor or array in nested dicts that has no row for each env."""
+    for name, held in flat_entries(value):
+        if isinstance(held, torch.Tensor | np.ndarray) and held.shape[:1] != (num_envs,):
+            if num_envs > 1 or held.ndim:  # ManiSkill takes shape () for a single env
+                yield name, type_text(held)
+
+
+def describe(value: object) -> str:
+    """A value in a message: its type, with the shape of an array, or its text."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"a {type_text(value)}"
     if value is None:

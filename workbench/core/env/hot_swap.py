@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -50,8 +51,7 @@ def can_exchange_cameras(env: BaseEnv) -> bool:
 def exchange_cameras(env: BaseEnv) -> None:
     """Replace the env's cameras by those that its class configures now.
 
-    No picture may be pending. If the class raises, the env lacks the cameras that were not made: call this again with a
-    class that works.
+    No picture may be pending. If the class raises, the env lacks the cameras that were not made.
     """
     if not env.scene.can_render():
         return
@@ -79,7 +79,7 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
         What could not be undone (for example attributes that a hook made): name and reason.
 
     Raises:
-        Exception: raised by a hook; the env is as before.
+        Exception: raised by a hook; state is as before, attributes that the hook set are not.
     """
     every = list(range(env.num_envs))
 
@@ -98,15 +98,13 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
 def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
     """Call `do`, and undo what it did to the env; returns and raises as `rehearse_hooks`."""
     every = list(range(env.num_envs))
-    kept, had = take_snapshot(env), set(vars(env))
+    kept, px = take_snapshot(env), batched_system(env.scene)
     try:
-        with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+        with (
+            torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []),
+            nullcontext() if px is None else px.holding_back(),
+        ):
             do()
-    except BaseException:
-        # Else a buffer with a row for the one env of the rehearsal is what the mended hook finds.
-        for name in set(vars(env)) - had:
-            delattr(env, name)
-        raise
     finally:
         maniskill_private.set_reset_mask(env, every)
         own = isinstance(env, BatchedCpuMixin)

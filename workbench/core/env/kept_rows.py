@@ -18,13 +18,13 @@ from workbench.core.broken_rule import (
     files_of_task,
     find_assignment,
     frames_of_the_task,
-    is_installed,
     place_of_hook,
 )
 from workbench.core.maniskill_private import task_class
 from workbench.core.simulation.strict_system import envs_named
 from workbench.core.snapshots.task_attributes import Walk, walk_task_values
 from workbench.core.snapshots.task_state import is_per_env, version_of
+from workbench.machine.library_files import is_installed
 
 MOST_LINES = 2000
 """Lines of the author's code after which values are compared, in one reset."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,15 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 from mani_skill.agents.controllers.base_controller import BaseController, CombinedController
-from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs import Pose
 
-from workbench.core.broken_rule import BrokenRule, Place, files_of_task, find_assignment
+from workbench.core.broken_rule import find_assignment
 from workbench.core.env.kept_rows import KeptRows
 from workbench.core.env_numbers import env_numbers, envs_of_batch
+from workbench.core.error_notes import CoreRefusal, Note
 from workbench.core.maniskill_private import agents, drawing_from, set_episode_seeds, task_class
-
-_CORE = str(Path(__file__).parents[1])
 
 
 class KeptControllers:
@@ -54,6 +51,16 @@ def active_controllers(env: Any) -> list[BaseController]:
     return single
 
 
+TARGET_FLAGS = ("sets_target_qpos", "sets_target_qvel")
+"""What ManiSkill asks a controller in each step, on the GPU alone: which drive targets it sets."""
+
+
+def without_target_flags(env: Any) -> list[BaseController]:
+    """The controllers of robots that do not say what `TARGET_FLAGS` asks, as ``BaseController`` does not."""
+    controllers = [agent.controller for agent in agents(env)]
+    return [one for one in controllers if not all(hasattr(one, flag) for flag in TARGET_FLAGS)]
+
+
 def untouched_envs(env: Any, options: dict[str, Any] | None) -> list[int]:
     """The envs that a reset with these options does not touch; empty for a reset of all."""
     chosen = _chosen(env, options or {})
@@ -61,13 +68,16 @@ def untouched_envs(env: Any, options: dict[str, Any] | None) -> list[int]:
 
 
 def _chosen(env: Any, options: Mapping[str, Any]) -> list[int] | None:
-    """The named envs to reset; None for all. As in ManiSkill, -1 is the last env and an empty list is allowed."""
+    """The named envs to reset; None for all. As in ManiSkill, -1 is the last env, and a mask with a row for each env names
+    those where it is True."""
     named = options.get("env_idx")
     if named is None:
         return None
     count = env.num_envs
+    if isinstance(named, (torch.Tensor, np.ndarray)) and named.dtype in (torch.bool, np.bool_):
+        named = np.flatnonzero(np.asarray(named)) if named.shape == (count,) else named
     chosen = [i + count if -count <= i < 0 else i for i in env_numbers(named)]
-    return envs_of_batch(chosen, count) if chosen else []
+    return envs_of_batch(chosen, count)
 
 
 def in_ascending_order(
@@ -85,7 +95,8 @@ def in_ascending_order(
         The options, and the seeds if there is one for each env of a partial reset.
 
     Raises:
-        TypeError, IndexError, ValueError: ``env_idx`` is a mask, or names an env that does not exist, or one twice.
+        TypeError, IndexError, ValueError: ``env_idx`` is a mask of another length, or names an env that does not exist, one
+            twice, or none.
     """
     chosen = _chosen(env, options)
     if chosen is None:
@@ -121,50 +132,25 @@ def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
 
 
 @contextmanager
-def explain_reset_errors(env: Any, untouched: list[int]) -> Iterator[None]:
-    """Add a note with the task's line, and the buffers that shrank, to an exception that a reset raises.
+def note_what_was_reset(env: Any, untouched: list[int]) -> Iterator[None]:
+    """Add notes to an exception of a partial reset: which envs it was for, and the buffers that have fewer rows now.
 
-    A hook that makes ``num_envs`` rows instead of ``len(env_idx)``, or replaces a buffer of N rows by the subset's, raises a
-    torch message about sizes, often in a hook that is right.
+    A hook that replaces a buffer of N rows by one of ``len(env_idx)`` makes another hook, which is right, raise a torch
+    message about sizes.
     """
+    if not untouched:
+        yield
+        return
     chosen = sorted(set(range(env.num_envs)).difference(untouched))
-    rows = KeptRows(env, chosen) if untouched else None
+    rows = KeptRows(env, chosen)
     try:
         yield
-    except BrokenRule:
-        raise  # has the line already
+    except CoreRefusal:
+        raise  # its text says what it is about
     except Exception as error:
-        line = _line_of_the_task(error, env)
-        lost = [] if rows is None else [path for path, envs in rows.changed_envs().items() if not envs]
-        if line is not None or lost:
-            error.add_note(_note(env, chosen, line, lost))
+        error.add_note(Note(f"Envs {chosen} of {env.num_envs} were being reset."))
+        for path in (path for path, envs in rows.changed_envs().items() if not envs):
+            place = find_assignment(task_class(env), path)
+            at = "" if place is None else f" ({Path(place[0]).name}:{place[1]})"
+            error.add_note(Note(f"self.{path}: {env.num_envs} rows before the reset, {len(chosen)} now{at}."))
         raise
-
-
-def _note(env: BaseEnv, chosen: list[int], line: Place | None, lost: list[str]) -> str:
-    where = "." if line is None else f": {Path(line[0]).name}:{line[1]}, in {line[2]}."
-    note = f"This error is {type(env).__name__}'s own, not the batched core's{where}"
-    if len(chosen) == env.num_envs:
-        return note
-    note += (
-        f" Envs {chosen} of {env.num_envs} were being reset: _initialize_episode must make len(env_idx) rows, "
-        "not num_envs, and write what it keeps on self as `self.x[env_idx] = ...`."
-    )
-    for path in lost:
-        place = find_assignment(task_class(env), path)
-        at = "" if place is None else f" ({Path(place[0]).name}:{place[1]})"
-        note += f" It replaced self.{path}: {env.num_envs} rows before, {len(chosen)} now{at}."
-    return note + " ManiSkill's GPU simulation runs the same code."
-
-
-def _line_of_the_task(error: Exception, env: BaseEnv) -> Place | None:
-    """The innermost line in a file of the task's classes; None if the core failed below it."""
-    files, found = files_of_task(task_class(env)), None
-    for frame, line in traceback.walk_tb(error.__traceback__):
-        file = frame.f_code.co_filename
-        if file in files:
-            found = file, line, frame.f_code.co_name
-        elif file.startswith(_CORE) and not isinstance(error, ValueError):
-            # The core refuses arguments with a ValueError; anything else may be its own fault.
-            found = None
-    return found

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -13,14 +14,23 @@ from workbench.core.broken_rule import (
     BrokenRule,
     BrokenRules,
     WrongReturn,
+    find_entry,
+    in_brackets,
+    place_of_class,
     place_of_hook,
     warn_of,
 )
-from workbench.core.env.evaluate_entries import wrong_evaluate, wrong_observation, wrong_reward
+from workbench.core.env.evaluate_entries import (
+    without_rows,
+    wrong_evaluate,
+    wrong_flags,
+    wrong_observation,
+    wrong_reward,
+)
 from workbench.core.env.kept_rows import ResetWatch
-from workbench.core.env.partial_reset import untouched_envs
+from workbench.core.env.partial_reset import TARGET_FLAGS, untouched_envs, without_target_flags
+from workbench.core.error_notes import CoreRefusal, Note
 from workbench.core.rules import Degree, Finding, degrees_of
-from workbench.core.simulation.accessors import guard_scenes
 from workbench.core.simulation.strict_system import StrictCpuSystem
 
 _REWARD_HOOK = {
@@ -33,19 +43,18 @@ _REWARD_HOOK = {
 class StrictMixin:
     """Checks of the rules for a batched task class, as the first of its bases.
 
-    Most mistakes that the GPU does not forgive stop in the batched CPU core too. These are silent, and reported at the
-    author's line:
+    The batched CPU core does what a stock CPU env does. Where a GPU does otherwise is reported at the author's line:
 
     * state set and not applied, applied or read without a fetch after a step, links read before their articulation's new
       qpos reached them (`strict_system`);
+    * what the GPU refuses: state touched while the scene is built, static actors moved, masses set later (`accessors`);
     * SAPIEN's own setters, which the GPU ignores (`accessors`);
     * in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or changed (here,
       and `kept_rows`);
     * returns of ``evaluate``, the reward and the observation hooks without a row for each env (`evaluate_entries`).
 
-    What the GPU refuses in any case (another batch size, a static actor moved, two applies without a fetch, state touched
-    while the scene loads) is refused at every degree, see `accessors`. Values are compared, so only what goes wrong is
-    reported; ``tests/core/env/test_strict.py`` lists the ManiSkill tasks that break a rule.
+    Values are compared, so only what goes wrong is reported; ``tests/core/env/test_strict.py`` lists the ManiSkill tasks that
+    break a rule.
     """
 
     num_envs: int
@@ -63,10 +72,9 @@ class StrictMixin:
         """Breaches so far; belongs to the env, and outlives its scene and class."""
         return BrokenRules(degrees_of(self._rule_choice), self._on_finding)
 
-    def _setup_scene(self) -> None:
-        super()._setup_scene()  # type: ignore[misc]
+    def _make_scene(self) -> None:
+        super()._make_scene()  # type: ignore[misc]
         self._strict_system.rules = self.broken_rules
-        guard_scenes(self._strict_system)
 
     @property
     def _strict_system(self) -> StrictCpuSystem:
@@ -77,6 +85,18 @@ class StrictMixin:
             stepped = super().step(action)  # type: ignore[misc]
         self.broken_rules.step += 1
         return stepped
+
+    def _step_action(self, action: Any) -> Any:
+        for controller in without_target_flags(self):
+            cls = type(controller)
+            self.broken_rules.report_breach(
+                "controller-targets",
+                f"{cls.__name__} lacks {' and '.join(flag for flag in TARGET_FLAGS if not hasattr(controller, flag))}.",
+                frames=None,
+                place=place_of_class(cls),
+                subject=cls,
+            )
+        return super()._step_action(action)  # type: ignore[misc]
 
     # --- partial resets ------------------------------------------------------------------------------
 
@@ -111,7 +131,7 @@ class StrictMixin:
         if bool(reset.all()):
             return super()._initialize_episode(env_idx, options)  # type: ignore[misc]
         state = system.copy_of_state()
-        system.being_reset, system.stepped_in_reset = reset, False
+        system.being_reset = reset
         system.reported_elsewhere.clear()
         system.hook_of_reset = place_of_hook(self._workbench_task, "_initialize_episode")
         watch = self._watch
@@ -131,10 +151,12 @@ class StrictMixin:
     def evaluate(self) -> dict[str, Any]:
         evaluated = super().evaluate()  # type: ignore[misc]
         self._returned("evaluate-rows", "evaluate", wrong_evaluate(evaluated, self.num_envs))
+        self._returned("evaluate-flags", "evaluate", wrong_flags(evaluated))
         return evaluated
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
-        reward = super().get_reward(obs=obs, action=action, info=info)  # type: ignore[misc]
+        with self._noting_rows(info, obs):
+            reward = super().get_reward(obs=obs, action=action, info=info)  # type: ignore[misc]
         hook = _REWARD_HOOK.get(self.reward_mode)  # type: ignore[attr-defined]
         if hook is not None:
             self._returned("reward-rows", hook, wrong_reward(reward, self.num_envs, info))
@@ -150,10 +172,11 @@ class StrictMixin:
         self._observed("_get_obs_agent", obs)
         return obs
 
-    def get_obs(self, *args: Any, **kwargs: Any) -> Any:
+    def get_obs(self, info: Any = None, *args: Any, **kwargs: Any) -> Any:
         self._wrong_obs = None
         try:
-            obs = super().get_obs(*args, **kwargs)  # type: ignore[misc]
+            with self._noting_rows(info):
+                obs = super().get_obs(info, *args, **kwargs)  # type: ignore[misc]
         except Exception as error:
             if self._wrong_obs is None or isinstance(error, BrokenRule):
                 raise
@@ -167,6 +190,32 @@ class StrictMixin:
             # `evaluate` may store values of all envs, which is not the reset's fault: compare from here.
             self._watch.go_on(self)  # type: ignore[arg-type]
         return obs
+
+    @contextmanager
+    def _noting_rows(self, info: Any, obs: Any = None) -> Iterator[None]:
+        """Note what has no row for each env in what ``evaluate`` and ``_get_obs_extra`` returned to a hook that fails with it."""
+        try:
+            yield
+        except CoreRefusal:
+            raise
+        except (
+            RuntimeError,
+            ValueError,
+            TypeError,
+            IndexError,
+        ) as error:  # what torch and numpy raise for shapes
+            extra = obs.get("extra") if isinstance(obs, Mapping) else None
+            for hook, returned in (("evaluate", info), ("_get_obs_extra", extra)):
+                for name, what in (
+                    without_rows(returned, self.num_envs) if isinstance(returned, Mapping) else ()
+                ):
+                    place = find_entry(self._workbench_task, hook, name.rpartition("/")[2])
+                    error.add_note(
+                        Note(
+                            f"{hook}() returned {name!r} as a {what}, for {self.num_envs} envs{in_brackets(place)}."
+                        )
+                    )
+            raise
 
     def _observed(self, hook: str, obs: Any) -> None:
         problem = wrong_observation(obs, self.num_envs)

@@ -360,6 +360,8 @@ def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
 def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
     """(N, ...), a copy; a single value (of a task written for one env) is repeated."""
     array = np.array(value.numpy(force=True) if isinstance(value, torch.Tensor) else value, dtype)
+    if num_envs == array.size == 1:
+        return array.reshape(1)
     batched = array.ndim > 0 and len(array) == num_envs
     return array if batched else np.broadcast_to(array, (num_envs, *array.shape)).copy()
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -12,15 +11,14 @@ from typing import Any
 
 import sapien
 import sapien.render
-from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
 from workbench.core.backends import give_brdf_table
+from workbench.core.camera_shader import MINIMAL, selected
 from workbench.machine.folders import cache_folder, read_private, write_private
 
 COLOR = frozenset({"Color"})
 ALL = frozenset({"Color", "PositionSegmentation", "GbufferDepth"})
 """Textures of the minimal shader that a fast camera has: those of `COLOR` alone, or all."""
-_SHADER = PREBUILT_SHADER_CONFIGS["minimal"]
 
 Edits = tuple[tuple[str, str], ...]
 """Passages of a shader's text, each of which is there once, and what stands in place of them."""
@@ -150,12 +148,12 @@ class FastCameras:
         chosen = _smallest(textures)
         system = self._sub_scenes[env].render_system
         folder = shader_folder(chosen) if ALL.issuperset(textures) else None
-        if folder is None or config.shader_config is not _SHADER or system.cubemap is not None:
+        if folder is None or config.shader_config is not MINIMAL or system.cubemap is not None:
             self._made.pop((id(exact), chosen), None)
             return
         fast = self._made.get((id(exact), chosen))
         if fast is None:
-            with _shader(folder):
+            with selected(MINIMAL, folder):
                 fast = self._made[id(exact), chosen] = _beside(exact, system)
         fast.component.local_pose = exact.get_global_pose()
         k = exact.get_intrinsic_matrix()
@@ -182,17 +180,3 @@ def _beside(exact: sapien.render.RenderCameraComponent, system: Any) -> _Fast:
     scene.add_entity(entity)
     give_brdf_table(component)
     return _Fast(exact, component, scene)
-
-
-@contextmanager
-def _shader(folder: Path) -> Iterator[None]:
-    """Select a shader: SAPIEN makes every camera with the one that was selected last in the process."""
-    before = sapien.render.get_camera_shader_dir()
-    set_shader_pack(_SHADER)
-    sapien.render.set_camera_shader_dir(str(folder))
-    try:
-        yield
-    finally:
-        if Path(before).name == "default":
-            set_shader_pack(PREBUILT_SHADER_CONFIGS["default"])  # the formats of its pictures too
-        sapien.render.set_camera_shader_dir(before)

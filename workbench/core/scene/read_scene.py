@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,11 +16,13 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
+from workbench.core import maniskill_private
 from workbench.core.scene.mesh_levels import reduced_mesh
 from workbench.core.scene.normals import with_normals
 from workbench.core.scene.scene_index import scene_index
 from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual, srgb
 from workbench.core.scene.simplify import drop_uvs, flat_rectangle, share_vertices
+from workbench.core.simulation.hiding import shown_visibility
 
 _FLAT_FACES = 100
 """Meshes with more faces are tested for being a flat rectangle."""
@@ -58,7 +60,7 @@ def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_
     markers) are missing then.
     """
     index = scene_index(env)
-    walk = _RenderWalk(max_faces, max_texels)
+    walk = _RenderWalk(max_faces, max_texels, maniskill_private.hidden_objects(env))
     rendered = env.scene.can_render()
     instances: dict[Hashable, list[tuple[int, int]]] = {}
     first: dict[Hashable, MeshPart] = {}
@@ -113,16 +115,15 @@ def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[MeshPart]:
 class _RenderWalk:
     """One walk over the render bodies of a scene; keeps the textures that it found."""
 
-    def __init__(self, max_faces: int, max_texels: int) -> None:
-        self._max_faces, self._max_texels = max_faces, max_texels
+    def __init__(self, max_faces: int, max_texels: int, hidden: Sequence[Any]) -> None:
+        self._max_faces, self._max_texels, self._hidden = max_faces, max_texels, hidden
         self._textures: list[tuple[Any, NDArray[np.uint8] | None]] = []
 
     def parts(self, entity: Any) -> Iterator[MeshPart]:
         body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
         if body is None:
             return
-        # 0 is a body that ManiSkill hides now; other values are intended: a ghost, a glass.
-        visibility = body.visibility or 1.0
+        visibility = shown_visibility(self._hidden, body)
         for shape in body.render_shapes:
             place = _Placement.of(shape)
             for index, part in enumerate(shape.parts):

@@ -14,20 +14,24 @@ from numpy.typing import NDArray
 
 from workbench.core import maniskill_private
 from workbench.core.scene.shapes import BodyKind
+from workbench.core.simulation.cpu_system import batched_system
 
 _T = TypeVar("_T")
+_AWAY = 5e4
+"""Metres along each axis from where an actor was hidden, if it is still hidden; ``Actor.hide_visual`` moves it by 99999."""
 
 
 def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
-    """Cache ``find(env)`` on the env's scene, so that it is called once a scene."""
+    """Cache ``find(env)`` on the env's scene, so that it is called once a scene, and again when bodies came or went."""
     name = f"_workbench {find.__module__}.{find.__qualname__}"
 
     @wraps(find)
     def known(env: Any) -> _T:
-        held = vars(env.scene)
-        if name not in held:
-            held[name] = find(env)
-        return held[name]
+        held, px = vars(env.scene), batched_system(env.scene)
+        version = 0 if px is None else px.layout_version
+        if name not in held or held[name][0] != version:
+            held[name] = version, find(env)
+        return held[name][1]
 
     return known
 
@@ -38,8 +42,8 @@ class SceneIndex:
 
     Asked one by one a body's pose costs 2 us, so 64 envs of 16 bodies cost 2 ms a frame. Here it is found once which row of
     ``px.cuda_rigid_body_data`` belongs to which (env, body), and a frame is one gather. Static bodies are not in that
-    tensor: `fixed` has their poses. A hidden body was moved 99999 m away; `hidden_poses` has its true pose. Objects that
-    differ from env to env (`Actor.merge`) are one body by the merged name.
+    tensor: `fixed` has their poses. In GPU simulation a hidden body was moved 99999 m away; `hidden_poses` has its true pose.
+    Objects that differ from env to env (`Actor.merge`) are one body by the merged name.
     """
 
     names: tuple[str, ...]
@@ -112,8 +116,9 @@ def scene_index(env: Any) -> SceneIndex:
                 if kinds[body] == "static":
                     fixed[e, body] = [*entity.pose.p, *entity.pose.q]
             if kinds[body] != "static" and scene.gpu_sim_enabled:
-                slots.append(envs * len(names) + body)
-                rows.append(maniskill_private.data_rows_of(struct))
+                own = maniskill_private.data_rows_of(struct)
+                slots.append((envs * len(names) + body)[(own >= 0).numpy(force=True)])
+                rows.append(own[own >= 0])  # a body that was removed has none
     slot_of = {id(entity): slot for slot, entity in enumerate(entities.ravel()) if entity is not None}
     hidden = {
         id(entity)
@@ -156,6 +161,12 @@ def read_poses(env: Any) -> NDArray[np.float32]:
     index = scene_index(env)
     poses = index.fixed.copy()
     flat = poses.reshape(-1, 7)
+    px = batched_system(env.scene)
+    if px is not None and px.static_moves:
+        for env_idx, body in np.argwhere(~np.isnan(index.fixed[:, :, 0])):
+            entity: Any = index.entities[env_idx, body]
+            pose = entity.pose
+            poses[env_idx, body] = [*pose.p, *pose.q]
     if index.rows is None:
         # A stock CPU env has no such tensor, and does not move what it hides.
         for slot, entity in enumerate(index.entities.ravel()):
@@ -202,13 +213,15 @@ def read_joints(env: Any) -> NDArray[np.float32] | None:
 
 
 def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-    """For each hidden Actor: the slots (M,) of its entities and their true poses (M, 7).
-
-    On the CPU the poses are ManiSkill's own array, which callers write to.
-    """
+    """For each Actor that GPU simulation has moved away to hide it: slots (M,) and true poses (M, 7) of its entities, without
+    those that something else has moved since."""
     for actor, slots in scene_index(env).actors:
-        if actor.hidden and (kept := maniskill_private.pose_before_hiding(actor)) is not None:
-            yield slots, kept.cpu().numpy()
+        if (kept := maniskill_private.pose_before_hiding(actor)) is not None:
+            now = rows_of(env.scene.px.cuda_rigid_body_data, maniskill_private.data_rows_of(actor).long())[
+                :, :3
+            ]
+            away = ((now - kept[:, :3]).abs() > _AWAY).all(dim=1).cpu().numpy()
+            yield slots[away], kept.cpu().numpy()[away]
 
 
 def present_states(env: Any) -> dict[str, Any]:
@@ -255,7 +268,7 @@ def state_rows(env: Any) -> StateRows:
     asked = {
         name: in_every_env(env, struct, struct.get_state())
         for name, (struct, column, joints, _) in places.items()
-        if column is None or (joints is None and struct.hidden)
+        if column is None or (joints is None and maniskill_private.pose_before_hiding(struct) is not None)
     }
     qpos, qvel = px.cuda_articulation_qpos.torch(), px.cuda_articulation_qvel.torch()
     qpos, qvel = (q.numpy().copy() if q.is_cpu else q.clone() for q in (qpos, qvel))
@@ -269,16 +282,18 @@ def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, in
     every, rows, still = np.arange(env.num_envs), [], []
     places: dict[str, tuple[Any, int | None, Any, int]] = {}
     for name, struct in scene_index(env).states.items():
-        if not np.array_equal(maniskill_private.envs_of(struct), every):
+        body = struct if name.startswith("actors/") else struct.root
+        removed = bool((maniskill_private.data_rows_of(body) < 0).any())
+        if removed or not np.array_equal(maniskill_private.envs_of(struct), every):
             places[name] = struct, None, None, 0
             continue
         if name.startswith("actors/"):
             if struct.px_body_type != "dynamic":
                 still.append(len(rows))
-            places[name], body = (struct, len(rows), None, 0), struct
+            places[name] = struct, len(rows), None, 0
         else:
             joints = row_index(maniskill_private.data_rows_of_articulation(struct))
-            places[name], body = (struct, len(rows), joints, maniskill_private.joints_of(struct)), struct.root
+            places[name] = struct, len(rows), joints, maniskill_private.joints_of(struct)
         rows.append(maniskill_private.data_rows_of(body).long())
     none = torch.zeros((env.num_envs, 0), dtype=torch.long, device=env.device)
     return row_index(torch.stack(rows, dim=1) if rows else none), still, places

@@ -85,6 +85,10 @@ class SceneGeometry:
     """(B,) whether the task hides it from sensors (goal markers: ``_hidden_objects``)."""
     visuals: tuple[Visual, ...]
 
+    @property
+    def hidden_names(self) -> tuple[str, ...]:
+        return tuple(name for name, hidden in zip(self.body_names, self.body_hidden, strict=True) if hidden)
+
 
 # --- shapes that look the same -----------------------------------------------------------------------
 

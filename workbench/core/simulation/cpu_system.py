@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,45 +12,51 @@ import sapien.physx as physx
 import torch
 from numpy.typing import NDArray
 
+from workbench.core.broken_rule import NeedsOneEnv, frames_of_the_task, place_of
+from workbench.core.error_notes import RefusedCall, RefusedMember
 from workbench.core.simulation.contact_queries import ContactReader, CpuArray, ImpulseQuery
-from workbench.core.simulation.drawn_poses import Places, bodies_elsewhere
-from workbench.core.simulation.mirrors import Group, Mirror, Mirrors, refuse_nan
-from workbench.core.simulation.state_layout import StateLayout, check_layout, lay_out
+from workbench.core.simulation.mirrors import DriveTargets, Group, Mirror, Mirrors
+from workbench.core.simulation.state_layout import StateLayout, check_layout, lay_out, link_poses_at
 from workbench.core.simulation.stepping import Stepper
 
 _TOO_EARLY = (
-    "The simulation is not initialised yet: in _load_agent and _load_scene only initial poses "
-    "may be set. Read and write state (poses, qpos, velocities) in _initialize_episode."
+    "The simulation is not initialised yet, so there are no tensors of state in _load_agent and _load_scene, on the GPU or "
+    "here. Use them in _after_reconfigure or _initialize_episode."
 )
+TENSORS: Mapping[str, tuple[Group, ...]] = {
+    "cuda_rigid_body_data": ("bodies", "links"),
+    "cuda_rigid_dynamic_data": ("bodies", "links"),
+    "cuda_articulation_link_data": ("bodies", "links"),
+    "cuda_articulation_qpos": ("joints",),
+    "cuda_articulation_qvel": ("joints",),
+    "cuda_articulation_qf": ("forces",),
+    "cuda_articulation_target_qpos": ("targets",),
+    "cuda_articulation_target_qvel": ("targets",),
+}
+MOVING: tuple[Group, ...] = ("bodies", "links", "joints")
+"""What a step moves; targets and joint forces stay as they were set."""
+_OF_ALL = {"config", "get_config", "get_timestep", "scene_collision_id", "get_scene_collision_id"}
+"""Members of a system that give the same for each env."""
+_WRITES = {"unpack"}
+"""Members of a CPU system that change its state."""
 
 
-def _uncommon_member(name: str) -> Any:
-    """Refuse a member that `BatchedCpuSystem` does not define.
-
-    Raises:
-        NotImplementedError: SAPIEN's GPU system has it.
-        AttributeError: SAPIEN's does not have it either.
-    """
-    if hasattr(physx.PhysxGpuSystem, name):
-        raise NotImplementedError(
-            f"{name} is a member of SAPIEN's GPU system that the batched CPU simulation does not have: here every env has "
-            "its own physics, at its own origin. For what all of them share, use self.scene.px.systems[0]."
-        )
-    raise AttributeError(f"the batched CPU system has no '{name}'")
-
-
-def _applies(mirror: Callable[[Mirrors], Mirror], keep_awake: bool = False) -> Callable[..., None]:
-    """A ``gpu_apply_*`` of one mirror. Refuses SAPIEN's index buffer: only what differs from the last fetch is applied."""
+def _applies(mirror: Callable[[Mirrors], Mirror]) -> Callable[..., None]:
+    """A ``gpu_apply_*`` of one mirror. What differs from the last fetch is applied, whatever the index buffer names."""
 
     def apply(self: BatchedCpuSystem, index_buffer: Any = None) -> None:
-        if index_buffer is not None:
-            raise NotImplementedError(
-                "gpu_apply_... takes no index buffer in the batched CPU simulation: call it without, it applies the "
-                "rows that were changed."
-            )
-        self._apply(mirror(self._mirrors), keep_awake)
+        self._apply(mirror(self._mirrors))
 
     return apply
+
+
+def _tensor(name: str) -> property:
+    def get(self: BatchedCpuSystem) -> CpuArray:
+        if not self.laid_out:
+            raise RefusedCall(_TOO_EARLY)
+        return self.tensor(name)
+
+    return property(get)
 
 
 class BatchedCpuSystem:
@@ -62,7 +68,9 @@ class BatchedCpuSystem:
 
     * A fetch is ``PhysxCpuSystem.pack()`` and ``sapien.Scene.pack_poses()`` of each env (about 3 us) and one gather over all
       envs; a Python getter costs 2 us *a body*.
-    * An apply writes only what differs from the last fetch: a partial reset wakes no body of another env.
+    * ManiSkill's setters write through (`wrote`), its getters give the state of now (`refresh`), as on a stock CPU env: a
+      task that neither applies nor fetches does here what it does there.
+    * An apply writes what else differs from the last fetch: a partial reset wakes no body of another env.
     * Link velocities, joint accelerations and joint forces are fetched when they are read: few tasks do.
 
     Shapes: R bodies (dynamic and kinematic actors, then links, env after env), A articulations,
@@ -80,8 +88,22 @@ class BatchedCpuSystem:
         self._posed: NDArray[np.float32] | None = None
         self._pose_lengths: list[int] = []
         self._link_pose_at = np.zeros((0, 7), dtype=np.int64)
+        self._behind: set[Group] = set()
+        """Groups whose tensors are older than the simulation."""
+        self.is_writing = False
+        """Whether a setter of ManiSkill's runs."""
+        self.held_back = False
+        """Whether setters write to the tensors alone, see `holding_back`."""
+        self.resetting: torch.Tensor | None = None
+        """(N,) bool during a reset of some envs and not of others: only they are stepped."""
+        self.static_moves = 0
+        """Poses that static actors were given."""
         self._version = 0
         """Grows when the simulation may differ from what was fetched."""
+        self._beginning: list[bytes] = []
+        """Of each env the packed state that it was built with."""
+        self.layout_version = 0
+        """Grows when rows belong to other bodies."""
         self._read_at: dict[str, int] = {}
         """`_version` at the last read of each value that is read on demand."""
 
@@ -116,44 +138,62 @@ class BatchedCpuSystem:
         """(3,) always zero: every env has its own origin."""
         return np.zeros(3, dtype=np.float32)
 
-    def get_contacts(self) -> list[physx.PhysxContact]:
-        raise NotImplementedError(
-            "scene.get_contacts() does not exist in batched simulation (nor on the GPU). Use "
-            "scene.get_pairwise_contact_impulses(a, b) or actor.get_net_contact_impulses()."
-        )
+    def get_rigid_dynamic_components(self) -> list[physx.PhysxRigidDynamicComponent]:
+        return self.rigid_dynamic_components
+
+    def get_rigid_static_components(self) -> list[physx.PhysxRigidStaticComponent]:
+        return self.rigid_static_components
+
+    def get_articulation_link_components(self) -> list[physx.PhysxArticulationLinkComponent]:
+        return self.articulation_link_components
+
+    def set_timestep(self, timestep: float) -> None:
+        self.timestep = timestep
+
+    def set_scene_collision_id(self, id: int) -> None:
+        for system in self.systems:
+            system.set_scene_collision_id(id)
 
     def step(self) -> None:
-        """One substep of every env."""
-        if self.stepper.step():
+        """One substep of every env; during a partial reset, of those that are being reset."""
+        self._apply_targets()
+        if self.resetting is None:
+            if self.stepper.step():
+                self._stepped()
+            return
+        frozen, others = self.stepper.frozen, np.flatnonzero(~self.resetting.numpy())
+        self.freeze_envs(frozen.union(others.tolist()))
+        try:
+            self.stepper.step()
+            self.catch_up()
             self._stepped()
+        finally:
+            self.freeze_envs(frozen)
 
     def freeze_envs(self, envs: Collection[int]) -> None:
         """Stop stepping these envs in PhysX; an empty collection steps all again."""
-        self._catch_up()
+        self.catch_up()
+        self._apply_targets()
         self.stepper.forget()
         self.stepper.frozen = frozenset(envs)
 
-    def keep_drives(self, envs: Sequence[int], flags: Sequence[NDArray[np.bool_]]) -> None:
-        """Discard drive targets that were written for these envs while they were frozen.
-
-        Args:
-            flags: `drive_flags` from before.
-        """
-        rows = np.isin(self._mirrors.targets.envs, envs)
-        for now, was in zip(self.drive_flags, flags, strict=True):
-            now[rows] = was[rows]
-        for targets in (self._mirrors.targets, self._mirrors.velocity_targets):
-            targets.drop()
-        self._fetch("targets")
+    @contextmanager
+    def holding_back(self) -> Iterator[None]:
+        """Within this, setters write to the tensors alone, and the simulation sees it if it is applied."""
+        self.held_back = True
+        try:
+            yield
+        finally:
+            self.held_back = False
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
         """Within this, `substeps` calls of `step` may be done together; a read of state does them at once."""
         with self.stepper.merging(substeps):
             yield
-        self._catch_up()
+        self.catch_up()
 
-    def _catch_up(self) -> None:
+    def catch_up(self) -> None:
         if self.stepper.owes:
             self.stepper.catch_up()
             self._stepped()
@@ -172,7 +212,10 @@ class BatchedCpuSystem:
 
     def gpu_init(self) -> None:
         """Make the tensors over the scene's bodies; called once, when the scene is complete."""
-        layout = self._layout = lay_out(self.systems, self.scenes)
+        layout = self._layout = lay_out(self.systems)
+        self.layout_version += 1
+        self._packed = self._posed = None
+        self._pose_lengths = []
         found = self._found = Mirrors(
             layout, self._pack, self._link_poses, self._setter, self.stepper.write_before_step
         )
@@ -180,14 +223,17 @@ class BatchedCpuSystem:
         most_links = max((len(a.links) for a in layout.articulations), default=0)
         self._joint_forces = np.zeros((len(layout.articulations), most_links, 6), dtype=np.float32)
         self._force, self._torque = np.zeros((2, len(layout.entities), 3), dtype=np.float32)
-        self.cuda_rigid_body_data = _array(found.bodies.now)
-        self.cuda_rigid_dynamic_data = self.cuda_rigid_body_data
-        self.cuda_articulation_link_data = self.cuda_rigid_body_data
-        self.cuda_articulation_qpos = _array(found.qpos.now)
-        self.cuda_articulation_qvel = _array(found.qvel.now)
-        self.cuda_articulation_qf = _array(found.qf.now)
-        self.cuda_articulation_target_qpos = _array(found.targets.now)
-        self.cuda_articulation_target_qvel = _array(found.velocity_targets.now)
+        data = _array(found.bodies.now)
+        self._tensors = {
+            "cuda_rigid_body_data": data,
+            "cuda_rigid_dynamic_data": data,
+            "cuda_articulation_link_data": data,
+            "cuda_articulation_qpos": _array(found.qpos.now),
+            "cuda_articulation_qvel": _array(found.qvel.now),
+            "cuda_articulation_qf": _array(found.qf.now),
+            "cuda_articulation_target_qpos": _array(found.targets.now),
+            "cuda_articulation_target_qvel": _array(found.velocity_targets.now),
+        }
         self.cuda_rigid_body_force = _array(self._force)
         self.cuda_rigid_body_torque = _array(self._torque)
         self.cuda_rigid_dynamic_force = self.cuda_rigid_body_force
@@ -195,14 +241,73 @@ class BatchedCpuSystem:
         check_layout(layout, self._pack(), self._link_poses)
         for mirror in found.all:
             mirror.fetch()
+        for row, articulation in enumerate(layout.articulations):  # which no pack holds
+            found.qf.now[row, : articulation.dof] = found.qf.seen[row, : articulation.dof] = articulation.qf
+        self._behind.clear()
+
+    cuda_rigid_body_data = _tensor("cuda_rigid_body_data")
+    cuda_rigid_dynamic_data = _tensor("cuda_rigid_dynamic_data")
+    cuda_articulation_link_data = _tensor("cuda_articulation_link_data")
+    cuda_articulation_qpos = _tensor("cuda_articulation_qpos")
+    cuda_articulation_qvel = _tensor("cuda_articulation_qvel")
+    cuda_articulation_qf = _tensor("cuda_articulation_qf")
+    cuda_articulation_target_qpos = _tensor("cuda_articulation_target_qpos")
+    cuda_articulation_target_qvel = _tensor("cuda_articulation_target_qvel")
 
     def row_of(self, body: physx.PhysxRigidBodyComponent) -> int:
-        """Row of a dynamic or kinematic body, or of a link, in the (R, 13) tensor."""
-        return self._laid_out.row_of[id(body)]
+        """Row of a dynamic or kinematic body, or of a link, in the (R, 13) tensor; -1 if it was removed."""
+        if id(body) not in self._laid_out.row_of and body.entity.scene is not None:
+            self._lay_out_again()
+        return self._laid_out.row_of.get(id(body), -1)
 
     def index_of(self, articulation: physx.PhysxArticulation) -> int:
-        """Row of an articulation in the (A, D) tensors."""
-        return self._laid_out.index_of[id(articulation)]
+        """Row of an articulation in the (A, D) tensors; -1 if it was removed."""
+        if id(articulation) not in self._laid_out.index_of and articulation.links[0].entity.scene is not None:
+            self._lay_out_again()
+        return self._laid_out.index_of.get(id(articulation), -1)
+
+    def _lay_out_again(self) -> None:
+        """Bodies were added or removed since the scene was laid out."""
+        self.refused_by_gpu(
+            "Bodies are built or removed once the simulation runs: on the GPU this fails. Build them in _load_scene; with "
+            "reconfiguration_freq=1 it runs before each episode."
+        )
+        self._apply_targets()
+        self._moved(MOVING)
+        self.gpu_init()
+        self.keep_beginning()
+
+    def keep_beginning(self) -> None:
+        """Keep the present state as the one that `heal` puts back."""
+        self._beginning = [*self.packs()]
+
+    def heal(self, envs: Sequence[int]) -> None:
+        """Put back what is NaN or infinite in these envs: each such body or articulation to where it was built.
+
+        PhysX carries a NaN on for ever, and a reset puts right only what the task sets.
+        """
+        numbers = self._pack()
+        if np.isfinite(numbers).all():
+            return
+        starts = np.cumsum([0, *map(len, self._beginning)]) // numbers.itemsize
+        for env in envs:
+            now = numbers[starts[env] : starts[env + 1]].copy()
+            built = np.frombuffer(self._beginning[env], np.float32)
+            if np.isfinite(now).all() or not np.isfinite(built).all():
+                continue
+            for part in self._laid_out.parts[env]:
+                if not np.isfinite(now[part]).all():
+                    now[part] = built[part]
+            self.systems[env].unpack(now.tobytes())
+        held: tuple[Group, ...] = (*MOVING, "targets")
+        self._moved(held)
+        for group in held:
+            self.refresh(group)
+
+    def note_structure(self) -> None:
+        """Entities were removed from a scene."""
+        self._moved(MOVING)
+        self._pose_lengths = []
 
     @property
     def laid_out(self) -> bool:
@@ -211,22 +316,74 @@ class BatchedCpuSystem:
 
     @property
     def _laid_out(self) -> StateLayout:
-        self._catch_up()
+        self.catch_up()
         if self._layout is None:
-            raise RuntimeError(_TOO_EARLY)
+            raise RefusedCall(_TOO_EARLY)
         return self._layout
 
     @property
     def _mirrors(self) -> Mirrors:
         if self._found is None:
-            raise RuntimeError(_TOO_EARLY)
+            raise RefusedCall(_TOO_EARLY)
         return self._found
 
     def __getattr__(self, name: str) -> Any:
         # The tensors exist from `gpu_init` on: explain an earlier access.
         if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
-            raise RuntimeError(_TOO_EARLY)
-        return _uncommon_member(name)
+            raise RefusedCall(_TOO_EARLY)
+        if name in _OF_ALL:
+            return getattr(self.systems[0], name)
+        if hasattr(physx.PhysxCpuSystem, name) and not name.startswith("_"):
+            return self._of_one_env(name)
+        if hasattr(physx.PhysxGpuSystem, name):
+            raise RefusedMember(
+                f"{name} is a member of SAPIEN's GPU system that the batched CPU simulation does not have: here every env "
+                "has its own physics, at its own origin."
+            )
+        raise AttributeError(f"the batched CPU system has no '{name}'")
+
+    def _of_one_env(self, name: str) -> Any:
+        """A member of the CPU system of the only env.
+
+        Raises:
+            NeedsOneEnv: there are several.
+        """
+        place = place_of(frames_of_the_task())
+        if len(self.systems) > 1:
+            raise NeedsOneEnv(
+                f"scene.px.{name} is of one CPU simulation, and there are {len(self.systems)} here",
+                _INSTEAD.get(name, ""),
+                place,
+            )
+        self.report(
+            "one-env-only", f"scene.px.{name} does not exist in GPU simulation.{_INSTEAD.get(name, '')}"
+        )
+        self.packs()  # makes pending substeps, and writes pending targets
+        member = getattr(self.systems[0], name)
+        if name not in _WRITES:
+            return member
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            result = member(*args, **kwargs)
+            self.note_change()
+            return result
+
+        return call
+
+    # --- for the rules: see `StrictCpuSystem` -----------------------------------------------------------
+
+    def report(self, rule: str, message: str) -> None:
+        """The task breaks a rule."""
+
+    def refused_by_gpu(self, message: str) -> None:
+        """The task does what GPU simulation refuses."""
+        self.report("refused-by-gpu", message)
+
+    def about_to_write(self, struct: Any, group: Group, rows: NDArray[np.int64]) -> None:
+        """A setter of `struct` will write `rows` of `group`'s tensor."""
+
+    def about_to_read(self, struct: Any, group: Group, rows: NDArray[np.int64]) -> None:
+        """A getter of `struct` will read `rows` of `group`'s tensor."""
 
     def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
         """The method that sets one kind of drive target of a joint."""
@@ -234,10 +391,34 @@ class BatchedCpuSystem:
 
     # --- reading: gpu_fetch_* ----------------------------------------------------------------------
 
+    def _follow_structure(self) -> None:
+        self.catch_up()
+        if len(self._pack()) != self._laid_out.size + 1:
+            self._lay_out_again()
+
     def _fetch(self, group: Group) -> None:
         """Read `group` from the simulation, overwriting what was not applied."""
+        self._follow_structure()
+        if group == "targets":
+            self._apply_targets()
         for mirror in self._mirrors.of[group]:
             mirror.fetch()
+        self._behind.discard(group)
+
+    def refresh(self, group: Group) -> None:
+        """Read `group` from the simulation if it is behind, but not over what was written and not applied."""
+        self.catch_up()
+        if group in self._behind:
+            self._follow_structure()
+            self._behind.discard(group)
+            for mirror in self._mirrors.of[group]:
+                mirror.refresh()
+
+    def tensor(self, name: str) -> CpuArray:
+        """One of `TENSORS`, as the simulation is now (within a setter: as it was read last)."""
+        for group in () if self.is_writing else TENSORS[name]:
+            self.refresh(group)
+        return self._tensors[name]
 
     def gpu_fetch_rigid_dynamic_data(self) -> None:
         self._fetch("bodies")
@@ -300,7 +481,7 @@ class BatchedCpuSystem:
                 now[row, 10:13] = seen[row, 10:13] = link.angular_velocity
 
     def _pack(self) -> NDArray[np.float32]:
-        self._catch_up()
+        self.catch_up()
         if self._packed is None:
             joined = b"".join(self.stepper.packs())
             self._packed = np.empty(len(joined) // 4 + 1, dtype=np.float32)
@@ -315,35 +496,35 @@ class BatchedCpuSystem:
             packs = self.stepper.pose_packs()
             lengths = [len(pack) // 4 for pack in packs]
             if lengths != self._pose_lengths:
-                # Cameras are added after the scene is laid out: each makes its env's pack longer.
-                starts = np.cumsum([0, *lengths[:-1]])
-                rows = layout.link_rows
-                self._link_pose_at = layout.pose_at[rows] + starts[layout.env_of_row[rows]][:, None]
+                # Cameras are added after the scene is laid out, and a task may remove what is drawn.
+                self._link_pose_at = link_poses_at(layout, self.scenes)
                 self._pose_lengths = lengths
             self._posed = np.frombuffer(b"".join(packs), dtype=np.float32)
         return self._posed[self._link_pose_at]
 
     def note_change(self) -> None:
-        """Drop packed state after a write to the simulation, here or by a call on one of `systems`."""
-        self._catch_up()
-        self.stepper.forget()
-        self._moved()
+        """The state was changed by a call on one of `systems` or of their objects."""
+        self._moved(MOVING)
+
+    def note_direct_write(self, env: int) -> None:
+        """The task writes to one of SAPIEN's objects in this env."""
+        self._moved(MOVING, {env})
 
     def _stepped(self) -> None:
         self.contacts.stepped(self.stepper.frozen)
-        self._moved()
+        self._forget_packs(MOVING)
 
-    def _moved(self) -> None:
+    def _moved(self, behind: Iterable[Group], envs: Iterable[int] | None = None) -> None:
+        """At a write to the simulation of these envs (None: of all): drop packed state, and note which groups are behind."""
+        self.catch_up()
+        self.stepper.forget(envs)
+        self._forget_packs(behind)
+
+    def _forget_packs(self, behind: Iterable[Group]) -> None:
         self._packed = self._posed = None
         self._version += 1
+        self._behind.update(behind)
         self.contacts.invalidate()
-
-    def elsewhere(self, envs: Sequence[int]) -> dict[int, Places]:
-        """By env, bodies that the tensor has elsewhere than SAPIEN, and where; see `bodies_elsewhere`."""
-        self._catch_up()
-        if self._layout is None:
-            return {}
-        return bodies_elsewhere(self.scenes, self._layout, self._mirrors.bodies.now, envs)
 
     def replace(self, env: int, scene: sapien.Scene) -> None:
         """Use another scene and system for this env, with its entities in the same order."""
@@ -357,23 +538,71 @@ class BatchedCpuSystem:
 
     def packs(self) -> list[bytes]:
         """``PhysxCpuSystem.pack()`` of every env, now."""
-        self._catch_up()
+        if self._layout is not None:
+            self._follow_structure()
+        self.catch_up()
+        self._apply_targets()
         return self.stepper.packs()
 
-    @property
-    def drive_flags(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(A,), (A,) whether position and velocity targets were ever set; see `DriveTargets`."""
-        return self._mirrors.targets.driven, self._mirrors.velocity_targets.driven
+    # --- writing: ManiSkill's setters, and gpu_apply_* ------------------------------------------------
 
-    # --- writing: gpu_apply_* ----------------------------------------------------------------------
+    def wrote(
+        self,
+        mirror: Mirror,
+        at: tuple[NDArray[np.int64], Any],
+        values: NDArray[np.float32],
+        write: Callable[[NDArray[np.bool_]], None],
+    ) -> None:
+        """A setter wrote `values` to the rows and columns `at` of a mirror's tensor: write them to the simulation too.
 
-    def _apply(self, mirror: Mirror, keep_awake: bool = False) -> None:
+        Args:
+            write: does so, through SAPIEN's objects; called with which of the rows to write.
+
+        Raises:
+            ValueError: as `Mirror.may_write`; the tensor is as before.
+        """
+        if self.held_back:
+            return
+        whole = np.ones(len(values), dtype=bool)
+        if not np.isfinite(values).all():
+            mirror.now[at] = mirror.seen[at]
+            each = zip(at[0].tolist(), values, strict=True)
+            whole = np.array([mirror.may_write(value, row) for row, value in each], dtype=bool)
+        own = self._mirrors
+        # Links follow: their poses and, as PhysX rounds it, the root's.
+        follow: tuple[Group, ...] = ("links",) if mirror in (own.qpos, own.links) else ()
+        self._moved(follow, {*mirror.envs[at[0]].tolist()})
+        write(whole)
+        at = (at[0][whole], at[1][whole] if isinstance(at[1], np.ndarray) else at[1])
+        mirror.now[at] = mirror.seen[at] = values[whole]
+
+    def wrote_targets(self, mirror: DriveTargets, rows: NDArray[np.int64]) -> None:
+        """A setter wrote drive targets of these articulations: they are applied before the next step."""
+        mirror.note(rows)
+
+    def mirror(self, name: str) -> Any:
+        """The mirror of this name; see `Mirrors`."""
+        return getattr(self._mirrors, name)
+
+    def _apply_targets(self) -> None:
+        """Apply the drive targets that setters wrote."""
+        if self._found is not None and not self.held_back:
+            for targets in (self._found.targets, self._found.velocity_targets):
+                if targets.pending:
+                    self._put(targets)
+
+    def _apply(self, mirror: Mirror) -> None:
         """Write to the simulation what differs from the last fetch."""
-        changed = mirror.differs().any()
-        if changed:
-            self.note_change()
-        if changed or keep_awake:
-            mirror.apply(keep_awake)
+        self._put(mirror)
+
+    def _put(self, mirror: Mirror) -> None:
+        if mirror.differs().any():
+            own = self._mirrors
+            follow: tuple[Group, ...] = ("links",) if mirror in (own.qpos, own.roots) else ()
+            self._moved(follow, {*mirror.envs[mirror.rows[mirror.changed()]].tolist()})
+            mirror.apply()
+        elif isinstance(mirror, DriveTargets) and mirror.pending:
+            mirror.apply()
 
     def apply_changes(self) -> None:
         """Apply what ``ManiSkillScene._gpu_apply_all`` applies, but only what differs."""
@@ -395,8 +624,8 @@ class BatchedCpuSystem:
     gpu_apply_articulation_qpos = _applies(lambda own: own.qpos)
     gpu_apply_articulation_qvel = _applies(lambda own: own.qvel)
     gpu_apply_articulation_qf = _applies(lambda own: own.qf)
-    gpu_apply_articulation_target_position = _applies(lambda own: own.targets, keep_awake=True)
-    gpu_apply_articulation_target_velocity = _applies(lambda own: own.velocity_targets, keep_awake=True)
+    gpu_apply_articulation_target_position = _applies(lambda own: own.targets)
+    gpu_apply_articulation_target_velocity = _applies(lambda own: own.velocity_targets)
 
     def gpu_apply_rigid_dynamic_force(self) -> None:
         self._apply_forces(self._force, "force")
@@ -414,7 +643,8 @@ class BatchedCpuSystem:
         rows = np.concatenate([layout.body_rows, layout.link_rows]).tolist()
         for row, body in zip(rows, [*layout.bodies, *layout.links], strict=True):
             if values[row].any():
-                refuse_nan(values[row], layout.names[row], int(layout.env_of_row[row]))
+                if not self._mirrors.bodies.may_write(values[row], row):
+                    continue
                 if kind == "force":
                     body.add_force_torque(values[row], zero)
                 else:
@@ -431,10 +661,16 @@ class BatchedCpuSystem:
         return self.contacts.create_pair_query(body_pairs)
 
     def gpu_query_contact_body_impulses(self, query: ImpulseQuery) -> None:
-        self._catch_up()
+        self.catch_up()
         self.contacts.answer(query)
 
     gpu_query_contact_pair_impulses = gpu_query_contact_body_impulses
+
+
+_INSTEAD = {
+    "get_contacts": " Use scene.get_pairwise_contact_impulses(a, b) or actor.get_net_contact_impulses(), which give a row for "
+    "each env."
+}
 
 
 def _array(values: NDArray[np.float32]) -> CpuArray:

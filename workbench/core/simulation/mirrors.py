@@ -9,6 +9,7 @@ import numpy as np
 import sapien
 from numpy.typing import NDArray
 
+from workbench.core.error_notes import RefusedValue
 from workbench.core.simulation.state_layout import BODY, StateLayout
 
 Group = Literal["bodies", "links", "joints", "targets", "forces"]
@@ -54,26 +55,28 @@ class Mirror:
         self.rows = np.arange(len(self.now)) if rows is None else rows
         self.at: Any = columns if rows is None else (rows, columns)
         self.sources, self._owners, self._put = sources, owners, put
+        self.sound: Callable[[int], bool] = lambda env: True
+        """Whether all that is known of the state of an env is finite."""
 
     def differs(self) -> NDArray[np.bool_]:
-        """(K, W) what was written and neither applied nor overwritten by a fetch; True for any NaN."""
-        return self.now[self.at] != self.seen[self.at]
+        """(K, W) what was written and neither applied nor overwritten by a fetch."""
+        return differ(self.now[self.at], self.seen[self.at])
 
     def changed(self) -> NDArray[np.int64]:
         """Which of the K rows differ."""
         return np.flatnonzero(self.differs().any(axis=1))
 
-    def written(self) -> NDArray[np.bool_]:
-        """As `differs`, without NaNs of the simulation's own."""
-        differs = self.differs()
-        if differs.any():
-            differs &= ~(np.isnan(self.now[self.at]) & np.isnan(self.seen[self.at]))
-        return differs
-
     def fetch(self) -> None:
         """Read the simulation's values."""
         for at, read in self.sources:
             self.now[at] = self.seen[at] = read()
+
+    def refresh(self) -> None:
+        """Read the simulation's values, except over what was written and not applied."""
+        for at, read in self.sources:
+            written = differ(self.now[at], self.seen[at])
+            self.seen[at] = read()
+            self.now[at] = np.where(written, self.now[at], self.seen[at])
 
     def drop(self) -> None:
         """Discard what was written and not applied."""
@@ -84,26 +87,56 @@ class Mirror:
         at, read = self.sources[0]
         return np.abs(self.now[at] - read()) > _MOVED
 
-    def apply(self, keep_awake: bool) -> None:
+    def apply(self) -> None:
         """Write what differs to the simulation.
 
         Raises:
-            ValueError: a number of a changed row is NaN or infinite.
+            ValueError: as `may_write`.
         """
-        now, differs = self.now[self.at], self.differs()
+        now, seen, differs = self.now[self.at], self.seen[self.at], self.differs()
         for i in np.flatnonzero(differs.any(axis=1)).tolist():
-            refuse_nan(now[i], self.names[int(self.rows[i])], int(self.envs[self.rows[i]]))
-            self._put(self._owners[i], now[i], differs[i])
-        self.seen[self.at] = now
+            if self.may_write(now[i][differs[i]], int(self.rows[i])):
+                self._put(self._owners[i], now[i], differs[i])
+            else:
+                now[i] = seen[i]
+        self.seen[self.at] = self.now[self.at] = now
+
+    def may_write(self, values: Floats, row: int) -> bool:
+        """Whether to write these numbers of a row to the simulation.
+
+        PhysX does not check: a NaN pose spreads to everything that it touches and may crash the process. In an env that holds
+        NaN already, whatever is computed of it is NaN: there it is left out, until a reset puts the env right.
+
+        Raises:
+            ValueError: one is NaN or infinite, and the env is sound. What was written and not applied is discarded, or every
+                later apply would raise again.
+        """
+        if np.isfinite(values).all():
+            return True
+        env = int(self.envs[row])
+        if self.sound(env):
+            self.drop()
+            raise RefusedValue(
+                f"{self.names[row]} of env {env}: the state to be set holds NaN or infinity: {values}"
+            )
+        return False
+
+
+def differ(a: Floats, b: Floats) -> NDArray[np.bool_]:
+    """Where two arrays differ; NaN equals NaN, which the simulation itself may hold."""
+    differs = a != b
+    if differs.any():
+        differs &= ~(np.isnan(a) & np.isnan(b))
+    return differs
 
 
 class DriveTargets(Mirror):
     """Position or velocity targets of the joints of every articulation.
 
     Setting a target wakes a sleeping articulation even if the value stays, and ManiSkill's CPU controllers set theirs at
-    every control step. So a target that was ever set is written at every apply, or a robot at rest would fall asleep here
-    and not in stock; one that was never set is not, or it would never sleep. That is 1200 calls a control step for 64
-    Pandas, so each env's thread makes them, just before its step.
+    every control step. So an articulation whose targets were set since the last apply is written, whether or not they
+    changed, or a robot at rest would fall asleep here and not in stock. That is 1200 calls a control step for 64 Pandas, so
+    each env's thread makes them, just before its step.
     """
 
     def __init__(
@@ -119,26 +152,35 @@ class DriveTargets(Mirror):
             later: takes a function that writes the targets of one env before its next step.
         """
         super().__init__("targets", *mirror, sources=sources)
-        self.driven = np.zeros(len(self.now), dtype=bool)
-        """(A,) whether a target was ever set."""
+        self._set = np.zeros(len(self.now), dtype=bool)
+        """(A,) whether targets were set since the last apply."""
+        self.pending = False
+        """Whether any were."""
         self._setters, self._later = setters, later
         self._of_env = {int(env): np.flatnonzero(self.envs == env).tolist() for env in np.unique(self.envs)}
 
-    def apply(self, keep_awake: bool) -> None:
-        """Schedule what was written.
+    def note(self, rows: NDArray[np.int64]) -> None:
+        """These rows were set."""
+        self._set[rows] = self.pending = True
 
-        Args:
-            keep_awake: also write targets that did not change, of articulations that were ever driven.
+    def drop(self) -> None:
+        super().drop()
+        self._set[:] = self.pending = False
+
+    def apply(self) -> None:
+        """Schedule what was set.
 
         Raises:
-            ValueError: one of them is NaN or infinite.
+            ValueError: as `may_write`.
         """
-        changed = self.differs().any(axis=1)
-        self.driven |= changed
-        chosen = np.flatnonzero(self.driven if keep_awake else changed).tolist()
+        chosen = np.flatnonzero(self._set | self.differs().any(axis=1)).tolist()
         if not np.isfinite(self.now).all():
-            for i in chosen:
-                refuse_nan(self.now[i], self.names[i], int(self.envs[i]))
+            kept = [i for i in chosen if self.may_write(self.now[i], i)]
+            left = sorted(set(chosen).difference(kept))
+            self.now[left], chosen = self.seen[left], kept
+        self._set[:] = self.pending = False
+        if not chosen:
+            return
         self.seen[:] = self.now
         values, written = self.now.tolist(), set(chosen)
 
@@ -215,6 +257,12 @@ class Mirrors:
         """Each number once; `roots` and `root_velocities` are part of `links`."""
         self.of = {group: [mirror for mirror in self.all if mirror.group == group] for group in GROUPS}
         """Mirrors that are fetched together."""
+        for mirror in (*self.all, self.roots, self.root_velocities):
+            mirror.sound = self._is_sound
+
+    def _is_sound(self, env: int) -> bool:
+        held = ((each.seen, each.envs) for each in (self.bodies, self.qpos, self.qvel))
+        return all(np.isfinite(seen[envs == env]).all() for seen, envs in held)
 
 
 def _twin(shape: tuple[int, ...]) -> tuple[Floats, Floats]:
@@ -223,14 +271,14 @@ def _twin(shape: tuple[int, ...]) -> tuple[Floats, Floats]:
 
 def _put_body(body: Any, row: Floats, differs: NDArray[np.bool_]) -> None:
     if differs[:7].any():
-        body.entity.pose = _pose(row)
+        body.entity.pose = pose_of_row(row)
     if differs[7:].any() and not body.kinematic:
         body.linear_velocity = row[7:10]
         body.angular_velocity = row[10:13]
 
 
 def _put_root_pose(articulation: Any, row: Floats, differs: NDArray[np.bool_]) -> None:
-    articulation.links[0].pose = _pose(row)
+    articulation.links[0].pose = pose_of_row(row)
 
 
 def _put_root_velocity(articulation: Any, row: Floats, differs: NDArray[np.bool_]) -> None:
@@ -238,11 +286,5 @@ def _put_root_velocity(articulation: Any, row: Floats, differs: NDArray[np.bool_
     articulation.set_root_angular_velocity(row[3:])
 
 
-def _pose(row: Floats) -> sapien.Pose:
+def pose_of_row(row: Floats) -> sapien.Pose:
     return sapien.Pose(row[:3], row[3:7])  # type: ignore[arg-type]  # the stubs want a literal shape
-
-
-def refuse_nan(values: Floats, name: str, env: int) -> None:
-    # PhysX does not check: a NaN pose spreads to everything it touches and may crash the process.
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name} of env {env}: the state to be set holds NaN or infinity: {values}")

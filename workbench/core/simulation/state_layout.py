@@ -49,8 +49,6 @@ class StateLayout:
     target_qvel_at: NDArray[np.int64]
     entities: list[Any]
     """(R,) of each row."""
-    pose_at: NDArray[np.int64]
-    """(R, 7) of each row, within the packed poses of its own env."""
     env_of_row: NDArray[np.int64]
     names: list[str]
     """(R,) of the body in each row, the same in every env."""
@@ -58,27 +56,33 @@ class StateLayout:
     """(A,) likewise."""
     row_of: dict[int, int]
     index_of: dict[int, int]
+    size: int
+    """Numbers in the packs of all envs."""
+    parts: list[list[slice]]
+    """Of each env: the numbers of each body and articulation in its pack."""
 
 
-def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Scene]) -> StateLayout:
+def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:
     rows: list[Any] = []  # the component of each
-    entity_at, env_of_row, body_at, joints_at = [], [], [], []
+    env_of_row, body_at, joints_at = [], [], []
     roots: dict[int, tuple[int, Any]] = {}  # row and articulation of the first link of each
     packed = 0
-    for env, (system, scene) in enumerate(zip(systems, scenes, strict=True)):
-        entities = scene.entities  # held, because an id is unique only among objects that are alive
-        where = {id(entity): 7 * i for i, entity in enumerate(entities)}
+    parts: list[list[slice]] = []
+    for env, system in enumerate(systems):
         bodies, links = system.rigid_dynamic_components, system.articulation_link_components
         body_at += [packed + BODY * i for i in range(len(bodies))]
         packed += BODY * len(bodies)
         before = len(roots)
         for row, link in enumerate(links, len(rows) + len(bodies)):
             roots.setdefault(id(link.articulation), (row, link.articulation))
+        own = [slice(BODY * i, BODY * (i + 1)) for i in range(len(bodies))]
         for _, articulation in [*roots.values()][before:]:
             joints_at.append(packed + BODY)
             packed += BODY + 4 * articulation.dof
+            start = own[-1].stop if own else 0
+            own.append(slice(start, start + BODY + 4 * articulation.dof))
+        parts.append(own)
         rows += [*bodies, *links]
-        entity_at += [where[id(component.entity)] for component in (*bodies, *links)]
         env_of_row += [env] * (len(bodies) + len(links))
     is_link = np.array([isinstance(c, physx.PhysxArticulationLinkComponent) for c in rows], dtype=bool)
     articulations = [articulation for _, articulation in roots.values()]
@@ -104,13 +108,25 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
         target_qpos_at=joint_columns(2 * dof + 2 * each),
         target_qvel_at=joint_columns(2 * dof + 2 * each + 1),
         entities=entities,
-        pose_at=_numbers(entity_at)[:, None] + _FROM_PACKED_POSE,
         env_of_row=_numbers(env_of_row),
         names=[_IN_ENV.sub("", entity.name) for entity in entities],
         articulation_names=[_IN_ENV.sub("", articulation.name) for articulation in articulations],
         row_of={id(component): row for row, component in enumerate(rows)},
         index_of={id(a): i for i, a in enumerate(articulations)},
+        size=packed,
+        parts=parts,
     )
+
+
+def link_poses_at(layout: StateLayout, scenes: Sequence[sapien.Scene]) -> NDArray[np.int64]:
+    """(L, 7) of each link, in the packed poses of all envs, one env's after the other's."""
+    where: dict[int, int] = {}
+    first, held = 0, [scene.entities for scene in scenes]  # an id is unique only among objects that are alive
+    for entities in held:
+        where.update({id(entity): first + 7 * i for i, entity in enumerate(entities)})
+        first += 7 * len(entities)
+    found = [where.get(id(link.entity), 0) for link in layout.links]
+    return _numbers(found)[:, None] + _FROM_PACKED_POSE
 
 
 def _numbers(values: list[int]) -> NDArray[np.int64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -51,8 +51,8 @@ class Stepper:
         self._owed = 0
         self._in_a_row = 1
         self._writes: list[Callable[[int], None]] = []
-        self._packs: list[bytes] | None = None
-        self._pose_packs: list[bytes] | None = None
+        self._packs: list[bytes | None] = [None] * len(systems)
+        self._pose_packs: list[bytes | None] = [None] * len(systems)
         self.frozen: frozenset[int] = frozenset()
         """Envs that are neither stepped nor given drive targets."""
 
@@ -93,6 +93,7 @@ class Stepper:
         for env in range(len(self._systems)) if writes else ():
             for write in writes if env not in self.frozen else ():
                 write(env)
+            self._packs[env] = None
 
     def catch_up(self) -> None:
         """Do the pending substeps."""
@@ -117,25 +118,34 @@ class Stepper:
                 pose_packs[env] = self._scenes[env].pack_poses()
 
         env_threads().run(advance, len(self._systems), self.threads)
-        self._packs, self._pose_packs = (packs, pose_packs) if packing else (None, None)
+        count = len(packs)
+        self._packs = [*packs] if packing else [None] * count
+        self._pose_packs = [*pose_packs] if packing else [None] * count
 
-    def forget(self) -> None:
-        """Drop the packs after a write to the simulation."""
+    def forget(self, envs: Iterable[int] | None = None) -> None:
+        """Drop the packs of these envs (None: of all) after a write to the simulation."""
         self.write_now()
-        self._packs = self._pose_packs = None
+        for env in range(len(self._systems)) if envs is None else envs:
+            self._packs[env] = self._pose_packs[env] = None
 
     def packs(self) -> list[bytes]:
         """``pack()`` of every system, now."""
         self.write_now()
-        if self._packs is None:
-            self._packs = [system.pack() for system in self._systems]
-        return self._packs
+        made = [
+            system.pack() if pack is None else pack
+            for system, pack in zip(self._systems, self._packs, strict=True)
+        ]
+        self._packs = [*made]
+        return made
 
     def pose_packs(self) -> list[bytes]:
         """``pack_poses()`` of every scene, now."""
-        if self._pose_packs is None:
-            self._pose_packs = [scene.pack_poses() for scene in self._scenes]
-        return self._pose_packs
+        made = [
+            scene.pack_poses() if pack is None else pack
+            for scene, pack in zip(self._scenes, self._pose_packs, strict=True)
+        ]
+        self._pose_packs = [*made]
+        return made
 
 
 def _step_of(system: physx.PhysxCpuSystem) -> Callable[[], None]:
@@ -254,18 +264,22 @@ class EnvThreads:
             for index in todo:
                 job(index)
             return
+        working: list[_Helper] = []
         with self._busy:
-            while len(self._helpers) < helpers:
-                self._helpers.append(_Helper())
-            working = self._helpers[:helpers]
-            for helper in working:
-                helper.begin(job, todo)
+            # A run that is torn (by too deep a recursion, or an interrupt) leaves none: nobody knows what they wait for.
+            every, self._helpers = self._helpers, []
             try:
+                while len(every) < helpers:
+                    every.append(_Helper())
+                for helper in every[:helpers]:
+                    helper.begin(job, todo)
+                    working.append(helper)
                 for index in todo:
                     job(index)
             finally:
                 # Also after an exception here: the others still use what the caller will release.
                 errors = [helper.end() for helper in working]
+            self._helpers = every
         for error in errors:
             if error is not None:
                 raise error

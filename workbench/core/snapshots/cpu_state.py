@@ -14,7 +14,8 @@ import sapien.physx as physx
 from numpy.typing import NDArray
 
 from workbench.core.backends import give_brdf_table
-from workbench.core.scene.scene_index import hidden_poses, once_a_scene, scene_index
+from workbench.core.camera_shader import made_again
+from workbench.core.scene.scene_index import once_a_scene, scene_index
 from workbench.core.simulation.cpu_system import BatchedCpuSystem, batched_system
 from workbench.core.simulation.state_layout import BODY
 
@@ -24,8 +25,6 @@ _EXACT_POINT_ATTEMPTS = 40
 """Attempts to find a state that reads back as written; all but some humanoids need one."""
 _LAST_BIT = np.float32(2**-24)
 """Of the numbers of a quaternion, and of a metre."""
-_FAR = np.float32(99999)
-"""By how much ``Actor.hide_visual`` moves an actor along each axis, metres."""
 
 
 @dataclass(frozen=True)
@@ -59,26 +58,26 @@ class CpuState:
       they differ, the bytes are put together from the target's and the source's.
     * *Sleep*: writing a pose wakes a body, which then moves by micrometres. What slept is put to sleep again. Every body is
       asked (2 us each): a velocity in the pack does not mean that one is awake (cubes of StackCube sleep with some left).
-    * *Forces* of ``set_qf``, and which drives were ever set (`BatchedCpuSystem.drive_flags`).
+    * *Forces* of ``set_qf``.
     * *Contacts*: after a restore PhysX's list is that of another moment, and ``is_grasping`` would answer for it. The counted
       impulses are kept, and answer queries until the next substep.
-    * *Hidden objects* are 99999 m away; their true pose is kept.
+    * *Static actors* are where they were built, unless the task has moved one.
     """
 
     contents: tuple[Contents, ...]
     """(n,)"""
     packed: tuple[bytes, ...]
-    """(n,) as ``PhysxCpuSystem.pack()`` gives it; hidden actors where they really are."""
+    """(n,) as ``PhysxCpuSystem.pack()`` gives it."""
     asleep: tuple[tuple[bool, ...], ...]
     """(n,) one for each of its `contents`."""
     qf: NDArray[np.float32]
     """(A, D) joint forces of their articulations, env after env, padded with zeros."""
-    driven: NDArray[np.bool_]
-    """(2, A) whether position and velocity targets were ever set."""
     touching: tuple[tuple[int, str, str], ...]
     """(T,) contacts that a query counts: which of the n envs, and the names of two bodies."""
     impulses: NDArray[np.float32]
     """(T, 3) N s on the first body of each."""
+    statics: tuple[dict[str, tuple[float, ...]], ...]
+    """(n,) poses (7,) of static actors, by name; empty where none was ever moved."""
 
     def articulations(self, k: int) -> slice:
         """Which of `qf` are env k's."""
@@ -88,8 +87,7 @@ class CpuState:
     def essence(self, k: int) -> tuple[Any, ...]:
         """Equal for equal states of env k in PhysX."""
         rows = self.articulations(k)
-        numbers = self.qf[rows].tobytes(), self.driven[:, rows].tobytes()
-        return self.contents[k], self.packed[k], self.asleep[k], *numbers
+        return self.contents[k], self.packed[k], self.asleep[k], self.qf[rows].tobytes(), self.statics[k]
 
 
 def _articulations(contents: Contents) -> int:
@@ -110,10 +108,10 @@ class CpuStatePlan:
     """Env and name of a body, by the ``id`` of its component."""
     bodies: list[dict[str, int]]
     """Of each env: the ``id`` of the component, by name."""
+    statics: list[dict[str, Any]]
+    """Of each env: entities of static actors, by name."""
     held: list[Any]
     """Objects whose ids are used, kept alive: ids are reused once an object is gone."""
-    offsets: dict[int, tuple[int, int]]
-    """Env and offset in its packed floats of an actor, by the slot of its entity (`SceneIndex`)."""
     settled: list[dict[int, tuple[bytes, bytes]]]
     """Of each env, by offset in its packed bytes: a root pose, and the pose to set so that it reads back as that."""
 
@@ -129,7 +127,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         return scene.name_of(component) or component.entity.name
 
     alike: dict[Contents, Contents] = {}
-    plan = CpuStatePlan([], [], [], {}, [], [], {}, [{} for _ in px.systems])
+    plan = CpuStatePlan([], [], [], {}, [], [], [], [{} for _ in px.systems])
     first_articulation = 0
     for index, system in enumerate(px.systems):
         bodies, links = system.rigid_dynamic_components, system.articulation_link_components
@@ -137,11 +135,10 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         plan.held += [*bodies, *links, *statics]
         by_name = {name_of(c): id(c) for c in [*statics, *links, *bodies]}
         plan.bodies.append(by_name)
+        plan.statics.append({name_of(c): c.entity for c in statics})
         plan.names.update({component: (index, name) for name, component in by_name.items()})
         parts, sleepers = [], []
         for body in bodies:
-            if id(body.entity) in scene.slot_of:
-                plan.offsets[scene.slot_of[id(body.entity)]] = index, sum(part.size for part in parts)
             if not body.kinematic:
                 sleepers.append((len(parts), _getter(body, "is_sleeping"), body))
             parts.append(PackedPart(name_of(body), None))
@@ -171,12 +168,7 @@ def read_cpu_state(env: Any, env_idx: list[int]) -> CpuState:
     """The simulation state of the envs in `env_idx`."""
     px: BatchedCpuSystem = env.scene.px
     plan = plan_cpu_state(env)
-    packs = [*px.packs()]
-    for i, hidden in _hidden(env, plan).items():
-        numbers = np.frombuffer(packs[i], dtype=np.float32).copy()
-        for offset, pose in hidden:
-            numbers[offset : offset + 7] = pose[[3, 4, 5, 6, 0, 1, 2]]
-        packs[i] = numbers.tobytes()
+    packs = px.packs()
     awake = {len(contents): (False,) * len(contents) for contents in plan.contents}
     asleep = []
     for i in env_idx:
@@ -190,10 +182,16 @@ def read_cpu_state(env: Any, env_idx: list[int]) -> CpuState:
         packed=tuple([packs[i] for i in env_idx]),
         asleep=tuple(asleep),
         qf=px.cuda_articulation_qf.torch().numpy()[rows],
-        driven=np.stack(px.drive_flags)[:, rows],
         touching=tuple([touch for touch, _ in touches]),
         impulses=np.array([impulse for _, impulse in touches], np.float32).reshape(-1, 3),
+        statics=tuple(
+            [_poses(plan.statics[i]) for i in env_idx] if px.static_moves else [{} for _ in env_idx]
+        ),
     )
+
+
+def _poses(entities: dict[str, Any]) -> dict[str, tuple[float, ...]]:
+    return {name: tuple(map(float, (*e.pose.p, *e.pose.q))) for name, e in entities.items()}
 
 
 def write_cpu_state(
@@ -217,7 +215,6 @@ def write_cpu_state(
     if fresh_physics:
         for i in renew_physics(env.scene, env_idx):
             missed[f"fresh physics of env {i}"] = "entities were removed from its scene since it was built"
-    hidden = _hidden(env, plan)
     packed: dict[int, bytes] = {}
     matches: dict[int, Sequence[int | None]] = {}
     alike: dict[int, Contents] = {}
@@ -227,8 +224,12 @@ def write_cpu_state(
             alike[id(contents)], matches[i] = contents, range(len(contents))
         else:
             packed[i], matches[i] = _joined(contents, own[i], state, k, carried, missed)
-        if i in hidden:
-            packed[i] = _hide(packed[i], hidden[i])
+    for i, k in zip(env_idx, positions, strict=True):
+        there = _poses(plan.statics[i]) if state.statics[k] else {}
+        for name, pose in state.statics[k].items():
+            if there.get(name, pose) != pose:
+                plan.statics[i][name].pose = sapien.Pose(pose[:3], pose[3:])
+                px.static_moves += 1
     _unpack(px, plan, packed)
     _write_joint_forces(px, plan, dict(zip(env_idx, positions, strict=True)), state, matches, fresh_physics)
     touches: dict[int, list[tuple[str, str, Any]]] = {}
@@ -298,7 +299,7 @@ def _write_joint_forces(
     matches: dict[int, Sequence[int | None]],
     fresh_physics: bool,
 ) -> None:
-    """Write ``set_qf``'s forces and the drives' flags into each env; `matches` as of `_joined`."""
+    """Write ``set_qf``'s forces into each env; `matches` as of `_joined`."""
     rows, theirs = [], []
     firsts = list(accumulate(map(_articulations, state.contents), initial=0))
     for i, k in sources.items():
@@ -311,8 +312,6 @@ def _write_joint_forces(
     qf = px.cuda_articulation_qf.torch().numpy()
     width = min(qf.shape[1], state.qf.shape[1])
     qf[rows, :width] = state.qf[theirs, :width]
-    for flags, was in zip(px.drive_flags, state.driven, strict=True):
-        flags[rows] = was[theirs]
     px.gpu_apply_articulation_qf()
     if fresh_physics and qf.any():
         for row in (row for i in sources for row in plan.articulations[i]):
@@ -403,26 +402,6 @@ def _touching(
     return found
 
 
-def _hidden(env: Any, plan: CpuStatePlan) -> dict[int, list[tuple[int, NDArray[np.float32]]]]:
-    """For each env with hidden actors: their offsets in its packed floats, and their true poses [p, q]."""
-    found: dict[int, list[tuple[int, NDArray[np.float32]]]] = {}
-    for slots, poses in hidden_poses(env):
-        for slot, pose in zip(slots.tolist(), poses, strict=True):
-            if slot in plan.offsets:
-                index, offset = plan.offsets[slot]
-                found.setdefault(index, []).append((offset, pose))
-    return found
-
-
-def _hide(packed: bytes, hidden: list[tuple[int, NDArray[np.float32]]]) -> bytes:
-    numbers = np.frombuffer(packed, dtype=np.float32).copy()
-    for offset, kept in hidden:
-        pose = numbers[offset : offset + 7]
-        kept[:] = pose[[4, 5, 6, 0, 1, 2, 3]]
-        pose[4:] += _FAR
-    return numbers.tobytes()
-
-
 # --- physics without a past --------------------------------------------------------------------------
 
 
@@ -471,14 +450,20 @@ def _moved(old: sapien.Scene, physics: physx.PhysxCpuSystem) -> sapien.Scene:
     """A scene over `physics` that has all entities of `old`, in their order, and its render system."""
     entities = old.entities
     systems = _render_systems(old)
+    cameras = [camera for system in systems for camera in system.cameras]
     new = sapien.Scene([physics, *systems])
     for entity in entities:
         entity.remove_from_scene()
+    carriers = [camera.entity for camera in cameras]
+    for entity, camera in zip(carriers, cameras, strict=True):
+        entity.remove_component(camera)
     for entity in entities:
         new.add_entity(entity)
-    for system in systems:
-        for camera in system.cameras:
-            give_brdf_table(camera)  # it has a new renderer, which would compute one for seconds
+    for entity, camera in zip(carriers, cameras, strict=True):
+        # One by one, since two cameras of an entity may have different shaders.
+        with made_again(camera):
+            entity.add_component(camera)
+        give_brdf_table(camera)  # it has a new renderer, which would compute one for seconds
     return new
 
 

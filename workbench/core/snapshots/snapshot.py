@@ -279,7 +279,6 @@ def step_only(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iter
                 restore_snapshot(env, others)
         return
     before = px.packs()
-    flags = [flag.copy() for flag in px.drive_flags]
     px.freeze_envs(set(range(env.num_envs)) - {int(i) for i in env_idx})
     try:
         yield
@@ -294,7 +293,6 @@ def step_only(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iter
             if still:
                 positions = [others.env_idx.index(i) for i in still]
                 restore_memory(env, others.memory, still, positions, whole=False)
-            px.keep_drives(still, flags)
             env.scene._gpu_fetch_all()
 
 

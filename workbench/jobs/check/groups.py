@@ -19,6 +19,7 @@ from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.results import RuleResult
 from workbench.checks.rules import degree_of_each
 from workbench.core.backends import find_renderer, keep_render_device
+from workbench.core.broken_rule import NeedsOneEnv
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.step_result import StepResult
@@ -75,6 +76,7 @@ class _Worker:
         self._what, self._loaded, self._runs, self._here, self._queue = what, loaded, runs, here, queue
         self._degrees = degree_of_each(what.select, what.ignore, solve=what.solve)
         self._plan = plan_of(what, self._degrees)
+        self._num_envs = what.options.num_envs
         self._number = -1
         self._part = -1
         self._checkup: Checkup | None = None
@@ -97,7 +99,13 @@ class _Worker:
                 )
             )
             task = self.task if number == chunk.numbers[0] else None
-            self._queue.send_result(number, self._checked(group, checkup, task))
+            outcome = self._checked(group, checkup, task)
+            if self._num_envs > 1 and any(_needs_one_env(error) for error in checkup.failed.values()):
+                self._num_envs = 1
+                self.close()
+                self._checkup = None
+                outcome = self._checked(group, self._checkup_of(part), task)
+            self._queue.send_result(number, outcome)
 
     def _keep_going(self) -> None:
         if self._queue.limit() <= self._number:
@@ -119,7 +127,7 @@ class _Worker:
         self._checkup = Checkup(
             self._loaded,
             what.options.env_kwargs,
-            num_envs=what.options.num_envs,
+            num_envs=self._num_envs,
             seeds=len(episodes),
             first_seed=what.options.seed + episodes.start,
             actors=[given] if given is not None and given.seeds else [],
@@ -144,6 +152,10 @@ class _Worker:
             checkup.picture_seconds,
             task,
         )
+
+
+def _needs_one_env(error: TaskError) -> bool:
+    return isinstance(error.__cause__, NeedsOneEnv)
 
 
 def _require_assets(loaded: LoadedTask, what: CheckOptions) -> None:

@@ -18,6 +18,7 @@ from workbench.jobs.pool.worker import MESSAGES, Asks, Listener, Message, Worker
 from workbench.machine.processes.child_python import child_environment, python_command, quick_imports
 from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.processes.family import describe_exit, end_family
+from workbench.machine.processes.time_limit import end_after
 from workbench.machine.processes.wire import MessageSocket, Unreadable, pack_message
 from workbench.machine.text import guard_terminal
 
@@ -204,6 +205,7 @@ def main(socket_fd: str) -> None:
     guard_terminal()
     refuse_breakpoints(ONE_PROCESS)
     treat_ctrl_c_as_error()
+    end_after()
     connection = Connection(int(socket_fd))
     queue = _SocketQueue(connection)
     try:

@@ -21,7 +21,7 @@ import torch
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import undo_load
-from workbench.core.cameras.render import recorded_pictures, step_pictures
+from workbench.core.cameras.render import findings_of_shaders, recorded_pictures, step_pictures
 from workbench.core.capture.recorded_run import RecordedRun, states_of
 from workbench.core.capture.recorded_state import state_distance
 from workbench.core.capture.state_columns import read_state_columns
@@ -245,6 +245,9 @@ def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> Opened
         on_activity=lambda activity: queue.send_update(RecordUpdate(activity)),
         on_finding=lambda finding: queue.send_update(RecordUpdate(finding=finding)),
     )
+    if what.pictures:
+        for finding in findings_of_shaders(opened.description.cameras):
+            queue.send_update(RecordUpdate(finding=finding))
     if isinstance(opened.env.env, BatchedCpuMixin):
         # Else an episode depends, by its last bits, on those that the same process made before.
         opened.env.env.begins_anew = True
@@ -487,7 +490,8 @@ class _Episodes:
 
     def _stepped(self, step: StepResult, reset_mask: np.ndarray, pictured: list[int]) -> Stepped:
         task = self._opened.env
-        pictures = tuple(step_pictures(task, pictured, self._wanted))
+        with blamed("pictures", self._opened.loaded, task):
+            pictures = tuple(step_pictures(task, pictured, self._wanted))
         with blamed("step", self._opened.loaded, task):
             columns = read_state_columns(task)
         return Stepped(step, reset_mask, pictures, task.episode_seeds, columns=columns)

@@ -72,13 +72,15 @@ class Recording:
     """Why it cannot be rescored, if that is known before."""
     refused: bool = False
     """Because its code may not run."""
+    damaged: bool = False
+    """Because it cannot be read."""
 
     def source(self) -> Source:
         """Where it is on the submitting side."""
         return Source(Path(os.fsdecode(self.path)), self.part, self.id, self.name)
 
     def verdict(self, why_not: str) -> Verdict[Source]:
-        return Verdict(self.source(), task=self.task, why_not=why_not)
+        return Verdict(self.source(), task=self.task, why_not=why_not, damaged=self.damaged)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ class _Rescoring:
     run: RecordedRun
     missed: dict[str, str]
     """What cannot be read or put into the env, with the reason."""
+    damaged: bool = False
     start_differs: bool = False
     reward: list[float] = field(default_factory=list)
     """(T,) new rewards."""
@@ -65,6 +66,7 @@ class _Rescoring:
             seed=run.seed,
             start_differs=self.start_differs,
             missed=self.missed,
+            damaged=self.damaged,
         )
 
 
@@ -157,17 +159,21 @@ def _open_episode(
     try:
         episode = read(file)
     except (UnreadableRecording, OSError) as error:
-        return Verdict(file, why_not=str(error))
+        return Verdict(file, why_not=str(error), damaged=True)
     run, info = run_of(episode), episode.info
     why_not = why_not_replayable(opened, run)
     if run.length == 0:
         why_not = "it has no step"
     elif use_env_states and not run.env_states:
         why_not = "it holds no env states"
+    damaged = bool(episode.broken_files)
     if why_not:
         why_not = ". ".join((why_not, *(broken.sentence for broken in episode.broken_files)))
-        return Verdict(file, task=info.task, seed=info.seed, length=run.length, why_not=why_not)
-    return _Rescoring(file, info.task, run, {broken.file: broken.what for broken in episode.broken_files})
+        return Verdict(
+            file, task=info.task, seed=info.seed, length=run.length, why_not=why_not, damaged=damaged
+        )
+    missed = {broken.file: broken.what for broken in episode.broken_files}
+    return _Rescoring(file, info.task, run, missed, damaged)
 
 
 def _begin(opened: OpenedTask, rescorings: dict[int, _Rescoring]) -> None:

@@ -71,6 +71,8 @@ class Verdict(Generic[Of]):
     """What could not be put into the env, with the reason."""
     why_not: str = ""
     """Why it was not rescored; all else is then empty."""
+    damaged: bool = False
+    """Its files, or some of them, cannot be read."""
     old_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     new_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
@@ -103,6 +105,7 @@ def compare(
     seed: int = -1,
     start_differs: bool = False,
     missed: Mapping[str, str] | None = None,
+    damaged: bool = False,
 ) -> Verdict[Of]:
     """Compare recorded scores with new ones.
 
@@ -162,6 +165,7 @@ def compare(
         drift_at=drift_at,
         start_differs=start_differs,
         missed=dict(missed or {}),
+        damaged=damaged,
         old_reward=was[0, 1:].astype(np.float32),
         new_reward=np.asarray(new.reward, np.float32),
     )

@@ -23,6 +23,11 @@ def python_command(*arguments: str) -> list[str]:
     return [sys.executable, "-P", *arguments]
 
 
+def script_command(script: str, *arguments: str) -> list[str]:
+    """Command line of a child that runs a file with the standard library alone, which starts in some milliseconds."""
+    return [sys.executable, "-I", "-S", script, *arguments]
+
+
 def child_environment(**further: str) -> dict[str, str]:
     """Environment of such a child, with ``further`` variables.
 

@@ -167,7 +167,9 @@ class MessageSocket:
 
 
 def pack(value: object) -> bytes:
-    """Bytes of dataclasses, arrays and plain data.
+    r"""Bytes of dataclasses, arrays and plain data.
+
+    A text with lone surrogates arrives escaped (``\udcff``), which can be read but opens no file; a `Path` arrives as it is.
 
     Raises:
         TypeError: it contains something else.
@@ -175,10 +177,10 @@ def pack(value: object) -> bytes:
     arrays = _Written()
     try:
         message = msgspec.msgpack.Encoder(enc_hook=arrays.hook).encode(value)
-    except UnicodeEncodeError:  # a lone surrogate in the author's text
+    except UnicodeEncodeError:  # a lone surrogate in the author's text, or in the name of a file
         arrays = _Written()
-        plain = msgspec.to_builtins(value, builtin_types=(bytes, np.ndarray, np.generic, Path))
-        message = msgspec.msgpack.Encoder(enc_hook=arrays.hook).encode(_can_be_written(plain))
+        plain = msgspec.to_builtins(value, builtin_types=(bytes, msgspec.msgpack.Ext), enc_hook=arrays.hook)
+        message = msgspec.msgpack.encode(_can_be_written(plain))
     return b"".join((_LENGTH.pack(len(message)), message, *arrays.parts))
 
 

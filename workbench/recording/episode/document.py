@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass
 from functools import cache
@@ -26,21 +27,36 @@ from workbench.machine.files import (
     replace_file,
 )
 from workbench.recording.episode.columns import TextTrack
-from workbench.recording.episode.episode import NO_SEED, ActedBy, EpisodeInfo, Seal
+from workbench.recording.episode.episode import (
+    DEEPEST,
+    MOST_BODIES,
+    NO_SEED,
+    ActedBy,
+    Entries,
+    EpisodeInfo,
+    Name,
+    PathText,
+    Seal,
+    Seconds,
+    SmallInt,
+    is_shallow,
+)
 from workbench.recording.episode.row import clean_note, clean_tags
 
-FORMAT = 1
+FORMAT = 2
+"""Since 2 the ``.json`` ends with a checksum of itself (`with_checksum`)."""
 MOST_BYTES = 64 << 20
 """ManiSkill's ``.json`` of 100,000 episodes has 40 MB."""
 _BLOCK = 1 << 20
+_ESCAPED_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 MOST_PARTS = 40
 """Parts of a recorded path that are tried: the path comes from an untrusted file."""
 
 T = TypeVar("T")
-Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Vector = tuple[float, float, float]
-ColumnType = tuple[str, tuple[int, ...]]
+ColumnType = tuple[Name, Annotated[tuple[SmallInt, ...], Meta(max_length=32)]]
 """numpy dtype, and shape of one row."""
+Columns = Annotated[dict[Name, ColumnType], Entries]
 
 
 class WrongDocument(ValueError):
@@ -50,36 +66,43 @@ class WrongDocument(ValueError):
 class CameraJson(Struct, frozen=True):
     """A camera's parameters, without its position in the task's source."""
 
-    name: str
+    name: Name
     kind: CameraKind
-    width: int
-    height: int
+    width: SmallInt
+    height: SmallInt
     fovy: float
     near: float
     far: float
     intrinsic: tuple[Vector, Vector, Vector]
-    mount: str | None
-    modalities: tuple[str, ...]
+    mount: Name | None
+    modalities: Annotated[tuple[Name, ...], Entries]
+    replaced_shader: Name = ""
+    """As `CameraInfo.replaced_shader`."""
 
     @classmethod
     def of(cls, camera: CameraInfo) -> CameraJson:
         rows = np.asarray(camera.intrinsic, dtype=np.float64).tolist()
         numbers = float(camera.fovy), float(camera.near), float(camera.far)
         size = camera.width, camera.height
-        return cls(camera.name, camera.kind, *size, *numbers, rows, camera.mount, camera.modalities)
+        of = camera.mount, camera.modalities, camera.replaced_shader
+        return cls(camera.name, camera.kind, *size, *numbers, rows, *of)
 
     def info(self) -> CameraInfo:
         intrinsic = np.array(self.intrinsic, dtype=np.float32)
         size, numbers = (self.width, self.height), (self.fovy, self.near, self.far)
-        return CameraInfo(self.name, self.kind, *size, *numbers, intrinsic, self.mount, self.modalities)
+        of = {"mount": self.mount, "modalities": self.modalities, "replaced_shader": self.replaced_shader}
+        return CameraInfo(self.name, self.kind, *size, *numbers, intrinsic, **of)
+
+
+Bodies = Meta(max_length=MOST_BODIES)
 
 
 class SceneJson(Struct, frozen=True):
     """Every body of the scene."""
 
-    body_names: tuple[str, ...]
-    body_kinds: tuple[BodyKind, ...]
-    body_hidden: tuple[bool, ...]
+    body_names: Annotated[tuple[Name, ...], Bodies]
+    body_kinds: Annotated[tuple[BodyKind, ...], Bodies]
+    body_hidden: Annotated[tuple[bool, ...], Bodies]
 
 
 class Checksum(Struct, frozen=True):
@@ -96,6 +119,10 @@ class SealJson(Struct, frozen=True):
     place: str
 
 
+MOST_SEGMENTS = 1_000_000
+"""Ids of a segmentation."""
+
+
 class Description(Struct, frozen=True, kw_only=True):
     """Metadata of a recording, in the ``.json`` and in the ``.rrd``; fields with a default may be missing.
 
@@ -105,51 +132,51 @@ class Description(Struct, frozen=True, kw_only=True):
 
     format: int = FORMAT
     # Up to `source_hash` as in `EpisodeInfo`.
-    id: str
-    task: str
-    env_index: Whole
-    seed: Whole | None
+    id: Name
+    task: Name
+    env_index: SmallInt
+    seed: SmallInt | None
     """None if unknown."""
-    control_dt: float
-    control_mode: str | None
-    backend: str
-    versions: dict[str, str]
-    env_kwargs: dict[str, Any]
-    reset_options: dict[str, Any]
-    max_episode_steps: int | None
-    written_at: str
+    control_dt: Seconds
+    control_mode: PathText | None
+    backend: Name
+    versions: Annotated[dict[Name, Name], Entries]
+    env_kwargs: Annotated[dict[Name, Any], Entries]
+    reset_options: Annotated[dict[Name, Any], Entries]
+    max_episode_steps: SmallInt | None
+    written_at: Name
     recovered: bool
-    source_hash: str
-    source_file: str | None
+    source_hash: Name
+    source_file: PathText | None
     """The name of the task's file."""
-    source: dict[str, str] | None
+    source: Annotated[dict[PathText, str], Entries] | None
     """Path relative to the task's folder, to text. None in the ``.rrd``, which holds the texts separately."""
-    side_files: dict[str, str] = {}
+    side_files: Annotated[dict[PathText, Name], Entries] = {}
     """Other files that the task reads, not included: path relative to the task's folder, to hash."""
     acted_by: ActedBy = ()
     pictures: PictureDegree = "exact"
     moved_cameras: tuple[MovedCamera, ...] = ()
-    length: Whole
+    length: SmallInt
     total_reward: float = msgspec.field(name="return")
     success: bool | None
     """In the last state (`success_once`: in any). None if the task has no such entry."""
     success_once: bool | None
     fail: bool | None
     fail_once: bool | None
-    action_names: tuple[str, ...]
-    cameras: list[CameraJson]
-    segmentation: dict[int, str]
+    action_names: Annotated[tuple[Name, ...], Entries]
+    cameras: Annotated[list[CameraJson], Entries]
+    segmentation: Annotated[dict[SmallInt, Name], Meta(max_length=MOST_SEGMENTS)]
     scene: SceneJson
-    evaluate: dict[str, ColumnType]
-    batch: dict[str, ColumnType] = {}
+    evaluate: Columns
+    batch: Columns = {}
     """Numbers that ``evaluate()`` returned without a row for each env."""
-    texts: dict[str, TextTrack] = {}
+    texts: Annotated[dict[Name, TextTrack], Entries] = {}
     """Entries of ``evaluate()`` that are not numbers."""
-    obs: dict[str, ColumnType]
+    obs: Columns
     # Only in the .json:
     files: dict[str, Checksum] | UnsetType = UNSET
     """Suffix of the other two files to checksum."""
-    source_path: str | None | UnsetType = UNSET
+    source_path: PathText | None | UnsetType = UNSET
     """Path of the task's file relative to the recording's folder."""
     thumbnail: str | None | UnsetType = UNSET
     """Base64 of a JPEG; None without cameras."""
@@ -183,17 +210,17 @@ SHARED = (
 class ResetJson(Struct, frozen=True):
     """Arguments of the reset, as ManiSkill records them."""
 
-    seed: Whole | list[Whole] | None = None
-    options: dict[str, Any] | None = None
+    seed: SmallInt | list[SmallInt] | None = None
+    options: Annotated[dict[Name, Any], Entries] | None = None
 
 
 class EpisodeJson(Struct, frozen=True):
     """An episode as ManiSkill records it; batched envs write a list of one instead of a number."""
 
-    episode_id: int
-    episode_seed: Whole | list[Whole] | None = None
-    control_mode: str | dict[str, Any] | None = None
-    elapsed_steps: Whole | list[Whole] | None = None
+    episode_id: SmallInt
+    episode_seed: SmallInt | list[SmallInt] | None = None
+    control_mode: PathText | dict[str, Any] | None = None
+    elapsed_steps: SmallInt | list[SmallInt] | None = None
     reset_kwargs: ResetJson | None = None
     success: bool | list[bool] | None = None
     fail: bool | list[bool] | None = None
@@ -209,9 +236,9 @@ class EpisodeJson(Struct, frozen=True):
 class EnvJson(Struct, frozen=True):
     """Arguments of ``gym.make``, as ManiSkill records them."""
 
-    env_id: str | None = None
-    env_kwargs: dict[str, Any] | None = None
-    max_episode_steps: int | None = None
+    env_id: Name | None = None
+    env_kwargs: Annotated[dict[Name, Any], Entries] | None = None
+    max_episode_steps: SmallInt | None = None
 
 
 @dataclass(frozen=True)
@@ -248,9 +275,16 @@ class Document:
 
 
 def read_document(path: Path) -> Document:
-    """Raises OSError, WrongDocument."""
-    data = read_json(path)
-    return Document(data if isinstance(data, dict) else {})
+    """
+    Raises:
+        OSError: it cannot be read.
+        WrongDocument: as `read_json`, or it was changed since the workbench wrote it.
+    """
+    content = _read_content(path, MOST_BYTES)
+    data = parse_json(content)
+    document = Document(data if isinstance(data, dict) else {})
+    _require_unchanged(content, document)
+    return document
 
 
 def description_in(text: str, source: Mapping[str, str]) -> Description:
@@ -266,20 +300,27 @@ def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
         OSError: it cannot be read.
         WrongDocument: not JSON, not a regular file, or longer than `most_bytes`.
     """
+    return parse_json(_read_content(path, most_bytes))
+
+
+def _read_content(path: Path, most_bytes: int) -> bytes:
+    """Raises as `read_json`."""
     try:
-        content = read_regular_file(path, most_bytes)
+        return read_regular_file(path, most_bytes)
     except FileTooLarge as error:
         raise WrongDocument(f"is longer than {most_bytes >> 20} MB") from error
     except NotARegularFile as error:
         raise WrongDocument(str(error.strerror)) from error
-    return parse_json(content)
 
 
 def parse_json(content: bytes | str) -> Any:
     """Raises WrongDocument."""
     try:
         # msgspec's parser refuses NaN, which a sum of rewards may be.
-        return json.loads(content)
+        data = json.loads(content)
+        if _ESCAPED_SURROGATE.search(content if isinstance(content, bytes) else content.encode()):
+            json.dumps(data, ensure_ascii=False).encode()  # half of a pair can be neither sent nor printed
+        return data
     except (ValueError, RecursionError) as error:
         raise WrongDocument("is not JSON, or was cut short") from error
 
@@ -322,6 +363,10 @@ def _plain(value: object) -> Any:
 
 
 def _typed(data: object, kind: type[T], place: str) -> T:
+    if not is_shallow(data):
+        raise WrongDocument(
+            f"is not as a recording is described: lists and objects nested deeper than {DEEPEST} at $.{place}"
+        )
     try:
         return msgspec.convert(data, kind, str_keys=True)
     except (msgspec.ValidationError, OverflowError) as error:
@@ -340,7 +385,8 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
     """
     if not source_path:
         return None
-    if (there := folder / source_path).is_file():
+    # Not `Path.is_file`, which raises for a name that no file can have.
+    if os.path.isfile(there := folder / source_path):
         return os.fspath(there.resolve())
     parts = [part for part in Path(source_path).parts if part not in ("..", os.sep)]
     if not source_path.endswith(".py") or len(parts) > MOST_PARTS:
@@ -351,7 +397,7 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
             try:
                 if task.encode(errors="surrogatepass") in read_regular_file(candidate, MOST_SOURCE_BYTES):
                     return os.fspath(candidate.resolve())
-            except OSError:
+            except (OSError, ValueError):  # a null byte
                 continue
     return None
 
@@ -361,9 +407,30 @@ def task_file(source_path: str | None, task: str, folder: Path) -> str | None:
 # Neither format detects a changed byte: HDF5 has checksums for chunks only, and most columns of an episode are too small
 # to be chunked; rerun has none. Rescoring such a file would be silently wrong. So the `.json` holds size and hash of the
 # other two. Both are in the page cache when just written: hashing takes a hundredth of the time of writing (measured).
+# The `.json` itself ends with a hash of all that is before it.
 #
 # This detects damage, not forgery. After an intended change (`rerun rrd optimize`), remove the file's entry from
-# `workbench.files` in the `.json`.
+# `workbench.files` in the `.json`; after one of the `.json`, set its hash to null.
+
+_OWN = "workbench_checksum"
+
+
+def with_checksum(text: bytes) -> bytes:
+    """The JSON object `text`, with a hash of all of it as its last member."""
+    body = text.rstrip().removesuffix(b"}").rstrip()
+    return b'%s,\n  "%s": "%s"\n}' % (body, _OWN.encode(), xxhash.xxh3_128_hexdigest(body).encode())
+
+
+def _require_unchanged(content: bytes, document: Document) -> None:
+    """Raises WrongDocument if it was changed since that got its checksum."""
+    if _OWN not in document.data:
+        # A changed byte in the name of the hash must not pass for an old recording, which has none.
+        if document.is_ours and document.data["workbench"].get("format", 1) != 1:
+            raise WrongDocument("was changed since it was written: it has lost its checksum")
+    elif document.data[_OWN] is not None:
+        before, comma, _ = content.rpartition(b',\n  "%s"' % _OWN.encode())
+        if not comma or with_checksum(before + b"}") != content.rstrip():
+            raise WrongDocument("was changed since it was written: its checksum differs")
 
 
 def checksum(path: Path) -> Checksum:
@@ -383,7 +450,9 @@ def check(path: Path, checksums: Mapping[str, Checksum]) -> None:
     Raises:
         OSError: it differs, or cannot be read.
     """
-    if (why := wrong_size(checksums, path.suffix, path.stat().st_size)) is not None:
+    with open_regular_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+    if (why := wrong_size(checksums, path.suffix, size)) is not None:
         raise OSError(why)
     written = checksums.get(path.suffix)
     if written is not None and written.xxh3_128 is not None and checksum(path) != written:
@@ -455,13 +524,17 @@ def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None
 
     Raises:
         OSError: it cannot be read or written.
-        ValueError: it is not a workbench recording. The message ends a sentence.
+        ValueError: it is not a workbench recording, or was changed: sealing that would hide it. The message ends a sentence.
     """
-    described = read_json(path, MOST_NOTES_BYTES)
+    content = _read_content(path, MOST_NOTES_BYTES)
+    described = parse_json(content)
     if not isinstance(described, dict) or not Document(described).is_ours:
         raise ValueError("is not a recording of the workbench")
+    _require_unchanged(content, Document(described))
+    is_sealed = described.get(_OWN) is not None
+    if is_sealed:
+        del described[_OWN]
     described["workbench"] |= {"tags": list(tags), "note": note}
     # Keep the indentation: people read these files.
-    with open_regular_file(path) as file:
-        indent = 2 if b"\n" in file.read(4) else None
-    replace_file(path, json.dumps(described, indent=indent).encode())
+    text = json.dumps(described, indent=2 if b"\n" in content[:4] else None).encode()
+    replace_file(path, with_checksum(text) if is_sealed else text)

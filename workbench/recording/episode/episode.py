@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import datetime
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraInfo, MovedCamera, PictureDegree
@@ -16,6 +17,34 @@ from workbench.core.env.step_result import OtherEntry
 from workbench.core.scene.shapes import BodyKind, SceneGeometry
 from workbench.recording.episode.columns import TextTrack, entry_at
 from workbench.recording.episode.encoded_pictures import EncodedPictures, Modality
+from workbench.recording.episode.row import UnreadableRecording
+
+# --- what a recording may hold: the .json and the reader are held to it, since both may come from anybody -----------
+
+Name = Annotated[str, Meta(max_length=1000)]
+PathText = Annotated[str, Meta(max_length=4096)]
+SmallInt = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+Seconds = Annotated[float, Meta(ge=1e-4, le=1e3)]
+"""Of a control step; films have such frame rates too."""
+MOST_ENTRIES = 10_000
+"""Of anything that a recording names: entries of ``evaluate()``, files, actions."""
+MOST_BODIES = 20_000
+"""Of a scene; a reader takes some seconds for so many."""
+DEEPEST = 32
+"""Nesting of keywords and options."""
+Entries = Meta(max_length=MOST_ENTRIES)
+ActedBy = Annotated[tuple[tuple[SmallInt, PathText], ...], Entries]
+
+
+def is_shallow(value: object) -> bool:
+    """Whether lists and dicts in `value` are nested at most `DEEPEST` deep: Python's ``repr`` ends at some hundreds."""
+    level = [value]
+    for _ in range(DEEPEST):
+        inside = (
+            one.values() if isinstance(one, dict) else one for one in level if isinstance(one, (dict, list))
+        )
+        level = [value for values in inside for value in values if isinstance(value, (dict, list))]
+    return not level
 
 
 def _now() -> str:
@@ -42,35 +71,35 @@ class Seal:
 class EpisodeInfo:
     """Identity of an episode, and what is needed to make it again."""
 
-    task: str
-    env_index: int
-    seed: int
+    task: Name
+    env_index: SmallInt
+    seed: SmallInt
     """Episode seed; `NO_SEED` when none was given or it is unknown."""
-    source_file: str | None
+    source_file: PathText | None
     """The task's file. When read from a recording: its path if the file exists, else its name alone."""
-    source_hash: str
-    source: dict[str, str]
+    source_hash: Name
+    source: Annotated[dict[PathText, str], Entries]
     """Path to text of the task's Python files; when read from a recording, relative to `source_file`'s folder."""
-    control_dt: float
+    control_dt: Seconds
     """Seconds of simulated time per step."""
-    control_mode: str | None
-    backend: str
-    versions: dict[str, str] = field(default_factory=dict)
+    control_mode: PathText | None
+    backend: Name
+    versions: Annotated[dict[Name, Name], Entries] = field(default_factory=dict)
     """Package name to version."""
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: Annotated[dict[Name, Any], Entries] = field(default_factory=dict)
     """Keywords of ``gym.make`` for this env (``robot_uids``, ``obs_mode``, ``control_mode`` ...), as JSON values."""
-    reset_options: dict[str, Any] = field(default_factory=dict)
+    reset_options: Annotated[dict[Name, Any], Entries] = field(default_factory=dict)
     """``options`` of the reset that began the episode."""
-    max_episode_steps: int | None = None
-    written_at: str = field(default_factory=_now)
+    max_episode_steps: SmallInt | None = None
+    written_at: Name = field(default_factory=_now)
     """When it was recorded, ISO 8601 in UTC."""
-    id: str = field(default_factory=lambda: uuid.uuid4().hex)
+    id: Name = field(default_factory=lambda: uuid.uuid4().hex)
     """Globally unique, independent of file names."""
     recovered: bool = False
     """Its writer was killed; the episode ends there."""
-    side_files: dict[str, str] = field(default_factory=dict)
+    side_files: Annotated[dict[PathText, Name], Entries] = field(default_factory=dict)
     """Other files that the task reads and the recording lacks: path relative to `source_file`'s folder, to hash."""
-    acted_by: tuple[tuple[int, str], ...] = ()
+    acted_by: ActedBy = ()
     """Source of the actions: index of its first action, and its name (``random``, ``policy act.py:act``). Empty if
     unknown."""
     pictures: PictureDegree = "exact"
@@ -103,6 +132,11 @@ class CameraTrack:
             "segmentation": self.segmentation,
         }
         return {modality: pictures for modality, pictures in tracks.items() if pictures is not None}
+
+
+def file_part(name: str) -> str:
+    """The name of a camera as part of the name of a file."""
+    return "".join(c if c.isalnum() or c in " ._-" else "_" for c in name)[:100]
 
 
 def camera_names(cameras: Sequence[CameraInfo]) -> list[str]:
@@ -219,6 +253,24 @@ class Episode:
         return found
 
 
+def read_whole(name: str, read: Callable[[], Episode]) -> Episode:
+    """The episode that `read` returns, for a dataset: of files none of which is damaged or missing.
+
+    Args:
+        name: of the recording, for messages.
+
+    Raises:
+        UnreadableRecording: it cannot be read, or not all of it; the message names the recording.
+    """
+    try:
+        episode = read()
+    except (OSError, UnreadableRecording) as error:
+        raise UnreadableRecording(str(error) if name in str(error) else f"{name}: {error}") from error
+    if episode.broken_files:
+        raise UnreadableRecording(" ".join(broken.sentence for broken in episode.broken_files))
+    return episode
+
+
 def _is_nan(value: NDArray | None) -> bool:
     return value is None or (value.dtype.kind == "f" and bool(np.isnan(value).all()))
 
@@ -236,9 +288,6 @@ def movable_bounds(poses: NDArray, kinds: Sequence[BodyKind]) -> tuple[NDArray, 
     if not len(points):
         points = np.zeros((1, 3), np.float32)
     return points.min(axis=0), points.max(axis=0)
-
-
-ActedBy = tuple[tuple[int, str], ...]
 
 
 def parse_acted_by(pairs: Iterable[Iterable[Any]] | None) -> ActedBy:

@@ -29,6 +29,8 @@ class Source:
     """The caller's id."""
     name: str = ""
     """Name to show."""
+    problem: str | None = None
+    """A sentence, if it is so damaged that nothing of it can be read."""
 
     @property
     def stem(self) -> str:

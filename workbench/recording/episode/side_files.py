@@ -90,7 +90,7 @@ def _changed_files(folder: Path | None, recorded: Mapping[str, str]) -> dict[str
     for name, hashed in recorded.items():
         path = side_file_path(folder, name)
         try:
-            if path is None or not path.is_file():
+            if path is None or not os.path.isfile(path):
                 changed[name] = "is not there"
             elif hash_of(path) != hashed:
                 changed[name] = "has changed since"

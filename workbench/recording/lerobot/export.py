@@ -17,7 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from workbench.recording.episode.document import as_json
-from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.episode import Episode, read_whole
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.films import Encoding, FilmWriter
 from workbench.recording.lerobot import format as form
 from workbench.recording.lerobot.format import Choice, Frames, feature_name, frames_of
@@ -33,7 +34,7 @@ class ExportOptions:
     only_successes: bool = False
     """Leave out episodes without success at any step."""
     only_fitting: bool = False
-    """Leave out, and report, episodes that cannot be read or lack a feature of the first one; else raise DoesNotFit."""
+    """Leave out, and report, episodes that cannot be read or lack a feature of the first one; else raise."""
     instruction: str | None = None
     """The task's instruction for language-conditioned policies; None is the task's id."""
     fps: int | None = None
@@ -73,7 +74,8 @@ def export_lerobot(
         on_progress: called with the number of finished episodes, and the name of the current one.
 
     Raises:
-        DoesNotFit: an episode cannot be read, or lacks a chosen feature or one of the first episode.
+        UnreadableRecording: an episode cannot be read, or not all of it.
+        DoesNotFit: an episode lacks a chosen feature or one of the first episode.
         ValueError: there is no episode to write.
         OSError: it cannot be written.
     """
@@ -92,7 +94,7 @@ def export_lerobot(
                 on_progress(number, name)
                 try:
                     fitting = writer.fitting(name, read)
-                except DoesNotFit as error:
+                except (DoesNotFit, UnreadableRecording) as error:
                     if not options.only_fitting:
                         raise
                     made.not_fitting.append(str(error))
@@ -176,13 +178,9 @@ class _Writer:
 
         Raises:
             DoesNotFit: it cannot be added.
+            UnreadableRecording: it cannot be read, or not all of it.
         """
-        try:
-            episode = read()
-        except ValueError as error:
-            raise DoesNotFit(str(error) if name in str(error) else f"{name}: {error}") from error
-        if episode.broken_files:
-            raise DoesNotFit(" ".join(broken.sentence for broken in episode.broken_files))
+        episode = read_whole(name, read)
         if self._options.only_successes and not _succeeds(episode):
             self._made.left_out += 1
             return None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.episode import Episode, file_part
 from workbench.recording.films import cameras_by_name, picture_index
 
 # As in lerobot 0.4.4 (``lerobot/datasets/utils.py``, ``compute_stats.py``, ``lerobot_dataset.py``), whose reader loads
@@ -182,8 +182,8 @@ class Frames:
 
 
 def feature_name(name: str) -> str:
-    """A camera's name as part of a feature's name, which must not contain a slash."""
-    return name.replace("/", "_")
+    """A camera's name as part of a feature's name, which is a folder's name too."""
+    return file_part(name)
 
 
 def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:

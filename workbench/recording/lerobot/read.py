@@ -35,10 +35,6 @@ _PLACE = re.compile(r"\{(?P<name>chunk_index|file_index|video_key)(:0?(?P<width>
 _NUMBER = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
-def is_lerobot(folder: Path) -> bool:
-    return (Path(folder) / form.INFO).is_file()
-
-
 def lerobot_rows(folder: Path) -> tuple[Facts, ...]:
     """The episodes of the dataset in this folder; success means success at some frame.
 

@@ -12,9 +12,11 @@ from typing import Any
 import h5py
 import numpy as np
 
+from workbench.machine.text import short_line
 from workbench.recording.episode.document import as_json, json_text
-from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.episode import Episode, read_whole
 from workbench.recording.episode.row import UnreadableRecording
+from workbench.recording.maniskill.sensors import missing_pictures, observed_pictures, put_pictures
 from workbench.recording.maniskill.write import maniskill_json, put_columns
 
 _FLAT = "state"
@@ -36,6 +38,10 @@ class Demonstrations:
     """Episodes without success."""
     not_fitting: list[str] = field(default_factory=list)
     """A sentence for each episode that was left out since it does not fit."""
+    lossy: bool = False
+    """Its colour pictures are those of recordings, which keep them as JPEG."""
+    incomplete: list[str] = field(default_factory=list)
+    """A sentence for each episode of whose observations something is not in its recording."""
 
 
 def export_maniskill(
@@ -47,8 +53,9 @@ def export_maniskill(
 ) -> Demonstrations:
     """Write these episodes to a new ``.h5`` and its ``.json``.
 
-    One by one, so memory use does not grow with their number. Observations of the mode ``state`` are one vector (T + 1, D), as
-    ManiSkill records them. The files get their names when they are complete.
+    One by one, so memory use does not grow with their number. Observations of the mode ``state`` are one vector (T + 1, D), and
+    pictures that were observed are in ``obs/sensor_data``, as ManiSkill records them. The files get their names when they are
+    complete.
 
     Args:
         sources: a name for messages and a function that reads the episode.
@@ -58,7 +65,8 @@ def export_maniskill(
         on_progress: called with the number of finished episodes, and the name of the current one.
 
     Raises:
-        OtherDemonstration: an episode cannot be read, or is of another task or made otherwise than the first one.
+        UnreadableRecording: an episode cannot be read, or not all of it.
+        OtherDemonstration: an episode has no step, is of another task, or was made otherwise than the first one.
         ValueError: there is no episode to write, or `file` has another suffix.
         OSError: it cannot be written.
     """
@@ -80,11 +88,13 @@ def export_maniskill(
             for number, (name, read) in enumerate(sources):
                 on_progress(number, name)
                 try:
-                    episode = _read(name, read)
+                    episode = read_whole(name, read)
+                    if episode.length == 0:
+                        raise OtherDemonstration(f"{name}: it has no step")
                     shape = _shape(episode)
                     if document is not None and (other := _difference(first, shape)):
                         raise OtherDemonstration(f"{name}: {other}")
-                except OtherDemonstration as error:
+                except (OtherDemonstration, UnreadableRecording) as error:
                     if not only_fitting:
                         raise
                     made.not_fitting.append(str(error))
@@ -98,6 +108,15 @@ def export_maniskill(
                     document, first = {**entry, "episodes": []}, shape
                 trajectory = written.create_group(f"traj_{made.episodes}", track_order=True)
                 put_columns(_flat(episode), trajectory)
+                put_pictures(episode, trajectory)
+                # ManiSkill's own files, which have no scene, keep them to the bit.
+                made.lossy |= episode.geometry is not None and any(
+                    "rgb" in m for m in shape["pictures"].values()
+                )
+                if missing := missing_pictures(episode):
+                    made.incomplete.append(
+                        f"{name}: its observations had more than its recording keeps: {missing}."
+                    )
                 moved = episode.info.moved_cameras
                 document["episodes"].append(
                     {
@@ -124,16 +143,6 @@ def export_maniskill(
     return made
 
 
-def _read(name: str, read: Callable[[], Episode]) -> Episode:
-    try:
-        episode = read()
-    except (OSError, UnreadableRecording) as error:
-        raise OtherDemonstration(f"{name} cannot be read: {error}") from error
-    if episode.length == 0:
-        raise OtherDemonstration(f"{name}: it has no step")
-    return episode
-
-
 def _shape(episode: Episode) -> dict[str, Any]:
     """What all episodes of a file have in common, by what a person calls it."""
     info = episode.info
@@ -143,6 +152,7 @@ def _shape(episode: Episode) -> dict[str, Any]:
         "arguments of the env": dict(info.env_kwargs),
         "number of action dimensions": episode.action.shape[1],
         "observations": {name: values.shape[1:] for name, values in episode.obs.items()},
+        "pictures": observed_pictures(episode),
     }
 
 
@@ -150,14 +160,17 @@ def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
     """In what an episode differs from the first one, as a sentence; empty if in nothing."""
     for what, wanted in first.items():
         if other[what] != wanted:
-            return f"its {what} is {other[what]!r}, and that of the first recording {wanted!r}"
+            found, expected = short_line(repr(other[what]), 300), short_line(repr(wanted), 300)
+            return f"its {what}: {found}, and of the first recording: {expected}"
     return ""
 
 
 def _flat(episode: Episode) -> Episode:
-    """With one vector of observations where the env gives one."""
-    if episode.info.env_kwargs.get("obs_mode") != _FLAT or not episode.obs:
+    """With one vector of state observations where the env gives one."""
+    mode = episode.info.env_kwargs.get("obs_mode")
+    if not episode.obs or not isinstance(mode, str) or _FLAT not in mode.split("+"):
         return episode
     count = episode.length + 1
     rows = [np.asarray(values, np.float32).reshape(count, -1) for values in episode.obs.values()]
-    return replace(episode, obs={"": np.concatenate(rows, axis=1)})
+    # Beside pictures it has a name.
+    return replace(episode, obs={"" if mode == _FLAT else _FLAT: np.concatenate(rows, axis=1)})

@@ -32,19 +32,6 @@ _UNKNOWN_DT = 0.05
 """ManiSkill's default control period (20 Hz), if the file has none."""
 
 
-def trajectories(path: Path) -> tuple[str, ...]:
-    """Names of the episodes in a ManiSkill .h5, in the order of their numbers.
-
-    Raises:
-        UnreadableRecording: it cannot be read as HDF5.
-    """
-    try:
-        with open_h5(path) as file:
-            return tuple(sorted((name for name in file if name.startswith("traj_")), key=_number))
-    except (OSError, RuntimeError, RefusedH5) as error:
-        raise UnreadableRecording(f"{Path(path).name} cannot be read as .h5: {error}") from error
-
-
 def read_maniskill(path: Path, trajectory: str) -> Episode:
     """Episode `trajectory` (``traj_0``) of an .h5 with its .json, both written by ManiSkill's RecordEpisode.
 
@@ -83,11 +70,6 @@ def leaves(
         for name in node:
             if name not in skip:
                 yield from leaves(node[name], f"{prefix}/{name}" if prefix else name)
-
-
-def _number(name: str) -> tuple[int, str]:
-    digits = name.removeprefix("traj_")
-    return (int(digits) if digits.isdigit() else 1 << 60, name)
 
 
 def _read_entry(path: Path, trajectory: str) -> tuple[Document, EpisodeJson]:
@@ -165,21 +147,25 @@ def _actions(node: H5Group | H5Dataset) -> tuple[NDArray[np.float32], tuple[str,
 # --- cameras --------------------------------------------------------------------------------------
 
 
-def _picture(path: Path, place: str, modality: Modality, number: int) -> bytes:
-    """Picture `number` of a dataset (P, H, W, C), encoded."""
+def _picture(path: Path, place: str, modality: Modality, number: int) -> NDArray:
+    """Picture `number` of a dataset (P, H, W, C), as `EncodedPictures` has it."""
     with open_h5(path) as file:
         dataset = file[place]
         if not isinstance(dataset, H5Dataset):
             raise OSError(f"{path.name} has changed since it was opened")
         picture = dataset.row(number)
     if modality == "rgb":
-        return encode("rgb", np.ascontiguousarray(picture[..., :3]))
+        return np.ascontiguousarray(picture[..., :3])
     plain = picture.reshape(picture.shape[:2])
     if modality == "depth":
         # Integers are millimetres; floats, from ray-tracing shaders, are metres.
         scale = MILLIMETRES_PER_METRE if plain.dtype.kind in "iu" else 1.0
-        return encode("depth", plain.astype(np.float32) / scale)
-    return encode("segmentation", plain.astype(np.int32))
+        return plain.astype(np.float32) / np.float32(scale)
+    return plain.astype(np.int32)
+
+
+def _encoded(path: Path, place: str, modality: Modality, number: int) -> bytes:
+    return encode(modality, _picture(path, place, modality, number))
 
 
 def _cameras(obs: H5Group | H5Dataset | None, path: Path) -> list[CameraTrack]:
@@ -206,8 +192,9 @@ def _cameras(obs: H5Group | H5Dataset | None, path: Path) -> list[CameraTrack]:
                 raise RefusedH5(
                     f"claims pictures of {dataset.shape[2]} x {dataset.shape[1]} pixels (at {dataset.name})"
                 )
-            one = partial(_picture, path, dataset.name, modality)
-            held[modality] = EncodedPictures(modality, LazyPictures(count, one))
+            where = path, dataset.name, modality
+            blobs = LazyPictures(count, partial(_encoded, *where))
+            held[modality] = EncodedPictures(modality, blobs, partial(_picture, *where))
         if held:
             parameters = obs.group(f"sensor_param/{name}")
             info = _camera_info(name, size, tuple(held), parameters)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.recording.episode.description import describe_json
-from workbench.recording.episode.document import json_text
+from workbench.recording.episode.document import json_text, with_checksum
 from workbench.recording.episode.episode import Episode
 
 TRAJECTORY = "traj_0"
@@ -132,7 +132,7 @@ def write_json(episode: Episode, path: Path, folder: Path, files: Sequence[Path]
         sealed: add this installation's seal.
     """
     described = describe_json(episode, folder, files, sealed)
-    content = json_text({**maniskill_json(episode), "workbench": described}, indent=2).encode()
+    content = with_checksum(json_text({**maniskill_json(episode), "workbench": described}, indent=2).encode())
     with path.open("xb") as file:
         file.write(content)
 

@@ -10,18 +10,19 @@ import sys
 from collections import OrderedDict
 from typing import Literal, get_args
 
+import msgspec
+
 from workbench.machine.processes.confinement import confine
 from workbench.machine.processes.family import end_with_parent
 from workbench.machine.processes.wire import MessageSocket, Unpacker, pack, pack_message
-from workbench.recording.episode.episode import CameraTrack
-from workbench.recording.episode.row import Source, UnreadableRecording, clean_text
+from workbench.recording.episode.episode import CameraTrack, EpisodeInfo
+from workbench.recording.episode.row import UnreadableRecording, clean_text
 from workbench.recording.reader.episode_wire import SentShapes, pack_episode
 from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.requests import (
     Answer,
     CloseEpisodes,
     EpisodeRead,
-    FindSources,
     GetExitCode,
     NewReader,
     OpenEpisode,
@@ -36,7 +37,6 @@ from workbench.recording.reader.requests import (
     Request,
     RerunInfo,
     RowsRead,
-    SourcesFound,
     SweepRead,
 )
 from workbench.recording.reader.scan import RecordingFiles
@@ -145,13 +145,11 @@ class _Reader:
     def _answer(self, request: Request) -> Answer:
         if isinstance(request, ReadRows):
             found = RecordingFiles(os.fsdecode(request.key), request.sizes, request.times)
-            return RowsRead(read_found(request.folder, found))
+            return RowsRead(read_found(request.folder, found, request.only_names))
         if isinstance(request, OpenEpisode):
             return self._open(request)
         if isinstance(request, ReadPicture):
             return self._picture(request)
-        if isinstance(request, FindSources):
-            return _sources(request)
         if isinstance(request, ReadRerunInfo):
             return _rerun_info(request)
         if isinstance(request, ReadSweep):
@@ -176,6 +174,12 @@ class _Reader:
             episode = read_maniskill(request.path, request.part)
         else:
             episode, source_path = read_without_task(request.path, shapes.shapes)
+        try:
+            msgspec.convert(msgspec.to_builtins(episode.info), EpisodeInfo)
+        except msgspec.ValidationError as error:
+            raise UnreadableRecording(
+                f"{request.path.name} is a recording, but a broken one: {error}."
+            ) from error
         self._number += 1
         self._opened[self._number] = episode.cameras
         return pack_episode(episode, source_path, self._number, shapes)
@@ -190,15 +194,6 @@ class _Reader:
         if request.encoded:
             return PictureRead(blob=pictures.blob(request.index))
         return PictureRead(pictures[request.index])
-
-
-def _sources(request: FindSources) -> SourcesFound:
-    from workbench.recording.maniskill.read import trajectories
-    from workbench.recording.reader.read_episode import sources_in
-
-    if request.trajectories:
-        return SourcesFound([Source(request.path, name) for name in trajectories(request.path)])
-    return SourcesFound(list(sources_in(request.path)))
 
 
 def _sweep(request: ReadSweep) -> SweepRead:

@@ -9,8 +9,9 @@ import signal
 import socket
 import subprocess
 import threading
+import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
@@ -22,6 +23,8 @@ from workbench.recording.reader.requests import Answer, CloseEpisodes, GetExitCo
 
 START_SECONDS = 60.0
 """Timeout of the fork server's start, which imports for half a second."""
+STOP_SECONDS = 0.2
+"""Seconds between two looks whether an answer is still needed."""
 
 
 FOR_READING = {
@@ -156,19 +159,21 @@ class Reader:
         seconds: float,
         patience: float | None = None,
         process: int | None = None,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> Answered:
         """
         Args:
             seconds: timeout of the answer.
             patience: timeout of waiting for other requests; None waits for ever.
             process: the process that the request refers to, such as one with an open episode.
+            stopped: asked a few times a second; once it is true, the answer is not needed any more.
 
         Raises:
             ReaderEnded: it ended the reader, or timed out. A new reader serves the next request.
             ReaderBusy, WrongProcess
             OSError: no reader can be started.
         """
-        (answer,) = self.ask_all([request], seconds, patience, process)
+        (answer,) = self.ask_all([request], seconds, patience, process, stopped)
         if isinstance(answer, ReaderEnded):
             raise answer
         return answer
@@ -179,6 +184,7 @@ class Reader:
         seconds: float,
         patience: float | None = None,
         process: int | None = None,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> list[Answered | ReaderEnded]:
         """Send several requests at once, each with this timeout; one that ends the reader does not affect the others.
 
@@ -198,8 +204,7 @@ class Reader:
                     for request in requests[begun:]:
                         line.send(request)
                     for _ in requests[begun:]:
-                        if (answer := line.receive(seconds)) is None:
-                            raise TimeoutError
+                        answer = _receive(line, seconds, stopped)
                         answers.append(Answered(answer, self.process))
                 except (OSError, EOFError) as error:
                     ended = self._ended(error, seconds)
@@ -267,6 +272,15 @@ class Reader:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self._pid, signal.SIGKILL)
         return fork_server.exit_code(self._pid)
+
+
+def _receive(line: MessageSocket, seconds: float, stopped: Callable[[], bool]) -> Answer:
+    """The next answer. Raises TimeoutError, also when it is `stopped`."""
+    until = time.monotonic() + seconds
+    while (left := until - time.monotonic()) > 0 and not stopped():
+        if (answer := line.receive(min(left, STOP_SECONDS))) is not None:
+            return answer
+    raise TimeoutError
 
 
 class _FairLock:

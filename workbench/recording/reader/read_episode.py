@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.scene.shapes import SceneGeometry, SharedShapes
+from workbench.machine.files import NotARegularFile
 from workbench.recording.episode.columns import MOST_LINES
 from workbench.recording.episode.document import (
     CameraJson,
     ColumnType,
     Description,
-    Document,
     WrongDocument,
     check,
     description_in,
@@ -27,11 +28,9 @@ from workbench.recording.episode.document import (
 )
 from workbench.recording.episode.encoded_pictures import EncodedPictures, Modality
 from workbench.recording.episode.episode import BrokenFile, CameraTrack, Episode
-from workbench.recording.episode.row import Source, UnreadableRecording
-from workbench.recording.lerobot.read import is_lerobot, lerobot_rows
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.maniskill.read import leaves
 from workbench.recording.maniskill.read import read_maniskill as read_maniskill
-from workbench.recording.maniskill.read import trajectories as trajectories
 from workbench.recording.maniskill.safe_h5 import open_h5
 from workbench.recording.maniskill.write import TRAJECTORY
 from workbench.recording.rerun.layout import (
@@ -53,9 +52,9 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     """The episode of a workbench recording.
 
     The ``.json`` describes it, the ``.rrd`` holds meshes, poses, pictures and curves, the ``.h5`` env states, observations
-    and actions. The content of a missing file is empty: without the .rrd no geometry, poses and pictures, without the
-    .h5 no env states. The same for a broken one, listed in `Episode.broken_files`; so a lone ``.rrd`` can be viewed. The
-    geometry is that of this env alone, as env 0 of 1. Pictures stay in the file until they are accessed.
+    and actions. A file that is broken or missing is listed in `Episode.broken_files`, and its content is empty: without the
+    .rrd no geometry, poses and pictures, without the .h5 no env states. A lone ``.rrd`` misses nothing. The geometry is that
+    of this env alone, as env 0 of 1. Pictures stay in the file until they are accessed.
 
     Args:
         path: its .rrd, .h5 or .json.
@@ -78,32 +77,34 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
     """
     path = Path(path)
     files = {suffix: path.with_suffix(suffix) for suffix in (".rrd", ".h5", ".json")}
-    there = {suffix: file for suffix, file in files.items() if file.is_file()}
+    there = {suffix: file for suffix, file in files.items() if os.path.lexists(file)}
     if not there:
         raise UnreadableRecording(f"{path.name} is not there any more.")
     broken_files: list[BrokenFile] = []
     in_json, not_json = _read_description(there.get(".json"))
-    files = {} if in_json is None else in_json.files or {}
+    if ".json" not in there and ".h5" in there:
+        not_json = FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+    checksums = {} if in_json is None else in_json.files or {}
     table = states = None
-    if ".rrd" in there:
+    if in_json is not None or ".rrd" in there:
         try:
-            check(there[".rrd"], files)
-            table = RerunTable(there[".rrd"], shapes)
+            check(files[".rrd"], checksums)
+            table = RerunTable(files[".rrd"], shapes)
         except (OSError, ValueError, RuntimeError) as error:
             lost = "its 3-D scene, its pictures and what evaluate() said are missing"
-            broken_files.append(_broken_file(there[".rrd"], error, lost))
-    if ".h5" in there:
+            broken_files.append(_broken_file(files[".rrd"], error, lost))
+    if in_json is not None or ".h5" in there:
         try:
-            check(there[".h5"], files)
-            states = _read_states(there[".h5"])
+            check(files[".h5"], checksums)
+            states = _read_states(files[".h5"])
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
-            broken_files.append(_broken_file(there[".h5"], error, "its env states are missing"))
+            broken_files.append(_broken_file(files[".h5"], error, "its env states are missing"))
     if table is None and states is None and broken_files:
         told = " ".join(broken.sentence for broken in broken_files)
         raise UnreadableRecording(f"{told} Copy it again from where it was recorded.")
     if not_json is not None and table is not None:
         broken_files.append(
-            _broken_file(there[".json"], not_json, "its tags, its note and the place of its task are missing")
+            _broken_file(files[".json"], not_json, "its tags, its note and the place of its task are missing")
         )
     description = in_json or _description(there.get(".json"), not_json, table, path)
     try:
@@ -121,6 +122,14 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
 
 
 def _broken_file(file: Path, error: Exception, lost: str) -> BrokenFile:
+    if isinstance(error, FileNotFoundError):
+        return BrokenFile(file.name, f"is not there: {lost}.")
+    if isinstance(error, WrongDocument):
+        return BrokenFile(file.name, f"{error}: {lost}.")
+    if isinstance(error, NotARegularFile):
+        return BrokenFile(file.name, f"{error.strerror}: {lost}.")
+    if isinstance(error, OSError) and error.errno is not None:
+        return BrokenFile(file.name, f"cannot be read ({error.strerror}): {lost}.")
     why = " ".join(str(error).split()).removeprefix(f"Failed to read RRD file at {file}: ")
     why = why if len(why) <= 160 else why[:159] + "\u2026"
     return BrokenFile(file.name, f"was cut short or changed ({why}): {lost}.")
@@ -289,55 +298,3 @@ def _add_states(episode: Episode, held: dict[str, Any]) -> None:
         for name in _FLAGS:
             if name in held:
                 episode.evaluate[name] = np.concatenate([[False], held[name]])
-
-
-# --- the recordings in a file or folder ------------------------------------------------------------
-
-_OURS = (".rrd", ".h5", ".json")
-
-
-def sources_in(path: Path) -> Iterator[Source]:
-    """The recordings in a file, or in a folder and below, by name. Raises OSError if a folder cannot be listed."""
-    if not path.is_dir():
-        yield from _in_file(path) if path.suffix in _OURS else ()
-    elif is_lerobot(path):
-        yield from _in_dataset(path)
-    else:
-        # Hidden folders are journals, indices or the trash.
-        there = sorted(inside for inside in path.iterdir() if not inside.name.startswith("."))
-        stems = {inside.with_suffix(""): inside for inside in there if inside.suffix in _OURS}
-        for inside in sorted([*stems.values(), *(inside for inside in there if inside.is_dir())]):
-            # A link may form a cycle.
-            if not (inside.is_dir() and os.path.islink(inside)):
-                yield from sources_in(inside)
-
-
-def _in_file(path: Path) -> Iterator[Source]:
-    json, h5, rrd = (path.with_suffix(suffix) for suffix in (".json", ".h5", ".rrd"))
-    document = _document(json)
-    if document.is_ours:
-        yield Source(json, None, str(document.data["workbench"].get("id") or json.resolve()), json.stem)
-    elif document.is_maniskill and h5.is_file():
-        try:
-            names = trajectories(h5)
-        except UnreadableRecording:
-            return
-        yield from (Source(h5, name, f"{h5.resolve()}#{name}", f"{h5.stem}#{name}") for name in names)
-    elif rrd.is_file():
-        yield Source(rrd, None, str(rrd.resolve()), rrd.stem)
-
-
-def _in_dataset(folder: Path) -> Iterator[Source]:
-    try:
-        numbers = [facts.trajectory for facts in lerobot_rows(folder)]
-    except UnreadableRecording:
-        numbers = ["0"]  # reading it reports the problem
-    for number in numbers:
-        yield Source(folder, number, f"{folder.resolve()}#{number}", f"{folder.name}#{number}")
-
-
-def _document(path: Path) -> Document:
-    try:
-        return read_document(path)
-    except (OSError, WrongDocument):
-        return Document({})

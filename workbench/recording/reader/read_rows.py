@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from workbench.machine.files import NotARegularFile, open_regular_file
+from workbench.machine.text import listed
 from workbench.recording.episode.document import (
     Document,
     EpisodeJson,
@@ -34,7 +35,7 @@ from workbench.recording.episode.row import (
     total,
     unix_seconds,
 )
-from workbench.recording.maniskill.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
+from workbench.recording.maniskill.safe_h5 import MOST_NODES, H5Dataset, H5Group, RefusedH5, open_h5
 from workbench.recording.reader.scan import DATASET_KEY, NOTES, RecordingFiles, broken
 
 THUMBNAIL_PIXELS = 96
@@ -47,15 +48,18 @@ _LARGEST_PICTURE = 4096
 """Pixels of the longer side of a picture that a thumbnail is made of."""
 
 
-def read_found(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
+def read_found(folder: Path, found: RecordingFiles, only_names: bool = False) -> list[LibraryEntry]:
     """The recordings in these files: none, one, or one per trajectory.
 
     A broken file becomes a row that states the problem, so that it is found. A ``.json`` that is something else gives
     none. The ``.json`` has everything but rewards and pictures of ManiSkill's trajectories, which are in the ``.h5``; a
     lone ``.rrd`` must be read through, which takes a tenth of a second or more.
+
+    Args:
+        only_names: leave out what takes long: rewards and pictures of trajectories, and the content of a lone ``.rrd``.
     """
     try:
-        entries = _read(folder, found)
+        entries = _read(folder, found, only_names)
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError) as error:
         # Untrusted files can fail in any way, and one must not hide the others.
         entries = [_broken(found, f"cannot be read ({error})")]
@@ -68,7 +72,9 @@ def read_found(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
     return entries
 
 
-def _read(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
+def _read(folder: Path, found: RecordingFiles, only_names: bool) -> list[LibraryEntry]:
+    if found.key.split("/")[-2:] == DATASET_KEY and ".json" in found.sizes:
+        return _lerobot_entries(folder, found)
     if ".json" in found.sizes:
         try:
             document = read_document(found.path(folder, ".json"))
@@ -76,10 +82,8 @@ def _read(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
             return [_broken(found, str(error))]
         if document.is_ours:
             return [_workbench_entry(found, document)]
-        if document.data and found.key.split("/")[-2:] == DATASET_KEY:
-            return _lerobot_entries(folder, found)
         if document.is_maniskill:
-            return _maniskill_entries(folder, found, document)
+            return _maniskill_entries(folder, found, document, only_names)
         if ".h5" in found.sizes:
             return [_broken(found, "names neither an env nor episodes")]
     elif ".h5" in found.sizes:
@@ -88,7 +92,7 @@ def _read(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
             broken(found, f"{name}.h5 needs {name}.json beside it, which names the env and the episodes.")
         ]
     if ".rrd" in found.sizes:
-        return [_rrd_only(folder, found)]
+        return [(Facts("rrd only"), None) if only_names else _rrd_only(folder, found)]
     return []
 
 
@@ -168,7 +172,9 @@ def _thumbnail(encoded: object) -> bytes | None:
         return None
 
 
-def _maniskill_entries(folder: Path, found: RecordingFiles, document: Document) -> list[LibraryEntry]:
+def _maniskill_entries(
+    folder: Path, found: RecordingFiles, document: Document, only_names: bool
+) -> list[LibraryEntry]:
     """One row per episode of ManiSkill's ``RecordEpisode``, which made its demonstrations too."""
     name = Path(found.key).name
     written = found.newest / 1e9
@@ -182,9 +188,10 @@ def _maniskill_entries(folder: Path, found: RecordingFiles, document: Document) 
             return []  # another program's .json with "episodes"
         lost = f"{name}.h5, which {name}.json describes, is missing."
         return [(Facts("maniskill", task=task, written=written, problem=lost), None)]
-    data = [_episode_or_problem(document, number) for number in range(min(count, MOST_EPISODES))]
+    most = MOST_NODES if only_names else MOST_EPISODES
+    data = [_episode_or_problem(document, number) for number in range(min(count, most))]
     names = [f"traj_{one.episode_id}" for one in data if isinstance(one, EpisodeJson)]
-    totals, pictures, broken = _read_h5(found.path(folder, ".h5"), names)
+    totals, pictures, broken, others = _read_h5(found.path(folder, ".h5"), names, only_names)
     problem = problem or broken
     if not task and problem is None:
         problem = f"{name}.json does not name the env."
@@ -211,8 +218,14 @@ def _maniskill_entries(folder: Path, found: RecordingFiles, document: Document) 
             problem=problem or lost,
         )
         entries.append((facts, pictures.get(trajectory)))
-    if count > MOST_EPISODES:
-        more = f"{name}.json names {count - MOST_EPISODES:,} episodes more than the {MOST_EPISODES:,} that are listed of a file."
+    if others and len(names) == count:
+        # Its writer was killed before it wrote the .json.
+        more = clean_text(f"{name}.json does not describe {listed(others)} of {name}.h5.", 500)
+        entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
+    if count > most:
+        more = (
+            f"{name}.json names {count - most:,} episodes more than the {most:,} that are listed of a file."
+        )
         entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
     return entries
 
@@ -238,30 +251,35 @@ def _lerobot_entries(folder: Path, found: RecordingFiles) -> list[LibraryEntry]:
 
 
 def _read_h5(
-    path: Path, trajectories: list[str]
-) -> tuple[dict[str, float | None], dict[str, bytes], str | None]:
-    """Sums of rewards (None if not recorded) and thumbnails of the trajectories in the ``.h5``, and the file's problem."""
+    path: Path, described: list[str], only_names: bool
+) -> tuple[dict[str, float | None], dict[str, bytes], str | None, list[str]]:
+    """Sums of rewards (None if not recorded) and thumbnails of the trajectories in the ``.h5``, the file's problem, and the
+    names of the trajectories that are not `described`."""
     totals: dict[str, float | None] = {}
     pictures: dict[str, bytes] = {}
+    others: list[str] = []
     try:
         with open_h5(path) as file:
-            for name in trajectories:
+            others = sorted({name for name in file if name.startswith("traj_")} - {*described})
+            for name in described:
                 group = file.group(name)
                 if group is None:
                     continue
                 totals[name] = None
+                if only_names:
+                    continue
                 rewards = group.get("rewards")
                 if isinstance(rewards, H5Dataset) and rewards.is_numbers:
                     totals[name] = total(float(rewards.read().sum(dtype=np.float64)))
                 if (picture := _last_picture(group)) is not None:
                     pictures[name] = picture
     except RefusedH5 as error:
-        return totals, pictures, f"{path.name} {error}."
+        return totals, pictures, f"{path.name} {error}.", others
     except NotARegularFile as error:
-        return totals, pictures, f"{path.name} {error.strerror}."
+        return totals, pictures, f"{path.name} {error.strerror}.", others
     except (OSError, RuntimeError, KeyError, ValueError):
-        return totals, pictures, f"{path.name} is damaged, or still being written."
-    return totals, pictures, None
+        return totals, pictures, f"{path.name} is damaged, or still being written.", others
+    return totals, pictures, None, others
 
 
 def _last_picture(group: H5Group) -> bytes | None:

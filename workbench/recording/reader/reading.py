@@ -6,7 +6,7 @@ import os
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -16,17 +16,16 @@ from workbench.recording.episode.document import task_file
 from workbench.recording.episode.encoded_pictures import Modality
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import (
+    Facts,
     LibraryEntry,
     Source,
     UnreadableRecording,
     clean_facts,
-    clean_text,
 )
 from workbench.recording.reader.episode_wire import InvalidEpisode, KnownShapes, unpack_episode
 from workbench.recording.reader.processes import Answered, Reader, ReaderEnded, WrongProcess, fork_server
 from workbench.recording.reader.requests import (
     EpisodeRead,
-    FindSources,
     OpenEpisode,
     PictureRead,
     ReadFailed,
@@ -38,10 +37,9 @@ from workbench.recording.reader.requests import (
     Recovered,
     RerunInfo,
     RowsRead,
-    SourcesFound,
     SweepRead,
 )
-from workbench.recording.reader.scan import NOTES, RecordingFiles, broken
+from workbench.recording.reader.scan import NOTES, SUFFIXES, RecordingFiles, broken, files_named, scan_folder
 from workbench.recording.sweeps import NoSweep, SweepResults, clean_results
 from workbench.recording.writing.publish import RecordingError
 
@@ -81,9 +79,12 @@ def stop_reading() -> None:
 
 
 def read_rows(
-    folder: Path, found_files: Iterable[RecordingFiles]
+    folder: Path, found_files: Iterable[RecordingFiles], only_names: bool = False
 ) -> Iterator[tuple[RecordingFiles, list[LibraryEntry]]]:
     """The recordings in these files of a library's folder, each with its thumbnail; problems become rows.
+
+    Args:
+        only_names: as of `read_rows.read_found`.
 
     Raises:
         OSError: no reader can be started.
@@ -94,14 +95,20 @@ def read_rows(
     for begin in range(0, len(found_files), _AT_ONCE):
         some = found_files[begin : begin + _AT_ONCE]
         requests = [
-            ReadRows(Path(folder), os.fsencode(found.key), found.sizes, found.times) for found in some
+            ReadRows(Path(folder), os.fsencode(found.key), found.sizes, found.times, only_names)
+            for found in some
         ]
         answers = reader.ask_all(requests, ROW_SECONDS)
         for found, answer in zip(some, answers, strict=True):
             yield found, _entries(found, answer)
 
 
-def read_recording(source: Source, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
+def read_recording(
+    source: Source,
+    shapes: SharedShapes | None = None,
+    folder: Path | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Episode:
     """An episode; its pictures are read on access.
 
     Recordings may come from anybody, and HDF5, Arrow, rerun, ffmpeg and Pillow parse them in millions of lines of C, C++
@@ -111,11 +118,14 @@ def read_recording(source: Source, shapes: SharedShapes | None = None, folder: P
     Args:
         shapes: shapes to share with other recordings.
         folder: what the process may read; by default the file's folder.
+        stopped: asked a few times a second; once it is true, reading is given up.
 
     Raises:
         UnreadableRecording: it cannot be read; the message says what is wrong.
         OSError: the system refuses its files.
     """
+    if source.problem is not None:
+        raise UnreadableRecording(source.problem)
     path, kind = source.path.absolute(), source.kind
     folder = folder or (path if kind == "lerobot" else path.parent)
     files = (path,) if kind == "lerobot" else tuple(path.with_suffix(s) for s in (".json", ".h5", ".rrd"))
@@ -124,7 +134,7 @@ def read_recording(source: Source, shapes: SharedShapes | None = None, folder: P
     shapes = SharedShapes() if shapes is None else shapes
     sharing, known = _shapes.of(shapes)
     request = OpenEpisode(kind, path, source.part or "", sharing)
-    read, process = _request(reader, request, EpisodeRead, path.name)
+    read, process = _request(reader, request, EpisodeRead, path.name, stopped)
     opened = _OpenEpisode(reader, request, process, read.opened, path.name)
     try:
         episode = unpack_episode(read, opened.picture, process, shapes, known)
@@ -135,16 +145,6 @@ def read_recording(source: Source, shapes: SharedShapes | None = None, folder: P
         if found is not None:
             episode.info = replace(episode.info, source_file=found)
     return episode
-
-
-def find_sources(path: Path) -> list[Source]:
-    """The recordings in a file or folder. Raises as `read_recording`."""
-    return _found(path, trajectories=False)
-
-
-def find_trajectories(path: Path) -> list[str]:
-    """Names of the episodes in an ``.h5`` of ManiSkill's, by number. Raises as `read_recording`."""
-    return [source.part for source in _found(path, trajectories=True) if source.part is not None]
 
 
 def read_rerun_info(path: Path) -> tuple[str | None, bytes | None]:
@@ -216,16 +216,6 @@ def recovered_text(paths: Sequence[str]) -> str:
     )
 
 
-def _found(path: Path, trajectories: bool) -> list[Source]:
-    path = Path(path).absolute()
-    reader = _reader(path if path.is_dir() else path.parent, episodes=True)
-    reader.allow(_link_targets([path]))
-    found, _ = _request(reader, FindSources(path, trajectories), SourcesFound, path.name)
-    return [
-        replace(one, id=clean_text(one.id, 8192), name=clean_text(one.name, 400)) for one in found.sources
-    ]
-
-
 def _reader(folder: Path, episodes: bool) -> Reader:
     key = (Path(folder).absolute(), episodes)
     gone = None
@@ -266,18 +256,24 @@ def _thumbnail(jpeg: bytes | None) -> bytes | None:
 
 
 def _request(
-    reader: Reader, request: OpenEpisode | FindSources | ReadRerunInfo | ReadSweep, kind: type[T], name: str
+    reader: Reader,
+    request: OpenEpisode | ReadRerunInfo | ReadSweep,
+    kind: type[T],
+    name: str,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> tuple[T, int]:
     """The answer, and the number of the process that answered."""
     try:
-        answered = reader.ask(request, OPEN_SECONDS)
+        answered = reader.ask(request, OPEN_SECONDS, stopped=stopped)
     except ReaderEnded as error:
         raise UnreadableRecording(f"{name} {error}.") from error
     answer = answered.answer
     if isinstance(answer, ReadFailed):
         if answer.why == "system":
             raise OSError(answer.message)
-        raise UnreadableRecording(answer.message)
+        raise UnreadableRecording(
+            answer.message if Path(name).stem in answer.message else f"{name}: {answer.message}"
+        )
     if not isinstance(answer, kind):
         raise UnreadableRecording(f"{name} gave {type(answer).__name__}.")
     return answer, answered.process
@@ -326,12 +322,57 @@ class _OpenEpisode:
 # --- recordings by path ------------------------------------------------------------------------------
 
 
+def find_sources(path: Path) -> list[Source]:
+    """The recordings in a file, or in a folder and the folders below it, by name: those that its library lists, damaged ones too.
+
+    Raises:
+        UnreadableRecording: a folder cannot be listed.
+        OSError: no reader can be started.
+    """
+    path = Path(path).absolute()
+    if path.is_dir():
+        folder, scan = path, scan_folder(path)
+        if scan.problem is not None:
+            raise UnreadableRecording(scan.problem)
+        found = [files for _, files in sorted((scan.found | scan.unsettled).items())]
+    else:
+        folder = path.parent
+        files = files_named(path) if path.suffix in SUFFIXES else None
+        found = [] if files is None else [files]
+    return [
+        _source(folder, files, facts, number)
+        for files, entries in read_rows(folder, found, only_names=True)
+        for number, (facts, _) in enumerate(entries)
+    ]
+
+
+def _source(folder: Path, files: RecordingFiles, facts: Facts, number: int) -> Source:
+    """Where to read the recording of a row.
+
+    Args:
+        number: of the row among those of these files.
+    """
+    path = files.paths(folder)[0]
+    part, problem = facts.trajectory, facts.problem
+    if facts.kind == "lerobot":
+        path, part = path.parents[1], part or "0"
+    elif part is not None:
+        path = path.with_suffix(".h5")
+    elif facts.kind == "workbench" or ".rrd" in files.sizes:
+        problem = None  # reading it says what is damaged, and gives the rest
+    name = path.name if facts.kind == "lerobot" else path.stem
+    name = name if part is None else f"{name}#{part}"
+    # A damaged copy must not hide the whole one, nor the other way round.
+    id = facts.uid if facts.uid and facts.problem is None else f"{os.path.realpath(path)}#{part or number}"
+    return Source(path, part, id, name, problem)
+
+
 def find_all_sources(paths: Sequence[Path]) -> tuple[Source, ...]:
     """The recordings in these files and folders, with the folders below them, each once.
 
     Raises:
         FileNotFoundError: a path does not exist.
-        UnreadableRecording: a file is not a recording, or the folders hold none; the message says what is looked for.
+        UnreadableRecording: a file is not a recording, the folders hold none, or one cannot be listed; the message says why.
     """
     found: dict[str, Source] = {}
     for path in paths:

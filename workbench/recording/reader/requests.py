@@ -12,7 +12,7 @@ from workbench.core.scene.shapes import Material, Mesh
 from workbench.recording.episode.document import CameraJson
 from workbench.recording.episode.encoded_pictures import Modality
 from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.row import LibraryEntry, Source, SourceKind
+from workbench.recording.episode.row import LibraryEntry, SourceKind
 from workbench.recording.sweeps import SweepResults
 
 
@@ -38,6 +38,8 @@ class ReadRows(msgspec.Struct, frozen=True):
     """Bytes, since it may be invalid UTF-8; with `sizes` and `times` a `scan.RecordingFiles`."""
     sizes: dict[str, int]
     times: dict[str, int]
+    only_names: bool = False
+    """As of `read_rows.read_found`."""
 
 
 class OpenEpisode(msgspec.Struct, frozen=True):
@@ -67,14 +69,6 @@ class CloseEpisodes(msgspec.Struct, frozen=True):
     opened: list[int]
 
 
-class FindSources(msgspec.Struct, frozen=True):
-    """The recordings in a file or folder; answered by `SourcesFound`."""
-
-    path: Path
-    trajectories: bool = False
-    """Read the ``.h5`` as ManiSkill's, without looking at its ``.json``."""
-
-
 class ReadRerunInfo(msgspec.Struct, frozen=True):
     """Id and blueprint of an ``.rrd``, for rerun's viewer; answered by `RerunInfo`."""
 
@@ -93,9 +87,7 @@ class Recover(msgspec.Struct, frozen=True):
     folder: Path
 
 
-Request = (
-    ReadRows | OpenEpisode | ReadPicture | CloseEpisodes | FindSources | ReadRerunInfo | ReadSweep | Recover
-)
+Request = ReadRows | OpenEpisode | ReadPicture | CloseEpisodes | ReadRerunInfo | ReadSweep | Recover
 
 
 class RowsRead(msgspec.Struct, frozen=True):
@@ -140,10 +132,6 @@ class PictureRead(msgspec.Struct, frozen=True):
     blob: bytes | None = None
 
 
-class SourcesFound(msgspec.Struct, frozen=True):
-    sources: list[Source]
-
-
 class RerunInfo(msgspec.Struct, frozen=True):
     store: str | None
     """Rerun's id of the recording."""
@@ -167,4 +155,4 @@ class ReadFailed(msgspec.Struct, frozen=True):
     message: str
 
 
-Answer = RowsRead | EpisodeRead | PictureRead | SourcesFound | RerunInfo | SweepRead | Recovered | ReadFailed
+Answer = RowsRead | EpisodeRead | PictureRead | RerunInfo | SweepRead | Recovered | ReadFailed

@@ -51,6 +51,17 @@ def broken(found: RecordingFiles, problem: str) -> LibraryEntry:
     return Facts(kind, written=found.newest / 1e9, problem=clean_text(problem, 500)), None
 
 
+def files_named(path: Path) -> RecordingFiles | None:
+    """The files of the recording that the file `path` belongs to, as those of its folder's library; None if there are none."""
+    stats: dict[str, os.stat_result] = {}
+    for suffix in (*SUFFIXES, NOTES):
+        try:
+            stats[suffix] = path.with_suffix(suffix).stat()
+        except OSError:
+            continue  # not there, or a link that leads nowhere
+    return _group(path.stem, stats)
+
+
 def key_of(path: str) -> str:
     """Key of a file from its path below the library's folder."""
     return os.path.splitext(path)[0]
@@ -69,6 +80,8 @@ class Scan:
     """By key."""
     folders: dict[str, int] = field(default_factory=dict)
     """Every scanned folder, and its time in nanoseconds."""
+    unsettled: dict[str, RecordingFiles] = field(default_factory=dict)
+    """By key: those whose ``.json`` may still come."""
     fresh: bool = False
     """Something was written so recently that it must be scanned again."""
     problem: str | None = None
@@ -115,17 +128,17 @@ def scan_folder(folder: Path) -> Scan:
         if entries > MOST_ENTRIES:
             problem = f"{_printable(folder)} holds more than {MOST_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
             break
-    found, waits = {}, False
+    found, unsettled = {}, {}
     for key, stats in names.items():
         group = _group(key, stats)
         if group is None:
             continue
         if ".json" not in group.sizes and ".h5" in group.sizes and now - group.newest < SETTLE_SECONDS * 1e9:
-            waits = True  # its .json may be published next
-            continue
-        found[key] = group
-    fresh = waits or any(now - at < SETTLE_SECONDS * 1e9 for at in folders.values())
-    return Scan(found, folders, fresh, problem)
+            unsettled[key] = group
+        else:
+            found[key] = group
+    fresh = bool(unsettled) or any(now - at < SETTLE_SECONDS * 1e9 for at in folders.values())
+    return Scan(found, folders, unsettled, fresh, problem)
 
 
 def _add(names: dict[str, dict[str, os.stat_result]], below: str, entry: os.DirEntry[str]) -> None:

@@ -60,7 +60,7 @@ class RerunTable:
         """Visuals by entity that another recording has loaded."""
         self._alone: dict[str, IndexedChunk] = {}
         """The static chunk of each entity with exactly one."""
-        store = RrdReader(path).store()
+        store = RrdReader(self._file.for_rerun).store()
         self._scan_index(index_of(store, STEP))
         for chunk in self._chunks(store):
             batch = chunk.to_record_batch()
@@ -287,7 +287,8 @@ def read_properties(path: Path) -> dict[str, dict[str, Any]]:
         OSError: `path` cannot be read.
     """
     found: dict[str, dict[str, Any]] = {}
-    for chunk in RrdReader(path).stream():
+    file = OpenFile(path)
+    for chunk in RrdReader(file.for_rerun).stream():
         if not chunk.entity_path.startswith(_PROPERTIES):
             continue
         name = chunk.entity_path[len(_PROPERTIES) :].lstrip("/")
@@ -324,9 +325,18 @@ class OpenFile:
 
     def __init__(self, path: Path) -> None:
         """Raises OSError."""
-        self.name = path.name
+        self.name, self._path = path.name, path
         with open_regular_file(path) as file:
             self._descriptor = os.dup(file.fileno())
+
+    @property
+    def for_rerun(self) -> Path:
+        """A path by which rerun opens it, while this object lives: it takes no name that is not UTF-8."""
+        try:
+            os.fspath(self._path).encode()
+        except UnicodeEncodeError:
+            return Path(f"/proc/self/fd/{self._descriptor}")
+        return self._path
 
     def __del__(self) -> None:
         if hasattr(self, "_descriptor"):

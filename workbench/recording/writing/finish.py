@@ -27,6 +27,8 @@ from workbench.recording.writing.journal import (
 from workbench.recording.writing.publish import RecordingError, candidates, publish, reason, sync_files
 
 SUFFIXES = (".rrd", ".h5", ".json")
+DAMAGED_SUFFIX = ".damaged"
+"""Of a journal that was damaged, which nothing reads."""
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,11 @@ def recover(folder: Path) -> list[EpisodeFiles]:
     """Make recordings of all journals in `folder` whose writer is dead, which left its journal unlocked.
 
     A writer may die while recording, while making files, and between two names of one recording; its journal is there
-    in each case. A journal without a control step is deleted. When one journal fails, the error is raised after the
-    others are done.
+    in each case. A journal without a control step is deleted, one that was damaged is kept under another name. When one
+    journal fails, the error is raised after the others are done.
 
     Raises:
-        RecordingError: files cannot be written, or the folder or a journal cannot be read; the journals stay.
+        RecordingError: files cannot be written, or the folder or a journal cannot be read or not all of it; the journals stay.
         MemoryError: a journal needs too much memory; the others are done.
     """
     folder = Path(folder)
@@ -147,8 +149,7 @@ def recover(folder: Path) -> list[EpisodeFiles]:
     try:
         for journal in sorted((folder / FOLDER).glob("*.arrow")):
             try:
-                if (files := _recover(journal, folder)) is not None:
-                    made.append(files)
+                made += _recover(journal, folder)
             except Exception as error:
                 # Of any type: a broken journal must not keep the others from being recovered.
                 failed = error
@@ -164,21 +165,31 @@ def recover(folder: Path) -> list[EpisodeFiles]:
     return made
 
 
-def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
+def _recover(journal: Path, folder: Path) -> list[EpisodeFiles]:
+    """Raises as `recover`, after the episode up to the damage was made of a damaged journal."""
     descriptor = claim(journal)
     if descriptor is None:
-        return None
+        return []
     try:
-        files = None
+        files: list[EpisodeFiles] = []
         with contextlib.closing(JournalReader(journal)) as reader:
             header = read_header(reader, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
             if header is not None and _already_made(header.info, journal, folder) is None:
                 header = mark_recovered(header)
                 episode = episode_in(reader, header)
                 if episode is not None and episode.length > 0:
-                    files = make_files(journal, header, folder)
-        journal.unlink(missing_ok=True)
-        return files
+                    files.append(make_files(journal, header, folder))
+            lost = reader.lost_bytes()
+        if not lost:
+            journal.unlink(missing_ok=True)
+            return files
+        aside = journal.with_suffix(DAMAGED_SUFFIX)
+        os.rename(journal, aside)
+        before = f"The steps before are in {files[0].json.name}. " if files else ""
+        raise RecordingError(
+            f"A journal in {folder} is damaged, and {lost} bytes of it cannot be read. {before}All of it is kept in "
+            f"{FOLDER}/{aside.name}."
+        )
     finally:
         os.close(descriptor)
 
@@ -216,5 +227,6 @@ def _id_of(path: Path) -> str | None:
 def _remove_strays(folder: Path) -> None:
     """Delete temporary files without a journal: their writer died while it cleaned up."""
     for path in (folder / FOLDER).glob("*"):
-        if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not path.with_suffix(".arrow").exists():
+        kept = (path.with_suffix(suffix) for suffix in (".arrow", DAMAGED_SUFFIX))
+        if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not any(one.exists() for one in kept):
             path.unlink(missing_ok=True)

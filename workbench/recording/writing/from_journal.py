@@ -158,6 +158,10 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
         elif kind.startswith("picture/"):
             _, index, name = kind.split("/")
             seen[int(index)].places.setdefault(_modality(name), []).append(place)
+        elif kind != "header":
+            raise ValueError(
+                f"{journal.path.name} holds an entry that is none of a journal's ({kind[:40]!r})"
+            )
     if not runs:
         return None
     columns = assemble([np.frombuffer(b"".join(rows), layouts[layout]) for layout, rows in runs])

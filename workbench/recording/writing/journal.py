@@ -18,7 +18,7 @@ from functools import lru_cache
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
@@ -36,6 +36,10 @@ _BATCH_BYTES = 2 << 20
 _MOST_BATCHES = 4
 """Batches cached while reading: pictures of the same states are read camera by camera."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
+_BEGIN = _SCHEMA.serialize().size
+"""Offset of the first batch."""
+_MARK = b"\xff\xff\xff\xff"
+"""With it each message of Arrow begins."""
 
 
 class JournalEntry(NamedTuple):
@@ -295,24 +299,42 @@ def before_writing(flush: Callable[[], None]) -> None:
     _journal_thread.flush_first.append(weakref.WeakMethod(flush))
 
 
+class _BoundedFile:
+    """A file for Arrow, of which no more is read than there is: a damaged length would allocate what it claims."""
+
+    mode = "rb"
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.size = file.seek(0, os.SEEK_END)
+        self.seek, self.tell, self.close = file.seek, file.tell, file.close
+
+    @property
+    def closed(self) -> bool:
+        return self._file.closed
+
+    def read(self, size: int) -> bytes:
+        return self._file.read(min(size, max(self.size - self._file.tell(), 0)))
+
+
 class JournalReader:
     """Reads a journal up to its last complete batch."""
 
     def __init__(self, path: Path) -> None:
         """Raises OSError."""
         self.path = path
-        self._file = open_regular_file(path)
+        self._file = _BoundedFile(open_regular_file(path))
         self._batch = lru_cache(maxsize=_MOST_BATCHES)(self._read)
+        self._end = _BEGIN
+        """Of the last complete batch that was read."""
 
     def __iter__(self) -> Iterator[tuple[int, list[JournalEntry]]]:
         """Offset and entries of each batch. Raises OSError."""
+        begin = self._end = _BEGIN
         try:
-            self._file.seek(0)
-            if pa.ipc.read_schema(self._file) != _SCHEMA:
-                return
-            begin = self._file.tell()
             while True:
                 batch, end = self._batch(begin)
+                self._end = end
                 yield (
                     begin,
                     [JournalEntry(*row) for row in zip(*(column.to_pylist() for column in batch.columns))],
@@ -324,6 +346,30 @@ class JournalReader:
             if error.errno is not None:  # Arrow's own OSErrors have no errno
                 raise
 
+    def lost_bytes(self) -> int:
+        """Bytes from the batch on at which the last iteration ended, if complete batches follow it: the journal was damaged,
+        and not cut short. 0 if nothing is lost but what was being written. Raises OSError."""
+        size, at = self._file.size, self._end
+        while (at := self._find_batch(at + 1, size)) < size:
+            try:
+                self._read(at)
+            except (EOFError, OSError, pa.ArrowInvalid):
+                continue
+            return size - self._end
+        return 0
+
+    def _find_batch(self, begin: int, size: int) -> int:
+        """Offset of the next bytes with which a batch begins; `size` if there are none."""
+        held = b""
+        while begin < size:
+            self._file.seek(begin)
+            held = self._file.read(_BATCH_BYTES)
+            if (at := held.find(_MARK)) >= 0:
+                return begin + at
+            # The mark may lie across the end of what was read.
+            begin += max(len(held) - len(_MARK) + 1, 1)
+        return size
+
     def value(self, place: tuple[int, int]) -> bytes:
         """Value of an entry: `place` is its batch's offset and its number in the batch."""
         return self._batch(place[0])[0].column(2)[place[1]].as_py()
@@ -331,7 +377,9 @@ class JournalReader:
     def _read(self, begin: int) -> tuple[pa.RecordBatch, int]:
         """The batch at offset `begin`, and its end. Raises OSError, EOFError or ArrowInvalid if it is incomplete."""
         self._file.seek(begin)
-        return pa.ipc.read_record_batch(pa.ipc.read_message(self._file), _SCHEMA), self._file.tell()
+        batch = pa.ipc.read_record_batch(pa.ipc.read_message(self._file), _SCHEMA)
+        batch.validate(full=True)  # one with other offsets would crash this process
+        return batch, self._file.tell()
 
     def close(self) -> None:
         self._batch.cache_clear()

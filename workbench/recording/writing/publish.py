@@ -24,6 +24,11 @@ def try_folder(folder: Path) -> None:
     Raises:
         RecordingError: they cannot be written.
     """
+    try:
+        os.fspath(folder.absolute()).encode()
+    except UnicodeEncodeError as error:
+        why = "its name is not UTF-8, and rerun writes to no such folder. Choose another one"
+        raise RecordingError(f"Cannot record to {folder}: {why}.") from error
     there = next(parent for parent in (folder, *folder.absolute().parents) if os.path.lexists(parent))
     try:
         with tempfile.TemporaryFile(dir=there):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from workbench.authoring.loading.reference import (
     RecordedTask,
@@ -19,17 +19,20 @@ from workbench.authoring.loading.reference import (
     reference_to_class,
 )
 from workbench.authoring.problem import Problem
+from workbench.core.camera_data import CameraKey
 from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.policy import NoPolicy, find_policy
 from workbench.jobs.task import Stepped, TaskDescription, TaskOptions, changed_options
+from workbench.machine.processes.wire import pack
 from workbench.session.history.env_table import EnvTable
 from workbench.session.live.timeline import Timeline
 from workbench.session.live.view import PastLoad, SessionView
 from workbench.session.process.heartbeat import death_problem, own_files_of
-from workbench.session.process.supervisor import Death
+from workbench.session.process.supervisor import Death, End
 from workbench.session.protocol.messages import (
     SCENE_KEPT,
+    CameraFailed,
     Event,
     Load,
     Loaded,
@@ -103,8 +106,11 @@ class LiveState:
         """
         task, report, before = event.task, event.reload, self.now.task
         self._take_options(event.options)
-        kept = scene_kept(event)
-        if kept and before is not None:
+        kept, past = scene_kept(event), past_after(before, event, restored)
+        drawn = kept or (
+            past != "gone" and before is not None and pack(before.geometry) == pack(task.geometry)
+        )
+        if drawn and before is not None:
             # The same object, so that the page sees that it need not build the scene again.
             task = replace(task, geometry=before.geometry)
         self.set(
@@ -115,6 +121,7 @@ class LiveState:
             reload=report,
             activity="",
             stale=stale,
+            failed_cameras=self.now.failed_cameras if restored else {},
         )
         level, reason = (None, "the first version") if report is None else (report.level, report.reason)
         self._remember(PastLoad(time.time(), level, reason, self.now.load_milliseconds))
@@ -122,10 +129,10 @@ class LiveState:
         if not kept:
             # Broken rules of the new scene are reported after it.
             self.set(rules=None, rules_serial=self.now.rules_serial + 1)
-            same = restored and before is not None and before.source_hash == task.source_hash
-            self._new_scene(task, event.first, its_past_stays=same)
+            self._new_scene(task, event.first, its_past_stays=past != "gone", drawn=drawn)
         elif self.timeline is not None:
             self.set(step=self.timeline.history.replace_last(event.first))
+        if past != "gone" and self.timeline is not None:
             if before is None or before.source_hash != task.source_hash:
                 self.timeline.history.begin_version(task.outlier_rules)
                 self.versions.append((self.timeline.history.last + 1, task))
@@ -145,11 +152,11 @@ class LiveState:
             self.set_problem(None)
         self._set_running()
 
-    def _new_scene(self, task: TaskDescription, first: StepResult, its_past_stays: bool) -> None:
+    def _new_scene(self, task: TaskDescription, first: StepResult, its_past_stays: bool, drawn: bool) -> None:
         settings = self.now.settings
         selected = min(settings.selected_env, task.num_envs - 1)
         self.set(
-            scene_serial=self.now.scene_serial + 1,
+            scene_serial=self.now.scene_serial + (not drawn),
             settings=replace(settings, sliders=(), selected_env=selected),
             inspection=None,
         )
@@ -203,6 +210,8 @@ class LiveState:
                 made = {picture.key: picture for picture in event.pictures}
                 shown = {key: p for key, p in {**now.pictures, **made}.items() if key in watched}
                 self.new_pictures(pictures=shown, picture_milliseconds=event.milliseconds)
+        elif isinstance(event, CameraFailed):
+            self._cameras_failed({event.key: event.why})
         elif isinstance(event, Placed):
             self._placed(event)
         elif isinstance(event, Inspection):
@@ -221,6 +230,9 @@ class LiveState:
                 self.set(activity="")
                 self._set_running()
 
+    def _cameras_failed(self, failed: dict[CameraKey, str]) -> None:
+        self.set(failed_cameras={**self.now.failed_cameras, **failed})
+
     def _placed(self, event: Placed) -> None:
         if event.info is None or self.now.task is None:
             return
@@ -231,12 +243,15 @@ class LiveState:
         if self.timeline is not None:
             self.timeline.camera_moved(*event.key)
 
-    def died(self, death: Death, while_loading: bool, printed: str) -> Problem | None:
+    def died(
+        self, death: Death, while_loading: bool, printed: str, texts: Mapping[str, str] | None = None
+    ) -> Problem | None:
         """The worker is gone.
 
         Args:
             while_loading: a version was being loaded, so the running one is not to blame.
             printed: the last lines.
+            texts: source by path of what ran; None for that of the running version.
 
         Returns:
             The problem to show; None if the end was requested.
@@ -244,13 +259,20 @@ class LiveState:
         if while_loading:
             self._refuse_options(self.tried_options)
         problem = None
-        if not death.asked or death.stack:
-            task = self.now.task
-            source = {} if task is None or while_loading else task.source
-            problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, source)
+        asked = death.end is End.ASKED and not death.stack
+        if not asked and death.end is not End.HANDED_OVER:
+            if texts is None:
+                texts = {} if self.now.task is None else self.now.task.source
+            problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, texts)
             self.set_problem(problem)
             self.problem_at_run = not while_loading
-        if not death.file_waits:
+        if death.doing == "drawing" and death.end is not End.ASKED:
+            # The next worker would die of the same picture.
+            why = (
+                f"The worker process {death.why} while it drew. Untick it and tick it again to try once more."
+            )
+            self._cameras_failed({(camera.kind, camera.name): why for camera in self.now.settings.cameras})
+        if death.end not in (End.FILE_WAITS, End.HANDED_OVER):
             self.wants_play = False
         self.set(
             playing=False,
@@ -318,6 +340,10 @@ class LiveState:
         if new == before:
             return False
         self.set(settings=new)
+        if new.cameras != before.cameras:
+            # One that is asked for again is tried again.
+            kept = {camera.key for camera in before.cameras} & {camera.key for camera in new.cameras}
+            self.set(failed_cameras={key: why for key, why in self.now.failed_cameras.items() if key in kept})
         if new.selected_env != before.selected_env:
             # Without this the other env's picture would stay until a new one comes.
             self.new_pictures(pictures={})
@@ -345,7 +371,13 @@ class LiveState:
             self.reference = str(self.reference)
 
     def load_request(
-        self, source: dict[str, str] | None, snapshot: bytes | None = None, level: LoadLevel = "auto"
+        self,
+        source: dict[str, str] | None,
+        snapshot: bytes | None = None,
+        number: int = 0,
+        level: LoadLevel = "auto",
+        because: str = "",
+        same_scene: bool = False,
     ) -> Load:
         """See `Load`."""
         tried = self.tried_options if source is None else None
@@ -353,15 +385,16 @@ class LiveState:
         # The version that ran is brought back even if another class of the file was chosen since.
         reference = self.reference if source is None else self.running_reference
         any_task = self.now.task is None and isinstance(reference, str)
-        return Load(reference, options, source, level, snapshot, any_task)
+        return Load(reference, options, source, level, snapshot, any_task, number, because, same_scene)
 
     def settings(self) -> Settings:
         """Settings for the worker: without cameras if no page is open."""
         chosen = self.now.settings
+        cameras = tuple(camera for camera in chosen.cameras if camera.key not in self.now.failed_cameras)
         return replace(
             chosen,
             policy_folder=None if self.folder is None else str(self.folder),
-            cameras=chosen.cameras if self.clients > 0 else (),
+            cameras=cameras if self.clients > 0 else (),
         )
 
     @property
@@ -453,6 +486,28 @@ class LiveState:
         if moment is None:
             return view
         return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))
+
+
+def past_after(
+    before: TaskDescription | None, event: Loaded, restored: bool
+) -> Literal["same", "patched", "gone"]:
+    """What a load means for the history: it goes on and means the same, it goes on with other code, or another begins.
+
+    Args:
+        before: the version that ran before.
+        restored: it was brought back.
+    """
+    if before is None:
+        return "gone"
+    report, same_source = event.reload, before.source_hash == event.task.source_hash
+    if report is None:
+        return "same" if restored and same_source else "gone"
+    if report.level in SCENE_KEPT:
+        return "patched" if report.level == "patched" else "same"
+    same_task = before.chosen == event.task.chosen and before.num_envs == event.task.num_envs
+    if report.level != "restarted" or not same_task or not (same_source or report.same_scene):
+        return "gone"
+    return "same" if same_source else "patched"
 
 
 def scene_kept(event: Loaded) -> bool:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 from workbench.authoring.loading.reference import TaskName
 from workbench.core.capture.inspection import Section
@@ -22,7 +22,7 @@ from workbench.session.checks.checks import Checks
 from workbench.session.checks.profile import StepProfiler
 from workbench.session.checks.solve_seeds import SeedsSolver
 from workbench.session.history.env_table import EnvRows
-from workbench.session.live.live_state import LiveState, SharedState, scene_kept
+from workbench.session.live.live_state import LiveState, SharedState, past_after
 from workbench.session.live.solver import Solver
 from workbench.session.live.timeline import TimeTravel
 from workbench.session.live.versions import Versions
@@ -30,7 +30,7 @@ from workbench.session.live.view import SessionView
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.captured_output import PrintedLine, PrintedLog
 from workbench.session.process.heartbeat import Busy
-from workbench.session.process.supervisor import Death, Supervisor, WorkerOptions
+from workbench.session.process.supervisor import Death, End, Supervisor, WorkerOptions
 from workbench.session.protocol.messages import (
     Answer,
     EnterRecording,
@@ -38,6 +38,8 @@ from workbench.session.protocol.messages import (
     Inspect,
     Loaded,
     LoadFailed,
+    Loading,
+    NewProcessNeeded,
     Placed,
     PlanDropped,
     PlanWanted,
@@ -410,7 +412,8 @@ class Session:
     # --- events of the worker, on the session's thread -------------------------------------------
 
     def _on_death(self, death: Death) -> None:
-        self._recorder.stop()
+        if death.end is not End.HANDED_OVER:
+            self._recorder.stop()
         self.solver.stop()
         self.studio.interrupted()
         problem, kept = self.versions.died(death, self._printed.tail(20))
@@ -427,6 +430,7 @@ class Session:
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, LoadFailed) and self._worker.load_pending and event.problem.interrupted:
+            self.versions.failed(event)
             return  # interrupted because a newer version waits: no failure to report
         if isinstance(event, Loaded):
             self._on_loaded(event)
@@ -441,6 +445,10 @@ class Session:
         else:
             with self._lock:
                 self._state.take(event)
+                if isinstance(event, Loading):
+                    self.versions.began(event)
+                if isinstance(event, NewProcessNeeded):
+                    self.versions.new_process_needed(event)
             if isinstance(event, Placed):
                 self.studio.placed(event, self._state.now.task)
             if isinstance(event, LoadFailed):
@@ -453,14 +461,15 @@ class Session:
     def _on_loaded(self, event: Loaded) -> None:
         self._worker.reset_deaths()
         recording, one_each = self._recorder.recording, self._recorder.one_each
-        if not scene_kept(event) or (event.reload is not None and event.reload.level != "same"):
-            # An episode must not mix steps of two versions.
+        if event.reload is None or event.reload.level != "same":
+            # An episode must not mix steps of two versions, nor of two processes.
             self._recorder.stop()
         with self._lock:
             s = self._state
             restored, stale = self.versions.version_loaded(event.task)
             before = s.now.task
-            what_to_do = rescore_after_load(s.now.task, event, self.rescorer.rescoring.view)
+            past = past_after(before, event, restored)
+            what_to_do = rescore_after_load(past, self.rescorer.rescoring.view)
             rescored = None
             if what_to_do == "rescore" and s.timeline is not None:
                 rescored = RescoredPast(s.timeline.history)
@@ -481,15 +490,17 @@ class Session:
         self._send_settings()
         self.studio.send_placements(placed)
         if recording:
-            self._continue_recording(event, recording, one_each)
+            self._continue_recording(past, recording, one_each)
         with self._lock:
             to_enter, self._to_enter = self._to_enter, None
         if to_enter is not None:
             self._send_enter(*to_enter)
 
-    def _continue_recording(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
+    def _continue_recording(
+        self, past: Literal["same", "patched", "gone"], env_idx: tuple[int, ...], one_each: bool
+    ) -> None:
         """Continue recording these envs after a version came in."""
-        if not scene_kept(event):
+        if past == "gone":
             self.start_recording(env_idx, next_episode=one_each, goes_on=True)
         elif not self._recorder.recording:
             # No reset, which would lose the present moment: recording continues with each env's next episode.
@@ -497,10 +508,12 @@ class Session:
                 task = self._state.now.task
             if task is not None:
                 self._recorder.start(task, env_idx, one_each, goes_on=True)
+                self._send(SetCapture(env_idx, from_reset=True))
 
     def _on_stepped(self, event: Stepped) -> None:
         with self._lock:
             self._state.stepped(event)
+            self.versions.stepped(event)
             planned = self._state.now.settings.action_source == "solve"
         self.solver.stepped(event, planned)
         self._recorder.take(event)

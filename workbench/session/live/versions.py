@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from workbench.authoring.loading.modules import read_source
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem
-from workbench.jobs.task import TaskDescription, TaskOptions
+from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
 from workbench.session.live.live_state import SharedState
-from workbench.session.process.supervisor import Death
-from workbench.session.protocol.messages import Load, LoadFailed, LoadLevel, Play, Request
+from workbench.session.process.supervisor import Death, End
+from workbench.session.protocol.messages import (
+    Load,
+    LoadFailed,
+    Loading,
+    LoadLevel,
+    NewProcessNeeded,
+    Play,
+    Request,
+)
 
 Attempt = Literal["file", "moment", "version", "nothing"]
+_GOOD_VERSIONS = 2
+_PROVEN_SECONDS = 30.0
+"""A version that crashes its process later than this after it was loaded had worked."""
 
 
 class LoadInputs(NamedTuple):
@@ -24,6 +37,8 @@ class LoadInputs(NamedTuple):
     """Texts to use in place of the files; None for those on disk."""
     snapshot: bytes | None
     """The moment to restore."""
+    number: int
+    """`Load.number`."""
 
 
 def is_on_disk(source: Mapping[str, str]) -> bool:
@@ -37,24 +52,45 @@ def is_on_disk(source: Mapping[str, str]) -> bool:
     return True
 
 
-class Recovery:
-    """Chooses what the next worker loads after one has died.
+@dataclass
+class _GoodVersion:
+    """A version that was loaded without a failure."""
 
-    Loading may kill the worker again: the moment cannot be restored, importing the file crashes, memory runs out. So the
-    attempts are, in order: the file on disk (if a newer one waits), the last good version at its newest moment, the same
-    from its start, and at last nothing, until the file changes. None is tried twice, so that no file can kill workers one
-    after the other. Used under the session's lock.
+    file: str | None
+    source: dict[str, str]
+    since: float
+    """When it was loaded last."""
+    crashes: int = 0
+    """Of its process, one after the other, each soon after it was loaded."""
+    idle_crashes: int = 0
+    """Of these, those since its last step while nothing was asked of it."""
+
+
+class Recovery:
+    """Chooses what the next worker loads after one has ended.
+
+    Loading may end the worker again: the version is refused, the moment cannot be restored, importing the file crashes,
+    memory runs out. So the attempts are, in order: the file on disk if no worker has tried it yet, the last good version at
+    its newest moment, the same from its start, and at last nothing, until the file changes. None is tried twice, so that
+    no file can end workers one after the other. A version that crashes twice, each time soon after it was loaded, is no good
+    one: the version before it comes back. Without one it comes back itself, unless it crashed twice without making a step.
+    Used under the session's lock.
     """
 
-    def __init__(self, newest: Callable[[], bytes | None]) -> None:
+    def __init__(
+        self, newest: Callable[[], bytes | None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
         """
         Args:
             newest: returns the newest state of the batch, a pickled `core.snapshots.snapshot.Snapshot`, or None. Called
                 only when needed, since assembling one takes longer than a step.
         """
-        self._good: TaskDescription | None = None
-        self._newest = newest
+        self._newest, self._clock = newest, clock
+        self._good: list[_GoodVersion] = []
+        """The newest last; at most `_GOOD_VERSIONS`."""
         self._attempt: Attempt = "file"
+        self._asked = self._begun = 1
+        """Numbers of the newest load of the file that was asked for, and of the newest that a worker has begun."""
         self.loading = True
         """A load is running."""
         self._has_env = False
@@ -64,49 +100,102 @@ class Recovery:
         """Whether the running load brings back the last good version."""
         return self.loading and self._attempt in ("moment", "version")
 
+    @property
+    def good_source(self) -> dict[str, str] | None:
+        """Of the version that is brought back; None if there is none."""
+        return self._good[-1].source if self._good else None
+
+    @property
+    def file_waits(self) -> bool:
+        """Whether no worker has begun to load the file as it was saved last."""
+        return self._asked > self._begun
+
     def next_load(self) -> LoadInputs | None:
         """What a new worker has to load; None for nothing."""
         if self._attempt == "nothing":
             return None
         self.loading = True
-        good = self._good.source if self._good is not None and self._attempt != "file" else None
-        return LoadInputs(good or None, self._newest() if self._attempt in ("file", "moment") else None)
+        good = self.good_source if self._attempt != "file" else None
+        snapshot = self._newest() if self._attempt in ("file", "moment") else None
+        return LoadInputs(good or None, snapshot, self._asked if good is None else 0)
 
     def file_requested(self) -> LoadInputs:
         """The present worker is to load the file on disk."""
         self._attempt, self.loading = "file", True
-        return LoadInputs(None, None if self._has_env else self._newest())
+        self._asked += 1
+        return LoadInputs(None, None if self._has_env else self._newest(), self._asked)
+
+    def began(self, number: int) -> None:
+        """A worker has begun the load of this number."""
+        self._begun = max(self._begun, number)
 
     def loaded(self, task: TaskDescription) -> None:
         """`task` runs: it is the last good version from now on."""
-        self._good, self._has_env = task, True
-        self._attempt, self.loading = "file", False
+        now, last = self._clock(), self._good[-1] if self._good else None
+        if last is not None and last.file != task.file:
+            self._good, last = [], None  # no version of another file comes back
+        if last is not None and last.source == task.source:
+            last.since = now
+        else:
+            self._good = [*self._good, _GoodVersion(task.file, task.source, now)][-_GOOD_VERSIONS:]
+        self._has_env = True
+        self._attempt, self.loading = "file", self.file_waits
+
+    def stepped(self) -> None:
+        """A step was made, which somebody had asked for."""
+        if self._good:
+            self._good[-1].idle_crashes = 0
 
     def failed(self, kept: bool) -> bool:
-        """A load failed in a worker that still runs. True if it has no version now, and `next_load` has one to try."""
-        was_loading, self.loading = self.loading, False
-        if kept or not was_loading:
+        """A load failed in a worker that goes on. True if it has no version now, and `next_load` has one to try."""
+        was_loading, self.loading = self.loading, self.file_waits
+        if kept or not was_loading or self.file_waits:
             return False
         self._step_down()
         return self._attempt != "nothing"
 
-    def died(self, file_waits: bool) -> None:
-        """The worker is gone; `file_waits`: it was ended since a newer file waited to be loaded."""
-        if file_waits:
+    def died(self, crashed: bool, idle: bool = False) -> None:
+        """The worker is gone.
+
+        Args:
+            crashed: by itself, and not because it was ended or handed over.
+            idle: nothing was asked of it at the time.
+        """
+        if self.file_waits:
             self._attempt = "file"
         elif self.loading:
             self._step_down()
         elif self._attempt != "nothing":
-            self._attempt = "moment" if self._good is not None else "nothing"
+            self._after_running(crashed, idle)
         self.loading = self._has_env = False
 
     def restart_requested(self) -> None:
-        """A person restarts the worker: the last good version comes back, or the file if there is none."""
-        self._attempt = "file" if self._good is None else "moment"
-        self.loading = self._has_env = False
+        """A person restarts the worker, to load the file as it is now; if that is just being loaded (it may loop there), to
+        have the last good version back."""
+        for version in self._good:
+            version.crashes = version.idle_crashes = 0
+        if self.loading and not self.restoring and not self.file_waits and self._good:
+            return  # `died` goes on from there
+        self._attempt, self.loading, self._has_env = "file", False, False
+        self._asked += 1
+
+    def _after_running(self, crashed: bool, idle: bool) -> None:
+        if not self._good:
+            self._attempt = "nothing"
+            return
+        self._attempt, version = "moment", self._good[-1]
+        if not crashed:
+            return
+        proven = self._clock() - version.since > _PROVEN_SECONDS
+        version.crashes = 0 if proven else version.crashes + 1
+        version.idle_crashes = 0 if proven else version.idle_crashes + idle
+        if version.crashes > 1 and len(self._good) > 1:
+            self._good.pop()
+        elif version.idle_crashes > 1:
+            self._attempt = "nothing"
 
     def _step_down(self) -> None:
-        if self._good is None:
+        if not self._good:
             self._attempt = "nothing"
         elif self._attempt == "file":
             self._attempt = "moment" if self._newest() is not None else "version"
@@ -137,6 +226,8 @@ class Versions:
         self._on_save = on_save
         self._recovery = Recovery(shared.state.newest_moment)
         self._watcher = SourceWatcher(self._on_files_changed)
+        self._needed = NewProcessNeeded("", False)
+        """Why the next worker is a new process, where the last one said so."""
 
     def start(self) -> None:
         """Watch the task's own file from now on."""
@@ -151,7 +242,7 @@ class Versions:
         """
         with self._shared.lock:
             state = self._shared.state
-            request = state.load_request(*self._recovery.file_requested(), level)
+            request = state.load_request(*self._recovery.file_requested(), level=level)
             stopped = state.now.state == "stopped"
         if stopped:
             self._replace_worker()  # the new one loads the file, see `first_requests`
@@ -179,7 +270,7 @@ class Versions:
         self.reload()
 
     def restart_worker(self) -> None:
-        """Kill the worker and start another with the last good version at its newest moment."""
+        """Kill the worker and start another, which loads the file as it is now, at the newest moment."""
         with self._shared.lock:
             self._recovery.restart_requested()
         self._replace_worker()
@@ -200,7 +291,10 @@ class Versions:
             requests: list[Request] = [state.settings()]
             next_load = self._recovery.next_load()
             if next_load is not None:
-                requests.append(state.load_request(*next_load))
+                needed, self._needed = self._needed, NewProcessNeeded("", False)
+                requests.append(
+                    state.load_request(*next_load, because=needed.reason, same_scene=needed.same_scene)
+                )
             else:
                 state.wait_for_file()
             if state.wants_play:
@@ -223,6 +317,19 @@ class Versions:
             task = self._shared.state.now.task
             return None if task is None else self._shared.state.load_request(dict(task.source))
 
+    def began(self, loading: Loading) -> None:
+        """The worker has begun a load. Under the lock."""
+        self._recovery.began(loading.number)
+
+    def stepped(self, event: Stepped) -> None:
+        """The worker has made a step. Under the lock."""
+        if event.step.action is not None:
+            self._recovery.stepped()
+
+    def new_process_needed(self, needed: NewProcessNeeded) -> None:
+        """The worker ends and leaves the load to the next one. Under the lock."""
+        self._needed = needed
+
     # --- results -------------------------------------------------------------------------------------
 
     def version_loaded(self, task: TaskDescription) -> tuple[bool, bool]:
@@ -240,16 +347,21 @@ class Versions:
         self._follow(task.source_files, {} if stale else task.source)
 
     def failed(self, failed: LoadFailed) -> None:
-        """A load failed; a worker without a version gets the next attempt of `Recovery`."""
+        """A load failed; a worker without a version gets the next attempt of `Recovery`, unless it is spoiled and ends."""
         with self._shared.lock:
-            next_load = self._recovery.next_load() if self._recovery.failed(failed.kept) else None
+            if failed.spoiled:
+                self._needed = NewProcessNeeded("a refused version had run in the process", False)
+                next_load = None
+            else:
+                next_load = self._recovery.next_load() if self._recovery.failed(failed.kept) else None
             request = None if next_load is None else self._shared.state.load_request(*next_load)
             task = self._shared.state.now.task
         if request is not None:
             self._send(request)
         if failed.problem.file is not None:
-            # It may be a module that the task has never imported without an error, so it is in no `source_files`.
-            self._follow((*(() if task is None else task.source_files), failed.problem.file), {})
+            # It may be a module that the task has never imported without an error, so it is in no `source_files`; or one of
+            # another folder, and a person mends it there.
+            self._follow(() if task is None else task.source_files, {}, Path(failed.problem.file))
 
     def died(self, death: Death, printed: str) -> tuple[Problem | None, bool]:
         """The worker is gone.
@@ -262,18 +374,29 @@ class Versions:
         """
         with self._shared.lock:
             while_loading = self._recovery.loading
-            self._recovery.died(death.file_waits)
-            problem = self._shared.state.died(death, while_loading, printed)
+            texts = self._loading_texts() if while_loading else None
+            self._recovery.died(death.end is End.DIED, idle=death.doing is None)
+            problem = self._shared.state.died(death, while_loading, printed, texts)
             return problem, self._shared.state.now.task is not None
+
+    def _loading_texts(self) -> Mapping[str, str]:
+        """Source by path of the version that is being loaded, as far as it is known. Under the lock."""
+        if self._recovery.restoring:
+            good = self._recovery.good_source
+            return {} if good is None else good
+        if self._recovery.file_waits:
+            # It was saved again since: its lines on disk are not those that ran.
+            return dict.fromkeys(self._shared.state.own_files(), "")
+        return {}
 
     def close(self) -> None:
         """Stop watching."""
         self._watcher.stop()
 
-    def _follow(self, paths: Iterable[str], texts: Mapping[str, str]) -> None:
-        """Watch the task's own file, and those of `paths` in its folder."""
+    def _follow(self, paths: Iterable[str], texts: Mapping[str, str], at_fault: Path | None = None) -> None:
+        """Watch the task's own file, those of `paths` in its folder, and the one that `at_fault` names, wherever it is."""
         own_file, folder = self._shared.state.own_file, self._shared.state.own_folder
         if own_file is None or folder is None:
             return
         modules = [Path(p) for p in paths if Path(p).is_relative_to(folder)]
-        self._watcher.follow({own_file, *modules}, texts)
+        self._watcher.follow({own_file, *modules, *([] if at_fault is None else [at_fault])}, texts)

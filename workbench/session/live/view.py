@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -49,6 +50,10 @@ class ShownCameras:
     """The camera that is placed by hand."""
     preview: bool = False
     """That camera is shown in another size than its own."""
+    failed: Mapping[CameraKey, str] = field(default_factory=dict)
+    """Why cameras cannot be drawn, as sentences."""
+    hidden: tuple[str, ...] = ()
+    """Bodies that the task hides from its sensors."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +100,8 @@ class SessionView:
     pictures: dict[tuple[CameraKind, str], Picture] = field(default_factory=dict)
     pictures_serial: int = 0
     picture_milliseconds: float | None = None
+    failed_cameras: Mapping[CameraKey, str] = field(default_factory=dict)
+    """Why cameras cannot be drawn, as sentences; they are left out."""
     problem: Problem | None = None
     problem_serial: int = 0
     refused: Problem | None = None
@@ -157,6 +164,8 @@ class SessionView:
             task.can_render,
             studio.selected,
             studio.preview_scale != 1.0,
+            self.failed_cameras,
+            task.geometry.hidden_names,
         )
 
     @property

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum, auto
 
 from workbench.authoring.problem import shorten
 from workbench.machine.processes.family import describe_exit
@@ -16,13 +17,18 @@ from workbench.session.process.memory_limit import format_size
 from workbench.session.process.worker_process import Output, WorkerProcess
 from workbench.session.protocol.messages import (
     Answer,
+    EnterRecording,
     Event,
     ListenForDebugger,
     Load,
     Loaded,
     Loading,
     Request,
+    Reset,
+    Restore,
+    SingleStep,
     WarmUp,
+    hands_over,
 )
 
 _LOOK = 0.1
@@ -63,16 +69,25 @@ class WorkerOptions:
     """The first worker loads nothing until a debugger has attached."""
 
 
+class End(Enum):
+    """How a worker came to its end."""
+
+    DIED = auto()
+    ASKED = auto()
+    """By `Supervisor.replace`."""
+    FILE_WAITS = auto()
+    """It was killed because it did not begin a load."""
+    HANDED_OVER = auto()
+    """It said that another process has to go on, see `messages.hands_over`."""
+
+
 @dataclass(frozen=True)
 class Death:
     """The end of a worker."""
 
     why: str
     """For example ``was killed by SIGSEGV``."""
-    asked: bool
-    """It was ended by `Supervisor.replace`."""
-    file_waits: bool
-    """It was ended because it did not begin a load."""
+    end: End
     doing: str | None
     """What it was doing; None for an idle worker."""
     stack: str
@@ -205,6 +220,9 @@ class Supervisor:
         self._load_sent: float | None = None
         self._replace_asked = False
         self._closing = False
+        self._hands_over = False
+        self._pressed: list[Request] = []
+        """Waits for the next worker."""
         self._deaths = 0
         self._interrupted: tuple[int, float] | None = None
         self._lives = 0
@@ -232,11 +250,16 @@ class Supervisor:
         return self._load_sent is not None
 
     def send(self, request: Request) -> None:
-        """Send to the current worker. Between two workers the request is lost; `first_requests` must include its effect."""
+        """Send to the current worker. While one hands over to the next, what a person pressed waits. Everything else that is
+        sent between two workers is lost; `first_requests` must include its effect."""
         with self._condition:
             worker = self._worker
             if isinstance(request, Load) and self._load_sent is None:
                 self._load_sent = time.monotonic()
+            if self._hands_over:
+                if isinstance(request, SingleStep | Reset | Restore | EnterRecording):
+                    self._pressed.append(request)
+                return
         if worker is not None:
             worker.send(request)
 
@@ -291,7 +314,7 @@ class Supervisor:
                 worker.stop(grace=0.0)
             why = f"was lost by the thread that supervises it ({type(error).__name__}: {shorten(str(error))})"
         try:
-            self._on_death(Death(why, False, False, None, "", gives_up))
+            self._on_death(Death(why, End.DIED, None, "", gives_up))
         except Exception as failure:
             report_failure("The page cannot be told that the worker was lost", failure)
         with self._condition:
@@ -315,8 +338,15 @@ class Supervisor:
             first = self._lives == 0
             worker.send(ListenForDebugger(self._options.debug_port, self._options.debug_wait and first))
         self._lives += 1
-        for request in self._first_requests():
-            worker.send(request)
+        requests = self._first_requests()
+        if not any(isinstance(request, Load) for request in requests):
+            # No version to bring back: the mended file, which comes next, finds shaders and imports ready.
+            requests.append(Call(0, self._warm_up))
+        with self._condition:
+            requests += self._pressed
+            self._pressed, self._hands_over = [], False
+            for request in requests:
+                worker.send(request)
         state = _WorkerState()
         try:
             self._serve(worker, state)
@@ -344,14 +374,13 @@ class Supervisor:
         worker.stop(grace=0.0)
         with self._condition:
             self._worker = None
-            asked = self._replace_asked
-            self._deaths += 0 if asked or state.file_waits else 1
+            if self._replace_asked:
+                state.end = End.ASKED
+            self._deaths += state.end is End.DIED
             gives_up = self._deaths >= _MOST_DEATHS
         seen = state.stack if state.stack_of == beat.number else ""
         stack = report if fatal_error(report) is not None else seen
-        self._on_death(
-            Death(state.why or describe_exit(code), asked, state.file_waits, _doing(beat), stack, gives_up)
-        )
+        self._on_death(Death(state.why or describe_exit(code), state.end, _doing(beat), stack, gives_up))
         with self._condition:
             if gives_up:
                 self._condition.wait_for(lambda: self._replace_asked or self._closing)
@@ -366,8 +395,15 @@ class Supervisor:
                 self._load_sent = None
             if isinstance(event, Loaded) and self._spare is not None:
                 self._spare.begin_soon()
+            if hands_over(event):
+                with self._condition:
+                    self._hands_over = True
             if event is not None:
                 self._on_event(event)
+            if hands_over(event):
+                state.end, state.why = End.HANDED_OVER, "was ended for another to go on"
+                worker.kill()
+                raise EOFError
             if time.monotonic() - looked >= _LOOK:
                 looked = time.monotonic()
                 self._check(worker, state)
@@ -408,7 +444,7 @@ class Supervisor:
                 self.interrupt()
             elif waited > _LOAD_WAITS and ignored is not None and ignored > _LONGEST_SILENCE:
                 state.why = f"did not answer for {waited:.0f} s"
-                state.file_waits = True
+                state.end = End.FILE_WAITS
                 self._end(worker, state)
         seconds = min(beat.seconds, now - state.held_changed)
         if not beat.held and seconds < _LONG.get(beat.doing, _BUSY):
@@ -460,7 +496,7 @@ class _WorkerState:
 
     why: str | None = None
     """Why the supervisor ended it."""
-    file_waits: bool = False
+    end: End = End.DIED
     stack: str = ""
     stack_of: int = 0
     """Number of the piece of work of `stack`."""

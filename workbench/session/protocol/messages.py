@@ -53,6 +53,12 @@ class Load(Question["Loaded"]):
     """Pickled `core.snapshots.snapshot.Snapshot` to restore after a build, by name, where shapes match."""
     any_task: bool = False
     """If no class is named and the first one fails, open another task of the file."""
+    number: int = 0
+    """Counts the loads of the file on disk; 0 for a version that is brought back."""
+    because: str = ""
+    """Why a new process loads it, for the `ReloadReport`."""
+    same_scene: bool = False
+    """A new process loads it, and the scene is built by the same code as before."""
 
 
 @dataclass(frozen=True)
@@ -283,11 +289,28 @@ def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
 # --- events: worker to server --------------------------------------------------------------------
 
 
+def hands_over(event: object) -> bool:
+    """Whether the worker ends with this event, and another one is to go on."""
+    return isinstance(event, NewProcessNeeded) or (isinstance(event, LoadFailed) and event.spoiled)
+
+
 @dataclass(frozen=True)
 class Loading:
     """What a load is doing, for the status line."""
 
     activity: str
+    number: int = 0
+    """Of the `Load`."""
+
+
+@dataclass(frozen=True)
+class NewProcessNeeded:
+    """The worker's answer to a `Load` that it must not do: the version that runs left something in this process that no
+    reload takes back. The worker ends; the next one loads the file at the newest moment."""
+
+    reason: str
+    same_scene: bool
+    """Only code that runs at resets and steps differs, if any does."""
 
 
 @dataclass(frozen=True)
@@ -301,6 +324,8 @@ class ReloadReport:
     """After a build: names of actors, articulations and attributes that kept their state."""
     not_carried: dict[str, str] = field(default_factory=dict)
     """Names of those that did not, each with the reason."""
+    same_scene: bool = False
+    """As `Load.same_scene`."""
 
 
 @dataclass(frozen=True)
@@ -329,6 +354,9 @@ class LoadFailed:
     """The tasks of the file, the one that was tried first; empty where the file has only one or none was tried."""
     options: TaskOptions | None = None
     """Those of the `Load` that failed; None if the problem came later."""
+    spoiled: bool = False
+    """The refused version's code ran in this process and may have left anything there: the worker ends, and the next one
+    brings the last good version back."""
 
 
 @dataclass(frozen=True)
@@ -361,6 +389,14 @@ class Pictures:
     """None where steps were made meanwhile, which took part of the time."""
     number: int
     """`Stepped.number` of the moment that they show."""
+
+
+@dataclass(frozen=True)
+class CameraFailed:
+    """A camera that cannot be drawn, and is left out until other cameras are watched or another version is loaded."""
+
+    key: CameraKey
+    why: str
 
 
 @dataclass(frozen=True)
@@ -443,12 +479,14 @@ class RulesBroken:
 
 Event = (
     Loading
+    | NewProcessNeeded
     | Loaded
     | LoadFailed
     | Stepped
     | PlanWanted
     | PlanDropped
     | Pictures
+    | CameraFailed
     | Placed
     | PastPictures
     | Inspection

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from workbench.core.capture.recorded_run import pose_distances
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.rescore.verdict import Scores, Verdict, compare, scalar_entries
-from workbench.jobs.task import TaskDescription
 from workbench.session.history.history import History, Moment
 from workbench.session.process.askers import Background
 from workbench.session.process.job_lane import Job, JobFailed
-from workbench.session.protocol.messages import Load, Loaded
+from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import MomentToRescore, RescoredMoments, RescoreMoments
 from workbench.session.rescore.background import RescoreView, Rescoring, StoppedBy
 
@@ -222,13 +221,16 @@ _SUMMARY_EVERY = 0.5
 
 
 def rescore_after_load(
-    before: TaskDescription | None, loaded: Loaded, view: RescoreView
+    past: Literal["same", "patched", "gone"], view: RescoreView
 ) -> Literal["rescore", "keep", "forget"]:
-    """Whether to rescore the history with the loaded version, keep the last results, or forget them with the episodes."""
-    level = None if before is None or loaded.reload is None else loaded.reload.level
-    if level == "patched":
+    """Whether to rescore the history with the loaded version, keep the last results, or forget them with the episodes.
+
+    Args:
+        past: what the load means for the history.
+    """
+    if past == "patched":
         return "rescore"
-    if level in ("same", "cameras"):
+    if past == "same":
         # Saved again without a relevant change: resume the job that the save stopped.
         return "rescore" if view.stopped_by is StoppedBy.SAVE else "keep"
     return "forget"

@@ -81,7 +81,7 @@ def group_episodes(
         try:
             info = _info_of(episode)
         except (UnreadableRecording, OSError) as error:
-            broken_files.append(Verdict(episode, why_not=str(error)))
+            broken_files.append(Verdict(episode, why_not=str(error), damaged=True))
             continue
         try:
             text = recorded_content(info).hash if recorded_source else ""

@@ -164,6 +164,7 @@ def as_rows(verdicts: Sequence[Verdict[Source]]) -> list[dict[str, Any]]:
             "first_state_put_in": verdict.start_differs,
             "not_carried": "; ".join(f"{what}: {why}" for what, why in verdict.missed.items()),
             "not_judged": verdict.why_not,
+            "damaged": verdict.damaged,
         }
         for verdict in verdicts
     ]

@@ -70,7 +70,7 @@ class Review:
     def __init__(
         self,
         library: Library,
-        read: Callable[[LibraryRow, SharedShapes], Episode] | None = None,
+        read: Callable[[LibraryRow, SharedShapes, Callable[[], bool]], Episode] | None = None,
         make_scene: SceneProcess | None = None,
         clock: Callable[[], float] = time.monotonic,
         most_bytes: int | None = None,
@@ -79,8 +79,8 @@ class Review:
         """
         Args:
             library: finds recordings by their ids.
-            read: reads the recording of a row, sharing shapes with others; raises OSError or UnreadableRecording with a
-                sentence. None for `read_recording`.
+            read: reads the recording of a row, sharing shapes with others, until it is stopped; raises OSError or
+                UnreadableRecording with a sentence. None for `read_recording`.
             make_scene: for recordings without a scene; None leaves them without.
             clock: seconds.
             most_bytes: of memory for the recordings of one opening; None for `MEMORY_SHARE`.
@@ -88,7 +88,9 @@ class Review:
         """
         self._most_bytes = int(MEMORY_SHARE * total_memory()) if most_bytes is None else most_bytes
         self._library, self._make_scene, self._clock = library, make_scene, clock
-        self._read = read or (lambda row, shapes: read_recording(row.source, shapes, library.folder))
+        self._read = read or (
+            lambda row, shapes, stopped: read_recording(row.source, shapes, library.folder, stopped)
+        )
         self._memory = memory
         self._changed = threading.Condition()
         self._view = ReviewView()
@@ -228,7 +230,7 @@ class Review:
                 self._change(loading=_opening_text(rows, done))
             stamps = _stamps_of(row)
             try:
-                episode = _shared(self._read(row, shapes), shapes)
+                episode = _shared(self._read(row, shapes, lambda: number != self._opening), shapes)
                 opened.append(Opened(row.id, row.name, episode, find_events(episode)))
                 files.update(stamps)
                 problems += [broken.sentence for broken in episode.broken_files]

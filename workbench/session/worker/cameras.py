@@ -20,7 +20,7 @@ from workbench.authoring.loading.load import LoadedTask, load_task, undo_load
 from workbench.authoring.loading.reference import reference_to_class
 from workbench.authoring.problem import problem_from_exception
 from workbench.authoring.source.names import Project
-from workbench.authoring.source.read_values import module_of
+from workbench.authoring.source.read_values import classes_of, module_of
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core import maniskill_private
 from workbench.core.camera_data import CameraKey, CameraSettings, Picture, PictureDegree
@@ -44,6 +44,7 @@ from workbench.core.cameras.visibility import (
     small_size,
 )
 from workbench.core.capture.state_columns import read_state_columns
+from workbench.core.drawing import CannotDraw
 from workbench.core.env.cpu_scene import BatchedCpuScene
 from workbench.core.env.hot_swap import keep_observation_space, put_class, undone
 from workbench.core.env.task_env import TaskEnv
@@ -53,6 +54,7 @@ from workbench.core.scene.shapes import Mesh
 from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.task import ShownPictures
 from workbench.session.protocol.messages import (
+    CameraFailed,
     CameraRequest,
     CannotAnswer,
     DrawPast,
@@ -179,6 +181,9 @@ class WorkerCameras:
         self.settle()  # the same scene is about to be drawn
         try:
             pictures = take_pictures(opened.env.env, request.env, request.cameras, request.poses)
+        except CannotDraw as error:
+            self.failed(error)
+            return
         except (RuntimeError, ValueError, IndexError) as error:
             self._task.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
             return
@@ -201,7 +206,10 @@ class WorkerCameras:
         for env in request.env_idx:
             if self._task.line.waits():
                 raise CannotAnswer("it was cancelled")
-            drawn += step_pictures(opened.env, [env], wanted)
+            try:
+                drawn += step_pictures(opened.env, [env], wanted)
+            except CannotDraw as error:
+                raise CannotAnswer(str(error)) from error
         return Captured(columns, tuple(drawn))
 
     # --- what the worker does to the scene -----------------------------------------------------------
@@ -233,10 +241,21 @@ class WorkerCameras:
 
     def finish_picture(self) -> None:
         """Finish the picture under way; call before the envs move."""
-        if self._begun is not None:
-            self._begun.pictures.finish()
-            self._begun, self._left = None, []
-            self._wanted = bool(self._there)
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            self._left, self._wanted = [], bool(self._there)
+            try:
+                begun.pictures.finish()
+            except CannotDraw as error:
+                self.failed(error)
+
+    def failed(self, error: CannotDraw) -> None:
+        """Leave out a camera that cannot be drawn, and say so."""
+        self._begun, self._left = None, []
+        self._there = tuple(camera for camera in self._there if camera.key != error.key)
+        self._hurried.discard(error.key)
+        self._wanted = bool(self._there)
+        self._task.line.send(CameraFailed(error.key, str(error)))
 
     def put_back(self) -> None:
         """Place the placed cameras again; call when the scene's cameras may be new ones."""
@@ -292,6 +311,9 @@ class WorkerCameras:
             if made is None:
                 self._begin_round(opened.env)
             self._begin(opened.env)
+        except CannotDraw as error:
+            self.failed(error)
+            return
         except RuntimeError as error:
             self._watch(())  # until other cameras are requested, or another version is loaded
             self._task.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
@@ -439,7 +461,7 @@ def answer_question(
     )
 
 
-def _draw_temporary(opened: OpenedTask, question: DrawCamera) -> Picture:
+def _draw_temporary(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Picture:
     """A picture in another size than the camera's, or by a camera that the env does not have."""
     settings, scale = question.settings, question.scale
     if settings is None or not 0 < scale <= LARGEST_SCALE:
@@ -447,6 +469,14 @@ def _draw_temporary(opened: OpenedTask, question: DrawCamera) -> Picture:
     size = (max(1, round(settings.width * scale)), max(1, round(settings.height * scale)))
     info = opened.description.camera(question.key)
     placement = Placement(settings, question.key[0], None if info is None else info.mount)
+    if (
+        info is not None
+        and placed.settings(info.key) is None
+        and settings == info.settings
+        and not info.varies
+    ):
+        # Where it is, to the last bit: its own quaternion may not be of unit length.
+        placement = placement_of(opened.env.env, info.key, question.env)
     picture = picture_of(opened.env.env, question.env, placement, question.poses, size)
     wanted = question.modalities
     return replace(
@@ -460,7 +490,7 @@ def _draw_temporary(opened: OpenedTask, question: DrawCamera) -> Picture:
 def _draw(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Picture:
     env, key = opened.env.env, question.key
     if question.scale != 1.0 or opened.description.camera(key) is None:
-        return _draw_temporary(opened, question)
+        return _draw_temporary(opened, placed, question)
     before = placed.settings(key)
     if question.settings is not None:
         placed.place(env, key, question.settings)
@@ -542,7 +572,7 @@ def _changed_attributes(before: Mapping[str, str], after: Mapping[str, str], own
     named = {n.attr for path in edited for n in new.file(path).nodes if isinstance(n, ast.Attribute)}
     found: dict[str, Any] = {}
     for name in named & vars(owner).keys():
-        was, stores = old.attribute_stores(name), new.attribute_stores(name)
+        was, stores = (project.attribute_stores(name, classes_of(type(owner))) for project in (old, new))
         if len(was) != 1 or len(stores) != 1 or was[0].value is None or stores[0].value is None:
             continue
         if ast.dump(was[0].value) != ast.dump(stores[0].value):

@@ -97,10 +97,17 @@ class GuardedTask:
         self.opened: OpenedTask | None = None
         self.requested_file: Path | None = None
         """The file that was requested last, loaded or not."""
+        self.failed = False
+        """`opened` has failed while it ran: what it was doing may be half done."""
+        self.spoiled = False
+        """A refused version's code ran in this process, which has to end."""
 
-    def run(self, doing: Doing | None, work: Callable[[], object]) -> Problem | None:
+    def run(self, doing: Doing | None, work: Callable[[], object], loads: bool = False) -> Problem | None:
         """Run `work`; if `doing` is not None it may run the author's code, and can be interrupted. Returns the failure,
         which was sent.
+
+        Args:
+            loads: `work` loads a version, which a failure refuses.
 
         A BaseException that is no Exception (KeyboardInterrupt, which only the author's code raises here, or a class of
         theirs) is a failure; an Exception is the workbench's own, and ends the process.
@@ -123,8 +130,11 @@ class GuardedTask:
             if isinstance(error, Interrupted):
                 self.line.drop_steps()
             problem = problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error))
-            self.fail(problem)
-            self.restore_last_step()
+            if loads:
+                self.refuse(LoadFailed(problem, kept=self.opened is not None, spoiled=True))
+            else:
+                self.fail(problem)
+                self.restore_last_step()
             return problem
         finally:
             self.heartbeat.begin("idle")
@@ -158,9 +168,15 @@ class GuardedTask:
         return interrupted
 
     def fail(self, problem: Problem) -> None:
-        """Send a failure, and stop playing."""
+        """Send a failure while the task runs, and stop playing."""
+        self.failed = self.failed or problem.stage != "policy"
         self.line.send(LoadFailed(problem, kept=self.opened is not None))
         self._on_failure()
+
+    def refuse(self, failed: LoadFailed) -> None:
+        """Send that a version was refused."""
+        self.spoiled = failed.spoiled
+        self.line.send(failed)
 
     def restore_last_step(self) -> None:
         """Put the batch back to the end of the last step, after one that was cut short."""

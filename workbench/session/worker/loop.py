@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.modules import executed_modules
 from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
 from workbench.core.capture.inspect_env import inspect_env
@@ -31,6 +32,7 @@ from workbench.machine.processes.debugger import (
     listening_text,
     wait_for_debugger,
 )
+from workbench.machine.processes.time_limit import end_after
 from workbench.machine.processes.wire import Call, Question, pack
 from workbench.session.process.heartbeat import Doing, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
@@ -87,7 +89,8 @@ from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
 from workbench.session.worker.make_scene import SceneEnv, draw_task, registered_ids
 from workbench.session.worker.pacing import Pacer, Rate, Shares, throttled
 from workbench.session.worker.plans import FollowedPlan, WorkerPlans, envs_to_plan, succeeded
-from workbench.session.worker.reload import Running, load_version
+from workbench.session.worker.process_state import ProcessState, read_process_state
+from workbench.session.worker.reload import Running, load_version, why_new_process
 from workbench.session.worker.step_events import StepEvents
 
 _STATUS_PERIOD = 0.25
@@ -130,6 +133,10 @@ class Worker:
         self._rules_reported = RulesBroken(())
         self._rules_serial: tuple[object, int] = None, 0
         self._quit = False
+        self._state_at_start: ProcessState = {}
+        """Before any version was loaded."""
+        self._state_when_loaded: ProcessState | None = None
+        """When the load of the running version had ended."""
         self._handlers: dict[type, Callable[[Any], None]] = {
             Load: self._load,
             Play: self._play,
@@ -152,15 +159,18 @@ class Worker:
     def run(self) -> None:
         """Run until the server sends Quit or closes the connection."""
         self._interrupts.install()
-        while not (self._quit or self._line.closed):
+        self._state_at_start = read_process_state()
+        while not self._ends:
             self._heartbeat.begin("idle")
             self._line.listen(self._sleep())
-            while (request := self._line.next()) is not None:
+            while not self._ends and (request := self._line.next()) is not None:
                 if isinstance(request, Call):
                     self._call(request)
                     continue
                 work = partial(self._handlers[type(request)], request)
-                self._task.run(_DOING.get(type(request)), work)
+                self._task.run(_DOING.get(type(request)), work, loads=isinstance(request, Load))
+            if self._ends:
+                return
             if self._playing and self._step_due(time.monotonic()):
                 self._pacer.spend()
                 self._task.run("stepping", partial(self._task.guarded, self._step_once))
@@ -172,6 +182,10 @@ class Worker:
             self._send_status(time.monotonic())
             if time.monotonic() - self._rules_sent > _STATUS_PERIOD:
                 self._send_rules()
+
+    @property
+    def _ends(self) -> bool:
+        return self._quit or self._task.spoiled or self._line.closed
 
     # --- questions ---------------------------------------------------------------------------------
 
@@ -247,35 +261,47 @@ class Worker:
         return min(waits)
 
     def _load(self, request: Load) -> None:
+        running, when_loaded = self._running, self._state_when_loaded
+        if running is not None and when_loaded is not None:
+            needed = why_new_process(request, running, self._task.failed, self._state_at_start, when_loaded)
+            if needed is not None:
+                self._line.send(needed)
+                self._quit = True
+                return
+        self._line.send(Loading("loading", request.number))
+        executed = executed_modules()
         try:
             self._load_version(request, self._line.send)
         except TaskError as error:
             self._task.drop_steps_if_interrupted(error)
             kept = self._task.opened is not None
-            self._line.send(LoadFailed(error.problem, kept, error.classes, request.options))
+            spoiled = executed_modules() > executed
+            self._task.refuse(LoadFailed(error.problem, kept, error.classes, request.options, spoiled))
+
+    @property
+    def _running(self) -> Running | None:
+        opened = self._task.opened
+        if opened is None or self._loaded_by is None or self._last is None:
+            return None
+        return Running(self._loaded_by, opened, self._last)
 
     def _load_version(self, request: Load, send: Callable[[Loaded], None]) -> None:
         self._cameras.settle()
         with self._start_folder.again():
             self._task.requested_file = named_file(request.task)
-        before, running = self._task.opened, None
-        if before is not None and self._loaded_by is not None and self._last is not None:
-            running = Running(self._loaded_by, before, self._last)
-        try:
-            # A load starts in the first current folder; if it fails, the previous version's comes back.
-            with self._start_folder.again(stay=True):
-                opened, report = load_version(
-                    request,
-                    running,
-                    Opening(
-                        on_activity=lambda activity: self._line.send(Loading(activity)),
-                        on_finding=lambda finding: None,  # see `_send_rules`
-                        begins_anew=True,
-                    ),
-                )
-        except TaskError:
-            self._cameras.put_back()  # trying the new cameras removed the old ones
-            raise
+        running = self._running
+        # A load starts in the first current folder; if it fails, the previous version's comes back.
+        with self._start_folder.again(stay=True):
+            opened, report = load_version(
+                request,
+                running,
+                Opening(
+                    on_activity=lambda activity: self._line.send(Loading(activity, request.number)),
+                    on_finding=lambda finding: None,  # see `_send_rules`
+                    begins_anew=True,
+                ),
+            )
+        self._state_when_loaded = read_process_state()
         # No interrupt here: it would leave the page with another task than the worker's.
         with self._interrupts.shielded():
             self._replace_task(opened, report, request, send)
@@ -288,6 +314,7 @@ class Worker:
         self._plans.loaded(opened, None if report is None else report.level)
         self._followed.forget()
         before, self._task.opened = self._task.opened, opened
+        self._task.failed = False
         self._loaded_by, self._last = request, opened.first
         if report is None or report.level not in ("same", "patched"):
             self._cameras.forget_placed()
@@ -532,7 +559,15 @@ class Worker:
             self._cameras.settle()  # the same scene is about to be drawn
         acted_by = "" if restored else self._chooser.name
         event = self._steps.event(
-            self._task.opened, step, reset_mask, seeds, restored, acted_by, resumed, self._cameras.placed
+            self._task.opened,
+            step,
+            reset_mask,
+            seeds,
+            restored,
+            acted_by,
+            resumed,
+            self._cameras.placed,
+            self._cameras.failed,
         )
         self._shares.add("recorded", self._steps.recording_took, time.monotonic())
         self._cameras.scene_changed()
@@ -609,4 +644,5 @@ def work(connection: int, heartbeat: HeartbeatWriter) -> None:
     torch.set_num_threads(1)
     mark_camera_configs()
     treat_ctrl_c_as_error()
+    end_after()
     Worker(connection, heartbeat).run()

@@ -14,7 +14,7 @@ from workbench.core.env import actions
 from workbench.core.env.hot_swap import put_class
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv, given_arguments
-from workbench.core.maniskill_private import objects_of
+from workbench.core.maniskill_private import objects_of, tool_of
 from workbench.core.scene.scene_index import scene_index
 from workbench.core.snapshots.snapshot import Snapshot
 from workbench.jobs.open_task import OpenedTask
@@ -244,7 +244,7 @@ def _body_to_trace(rolled: TaskEnv, name: str) -> int | None:
     names = scene_index(env).names
     if name in names:
         return names.index(name)
-    tool = getattr(env.agent, "tcp", None)
+    tool = tool_of(env.agent)
     if tool is not None:
         found = scene_index(env).name_of(objects_of(tool)[0])
         if found is not None:

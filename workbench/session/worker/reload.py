@@ -10,10 +10,16 @@ import numpy as np
 from workbench.authoring.loading.blamed import blamed, returns_check
 from workbench.authoring.loading.load import LoadedTask, RefusedClass, load_task, undo_load, with_late_imports
 from workbench.authoring.loading.modules import read_source
-from workbench.authoring.loading.reference import reference_to_class
+from workbench.authoring.loading.reference import named_file, reference_to_class
 from workbench.authoring.problem import Interrupted, TaskError
 from workbench.authoring.reload.call_graph import line_in
-from workbench.authoring.reload.level import RESET_HOOKS, Change, find_change, inherited_names
+from workbench.authoring.reload.level import (
+    RESET_HOOKS,
+    Change,
+    find_change,
+    inherited_names,
+    removed_effects,
+)
 from workbench.checks.evidence.places import rules_of_outliers
 from workbench.core.broken_rule import BrokenRules
 from workbench.core.cameras.render import list_cameras
@@ -27,7 +33,6 @@ from workbench.core.env.hot_swap import (
 )
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
-from workbench.core.maniskill_private import task_class
 from workbench.core.rules import Finding
 from workbench.core.snapshots.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.jobs.open_task import (
@@ -40,7 +45,14 @@ from workbench.jobs.open_task import (
     with_advice,
 )
 from workbench.jobs.task import changed_options
-from workbench.session.protocol.messages import Load, ReloadReport
+from workbench.machine.parse_python import parse_python
+from workbench.session.protocol.messages import Load, NewProcessNeeded, ReloadReport
+from workbench.session.worker.process_state import (
+    ProcessState,
+    changed_settings,
+    read_process_state,
+    threads_of,
+)
 
 
 @dataclass(frozen=True)
@@ -72,7 +84,7 @@ def load_version(
     changed. No picture may be under way.
 
     Raises:
-        TaskError: the version does not work; `running` is unchanged.
+        TaskError: the version does not work. If its code ran, nothing that it did is undone: the process has to end.
     """
     opening = opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
@@ -87,10 +99,7 @@ def load_version(
             if found is not None:
                 return found, None
         else:
-            same = running.opened.loaded.chosen == loaded.chosen
-            knows_others = same or not loaded.alternatives
-            if same and not isinstance(error.__cause__, _MAY_BE_OF_THE_BATCH):
-                raise  # a misspelt name cannot depend on the batch: report it without trying one env
+            knows_others = running.opened.loaded.chosen == loaded.chosen or not loaded.alternatives
         raise with_advice(
             error,
             loaded,
@@ -98,10 +107,6 @@ def load_version(
             lambda: load_task(request.task, source=request.source),
             knows_others,
         ) from error.__cause__
-
-
-_MAY_BE_OF_THE_BATCH = (RuntimeError, ValueError, TypeError, IndexError)
-"""What torch and numpy raise for shapes, which may be right with one env."""
 
 
 def _open_another(request: Load, tried: LoadedTask, error: TaskError, opening: Opening) -> OpenedTask | None:
@@ -144,6 +149,62 @@ def _bring_in(
         # The running version must not use the failed one's helper modules and registrations.
         undo_load(loaded)
         raise
+
+
+# --- which process ---------------------------------------------------------------------------------
+
+
+def why_new_process(
+    request: Load, running: Running, failed: bool, at_start: ProcessState, when_loaded: ProcessState
+) -> NewProcessNeeded | None:
+    """What the running version left in this process that no reload takes back; None if nothing, or if the new version
+    leaves it too.
+
+    Args:
+        failed: it raised while it ran.
+        at_start: settings of the process before any version was loaded.
+        when_loaded: after the running version was loaded.
+    """
+    before = with_late_imports(running.opened.loaded)
+    same_file = named_file(request.task) == named_file(running.request.task)
+    texts = _earlier_modules(before, request) if same_file else {}
+    if same_file and before.file is not None and not _is_python(texts.get(str(before.file))):
+        return None  # it is refused before any of it runs
+    while_running = changed_settings(when_loaded, read_process_state()) + threads_of(before.source)
+    at_load = changed_settings(at_start, when_loaded)
+    gone = removed_effects(before.source, texts) if before.followed else ""
+    if not (failed or while_running or at_load or gone):
+        return None
+    inherited = inherited_names(before.cls, {*before.source})
+    change = find_change(before.source, texts, str(before.file), before.class_name, inherited)
+    same_scene = same_file and before.followed and change.level != "rebuilt"
+    if failed:
+        reason = "the version before failed while it ran"
+    elif while_running:
+        reason = f"the version before has changed {_some(while_running)}"
+    elif same_scene or not before.followed:
+        return None  # what was imported and built stays as it is
+    elif at_load:
+        reason = f"the version before has changed {_some(at_load)}"
+    else:
+        reason = f"what {gone} did when it was imported cannot be taken back"
+    return NewProcessNeeded(reason, same_scene)
+
+
+def _is_python(text: str | None) -> bool:
+    """Whether a file's text can be executed; None if the file cannot be read."""
+    if text is None:
+        return False
+    try:
+        parse_python(text)
+    except (SyntaxError, ValueError, RecursionError):
+        return False
+    return True
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - 2} more" if len(names) > 2 else ""
+    return ", ".join(names[:2]) + more
 
 
 # --- which level -----------------------------------------------------------------------------------
@@ -211,37 +272,29 @@ def _exchange(
     opened, env = running.opened, running.opened.env.env
     if change.level == "cameras" and not can_exchange_cameras(env):
         raise _MustRebuild(f"{change.reason}, and cameras cannot be exchanged here")
-    before = task_class(env)
     rules = opened.env.broken_rules or BrokenRules({})
-    kept_rules = rules.copy()
+    # Nothing of this is undone if it fails: the process ends then.
     put_class(env, loaded.cls)
     left: dict[str, str] = {}
-    try:
-        if change.level != "same":
-            rules.edited(lambda row: _find_place(row, opened.loaded, loaded))
-        task = TaskEnv(
-            env,
-            loaded.max_episode_steps,
-            check=returns_check(loaded, opened.env.num_envs),
-            obs=opened.env.obs,
-        )
-        if change.level == "cameras":
-            with blamed("build", loaded, task):
-                exchange_cameras(env)
-        if change.tried_hooks:
-            resets = "_initialize_episode" in change.tried_hooks
-            with blamed("reset", loaded, task), rules.during("reset", confirms=resets):
-                left = rehearse_hooks(env, change.tried_hooks)
-        clock.lap("rehearse")
-        first = running.last if change.level == "same" else _rescore(task, loaded, running.last, change)
-        if change.level != "same":
-            keep_observation_space(env, task.obs)
-    except BaseException:
-        put_class(env, before)
-        rules.put_back(kept_rules)
-        if change.level == "cameras":
+    if change.level != "same":
+        rules.edited(lambda row: _find_place(row, opened.loaded, loaded))
+    task = TaskEnv(
+        env,
+        loaded.max_episode_steps,
+        check=returns_check(loaded, opened.env.num_envs),
+        obs=opened.env.obs,
+    )
+    if change.level == "cameras":
+        with blamed("build", loaded, task):
             exchange_cameras(env)
-        raise
+    if change.tried_hooks:
+        resets = "_initialize_episode" in change.tried_hooks
+        with blamed("reset", loaded, task), rules.during("reset", confirms=resets):
+            left = rehearse_hooks(env, change.tried_hooks)
+    clock.lap("rehearse")
+    first = running.last if change.level == "same" else _rescore(task, loaded, running.last, change)
+    if change.level != "same":
+        keep_observation_space(env, task.obs)
     clock.lap("rescore")
     loaded = with_late_imports(loaded)
     description = replace(
@@ -253,11 +306,11 @@ def _exchange(
         chosen=loaded.chosen,
         others=loaded.others,
         in_place_of=None,
-        notices=notices_of(loaded, running.request.options),
+        cameras=list_cameras(env) if change.level == "cameras" else opened.description.cameras,
         outlier_rules=rules_of_outliers(loaded, running.request.options.rules),
     )
-    if change.level == "cameras":
-        description = replace(description, cameras=list_cameras(env))
+    notices = notices_of(loaded, running.request.options, description.cameras)
+    description = replace(description, notices=notices)
     report = ReloadReport(change.level, change.reason, not_carried=left)
     return OpenedTask(loaded, task, description, first, clock.laps), report
 
@@ -312,8 +365,9 @@ def _build(
         raise
     opening.clock.lap("restore")
     level = "restarted" if running is None else "rebuilt"
-    reason = change.reason if running is not None else "the worker was restarted"
-    report = ReloadReport(level, reason, restored.carried, dict(restored.not_carried))
+    reason = change.reason if running is not None else request.because or "the worker was restarted"
+    same_scene = request.same_scene and bool(restored.carried)
+    report = ReloadReport(level, reason, restored.carried, dict(restored.not_carried), same_scene)
     return replace(opened, first=first, milliseconds=opening.clock.laps), report
 
 

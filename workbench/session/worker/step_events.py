@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from workbench.core.camera_data import CameraKey, CameraSettings, Picture
 from workbench.core.cameras.render import recorded_pictures, step_pictures
 from workbench.core.capture.state_columns import read_state_columns
+from workbench.core.drawing import CannotDraw
 from workbench.core.env.step_result import StepResult
 from workbench.core.snapshots.packing import PackedSnapshot, SnapshotPacker
 from workbench.core.snapshots.snapshot import Snapshot
@@ -29,6 +31,8 @@ class StepEvents:
         self._recording: set[int] = set()
         self._from_reset: set[int] = set()
         self._columns_fail = False
+        self._undrawable: set[CameraKey] = set()
+        """Cameras of the scene that failed."""
         self.moment: Snapshot | None = None
         """The batch at the newest event, to restore after a step that was cut short; None if it cannot be copied."""
         self.number = 0
@@ -41,6 +45,7 @@ class StepEvents:
         self.capture((), from_reset=False)
         self._packer = SnapshotPacker()
         self._columns_fail = False
+        self._undrawable.clear()
 
     def capture(self, env_idx: tuple[int, ...], from_reset: bool) -> None:
         """As `SetCapture`; an env that is captured already continues, also with `from_reset`."""
@@ -69,16 +74,20 @@ class StepEvents:
         acted_by: str,
         resumed: bool,
         placed: dict[CameraKey, CameraSettings],
+        on_failed: Callable[[CannotDraw], None],
     ) -> Stepped:
-        """The next event; see `Stepped` for the arguments."""
+        """The next event; see `Stepped` for the arguments.
+
+        Args:
+            on_failed: called with a camera that cannot be drawn, which is recorded without pictures.
+        """
         self.number += 1
         captured: tuple[Picture, ...] = ()
         columns: dict[str, NDArray] = {}
         began = time.monotonic()
         if self.pictures_due(step, reset_mask):
             columns = self._state_columns(opened)
-            wanted = recorded_pictures(opened.description.cameras)
-            captured = tuple(step_pictures(opened.env, sorted(self._recording), wanted))
+            captured = self._pictures(opened, on_failed)
         self.recording_took = time.monotonic() - began
         packed = self._packed_snapshot(opened)
         return Stepped(
@@ -96,6 +105,15 @@ class StepEvents:
             placed if columns or captured else {},
             resumed,
         )
+
+    def _pictures(self, opened: OpenedTask, on_failed: Callable[[CannotDraw], None]) -> tuple[Picture, ...]:
+        while True:
+            cameras = [camera for camera in opened.description.cameras if camera.key not in self._undrawable]
+            try:
+                return tuple(step_pictures(opened.env, sorted(self._recording), recorded_pictures(cameras)))
+            except CannotDraw as failed:
+                self._undrawable.add(failed.key)
+                on_failed(failed)
 
     def _state_columns(self, opened: OpenedTask) -> dict[str, NDArray]:
         """Of this moment; empty for a task whose ``get_state_dict`` raises, which is printed once."""

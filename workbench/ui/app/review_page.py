@@ -375,6 +375,7 @@ class ReviewPage:
                 self._pictures_serial,
                 episode.segmentation,
                 view.selected,
+                hidden=() if episode.geometry is None else episode.geometry.hidden_names,
             )
         )
 

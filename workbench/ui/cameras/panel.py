@@ -12,6 +12,7 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
+from workbench.machine.text import listed
 from workbench.session.cameras.studio import PREVIEW_MODALITIES
 from workbench.session.cameras.view import PickedPixel, StudioCamera
 from workbench.session.live.session import Session
@@ -106,6 +107,10 @@ class _Camera:
     """The picture and the modalities that its images show."""
     stale: bool = False
     """Whether its pictures are marked as of another moment."""
+    failed: str = ""
+    """Why it cannot be drawn."""
+    hidden: tuple[str, ...] = ()
+    """What the task hides from it."""
 
     def wanted(self) -> tuple[str, ...]:
         return tuple(modality for modality, tick in self.ticks.items() if tick.value)
@@ -157,8 +162,8 @@ class CamerasPanel:
         if seen.cameras_serial != self._cameras_serial:
             self._cameras_serial = seen.cameras_serial
             self._build(seen)
+        self._mark(seen)
         self._ask(seen)
-        self._mark_stale(seen)
         for camera in self._cameras.values():
             for image in camera.images.values():
                 image.settle()
@@ -247,8 +252,9 @@ class CamerasPanel:
             self._ask_for(wanted)
         for camera in self._cameras.values():
             for modality, tick in camera.ticks.items():
-                camera.captions[modality].visible = tick.value
-                camera.images[modality].show(tick.value)
+                shown = tick.value and not camera.failed
+                camera.captions[modality].visible = shown
+                camera.images[modality].show(shown)
 
     def _wanted_of(self, key: CameraKey, camera: _Camera, seen: ShownCameras) -> tuple[str, ...]:
         """The ticked modalities; for a camera that is being placed also what the Studio shows, in full size."""
@@ -257,14 +263,16 @@ class CamerasPanel:
             return wanted
         return tuple(m for m in modalities_of(camera.info) if m in (COLOUR, self._studio_shows(), *wanted))
 
-    def _mark_stale(self, seen: ShownCameras) -> None:
-        """Mark shown pictures that are not of the present moment."""
+    def _mark(self, seen: ShownCameras) -> None:
+        """Mark cameras that cannot be drawn, and shown pictures that are not of the present moment."""
         for key, camera in self._cameras.items():
             picture = seen.pictures.get(key)
             here = picture is not None and picture.env == seen.env
             stale = not here and any(image.visible for image in camera.images.values())
-            if stale != camera.stale:
-                camera.stale = stale
+            hidden = seen.hidden if camera.info.kind == "sensor" else ()
+            marks = stale, seen.failed.get(key, ""), hidden
+            if marks != (camera.stale, camera.failed, camera.hidden):
+                camera.stale, camera.failed, camera.hidden = marks
                 camera.facts.content = facts(camera)
 
     def _draw_camera(self, camera: _Camera, picture: Picture, seen: ShownCameras) -> None:
@@ -325,6 +333,12 @@ class StudioPicture:
             picture = studio.preview
             self._session.studio.draw_preview()
         self._picture.settle()
+        failed = "" if key is None else view.failed_cameras.get(key, "")
+        if failed:
+            self._drawn = None
+            self._picture.show(False)
+            self._caption.content, self._caption.visible = render("note", text=failed), True
+            return
         # The last picture stays until the next comes; another camera's does not.
         self._picture.show(self._drawn is not None and self._drawn[0] == key)
         self._caption.visible = self.visible and bool(self._caption.content)
@@ -351,7 +365,14 @@ def modalities_of(info: CameraInfo) -> tuple[str, ...]:
 def facts(camera: _Camera) -> str:
     """The line under a camera's name."""
     fovy = f"{np.degrees(camera.info.fovy):.0f}°"
-    return render("camera_facts", info=camera.info, fovy=fovy, stale=camera.stale)
+    return render(
+        "camera_facts",
+        info=camera.info,
+        fovy=fovy,
+        stale=camera.stale,
+        failed=camera.failed,
+        hidden=listed(camera.hidden, 3),
+    )
 
 
 # --- a press on the picture shows the body, the depth and the point there ---------------------------

@@ -114,7 +114,7 @@ class Banner(PagePart[SessionView]):
                 self._panel.visible = False
             self._drawn = None
             return
-        stopped = view.state == "stopped"
+        stopped = _stopped(view)
         self._restart.visible = stopped
         self._rebuild.visible = view.task is not None and not stopped and problem.stage in _MAY_BE_OLD
         # Written once for each problem: a new text would close an open traceback.
@@ -152,18 +152,24 @@ def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) ->
     return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view), link=link)
 
 
+def _stopped(view: SessionView) -> bool:
+    """Whether no worker has a version, and none will be started unasked."""
+    lost = view.problem is not None and view.problem.stage == "worker"
+    return view.state == "stopped" or (lost and view.state == "error")
+
+
 def _kept(view: SessionView) -> str:
     """Which version still runs, in a sentence."""
-    if view.state == "stopped":
-        return "The worker process is gone. Restart the worker to continue."
+    if _stopped(view):
+        return "No process runs the task. Restart the worker to load the file as it is now."
     if view.task is None and not (view.problem is not None and view.problem.file):
         return "There is nothing to show yet. Open another task (Ctrl O) or change how the envs are made (Run tab)."
     if view.task is None:
         return "No version has loaded yet. Fix the file and save it, and the page will show it."
+    if view.state in ("starting", "loading"):
+        return "A new process is taking over; the last good version will be back where it was."
     if view.problem is not None and view.problem.stage == "worker":
-        if view.state in ("starting", "loading"):
-            return "Another worker is taking over; the last good version will be restored where it was."
-        return "The last good version is restored where it was, and paused."
+        return "The last good version is back where it was, and paused."
     if view.playing:
         return "The last good version is still running."
     return "The last good version is still shown."
@@ -219,14 +225,14 @@ def busy_html(busy: Busy, view: SessionView, link: LinkTo = no_links) -> str:
     if busy.ignores_interrupt:
         advice = (
             "It did not stop when it was interrupted: it is in native code, or it catches every exception. Restart "
-            "ends the process and restores the last good version where it was."
+            "ends the process and loads the file as it is now; while it loads, the last good version comes back instead."
         )
     elif busy.drawing:
         advice = "The renderer is working. The first picture may take a while; Restart ends the process."
     else:
         advice = (
             "It may only be slow. Interrupt stops it there and shows the traceback; Restart ends the process and "
-            "restores the last good version where it was. Saving a fixed file does the same."
+            "loads the file as it is now. Saving a fixed file does the same."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
     return render("busy", subject=subject, busy=busy, advice=advice, link=link)

@@ -196,5 +196,5 @@ def assignments(values: dict[str, object]) -> str:
 def local_time(written: str) -> str:
     try:
         return datetime.datetime.fromisoformat(written).astimezone().strftime("%Y-%m-%d %H:%M:%S")
-    except ValueError:
+    except (ValueError, OverflowError):
         return written

@@ -76,14 +76,18 @@ async def send_file(
         fields["Content-Encoding"] = "gzip"
     if reply.download_as is not None:
         # RFC 6266: browsers take the encoded form for any name.
-        quoted = urllib.parse.quote(reply.download_as, safe="")
-        fields["Content-Disposition"] = f"attachment; filename*=UTF-8''{quoted}"
+        fields["Content-Disposition"] = f"attachment; filename*=UTF-8''{_quoted(reply.download_as)}"
     sent = _Sent(200, HTTPStatus.OK.phrase, Headers(fields))
     try:
         await _pour(connection, file, Response.serialize(sent), length)
     finally:
         await asyncio.to_thread(file.close)
     return sent
+
+
+def _quoted(name: str) -> str:
+    """A file's name for an address; of one that is not UTF-8 the bytes are escaped."""
+    return urllib.parse.quote(name.encode(errors="backslashreplace"), safe="")
 
 
 def _open(reply: FileReply, accepts_gzip: bool) -> tuple[BinaryIO, int, bool]:
@@ -158,7 +162,7 @@ class Downloads:
         with self._lock:
             key = self._ids.setdefault(reply, secrets.token_urlsafe(16))
             self._files[key] = reply
-        return f"{PREFIX}{key}/{urllib.parse.quote(path.name, safe='')}"
+        return f"{PREFIX}{key}/{_quoted(path.name)}"
 
     def _answer(self, asked: str) -> tuple[int, str, bytes] | FileReply:
         with self._lock:

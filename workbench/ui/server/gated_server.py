@@ -193,7 +193,7 @@ class _AccessCheck:
         connection.close_timeout = RESPONSE_SECONDS
         if isinstance(decision, access.Entered):
             return entered_reply(decision)
-        return await admitted_reply(routes, viser_hook, connection, request, decision.authority)
+        return await admitted_reply(routes, viser_hook, connection, request, decision.authority, self._told)
 
     def say_the_rest(self) -> None:
         """At the end: print what was held back, and how many requests were refused in all."""

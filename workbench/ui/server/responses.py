@@ -8,7 +8,6 @@ import functools
 import gzip
 import hashlib
 import html
-import logging
 import mimetypes
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
@@ -23,6 +22,7 @@ from workbench.machine.folders import web_assets_folder
 from workbench.machine.text import short_line
 from workbench.ui.server import access, viser_private
 from workbench.ui.server.file_response import FileReply, send_file
+from workbench.ui.server.strangers import RareLog
 
 Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
 """Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns status, content type
@@ -59,8 +59,6 @@ LONGEST_NAME = 255
 """Bytes of a file's name, in every usual file system."""
 LONGEST_PATH = 3000
 """Bytes of a path below a folder."""
-
-_log = logging.getLogger("workbench.door")
 
 
 def request_parts(request: Request) -> access.RequestParts:
@@ -113,6 +111,7 @@ async def admitted_reply(
     connection: ServerConnection,
     request: Request,
     authority: str,
+    told: RareLog,
 ) -> Response:
     page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
     # Decoded once, as viser does: what is still encoded is part of a file's name.
@@ -139,8 +138,8 @@ async def admitted_reply(
     def work() -> Response | FileReply:
         try:
             made = handler(path[len(prefix) :])
-        except Exception:
-            _log.exception("The route %s failed on %s.", prefix, short_line(path, 300))
+        except Exception as error:
+            told.happened(("route", prefix), f"The route {prefix} failed on {short_line(path, 200)}.", error)
             made = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
         if isinstance(made, FileReply):
             return made

@@ -111,7 +111,8 @@ class Connection(ServerConnection):
         if self.protocol.state is CONNECTING:
             self._head_bytes += len(data)
             if self._head_bytes > LONGEST_HEAD:
-                if self.request is None:
+                # After a head that is none `websockets` has closed its side, and nothing can be written.
+                if self.request is None and self.protocol.handshake_exc is None:
                     self.transport.write(_TOO_LONG)
                     self.transport.close()
                 else:
@@ -151,7 +152,9 @@ def unsent(connection: ServerConnection) -> int:
     return waiting + in_kernel
 
 
-async def close_when_stalled(connection: ServerConnection, unanswered: Callable[[], int] = lambda: 0) -> None:
+async def close_when_stalled(
+    connection: ServerConnection, told: RareLog, unanswered: Callable[[], int] = lambda: 0
+) -> None:
     """Close the connection when its client has read nothing for `READ_WITHIN` seconds. A task of the connection.
 
     A suspended browser or a sleeping laptop behind ``ssh -L`` keeps its connection open for hours. What waits for it is
@@ -171,14 +174,14 @@ async def close_when_stalled(connection: ServerConnection, unanswered: Callable[
         # Looks are counted, not seconds: while this machine sleeps no client can read.
         silent = 0 if left == 0 or left < before else silent + 1
         before = left
-    log.warning(
-        "Closed a browser's connection: it has read nothing for %.0f s. It may reconnect at any time.",
-        READ_WITHIN,
+    told.happened(
+        "stalled",
+        f"Closed a browser's connection: it has read nothing for {READ_WITHIN:.0f} s. It may reconnect at any time.",
     )
     connection.transport.abort()
 
 
-# --- log lines about them ----------------------------------------------------------------------------
+# --- log lines about them, and about all else that clients cause ----------------------------------------------------------------------------
 
 PAUSE = 60.0
 """Seconds between two lines of the same kind, at first."""
@@ -204,12 +207,13 @@ class RareLog:
         """Number of lines held back, and the last of them."""
         self._lock = threading.Lock()
 
-    def happened(self, kind: Hashable, sentence: str) -> None:
+    def happened(self, kind: Hashable, sentence: str, error: BaseException | None = None) -> None:
         """Log an event, or count it if its kind was logged recently.
 
         Args:
             kind: Events of equal kind count as the same.
             sentence: The line, with a full stop; control characters are shown escaped.
+            error: Logged with its traceback, if the line is.
         """
         now = time.monotonic()
         with self._lock:
@@ -224,8 +228,12 @@ class RareLog:
             self._silent_until[kind] = now + pause
             self._pauses[kind] = min(2 * pause, LONGEST_PAUSE)
             before, _ = self._untold.pop(kind, (0, ""))
-        for line in (*rest, _line(sentence, before)):
+        for line in rest:
             self._say(line)
+        if error is None:
+            self._say(_line(sentence, before))
+        else:
+            log.error("%s", _line(sentence, before), exc_info=error)
 
     def say_the_rest(self) -> None:
         """Log all that was held back; for the end of the program."""

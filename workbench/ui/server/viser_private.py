@@ -26,11 +26,13 @@ import viser._gui_api
 import viser._gui_handles
 import viser._icons
 import viser._messages
+import viser._threadpool_exceptions
 import viser.infra
 import viser.infra._infra
 import websockets.asyncio.server
 from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 
 from workbench.machine.processes.child_python import unchanged_environment
@@ -74,10 +76,14 @@ PRIVATE_NAMES = (
     *(f"messages.{name}" for name in (*sorted(KINDS), *REFUSED_FROM_CLIENTS)),
     "gui.AssignablePropsBase._queue_update",
     "gui._TabContainerMixin._rebuild_tab_props",
+    "callbacks.print_threadpool_errors",
+    "callbacks.print_awaited_callback_error",
+    "callbacks.traceback.print_exception",
 )
 """Names that this module relies on.
 
-``infra`` is ``viser.infra._infra``, ``messages`` ``viser._messages``, ``gui`` ``viser._gui_handles``.
+``infra`` is ``viser.infra._infra``, ``messages`` ``viser._messages``, ``gui`` ``viser._gui_handles``, ``callbacks``
+``viser._threadpool_exceptions``.
 """
 
 PRIVATE_ATTRIBUTES = (
@@ -181,7 +187,12 @@ def _missing(root: object, dotted: tuple[str, ...]) -> list[str]:
 
 def missing_names() -> list[str]:
     """Those of `PRIVATE_NAMES` that the installed viser does not have."""
-    roots = SimpleNamespace(infra=infra, messages=viser._messages, gui=viser._gui_handles)
+    roots = SimpleNamespace(
+        infra=infra,
+        messages=viser._messages,
+        gui=viser._gui_handles,
+        callbacks=viser._threadpool_exceptions,
+    )
     return _missing(roots, PRIVATE_NAMES)
 
 
@@ -260,6 +271,11 @@ def _watched(
     handler: Callable[[ServerConnection], Awaitable[None]], served: list[viser.ViserServer], told: RareLog
 ) -> Callable[[ServerConnection], Awaitable[None]]:
     async def watched(connection: ServerConnection) -> None:
+        if connection.subprotocol != f"viser-v{viser.__version__}":
+            # viser prints the client's version and sends it back, of any length.
+            told.happened("version", "Refused a page that another version of viser has served: reload it.")
+            await connection.close(1002, f"Version mismatch. Server: {viser.__version__}")
+            return
         receive = connection.recv
         guard = PageGuard(ViserPage(connection, served), told)
 
@@ -273,7 +289,7 @@ def _watched(
         line = Line(connection)
         connection.recv = receive_checked  # type: ignore[method-assign,assignment]
         connection.send = line.send  # type: ignore[method-assign,assignment]
-        listening = asyncio.create_task(close_when_stalled(connection, lambda: line.unanswered))
+        listening = asyncio.create_task(close_when_stalled(connection, told, lambda: line.unanswered))
         try:
             await handler(connection)
         except MalformedMessage as error:
@@ -290,21 +306,49 @@ def _watched(
     return watched
 
 
-@contextlib.contextmanager
-def _quiet_viser() -> Iterator[None]:
-    """Drop what viser prints: ``verbose=False`` does not stop its start and stop lines. Only calls from viser are
-    dropped, others may print meanwhile."""
-    print_rich = rich.print
+class _Terminal(logging.Filter):
+    """Keeps what viser, `websockets` and asyncio print and log of pages to some lines a minute: a page could fill the
+    terminal, by each frame a line, by each connection a traceback. Installed once in a process."""
 
-    def print_unless_viser(*things: Any, **options: Any) -> None:
-        if not sys._getframe(1).f_globals.get("__name__", "").startswith("viser"):
-            print_rich(*things, **options)
+    def __init__(self) -> None:
+        super().__init__()
+        self.told = RareLog()
+        self._installed = False
 
-    rich.print = print_unless_viser
-    try:
-        yield
-    finally:
-        rich.print = print_rich
+    def install(self) -> None:
+        if self._installed:
+            return
+        self._installed = True
+        for name in (_WEBSOCKETS_LOG, "asyncio"):
+            logging.getLogger(name).addFilter(self)
+        print_rich = rich.print
+
+        def print_unless_viser(*things: Any, **options: Any) -> None:
+            # ``verbose=False`` does not stop its lines of start, stop and refused pages. Others may print meanwhile.
+            if not sys._getframe(1).f_globals.get("__name__", "").startswith("viser"):
+                print_rich(*things, **options)
+
+        rich.print = print_unless_viser
+        callbacks: Any = viser._threadpool_exceptions
+        callbacks.print = lambda *things, **options: None
+        callbacks.traceback = SimpleNamespace(print_exception=self._callback_failed)
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.levelno < logging.WARNING:
+            return True
+        error = record.exc_info[1] if record.exc_info else None
+        if record.levelno >= logging.ERROR and not _has_left(error):
+            kind = record.name, record.pathname, record.lineno, type(error)
+            self.told.happened(kind, record.getMessage(), error)
+        return False
+
+    def _callback_failed(self, kind: object, error: BaseException, *_: object) -> None:
+        frames = traceback.extract_tb(error.__traceback__)
+        place = (frames[-1].filename, frames[-1].lineno) if frames else None
+        self.told.happened(("callback", type(error), place), "What a page asked for failed.", error)
+
+
+_terminal = _Terminal()
 
 
 @dataclass(frozen=True)
@@ -355,7 +399,7 @@ class GatedViser:
         if not loop.is_closed():
             with contextlib.suppress(RuntimeError):  # closed since: nothing is left to drop
                 loop.call_soon_threadsafe(drop)
-        with _making, _quiet_viser():
+        with _making:
             self.server.stop()
 
 
@@ -389,6 +433,8 @@ def make_viser(
         listening.close()
         raise _moved("viser no longer has " + ", ".join(missing))
     read_icons_once()
+    _terminal.install()
+    _terminal.told = told
     real_serve = websockets.asyncio.server.serve
     serving: list[websockets.asyncio.server.serve] = []
     served: list[viser.ViserServer] = []
@@ -422,15 +468,13 @@ def make_viser(
         real = infra.websockets
         infra.websockets = look_alike  # type: ignore[assignment]
         try:
-            with _quiet_viser():
-                # Where viser binds if it ever stops calling our serve: loopback, any port.
-                server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
+            # Where viser binds if it ever stops calling our serve: loopback, any port.
+            server = viser.ViserServer(host="127.0.0.1", port=0, label=label, verbose=False)
         finally:
             infra.websockets = real
     missing = _missing(server, PRIVATE_ATTRIBUTES)
     if missing or len(serving) != 1:
-        with _quiet_viser():
-            server.stop()
+        server.stop()
         listening.close()
         raise _moved(
             "viser did not start its server the known way" if not missing else f"viser has no {missing}"
@@ -444,21 +488,19 @@ def make_viser(
     return GatedViser(server, serving[0])
 
 
+_WEBSOCKETS_LOG = "workbench.door.websockets"
+
+
 def _quiet_logger() -> logging.Logger:
-    """Logger for `websockets`: a port scanner's garbage, or a browser that leaves before its response is complete, must
-    not put a traceback into the author's terminal."""
-    logger = logging.getLogger("workbench.door.websockets")
+    """Logger for `websockets`."""
+    logger = logging.getLogger(_WEBSOCKETS_LOG)
     logger.setLevel(logging.WARNING)
-    if not logger.filters:
-        logger.addFilter(_is_news)
     return logger
 
 
-def _is_news(record: logging.LogRecord) -> bool:
-    if record.getMessage() == "opening handshake failed":
-        return False
-    error = record.exc_info[1] if record.exc_info else None
-    if not isinstance(error, AssertionError):
-        return True
-    # `websockets` ends a connection after its response and asserts that it is still open: here the client has left.
-    return traceback.extract_tb(error.__traceback__)[-1].name != "send_eof"
+def _has_left(error: BaseException | None) -> bool:
+    """Whether it comes from a port scanner's garbage, or from a browser that leaves before its response is complete."""
+    if isinstance(error, AssertionError):
+        # `websockets` ends a connection after its response and asserts that it is still open: here the client has left.
+        return traceback.extract_tb(error.__traceback__)[-1].name == "send_eof"
+    return isinstance(error, (InvalidHandshake, ConnectionClosed, ConnectionError, EOFError))

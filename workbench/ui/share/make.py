@@ -26,8 +26,9 @@ from workbench.jobs.pool.deal import Deal, ItemQueue, PoolError, Work
 from workbench.jobs.pool.processes import Processes
 from workbench.machine.files import new_file
 from workbench.machine.software_vulkan import ensure_render_device
-from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.row import Source
+from workbench.machine.text import plain_text
+from workbench.recording.episode.episode import Episode, file_part
+from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.films import (
     FilmEye,
     camera_of,
@@ -47,7 +48,7 @@ from workbench.ui.widgets.templates import counted, sentence
 
 What = Literal["film", "scene", "page", "sheet", "zip", "lerobot", "maniskill"]
 MOST_SAID = 5
-"""Sentences about recordings that were left out."""
+"""Sentences about recordings that the page shows."""
 EVERY_CAMERA = ""
 
 
@@ -66,6 +67,11 @@ class MakeRequest:
     export: ExportOptions = ExportOptions()
     """Of a dataset."""
 
+    @property
+    def is_dataset(self) -> bool:
+        """Whether all recordings become one thing."""
+        return self.what in ("lerobot", "maniskill")
+
 
 @dataclass(frozen=True)
 class Made:
@@ -73,9 +79,20 @@ class Made:
 
     paths: tuple[Path, ...]
     words: str
-    """Summary in a sentence or two."""
-    not_made: tuple[str, ...] = ()
-    """A sentence for each recording that failed, with its name and the reason."""
+    """Summary."""
+    left_out: tuple[str, ...] = ()
+    """A sentence for each recording that nothing was made of, with its name and the reason."""
+    damaged: tuple[str, ...] = ()
+    """A sentence for each damaged file of a recording of which the rest was used."""
+    incomplete: tuple[str, ...] = ()
+    """A sentence for each recording that lacks something of what was made."""
+
+    @property
+    def said(self) -> tuple[str, ...]:
+        """What the page shows of these sentences."""
+        said = (*self.damaged, *self.left_out, *self.incomplete)
+        more = len(said) - MOST_SAID
+        return said[:MOST_SAID] + ((f"And {more} more.",) if more > 0 else ())
 
 
 OnProgress = Callable[[float, str], None]
@@ -88,6 +105,7 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
         on_progress: called with the part that is done, 0..1, and the current work.
 
     Raises:
+        UnreadableRecording: a recording is damaged, and nothing can be made.
         ValueError: it can be made from none of the recordings; the message says which lacks what.
         OSError: it cannot be written; the message says why. Finished files stay.
         RuntimeError: this machine has nothing to render with.
@@ -100,38 +118,45 @@ def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None
         return _zip(wanted, on_progress)
     paths: list[Path] = []
     not_made: list[str] = []
+    damaged: list[str] = []
+    unreadable = False
     for number, source in enumerate(wanted.sources):
         part_done = _part(on_progress, number, len(wanted.sources))
         part_done(0.0, source.stem)
+        broken: list[str] = []
         try:
-            paths += _of_readable(wanted, source, part_done)
+            with _reading():
+                episode = read_recording(source)
+            broken = [one.sentence for one in episode.broken_files]
+            paths += _of_one(wanted, source, episode, part_done)
+            damaged += broken
         except ValueError as error:
-            not_made.append(str(error) if source.stem in str(error) else f"{source.stem}: {error}")
+            unreadable = unreadable or bool(broken) or isinstance(error, UnreadableRecording)
+            # It does not lack pictures, they cannot be read.
+            why = " ".join(broken) or str(error)
+            not_made.append(why if source.stem in why else f"{source.stem}: {why}")
     if not paths:
-        raise ValueError("\n".join(not_made))
+        raise (UnreadableRecording if unreadable else ValueError)("\n".join(not_made))
     on_progress(1.0, "done")
     words = counted(len(paths), "file")
     if not_made:
-        words += f"; {len(not_made)} could not be made. {' '.join(not_made)}"
-    return Made(tuple(paths), words, tuple(not_made))
+        words += f"; {len(not_made)} could not be made"
+    return Made(tuple(paths), words, tuple(not_made), tuple(damaged))
 
 
 def file_name(what: What, source: str, camera: str = "") -> str:
     """File name of what is made from the recording `source`, and from its `camera` for a film."""
-    suffix = {"film": f".{camera.replace('/', '_')}.mp4", "scene": ".scene.mp4", "page": ".html"}
+    suffix = {"film": f".{file_part(camera)}.mp4", "scene": ".scene.mp4", "page": ".html"}
     return source + suffix.get(what, ".sheet.png")
 
 
-def _of_readable(wanted: MakeRequest, source: Source, on_progress: OnProgress) -> list[Path]:
-    episode = read_recording(source)
+@contextlib.contextmanager
+def _reading() -> Iterator[None]:
+    """What the system refuses within it is about the recording, and not about the disk that is written to."""
     try:
-        return _of_one(wanted, source, episode, on_progress)
-    except ValueError as error:
-        if not episode.broken_files:
-            raise
-        raise ValueError(
-            " ".join(broken.sentence for broken in episode.broken_files)
-        ) from error  # it does not lack pictures, they cannot be read
+        yield
+    except OSError as error:
+        raise UnreadableRecording(str(error)) from error
 
 
 def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
@@ -158,10 +183,12 @@ def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: 
             path, episode, wanted.eye, lambda done: on_progress(done, f"{name}: the animated page")
         )
     else:
+        with _reading():
+            sheet = contact_sheet(episode)
         with new_file(path) as temporary:
             about = PngInfo()
             about.add_itxt("Comment", _moved(episode))
-            contact_sheet(episode).save(temporary, format="PNG", pnginfo=about)
+            sheet.save(temporary, format="PNG", pnginfo=about)
     return [path]
 
 
@@ -184,7 +211,7 @@ def _dataset(wanted: MakeRequest, on_progress: OnProgress) -> Made:
         words += f"; {made.left_out} without success left out"
     if made.not_fitting:
         words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
-    return Made((made.folder,), " ".join([words + ".", *made.not_fitting[:MOST_SAID], *made.notes]))
+    return Made((made.folder,), " ".join([f"{words}.", *made.notes]), tuple(made.not_fitting))
 
 
 def _demonstrations(wanted: MakeRequest, on_progress: OnProgress) -> Made:
@@ -201,7 +228,8 @@ def _demonstrations(wanted: MakeRequest, on_progress: OnProgress) -> Made:
         words += f"; {made.left_out} without success left out"
     if made.not_fitting:
         words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
-    return Made((made.file,), " ".join([words + ".", *made.not_fitting[:MOST_SAID]]))
+    words += ". Colour pictures are as recorded, from JPEG." if made.lossy else "."
+    return Made((made.file,), words, tuple(made.not_fitting), incomplete=tuple(made.incomplete))
 
 
 def zip_name(names: Sequence[str]) -> str:
@@ -221,7 +249,8 @@ def _zip(wanted: MakeRequest, on_progress: OnProgress) -> Made:
         for number, file in enumerate(files):
             on_progress(number / len(files), file.name)
             # What takes space in it, meshes and pictures, is compressed already.
-            archive.write(file, file.relative_to(root), zipfile.ZIP_STORED)
+            # An archive holds no name that is not UTF-8.
+            archive.write(file, plain_text(str(file.relative_to(root))), zipfile.ZIP_STORED)
     on_progress(1.0, "done")
     return Made((path,), f"{counted(len(files), 'file')} of {counted(len(wanted.sources), 'recording')}")
 
@@ -246,7 +275,12 @@ def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:
 def _counted(
     pictures: Iterable[NDArray[np.uint8]], episode: Episode, doing: str, on_progress: OnProgress
 ) -> Iterator[NDArray[np.uint8]]:
-    for state, picture in enumerate(pictures):
+    numbered = enumerate(pictures)
+    while True:
+        with _reading():
+            state, picture = next(numbered, (0, None))
+        if picture is None:
+            return
         on_progress(state / (episode.length + 1), doing)
         yield picture
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -10,10 +9,9 @@ from collections.abc import Callable
 import viser
 
 from workbench.machine.processes.watched_thread import watched_thread
+from workbench.ui.server.strangers import RareLog
 from workbench.ui.server.viser_private import wait_until_taken
 from workbench.ui.widgets.inputs import tell_all
-
-log = logging.getLogger(__name__)
 
 FRAME = 1 / 30
 """Seconds. More pushes make a browser slower (measured: 350 a second leave it 13 to 30 frames a second)."""
@@ -47,6 +45,7 @@ class RedrawLoop:
     ) -> None:
         self._server, self._wait, self._has_viewers, self._draw = server, wait, has_viewers, draw
         self._stopping = threading.Event()
+        self._told = RareLog()
         self._thread = watched_thread(name, self._run)
 
     def start(self) -> None:
@@ -76,8 +75,9 @@ class RedrawLoop:
     def _draw_or_say(self) -> bool:
         try:
             self._draw()
-        except Exception:
-            log.exception("The page could not be drawn; trying again.")
+        except Exception as error:
+            # A second later the next one comes: not each has a traceback.
+            self._told.happened(type(error), "The page could not be drawn; trying again.", error)
             tell_all(
                 self._server,
                 "This page could not be drawn",

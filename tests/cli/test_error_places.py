@@ -1,0 +1,297 @@
+"""Where an error of a task is, as ``workbench check`` and ``record`` say it: file, line, and what came before."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.drive.session import TASKS
+from workbench.cli.main import main
+
+FEW = ("--envs-per-worker", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
+Check = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Check:
+    """Checks ``runs`` of a task below `tmp_path`; its error, or else its finding. Paths are relative."""
+    (tmp_path / ".git").mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    def run(task: str, *more: str) -> dict[str, Any]:
+        capsys.readouterr()
+        with pytest.raises(SystemExit):
+            main(["check", task, "--select", "runs", "--json", *FEW, *more])
+        told = json.loads(capsys.readouterr().out)
+        return told["error"] or (told["findings"] or [{}])[0]
+
+    return run
+
+
+def line_of(file: Path, words: str) -> int:
+    text = file.read_text()
+    return text[: text.index(words)].count("\n") + 1
+
+
+def edited(folder: Path, *edits: tuple[str, str]) -> Path:
+    """The smallest example, with other texts in place of some of its."""
+    text = (TASKS / "minimal.py").read_text()
+    for old, new in edits:
+        assert old in text, old
+        text = text.replace(old, new)
+    file = folder / "task.py"
+    file.write_text(text)
+    return file
+
+
+RESET, EVALUATED = "        self.cube.set_pose(Pose.create_from_pq(p=p))\n", 'return {"success":'
+
+
+def test_a_refusal_of_the_core_that_the_task_caught_is_told_before_the_error_that_it_led_to(
+    tmp_path: Path, check: Check
+) -> None:
+    caught = """
+        self.places = [1]
+        try:
+            self.moved()
+        except ValueError:
+            self.cube.set_pose(Pose.create_from_pq(p=p))
+            self.places = []
+        self.places[0]
+
+    def moved(self):
+        self.cube.set_pose(Pose.create_from_pq(torch.full((1, 3), torch.nan)))
+        self.scene._gpu_apply_all()
+"""
+    file = edited(tmp_path, (RESET, caught))
+    told = check("task.py")
+    assert told["line"] == line_of(file, "self.places[0]") and told["file"] == "task.py"
+    said = told["message"]
+    refused, swallowed = (
+        f"task.py:{line_of(file, words)}" for words in ("self.scene._gpu_apply_all()", "self.moved()")
+    )
+    assert said.index(refused) < said.index(swallowed) < said.index("IndexError"), said
+    assert "NaN" in said
+    # What is refused while no error follows is not told, and of the next call it is no part.
+    file.write_text(file.read_text().replace("        self.places[0]\n", ""))
+    assert check("task.py") == {}
+    file.write_text(
+        file.read_text().replace(
+            "    def moved", "    def _before_control_step(self):\n        {}[9]\n\n    def moved"
+        )
+    )
+    assert "NaN" not in check("task.py")["message"]
+
+
+def test_the_first_exception_of_a_chain_is_told_with_its_line(tmp_path: Path, check: Check) -> None:
+    chain = """
+        try:
+            {}["table"]
+        except KeyError as error:
+            raise ValueError("no such place") from error
+"""
+    file = edited(tmp_path, (RESET, chain))
+    told = check("task.py")
+    assert told["line"] == line_of(file, "raise ValueError")
+    assert told["message"].index(f"task.py:{line_of(file, '{}[')}") < told["message"].index("ValueError")
+
+
+def test_what_evaluate_returned_without_rows_is_named_where_another_hook_fails_with_it(
+    tmp_path: Path, check: Check
+) -> None:
+    hooks = """apart = self.cube.pose.p[:1, 0].repeat(3)
+        return {
+            "apart": apart,
+            "success": torch.zeros(self.num_envs, dtype=torch.bool),
+        }
+
+    def compute_dense_reward(self, obs, action, info):
+        return info["apart"] + self.cube.pose.p[:, 0]
+
+    def compute_normalized_dense_reward(self, obs, action, info):
+        return self.compute_dense_reward(obs, action, info)
+
+    def old(self):
+        return {"success":"""
+    file = edited(tmp_path, (EVALUATED, hooks), ('("sparse", "none")', '("normalized_dense", "dense")'))
+    told = check("task.py")
+    assert told["line"] == line_of(file, 'return info["apart"]')
+    entry = line_of(file, '"apart": apart')
+    assert "(3,)" in told["message"] and f"task.py:{entry}" in told["message"]
+
+
+BROKEN = {
+    "a name": ("from typing import nothing_like_it\n", "from typing"),
+    "a module": ("import os\nimport nothing_of_this_name\n", "import nothing"),
+    "a syntax": ("x = 1\ny = = 2\n", "y ="),
+    "at run time": ("SIZES = {}\nprint(SIZES['cube'])\n", "print"),
+    "a circle": ("from LAB.tasks.reach import LabEnv\n", "tasks.reach"),
+    "a relative one": ("from .nowhere import THING\n", "from .nowhere"),
+    "a name of a package": ("from . import nothing_there\n", "from . import"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+@pytest.mark.parametrize("where", ["robots/dual.py", "__init__.py", "robots/__init__.py"])
+def test_a_module_of_another_folder_that_cannot_be_imported_is_named_with_its_line(
+    kind: str, where: str, tmp_path: Path, check: Check
+) -> None:
+    text, words = BROKEN[kind]
+    # Python keeps a package that another test of this process has imported.
+    lab = f"lab_{kind.replace(' ', '_')}_{where.replace('/', '_').removesuffix('.py')}"
+    names = ("__init__.py", "robots/__init__.py", "robots/dual.py", "tasks/__init__.py")
+    files = dict.fromkeys(names, "") | {where: text.replace("LAB", lab)}
+    files["tasks/reach.py"] = f"import {lab}.robots.dual\n" + (TASKS / "minimal.py").read_text()
+    for name, held in files.items():
+        file = tmp_path / lab / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(held)
+    told = check(f"{lab}/tasks/reach.py")
+    assert (told["file"], told["line"]) == (f"{lab}/{where}", line_of(tmp_path / lab / where, words)), told
+
+
+def test_an_error_without_a_line_of_the_authors_has_none(tmp_path: Path, check: Check) -> None:
+    (tmp_path / "task.py").write_bytes(b"x = 1" * 10_000_000)
+    told = check("task.py")
+    assert (told["file"], told["line"]) == ("task.py", None), told
+
+
+ROBOT = """
+from pathlib import Path
+import numpy as np
+import sapien
+from mani_skill.agents.base_agent import BaseAgent, Keyframe
+from mani_skill.agents.controllers import PDJointPosControllerConfig
+from mani_skill.agents.registration import register_agent
+
+@register_agent()
+class Stick(BaseAgent):
+    uid = "stick_of_NAME"
+    KIND_path = str(Path(__file__).with_name("stick.xml"))
+    keyframes = {"rest": Keyframe(pose=sapien.Pose(p=[0, 0, 0.05]), qpos=np.array([0.3]))}
+
+    @property
+    def _controller_configs(self):
+        return {"pd": {"arm": PDJointPosControllerConfig(["hinge"], -0.1, 0.1, 1000, 100, use_delta=True)}}
+"""
+URDF = """<?xml version="1.0"?>
+<robot name="stick">
+  <link name="base">
+    <inertial><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>
+    <collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>
+  </link>
+  <link name="arm">
+    <inertial><mass value="0.5"/><inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial>
+    <collision><origin xyz="0 0 0.15"/><geometry><box size="0.03 0.03 0.3"/></geometry></collision>
+  </link>
+  <joint name="hinge" type="revolute">
+    <parent link="base"/><child link="arm"/><origin xyz="0 0 0.06"/><axis xyz="0 1 0"/>
+    <limit lower="-1.5" upper="1.5" effort="10" velocity="3"/>
+  </joint>
+</robot>
+"""
+MJCF = """<mujoco model="stick">
+  <worldbody>
+    <body name="base" pos="0 0 0.05">
+      <geom type="box" size="0.05 0.05 0.05"/>
+      <body name="arm" pos="0 0 0.06">
+        <joint name="hinge" type="hinge" axis="0 1 0" range="-1.5 1.5"/>
+        <geom type="box" size="0.015 0.015 0.15" pos="0 0 0.15"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+MISTAKES = {
+    "an inertia": (URDF, 'ixx="0.001"', 'ixx="-0.001"', '<link name="arm"', "arm"),
+    "no number": (URDF, "0.03 0.03 0.3", "0.03 wide 0.3", "0.03 wide 0.3", "arm"),
+    "a link twice": (
+        URDF,
+        '<link name="arm"',
+        '<link name="base"',
+        '<link name="base">\n    <inertial><mass value="0.5"',
+        "base",
+    ),
+    "no parent": (URDF, '<parent link="base"/>', '<parent link="bse"/>', '<joint name="hinge"', "hinge"),
+    "no limit": (
+        URDF,
+        '    <limit lower="-1.5" upper="1.5" effort="10" velocity="3"/>\n',
+        "",
+        '<joint name="hinge"',
+        "hinge",
+    ),
+    "a joint's type": (URDF, "revolute", "hinge", '<joint name="hinge"', "hinge"),
+    "not closed": (URDF, "</robot>\n", "", None, ""),
+    "an element of MJCF": (
+        MJCF,
+        'type="box" size="0.015 0.015 0.15"',
+        'type="box" size="0.015 thin 0.15"',
+        "thin",
+        "arm",
+    ),
+    "MJCF not closed": (MJCF, "</worldbody>", "", "</mujoco>", ""),
+}
+
+
+@pytest.mark.parametrize("kind", MISTAKES)
+def test_a_mistake_in_a_robots_file_is_told_with_its_line_and_the_line_that_names_the_file(
+    kind: str, tmp_path: Path, check: Check
+) -> None:
+    text, old, new, words, named = MISTAKES[kind]
+    name = "mjcf" if text is MJCF else "urdf"
+    robot = tmp_path / "stick.py"
+    robot.write_text(ROBOT.replace("KIND", name).replace("NAME", kind.replace(" ", "_").replace("'", "")))
+    described = tmp_path / "stick.xml"
+    described.write_text(text.replace(old, new))
+    told = check("stick.py")
+    line = text.replace(old, new).count("\n") + 1 if words is None else line_of(described, words)
+    assert (told["file"], told["line"]) == ("stick.py", line_of(robot, f"{name}_path")), told
+    assert f"{described}:{line}" in told["message"] and named in told["message"], told
+
+
+def test_what_a_robot_names_and_is_not_there_is_told_with_the_line(tmp_path: Path, check: Check) -> None:
+    robot = tmp_path / "stick.py"
+    text = ROBOT.replace("KIND", "urdf")
+    robot.write_text(text.replace("NAME", "no_file"))
+    told = check("stick.py")
+    assert told["line"] == line_of(robot, "urdf_path") and str(tmp_path / "stick.xml") in told["message"]
+    (tmp_path / "stick.xml").write_text(URDF)
+    robot.write_text(text.replace("NAME", "no_joint").replace('["hinge"]', '["hing"]'))
+    told = check("stick.py")
+    assert told["line"] == line_of(robot, '["hing"]') and "'hinge'" in told["message"], told
+
+
+def test_a_mesh_that_is_not_there_is_told_with_the_link_that_names_it(
+    renderer: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot, described = tmp_path / "stick.py", tmp_path / "stick.xml"
+    robot.write_text(ROBOT.replace("KIND", "urdf").replace("NAME", "no_mesh"))
+    visual = '<visual><geometry><mesh filename="meshes/arm.stl"/></geometry></visual>'
+    described.write_text(URDF.replace('<link name="arm">', f'<link name="arm">{visual}'))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["record", "stick.py", "--episodes", "1", "--envs-per-worker", "1"])
+    said = capsys.readouterr().err
+    assert ended.value.code == 1
+    assert f"{robot}:{line_of(robot, 'urdf_path')}" in said, said
+    assert f"{described}:{line_of(described, visual)}" in said and "'arm'" in said
+    assert str(tmp_path / "meshes" / "arm.stl") in said
+
+
+def test_a_file_that_the_task_loads_itself_is_told_with_the_line_that_loads_it(
+    tmp_path: Path, check: Check
+) -> None:
+    described = tmp_path / "door.xml"
+    described.write_text(URDF.replace('ixx="0.001"', 'ixx="-0.001"'))
+    loads = f"loader = self.scene.create_urdf_loader()\n        loader.parse({str(described)!r})\n        "
+    file = edited(
+        tmp_path, ("build_ground(self.scene)\n", f"build_ground(self.scene)\n        {loads}pass\n")
+    )
+    told = check("task.py")
+    assert told["line"] == line_of(file, "loader.parse")
+    link = line_of(described, '<link name="arm"')
+    assert f"{described}:{link}" in told["message"]

@@ -1,0 +1,58 @@
+"""A ray traced camera on a machine whose driver traces no rays: each command works, and names the camera's line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from workbench.cli.main import main
+from workbench.core.backends import why_no_ray_tracing
+
+pytestmark = pytest.mark.usefixtures("renderer")
+
+TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
+CAMERA = 'CameraConfig("render_camera", pose=pose, width=512, height=512,'
+
+
+@pytest.fixture
+def traced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, int]:
+    """The file, and the line of its camera."""
+    if why_no_ray_tracing() is None:
+        pytest.skip("this machine traces rays")
+    monkeypatch.chdir(tmp_path)
+    assert CAMERA in TEXT
+    text = TEXT.replace(
+        CAMERA, 'CameraConfig("render_camera", pose=pose, shader_pack="rt", width=64, height=64,'
+    )
+    text = text.replace("WorkbenchPushCube-v1", "TracedPushCube-v1")
+    file = tmp_path / "traced.py"
+    file.write_text(text)
+    return file, next(n for n, line in enumerate(text.splitlines(), 1) if 'shader_pack="rt"' in line)
+
+
+def test_it_is_recorded_and_the_recording_says_how(
+    traced: tuple[Path, int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, line = traced
+    with pytest.raises(SystemExit) as ended:
+        main(["record", str(file), "--episodes", "1", "--max-steps", "2"])
+    assert ended.value.code == 0
+    assert f"{file}:{line}" in capsys.readouterr().err
+    (description,) = file.parent.glob("recordings/*.json")
+    cameras = json.loads(description.read_text())["workbench"]["cameras"]
+    assert {camera["name"]: camera["replaced_shader"] for camera in cameras} == {
+        "base_camera": "",
+        "render_camera": "rt",
+    }
+
+
+def test_its_check_ends_with_a_finding(traced: tuple[Path, int], capsys: pytest.CaptureFixture[str]) -> None:
+    file, line = traced
+    with pytest.raises(SystemExit) as ended:
+        rules = "ray-traced,camera-sees,hidden-goal"
+        main(["check", str(file), "--select", rules, "--seeds", "2", "--workers", "1", "--json"])
+    report = json.loads(capsys.readouterr().out)
+    (finding,) = [each for each in report["findings"] if each["rule"] == "ray-traced"]
+    assert (ended.value.code, finding["file"], finding["line"]) == (0, file.name, line)

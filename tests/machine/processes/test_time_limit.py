@@ -1,0 +1,50 @@
+"""Native work that does not return ends its process with a message."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+# PyDLL keeps the interpreter's lock, as SAPIEN does while it waits for a picture.
+NATIVE = """
+import ctypes
+from workbench.machine.processes.time_limit import end_after, limited
+sleep = ctypes.PyDLL(None).sleep
+"""
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", NATIVE + code],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+
+
+def test_what_does_not_return_ends_with_its_message() -> None:
+    ended = run("end_after(0.5)\nwith limited('the picture of eye'): sleep(50)")
+    assert ended.returncode == -signal.SIGKILL
+    assert ended.stderr.strip() == "the picture of eye"
+
+
+def test_what_returns_goes_on_and_time_between_does_not_count() -> None:
+    code = "end_after(1.5)\nfor _ in range(3):\n    with limited('short'): sleep(1)\nsleep(2)\nprint('over')"
+    ended = run(code)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "over\n", "")
+
+
+def test_a_raised_error_ends_it_too() -> None:
+    code = "end_after(1)\ntry:\n    with limited('raises'): raise OSError\nexcept OSError: sleep(2)\nprint('over')"
+    assert run(code).stdout == "over\n"
+
+
+def test_without_a_limit_nothing_is_watched() -> None:
+    assert run("with limited('long'): sleep(2)\nprint('over')").stdout == "over\n"

@@ -1,0 +1,186 @@
+"""A version that was refused or taken out of the file leaves nothing behind, whatever its code did to the process."""
+
+# The fixture hands over a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.drive.session import live_session, start_over, step, wait_until
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+
+pytestmark = pytest.mark.usefixtures("child_process")
+
+EVALUATE = "    def evaluate(self) -> dict[str, torch.Tensor]:\n"
+AT_IMPORT = "\n\n@register_env("
+
+
+@pytest.fixture(scope="module")
+def good(task_file: Path) -> str:
+    text = task_file.read_text()
+    assert text.count(EVALUATE) == text.count(AT_IMPORT) == 1
+    return text
+
+
+@pytest.fixture(scope="module")
+def expected(good: str, session: Session) -> SessionView:
+    """What seed 0 gives in a session that has seen nothing else."""
+    return played(session)
+
+
+@pytest.fixture
+def mended(good: str, expected: SessionView, session: Session, task_file: Path) -> Iterator[Session]:
+    yield session
+    task_file.write_text(good)
+    runs(session, good)
+    found = played(session)
+    np.testing.assert_array_equal(found.step.poses, expected.step.poses)
+    np.testing.assert_array_equal(found.step.reward, expected.step.reward)
+
+
+def played(session: Session) -> SessionView:
+    start_over(session, 0)
+    return step(session, 3)
+
+
+def runs(session: Session, text: str) -> SessionView:
+    def reached(view: SessionView) -> bool:
+        return (
+            view.problem is None
+            and not view.stale
+            and view.state == "paused"
+            and text in view.task.source.values()
+        )
+
+    return wait_until(session, reached, "the version of the file")
+
+
+def refused(session: Session, task_file: Path, text: str) -> SessionView:
+    before = session.view()
+    task_file.write_text(text)
+
+    def reached(view: SessionView) -> bool:
+        return view.problem is not None and view.problem_serial > before.problem_serial
+
+    wait_until(session, reached, "the refusal")
+    # Its first moment comes after it.
+    return wait_until(
+        session,
+        lambda v: v.state == "paused" and v.timeline.last > before.timeline.last,
+        "the last good version",
+    )
+
+
+def in_evaluate(good: str, *lines: str) -> str:
+    return good.replace(EVALUATE, EVALUATE + "".join(f"        {line}\n" for line in lines))
+
+
+def at_import(good: str, *lines: str) -> str:
+    head, tail = good.split(AT_IMPORT)
+    return head + "\n" + "\n".join(lines) + AT_IMPORT + tail
+
+
+MISCHIEF = {
+    "a member of the task": ("self.cube = self.cube.pose.p",),
+    "a member of BaseEnv": ("self._elapsed_steps = 3",),
+    "a default type": ("torch.set_default_dtype(torch.float64)",),
+    "a default device": ("torch.set_default_device('meta')",),
+    "a function of torch": ("torch.rand = lambda size: torch.zeros(size)",),
+    "the clock": ("import time", "time.monotonic = lambda: 0.0"),
+    "a method of ManiSkill": (
+        "from mani_skill.utils.structs import Actor",
+        "Actor.set_pose = lambda *given: None",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", MISCHIEF)
+def test_what_a_refused_version_did_is_gone(
+    mended: Session, task_file: Path, good: str, expected: SessionView, what: str
+) -> None:
+    before = played(mended)
+    bad = in_evaluate(good, *MISCHIEF[what], "raise ValueError('enough')")
+    view = refused(mended, task_file, bad)
+    line = bad[: bad.index("raise ValueError('enough')")].count("\n") + 1
+    assert view.stale and (view.problem.file, view.problem.line) == (str(task_file), line)
+    # The last good version is there again, at the same moment (links are placed by their joints, in float32), and goes on.
+    np.testing.assert_allclose(view.step.poses, before.step.poses, atol=1e-5)
+    np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
+    np.testing.assert_array_equal(step(mended).step.elapsed_steps, before.step.elapsed_steps + 1)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("torch.set_num_threads(3)",),
+        ("from mani_skill.utils.structs import Actor", "Actor.kept = 1", "print('imported')"),
+        ("import threading, time", "threading.Thread(target=lambda: time.sleep(3600), daemon=True).start()"),
+    ],
+    ids=["a setting", "a class", "a thread"],
+)
+def test_what_a_version_set_that_ran_goes_with_its_line(
+    mended: Session, task_file: Path, good: str, lines: tuple[str, ...]
+) -> None:
+    task_file.write_text(at_import(good, *lines))
+    before = runs(mended, at_import(good, *lines))
+    worker = mended.worker_pid
+    task_file.write_text(good)
+    view = runs(mended, good)
+    assert mended.worker_pid != worker
+    assert view.reload.level == "restarted"
+    np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
+
+
+def test_a_version_that_failed_while_it_ran_does_not_spoil_the_mended_one(
+    mended: Session, task_file: Path, good: str
+) -> None:
+    bad = in_evaluate(good, "if self.elapsed_steps.max() > 1:", "    self.cube = self.cube.pose.p")
+    start_over(mended, 0)
+    task_file.write_text(bad)
+    runs(mended, bad)
+    while (view := mended.view()).problem is None:
+        mended.step()
+        wait_until(
+            mended,
+            lambda v, n=view.step_serial: v.problem is not None or v.step_serial > n,
+            "a step or the failure",
+        )
+    task_file.write_text(good)
+    view = runs(mended, good)
+    assert view.step.elapsed_steps.tolist() == [2, 2] or view.step.elapsed_steps.tolist() == [1, 1]
+
+
+def test_a_file_that_is_no_python_costs_no_process(mended: Session, task_file: Path, good: str) -> None:
+    worker = mended.worker_pid
+    task_file.write_text(good + "\ndef broken(:\n")
+    wait_until(mended, lambda v: v.problem is not None, "the refusal")
+    task_file.write_text(good)
+    runs(mended, good)
+    assert mended.worker_pid == worker, mended.view().reload
+
+
+def test_recording_and_playing_go_on_after_a_refused_version(
+    task_file: Path, good: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "push.py"
+    file.write_text(good)
+    with live_session(file, tmp_path / "recordings") as session:
+        session.change(speed=8.0)
+        session.start_recording((0,))
+        session.play()
+        wait_until(session, lambda v: v.recording.steps > 3, "some recorded steps")
+        file.write_text(in_evaluate(good, "raise ValueError('enough')"))
+        wait_until(session, lambda v: v.problem is not None, "the refusal")
+        again = wait_until(session, lambda v: v.problem is not None and v.state == "running", "playing again")
+        assert again.recording.active and again.recording.env_idx == (0,)
+        wait_until(session, lambda v: v.recording.episodes_written >= 1, "the episode that was running")
+        session.reset((0,))
+        wait_until(session, lambda v: v.recording.steps > 3, "steps of the next episode")
+        session.stop_recording()
+        wait_until(session, lambda v: v.recording.episodes_written >= 2, "both episodes")

@@ -1,0 +1,182 @@
+"""What the workbench puts in the place of a function of ManiSkill's or SAPIEN's takes what that takes."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import mani_skill.envs  # noqa: F401  imports all modules that are replaced in
+import pytest
+import sapien.physx as physx
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.scene import ManiSkillScene
+
+import workbench
+from tests.drive.envs import PUSH_CUBE, batched
+from workbench.checks.evidence.builds import noting_builds, noting_poses
+from workbench.core.env.assets import refuse_downloads
+from workbench.core.env.cpu_scene import BatchedCpuScene
+from workbench.core.maniskill_private import mark_camera_configs, noting_cameras
+from workbench.core.simulation.cpu_system import BatchedCpuSystem
+from workbench.core.simulation.strict_system import StrictCpuSystem
+
+OURS = str(Path(workbench.__file__).parent)
+Parameters = dict[str, inspect.Parameter]
+_VAR = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
+
+
+@pytest.fixture(scope="module")
+def replaced() -> Iterator[dict[str, tuple[Callable[..., Any], Callable[..., Any]]]]:
+    """Ours and theirs, by name, while all that is ever replaced is."""
+    env: Any = batched(PUSH_CUBE, 2)
+    mark_camera_configs()
+    with ExitStack() as stack:
+        for within in (noting_builds([], [], ()), noting_poses([], ()), refuse_downloads("PushCube")):
+            stack.enter_context(within)
+        stack.enter_context(noting_cameras(lambda config, frame: None))
+        yield dict(_replaced())
+    env.close()
+
+
+def _replaced() -> Iterator[tuple[str, tuple[Callable[..., Any], Callable[..., Any]]]]:
+    modules = [m for name, m in sorted(sys.modules.items()) if name.split(".")[0] in ("mani_skill", "sapien")]
+    owners: dict[int, Any] = {id(module): module for module in modules}
+    owners |= {
+        id(value): value for module in modules for value in vars(module).values() if isinstance(value, type)
+    }
+    for owner in owners.values():
+        for name, member in list(vars(owner).items()):
+            for suffix, function in _functions(member).items():
+                code = getattr(function, "__code__", None)
+                if code is not None and code.co_filename.startswith(OURS):
+                    called = f"{owner.__name__.rpartition('.')[2]}.{name}{suffix}"
+                    original = getattr(function, "__wrapped__", None)
+                    assert original is not None, f"{called} has no __wrapped__"
+                    yield called, (function, original)
+
+
+def _functions(member: Any) -> dict[str, Any]:
+    """By what stands behind the name where it is used."""
+    if isinstance(member, property):
+        return {"": member.fget, " = ...": member.fset}
+    return {"()": getattr(member, "__func__", member)}
+
+
+def test_what_is_replaced_takes_what_the_original_takes(replaced: Any) -> None:
+    known = {"Articulation.merge()", "Actor.pose = ...", "Entity.set_pose()", "download_asset.download()"}
+    assert known <= replaced.keys() and len(replaced) > 60, "the search finds too little"
+    called = {name: both for name, both in replaced.items() if name.endswith("()")}
+    wrong = {name: problem for name, both in called.items() if (problem := _refuses(*both))}
+    assert wrong == {}
+
+
+@pytest.mark.parametrize("base", [ManiSkillScene, BaseEnv], ids=lambda base: base.__name__)
+def test_what_overrides_a_method_of_maniskill_takes_what_that_takes(base: type) -> None:
+    env: Any = batched(PUSH_CUBE, 1)
+    cls = type(env.scene) if base is ManiSkillScene else type(env)
+    assert issubclass(cls, base) and (base is BaseEnv or cls is BatchedCpuScene)
+    wrong = {}
+    for owner in cls.__mro__:
+        if not owner.__module__.startswith("workbench."):
+            continue
+        for name, member in vars(owner).items():
+            theirs = getattr(base, name, None)
+            if inspect.isfunction(member) and inspect.isfunction(theirs) and name != "__init__":
+                wrong |= {name: problem} if (problem := _refuses(member, theirs)) else {}
+    env.close()
+    assert wrong == {}
+
+
+@pytest.mark.parametrize("ours", [BatchedCpuSystem, StrictCpuSystem])
+def test_a_member_of_the_batched_system_takes_what_sapiens_takes(ours: type) -> None:
+    """pybind11 gives signatures in docstrings only."""
+    wrong = {}
+    for system in (physx.PhysxCpuSystem, physx.PhysxGpuSystem):
+        for name in (name for name in dir(system) if not name.startswith("_")):
+            theirs = _documented(getattr(system, name))
+            if theirs is not None and inspect.isfunction(member := getattr(ours, name, None)):
+                problem = _differences(_parameters(member), theirs)
+                wrong |= {name: problem} if problem else {}
+    assert wrong == {}
+
+
+def test_a_wrapper_that_takes_less_would_be_seen() -> None:
+    def stock(self: Any, a: int, b: int = 0, *, c: int = 0) -> None: ...
+
+    def less(self: Any, a: int) -> None: ...
+    def other_name(self: Any, x: int, b: int = 0, c: int = 0) -> None: ...
+    def demands(self: Any, a: int, b: int, c: int = 0) -> None: ...
+    def more(self: Any, a: int, b: int = 0, c: int = 0, d: int = 0) -> None: ...
+    def all_of_it(*args: Any, **kwargs: Any) -> None: ...
+
+    assert [bool(_refuses(ours, stock)) for ours in (less, other_name, demands, more, all_of_it)] == [
+        *(True, True, True),
+        *(False, False),
+    ]
+
+
+def _parameters(function: Callable[..., Any]) -> Parameters:
+    return dict(inspect.signature(function, follow_wrapped=False).parameters)
+
+
+def _refuses(ours: Callable[..., Any], theirs: Callable[..., Any]) -> str:
+    """What `theirs` takes and `ours` does not; empty if nothing, or if SAPIEN does not say what it takes."""
+    try:
+        theirs_of = _parameters(theirs)
+    except ValueError:
+        documented = _documented(theirs)
+        if documented is None:
+            return ""
+        theirs_of = documented
+    return _differences(_parameters(ours), theirs_of)
+
+
+def _differences(ours: Parameters, theirs: Parameters) -> str:
+    kinds = {each.kind for each in ours.values()}
+    by_position = [
+        each for each in ours.values() if each.kind not in _VAR and each.kind is not each.KEYWORD_ONLY
+    ]
+    wrong = []
+    positions = 0
+    for name, each in theirs.items():
+        if each.kind in _VAR:
+            wrong += [] if each.kind in kinds else [f"takes no {each}"]
+            continue
+        own = ours.get(name)
+        named = own is not None or inspect.Parameter.VAR_KEYWORD in kinds
+        if each.kind is not each.KEYWORD_ONLY:
+            placed = positions < len(by_position) or inspect.Parameter.VAR_POSITIONAL in kinds
+            if placed and own is None and positions < len(by_position):
+                own = by_position[positions]
+                named = named or positions == 0 or name == "self" or each.kind is each.POSITIONAL_ONLY
+            positions += 1
+            wrong += [] if placed else [f"takes no {name} by position"]
+        wrong += [] if named else [f"takes no {name}="]
+        optional = own is None or own.default is not own.empty or own.kind in _VAR
+        wrong += [] if each.default is each.empty or optional else [f"wants {name}"]
+    wanted = [e.name for e in ours.values() if e.kind not in _VAR and e.default is e.empty]
+    wrong += [f"wants {name}" for name in wanted[len(theirs) :]]
+    return ", ".join(wrong)
+
+
+def _documented(member: Any) -> Parameters | None:
+    """The parameters of a pybind11 method, by its docstring; None where there are several ways to call it."""
+    first = (getattr(member, "__doc__", None) or "").partition("\n")[0]
+    match = re.match(r"\w+\((self: .*?)\) -> ", first)
+    if match is None:
+        return None
+    names = re.findall(r"(?:^|, )(\w+): ", re.sub(r"\[[^\[\]]*\]", "", re.sub(r"\[[^\[\]]*\]", "", match[1])))
+    optional = set(re.findall(r"(\w+): [^,]*? = ", match[1]))
+    return {
+        name: inspect.Parameter(
+            name,
+            inspect.Parameter.POSITIONAL_OR_KEYWORD,
+            default=None if name in optional else inspect.Parameter.empty,
+        )
+        for name in names
+    }

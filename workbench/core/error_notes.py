@@ -1,0 +1,141 @@
+"""Facts that the core knows about an error, added to it as notes, and its refusals that a task has caught."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from traceback import extract_tb
+from typing import Any, Literal
+
+from workbench.machine.library_files import is_installed
+
+Place = tuple[str, int, str]
+"""File, line, and the name of the function."""
+_MOST_REFUSALS = 3
+"""Remembered in one call: each keeps its frames alive."""
+_MOST_LETTERS = 400
+
+
+class Note(str):
+    """A fact about an error. Python prints it below the error.
+
+    ``before``: it tells of an earlier error. ``place``: the line at fault where no line of the author's is on the traceback.
+    """
+
+    before: bool
+    place: Place | None
+
+    def __new__(cls, text: str, place: Place | None = None, before: bool = False) -> Note:
+        note = super().__new__(cls, text)
+        note.place, note.before = place, before
+        return note
+
+
+def notes_of(error: BaseException) -> list[str]:
+    """Its notes, of the core and of others."""
+    return [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
+
+
+class CoreRefusal(Exception):
+    """The batched core refuses what a task asks for. The running `AuthorCall` remembers it: the task may catch it, and fail
+    later for want of what was refused.
+
+    `place` is the line at fault, where it is known better than from the traceback.
+    """
+
+    def __init__(self, *args: object, place: Place | None = None) -> None:
+        super().__init__(*args)
+        self.place = place
+        _running.remember(self)
+
+
+class RefusedCall(CoreRefusal, RuntimeError):
+    """Refused in this state, or for this object."""
+
+
+class RefusedValue(CoreRefusal, ValueError):
+    """Refused because of the value."""
+
+
+class RefusedMember(CoreRefusal, NotImplementedError):
+    """Refused because the batched simulation does not have it."""
+
+
+class WrongAction(ValueError):
+    """An action that does not fit the task. `problem` goes on from the name of what gave it."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(f"the action {problem}")
+        self.problem = problem
+
+
+class AuthorCall:
+    """A context around a call of the author's code: an error that leaves it is given a note for each refusal of the core
+    that was caught before. Nests."""
+
+    def __enter__(self) -> None:
+        self._first = len(_running.refusals)
+        _running.depth += 1
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> Literal[False]:
+        _running.depth -= 1
+        if error is not None:
+            told = [*chain_of(error, suppressed=True)]
+            for refusal in _running.refusals[self._first :]:
+                note = None if refusal in told else _caught_note(refusal)
+                if note is not None and note not in notes_of(error):
+                    error.add_note(note)
+        if _running.depth == 0:
+            _running.refusals.clear()  # they keep the frames of the call alive
+        return False
+
+
+class _Running(threading.local):
+    """The calls of this thread that run now."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self.refusals: list[CoreRefusal] = []
+
+    def remember(self, refusal: CoreRefusal) -> None:
+        if self.depth and len(self.refusals) < _MOST_REFUSALS:
+            self.refusals.append(refusal)
+
+
+_running = _Running()
+
+
+def chain_of(error: BaseException, suppressed: bool = False) -> Iterator[BaseException]:
+    """The error, what caused it, and so on. A refusal of the core ends it: its text explains its cause.
+
+    Args:
+        suppressed: include what ``raise ... from None`` hides.
+    """
+    seen: set[int] = set()
+    link: BaseException | None = error
+    while link is not None and id(link) not in seen:
+        seen.add(id(link))
+        yield link
+        if isinstance(link, CoreRefusal):
+            return
+        hides = link.__suppress_context__ and not suppressed
+        link = link.__cause__ or (None if hides else link.__context__)
+
+
+def _caught_note(refusal: CoreRefusal) -> Note | None:
+    """None for one that was never raised."""
+    frames = [(frame.filename, frame.lineno or 1, frame.name) for frame in extract_tb(refusal.__traceback__)]
+    if not frames:
+        return None
+    caught = frames[0]
+    at = refusal.place or next((place for place in reversed(frames) if not is_installed(place[0])), caught)
+    text = " ".join(str(refusal).split())
+    text = text if len(text) <= _MOST_LETTERS else text[: _MOST_LETTERS - 1] + "…"
+    where = "there" if at[:2] == caught[:2] else f"at {_text_of(caught)}"
+    return Note(f"Before this, {_text_of(at)} was refused, and caught {where}: {text}", at, before=True)
+
+
+def _text_of(place: Place) -> str:
+    file, line, function = place
+    return f"{Path(file).name}:{line} in {function}"

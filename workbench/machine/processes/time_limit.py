@@ -1,0 +1,116 @@
+"""Ends this process, with a message, where native code does not return. Run as a script this is the process that does it."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+
+PICTURE_SECONDS = 180.0
+"""Limit of one picture. The first of a process takes seconds, in which shaders are compiled."""
+_MOST_BYTES = 2000
+"""Of a message: a pipe takes it in one piece."""
+
+
+@dataclass
+class _Watcher:
+    """The process that watches this one."""
+
+    pid: int
+    """Of the process that is watched. A fork of it is not."""
+    seconds: float
+    process: subprocess.Popen[bytes] | None = None
+    pipe: int = -1
+    within: bool = False
+
+
+_watcher: _Watcher | None = None
+
+
+def end_after(seconds: float = PICTURE_SECONDS) -> None:
+    """End this process where what is done within `limited` takes longer. Without this call `limited` does nothing."""
+    global _watcher
+    end_limit()
+    _watcher = _Watcher(os.getpid(), seconds)
+
+
+def end_limit() -> None:
+    """Take back `end_after`."""
+    global _watcher
+    watcher, _watcher = _watcher, None
+    if watcher is not None and watcher.process is not None and watcher.pid == os.getpid():
+        os.close(watcher.pipe)
+        watcher.process.wait()
+
+
+@contextmanager
+def limited(message: str) -> Iterator[None]:
+    """Do native work within this that may not return, such as waiting for a driver.
+
+    Python's own threads and signal handlers do not run meanwhile, so another process watches: it prints `message` to stderr
+    and kills this one. It costs 6 MB from the first use on, and 20 us each time.
+    """
+    watcher = _watcher
+    if watcher is None or watcher.within or watcher.pid != os.getpid():
+        yield
+        return
+    if watcher.process is None:
+        _start(watcher)
+    _tell(watcher, " ".join(message.split()).encode()[:_MOST_BYTES])
+    watcher.within = True
+    try:
+        yield
+    finally:
+        watcher.within = False
+        _tell(watcher, b"")
+
+
+def _tell(watcher: _Watcher, line: bytes) -> None:
+    with suppress(BrokenPipeError):  # it was killed: nothing is limited from now on
+        os.write(watcher.pipe, line + b"\n")
+
+
+def _start(watcher: _Watcher) -> None:
+    # Here, since this file also runs as a script that has the standard library alone.
+    from workbench.machine.processes.child_python import script_command
+
+    read, watcher.pipe = os.pipe()
+    try:
+        watcher.process = subprocess.Popen(
+            script_command(__file__, str(read), str(watcher.pid), str(watcher.seconds)),
+            pass_fds=[read],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            process_group=0,  # Ctrl-C in the terminal is for the process that is watched
+        )
+    finally:
+        os.close(read)
+
+
+def _watch(fd: int, pid: int, seconds: float) -> None:
+    """Read the message of each piece of work (a line) and its end (an empty line), until the process is gone or takes too long."""
+    message, deadline, left = b"", None, b""
+    while True:
+        wait = None if deadline is None else max(0.0, deadline - time.monotonic())
+        if select.select([fd], [], [], wait)[0]:
+            if not (read := os.read(fd, 65536)):
+                return
+            *lines, left = (left + read).split(b"\n")
+            if lines:
+                message = lines[-1]
+                deadline = time.monotonic() + seconds if message else None
+        elif deadline is not None:
+            if os.getppid() == pid:
+                print(message.decode(errors="replace"), file=sys.stderr, flush=True)
+                os.kill(pid, signal.SIGKILL)
+            return
+
+
+if __name__ == "__main__":
+    _watch(int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]))

@@ -1,0 +1,79 @@
+"""Settings of the whole process that a task may change and that no reload takes back."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import sys
+import threading
+import types
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+_MODULES = (
+    *("torch", "torch.nn.functional", "numpy", "numpy.random", "random", "time", "math", "os", "builtins"),
+    *("mani_skill.envs.sapien_env", "mani_skill.utils.common", "mani_skill.utils.sapien_utils", "sapien"),
+)
+"""Their functions are compared: a task may have put its own in place of one."""
+_FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType)
+
+ProcessState = Mapping[str, object]
+
+
+def read_process_state() -> ProcessState:
+    """The present settings by name. Takes some milliseconds; compare two with `changed_settings`."""
+    state: dict[str, object] = {
+        "torch.get_default_dtype()": torch.get_default_dtype(),
+        "torch.get_default_device()": torch.get_default_device(),
+        "torch.is_grad_enabled()": torch.is_grad_enabled(),
+        "torch.are_deterministic_algorithms_enabled()": torch.are_deterministic_algorithms_enabled(),
+        "torch.get_num_threads()": torch.get_num_threads(),
+        "numpy.geterr()": np.geterr(),
+        "sys.excepthook": sys.excepthook,
+        "os.umask()": _umask(),
+        "sys.settrace()": sys.gettrace() is not None,
+    }
+    state |= {f"os.environ[{name!r}]": value for name, value in os.environ.items()}
+    state |= {f"signal handler of {number.name}": signal.getsignal(number) for number in signal.Signals}
+    state |= {
+        f"resource.{name}": resource.getrlimit(getattr(resource, name))
+        for name in dir(resource)
+        if name.startswith("RLIMIT_")
+    }
+    for module in _MODULES:
+        members = vars(sys.modules[module]) if module in sys.modules else {}
+        for name, value in members.items():
+            if isinstance(value, _FUNCTIONS):
+                state[f"{module}.{name}"] = value
+    return state
+
+
+def changed_settings(before: ProcessState, now: ProcessState) -> list[str]:
+    """Names of what differs: what had another value, or is gone. A function that came in addition is no change, a variable
+    of the environment is."""
+    found = [name for name, value in before.items() if name not in now or now[name] != value]
+    return found + [name for name in now if name not in before and name.startswith("os.environ")]
+
+
+def threads_of(files: Mapping[str, Any]) -> list[str]:
+    """Names of the threads, other than the main one, that run code of these files."""
+    frames = sys._current_frames()
+    found = []
+    for thread in threading.enumerate():
+        frame = frames.get(thread.ident or 0)
+        while frame is not None and thread is not threading.main_thread():
+            if frame.f_code.co_filename in files:
+                found.append(f"the thread {thread.name}")
+                break
+            frame = frame.f_back
+    return found
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
