@@ -14,4 +14,4 @@ class MomentPart(PagePart[SessionView]):
     """Faster, numbers of many rows cannot be read."""
 
     def urgent(self, view: SessionView) -> object:
-        return view.task_serial, view.state, view.playing, view.selected_env, view.timeline.shown is None
+        return view.task_serial, view.state, view.playing, view.selected_env, view.timeline.shown

@@ -219,6 +219,9 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
 
     # --- drawing -----------------------------------------------------------------------------------
 
+    def urgent(self, view: SessionView) -> object:
+        return super().urgent(view), self._episode_only
+
     def draw(self, view: SessionView) -> None:
         there = view.task is not None and view.timeline.moments > 0
         if self._draw_panel(there, view.timeline.shown):
@@ -332,7 +335,7 @@ def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
     marks: dict[int, tuple[int, int, str]] = {}
     for tick, flags in strip.events:
         flag = next(flag for flag in rank if flags & flag)
-        place = round(MOST_MARKS * (tick - strip.low) / max(strip.high - strip.low, 1))
+        place = MOST_MARKS * (tick - strip.low) // (strip.high - strip.low + 1)
         if place not in marks or rank.index(flag) < rank.index(marks[place][1]):
             name = NAMES[FLAGS[flag]]
             if flag == WENT_BACK:
