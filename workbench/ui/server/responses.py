@@ -231,11 +231,6 @@ def content_type(name: str) -> str:
 
 
 HANDLERS = (
-    "wb.press(event)",
-    "wb.choose(event,this)",
-    "wb.place(event)",
-    "wb.pick(event)",
-    "wb.copy(event)",
     "wb.intoSight(this)",
     "wb.follow(this)",
     "wb.openTab(this)",
