@@ -275,15 +275,21 @@ def test_a_jump_is_taken_back_in_the_envs_that_it_brought_where_they_are() -> No
     assert timeline.undo(1).origin == 4
 
 
-def test_what_a_going_back_could_not_put_back_is_told_until_the_next_jump() -> None:
+def test_what_a_going_back_could_not_put_back_is_told_of_its_env_and_episode_alone() -> None:
     timeline = played(3)
     put = Restored((1,), (1,), 2, None, {"actor ball": "the snapshot has none"}, how="put there")
     timeline.add(moment(2, (1,), restored=put))
     timeline.add(moment(3))
-    view = timeline.view(0, ())
+    view = timeline.view(1, ())
     assert view.not_carried == ("actor ball: the snapshot has none",) and view.arrived == "put there"
-    timeline.add(moment(0, (0,)))
     assert timeline.view(0, ()).not_carried == () and timeline.view(0, ()).arrived == ""
+    timeline.seek(1)
+    assert timeline.view(1, ()).not_carried == (), "before it went back"
+    timeline.seek(None)
+    timeline.add(moment(0, (0,)))
+    assert timeline.view(1, ()).not_carried, "another env was reset"
+    timeline.add(moment(0, (1,)))
+    assert timeline.view(1, ()).not_carried == ()
 
 
 def test_the_view_is_of_the_moment_that_is_shown() -> None:

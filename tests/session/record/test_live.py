@@ -249,6 +249,12 @@ def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Sess
     session.save_past((0,))
     view = wait_until(session, lambda view: view.recording.saving.failed, "the refusal")
     assert "its beginning is no longer in memory" in view.recording.saving.message
+    session.change(selected_env=1)
+    assert not session.view().recording.saving.message, "it is of env 0"
+    session.change(selected_env=0)
+    assert session.view().recording.saving.failed
+    step(session)
+    assert not session.view().recording.saving.message, "it is of the moment before"
     session._state.timeline.history.limit = 2**30  # type: ignore[union-attr]
 
 

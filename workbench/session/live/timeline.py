@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraKind, Picture
-from workbench.jobs.task import Restored, ShownPictures, Stepped
+from workbench.jobs.task import ShownPictures, Stepped
 from workbench.session.history.env_table import EnvRows, EnvTable
 from workbench.session.history.history import EnvMoment, History, Moment, ShownMoment
 from workbench.session.protocol.messages import CameraRequest, DrawPast, Request, Restore
@@ -98,8 +98,6 @@ class Timeline:
         self.history = History(table, limit, first_serial, joints)
         self._num_envs = table.rows().num_envs
         self._shown: int | None = None
-        self._jump: Restored | None = None
-        """The last jump; None for a reset."""
         self._entered = 0
         self._requested: tuple[int, int, tuple[CameraRequest, ...]] | None = None
 
@@ -107,8 +105,6 @@ class Timeline:
 
     def add(self, stepped: Stepped) -> Moment:
         moment = self.history.add(stepped)
-        if stepped.reset_mask.any():
-            self._jump = stepped.restored
         if stepped.restored is not None and stepped.restored.number:
             self._entered = stepped.restored.number
         if self._shown is not None and self._shown < self.history.first:
@@ -189,7 +185,10 @@ class Timeline:
         history, moment = self.history, self.shown
         at = moment if moment is not None else history.at(history.last)
         jump = history.last_jump(env)
-        missed, how = ({}, "") if self._jump is None else (self._jump.not_carried, self._jump.how)
+        begin = history.at(history.segment_at(env, self.at)[0]) if at is not None else None
+        # Of the env and the moment that are shown: another env, or a reset since, lacks nothing.
+        came = begin.restored if begin is not None and begin.jumped[env] else None
+        missed, how = ({}, "") if came is None else (came.not_carried, came.how)
         return TimelineView(
             first=history.first,
             last=history.last,
