@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.modules import executed_modules
 from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
 from workbench.core.capture.inspect_env import inspect_env
+from workbench.core.env.actions import width
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
@@ -62,6 +64,8 @@ from workbench.session.protocol.messages import (
     Settings,
     SingleStep,
     Status,
+    Tell,
+    Told,
     WarmUp,
 )
 from workbench.session.protocol.questions import (
@@ -143,6 +147,7 @@ class Worker:
             SingleStep: self._single_step,
             Reset: self._reset,
             Settings: self._apply_settings,
+            Tell: self._tell,
             ReadPolicyAgain: self._read_policy_again,
             FollowPlan: self._follow_plan,
             PlaceCamera: self._cameras.place,
@@ -330,9 +335,7 @@ class Worker:
         if report is None or not report.carried:
             self._chooser.seed(request.options.seed)
         self._rate.clear()
-        # The sliders belong to the previous scene; the server clears them too.
-        self._settings = replace(self._settings, sliders=())
-        self._chooser.sliders = ()
+        self._chooser.new_scene()
         self._cameras.update_watched()
         self._steps.new_scene()
         send(Loaded(opened.description, opened.first, opened.milliseconds, report, request.options))
@@ -380,7 +383,6 @@ class Worker:
         if new.speed != old.speed:
             self._pacer.speed = new.speed
             self._pacer.start(time.monotonic())
-        self._chooser.sliders = new.sliders
         self._cameras.watch(new.selected_env, new.cameras, new.pictures)
         if (new.action_source, new.solve_all, new.selected_env) != (
             old.action_source,
@@ -397,6 +399,23 @@ class Worker:
             old.policy_folder,
         ):
             self._task.run("importing the policy", self._use_action_source)
+            self._task.guarded(self._send_told)
+
+    def _tell(self, request: Tell) -> None:
+        def tell(opened: OpenedTask) -> None:
+            task = opened.env
+            # The page may have asked before it knew of a version with fewer envs, or of another robot.
+            if max(request.env_idx, default=0) < task.num_envs and max(request.dimensions, default=0) < width(
+                task.parts
+            ):
+                self._chooser.tell(task, request.env_idx, request.dimensions, request.values)
+                self._send_told(opened)
+
+        self._task.guarded(tell)
+
+    def _send_told(self, opened: OpenedTask) -> None:
+        if self._chooser.by_sliders:
+            self._line.send(Told(self._chooser.slider_action(opened.env)))
 
     def _use_action_source(self) -> bool:
         """Set the source of actions as in the settings. Returns whether it can be used."""
@@ -470,6 +489,7 @@ class Worker:
         before = self._last
         with blamed("step", opened.loaded, opened.env):
             step = opened.env.step(action)
+        self._chooser.acted(action)
         self._rate.tick(time.monotonic())
         self._send_step(step, np.zeros(opened.env.num_envs, bool))
         ended = np.flatnonzero(step.terminated | step.truncated)
@@ -498,6 +518,7 @@ class Worker:
         with blamed("reset", opened.loaded, opened.env):
             step = self._reset_with_seeds(opened.env, env_idx, seed)
         self._cameras.put_back()
+        self._chooser.begin(env_idx)
         self._send_step(step, _mask(opened, env_idx), seeds=opened.env.episode_seeds)
         return step
 
@@ -538,6 +559,7 @@ class Worker:
             raise
         finally:
             self._cameras.put_back()
+        self._chooser.begin(restored.env_idx, _led_there(request))
         self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
         self._send_status(None)
 
@@ -572,6 +594,7 @@ class Worker:
         self._shares.add("recorded", self._steps.recording_took, time.monotonic())
         self._cameras.scene_changed()
         self._line.send(event)
+        self._send_told(self._task.opened)
 
     # --- status and findings -----------------------------------------------------------------------
 
@@ -612,6 +635,14 @@ class Worker:
         if event.rows or self._rules_reported.rows:
             self._line.send(event)
         self._rules_reported = event
+
+
+def _led_there(request: Restore | EnterRecording) -> dict[int, NDArray[np.float32]]:
+    """(A,) the action that led to the state that an env is put back to, by env, as far as it is known."""
+    if isinstance(request, Restore):
+        return {env: way.actions[-1] for env, way in request.ways.items() if len(way.actions)}
+    run = request.run
+    return {env: run.action[-1] for env in request.env_idx} if run.length else {}
 
 
 def _mask(opened: OpenedTask, env_idx: tuple[int, ...] | None) -> np.ndarray:
