@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -637,12 +637,12 @@ class Worker:
         self._rules_reported = event
 
 
-def _led_there(request: Restore | EnterRecording) -> dict[int, NDArray[np.float32]]:
+def _led_there(request: Restore | EnterRecording) -> Mapping[int, NDArray[np.float32]]:
     """(A,) the action that led to the state that an env is put back to, by env, as far as it is known."""
     if isinstance(request, Restore):
         return {env: way.actions[-1] for env, way in request.ways.items() if len(way.actions)}
     run = request.run
-    return {env: run.action[-1] for env in request.env_idx} if run.length else {}
+    return {env: run.action[-1].copy() for env in request.env_idx} if run.length else {}
 
 
 def _mask(opened: OpenedTask, env_idx: tuple[int, ...] | None) -> np.ndarray:
