@@ -100,7 +100,7 @@ class Page:
         self._built: tuple[bool, Looks] | None = None
         self._waits_for_human = False
         stage = stage or Stage(server)
-        self._scene, self._framing = stage.scene, stage.framing
+        self._scene, self._framing, self._view_choice = stage.scene, stage.framing, stage.choice
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH)
@@ -154,7 +154,7 @@ class Page:
             add_hints(server)
             self._run = RunPanel(server, session)
             self._solve = SolvePanel(server, session, self._link)
-            self._view_panel = ViewPanel(server, dark)
+            self._view_panel = ViewPanel(server, dark, self._view_choice)
             version = VersionPanel(server, session, self._link)
             options = EnvOptionsPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
@@ -306,7 +306,7 @@ class Page:
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
         if self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size)):
             self._waits_for_human = alone
-            self.frame(view)
+            self._framing.frame_new(lambda aspect, height: self._viewpoint(view, aspect, height))
         if self._waits_for_human and any(kind == "human" for kind, _ in view.pictures):
             # The human camera's place comes with its first picture, after the scene.
             self._waits_for_human = False

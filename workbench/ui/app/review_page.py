@@ -150,7 +150,7 @@ class ReviewPage:
             share = sharing.part(server, library, self._library, self._make_way, self._other_unfolded)
         with review_tab:
             going = GoLivePart(server, go_live)
-            self._view_panel = ViewPanel(server, dark)
+            self._view_panel = ViewPanel(server, dark, place.stage.choice)
         return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
 
     def _add_library(self, library: Library) -> None:

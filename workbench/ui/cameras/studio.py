@@ -118,7 +118,7 @@ class StudioPanel(PagePart[SessionView]):
         self._folders = verdict, compare, self._suggest, CameraExport(server, session)
         self._presses = Presses(server)
         self._presses.when_unfolded(self._on_opened)
-        self._was_opened = self._has_chosen = False
+        self._was_opened = False
         with self._picture.folder:
             self._pick = CameraPick(server, session, self._presses)
         self._gizmos: dict[int, CameraGizmo] = {}
@@ -132,9 +132,8 @@ class StudioPanel(PagePart[SessionView]):
 
     def _choose_first(self, view: SessionView) -> None:
         """Choose the first sensor camera once the tab was opened. A person may then choose none."""
-        if self._has_chosen or not self._was_opened or view.task is None:
+        if view.studio.was_chosen or not self._was_opened or view.task is None:
             return
-        self._has_chosen = True
         cameras = sorted(view.task.cameras, key=lambda camera: camera.kind != "sensor")
         if cameras and view.studio.selected is None:
             self._session.studio.select(cameras[0].key)

@@ -89,7 +89,8 @@ class ActionSliders:
         for control, dimension, value in zip(self._controls, self._dimensions, told, strict=False):
             low, high = slider_bounds(dimension)
             # A policy's action may lie outside.
-            control.show(min(max(float(value), low), high))
+            # Three digits: the field beside the slider has no place for more.
+            control.show(min(max(float(f"{value:.3g}"), low), high))
 
     def _send(self, number: int, value: float) -> None:
         self._session.tell((number,), (value,), self._envs)
