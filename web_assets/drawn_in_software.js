@@ -134,10 +134,25 @@
     history.replaceState(history.state, "", address);
   }
 
+  // viser's notice of it lies over the view, in each new tab, until it is closed by hand. Once is enough, and a while.
+  function closeNotice() {
+    const [NOTICE, TOLD, STAYS] = ["webgl-software-rendering", "wb-told-software", 8000]; // viser 1.1, BrowserWarning.tsx
+    const seen = new MutationObserver(() => {
+      const notice = document.getElementById(NOTICE);
+      if (!notice) return;
+      seen.disconnect();
+      const told = localStorage.getItem(TOLD);
+      localStorage.setItem(TOLD, "yes");
+      setTimeout(() => notice.querySelector("button")?.click(), told ? 0 : STAYS);
+    });
+    seen.observe(document, { childList: true, subtree: true });
+  }
+
   const software = isDrawnInSoftware();
   // For `unfolded.js`, which says so to the server (`Presses.when_drawn_in_software`): it sends simpler shapes then.
   if (software) document.documentElement.dataset.drawnInSoftware = "yes";
   if (software) drawInLessTime();
+  if (software) closeNotice();
   if (software && !new URLSearchParams(location.search).has(KEY)) {
     const beginsWith = Math.min(Math.max(devicePixelRatio, 1), 2); // as react-three-fiber's canvas by itself
     changeAddress((asked) => asked.set(KEY, beginsWith));

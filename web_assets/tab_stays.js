@@ -1,7 +1,8 @@
 // Who comes back to a task, or to the review, finds the tab that was open there.
 //
 // Which tab is open is the browser's own matter, and a page that is built again begins with its first. The page says in
-// `data-which` what it shows (which.html); what was chosen there is kept for as long as the browser's tab lives.
+// `data-which` what it shows (which.html); what was chosen there is kept for as long as the browser's tab lives. Where the
+// server asks for it (`data-says`, a hidden number input), it is told which one is open, counted from 0.
 "use strict";
 {
   const KEEPS = "workbench tab of ";
@@ -49,7 +50,18 @@
     looking = looks > 0 ? setTimeout(() => openAgain(kept, left), LOOK) : 0;
   }
 
+  let said = {};
+  function sayWhichIsOpen() {
+    const mark = marker();
+    const input = mark?.dataset.says && document.getElementById(mark.dataset.says);
+    const place = input ? tabsOf(mark).findIndex((tab) => tab.getAttribute("aria-selected") === "true") : -1;
+    if (place < 0 || (said.input === input && said.place === place)) return;
+    said = { input, place };
+    wb.send(input, place);
+  }
+
   new MutationObserver(() => {
+    sayWhichIsOpen();
     const now = marker()?.dataset.which ?? "";
     if (now === which) return;
     which = now;
@@ -59,5 +71,5 @@
     if (marker()?.hasAttribute("data-anew")) sessionStorage.removeItem(KEEPS + now);
     const kept = sessionStorage.getItem(KEEPS + now);
     if (now && kept) openAgain(kept, LOOKS);
-  }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-which"] });
+  }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-which", "aria-selected"] });
 }

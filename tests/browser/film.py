@@ -117,9 +117,9 @@ def take_film(desk: Desk, path: Path) -> None:
     time.sleep(2)
     film.scene("... and save it to the file", 1.5, 2, lambda frame: time.sleep(1))
     desk.tab("Episodes")
-    desk.press("c", "Space")
+    desk.press("Shift+C", "Space")
     film.scene("Record episodes", 1.5, 5, lambda frame: time.sleep(1.5))
-    desk.press("c", "Space", "v")
+    desk.press("Shift+C", "Space", "v")
     row = page.locator(".wb-library [data-row]").first
     expect(row).to_be_visible(timeout=60_000)
     row.click()

@@ -262,7 +262,7 @@ def shoot_branch(browser: Browser) -> None:
     with live_page(browser, "--num-envs", "16", *CONTROL) as desk:
         take_policy(desk)
         desk.step(40)
-        desk.press(*18 * ["ArrowLeft"], "g")
+        desk.press(*18 * ["ArrowLeft"], "Shift+G")
         time.sleep(2)
         desk.step(25)
         desk.tab("Reward")

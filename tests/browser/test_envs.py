@@ -136,7 +136,7 @@ def test_the_selected_env_is_read_out_and_changes_are_marked(page: Page) -> None
     page.keyboard.press("Escape")
     page.locator(".wb-inspect").click()
     # How far Play came before is not known: at an episode's last step contacts are not known.
-    page.keyboard.press("r")
+    page.keyboard.press("Shift+R")
     until(lambda: cell(page, 0, 2) == "0", "the reset")
     page.keyboard.press("s")
     until(lambda: cell(page, 0, 2) == "1", "the step")

@@ -34,7 +34,7 @@ def desk(opened: Desk) -> Desk:
     """On the Run tab, at the first step of an episode."""
     opened.leave_inputs()
     opened.tab("Run")
-    opened.press("End", "r")
+    opened.press("End", "Shift+R")
     opened.timeline_says("step 0 /")
     return opened
 

@@ -37,7 +37,7 @@ VIEW = "canvas[data-engine]"
 def opened(example: At, browser: Browser) -> Iterator[Desk]:
     with example(browser) as desk:
         close_notice(desk.page)
-        desk.press("r")
+        desk.press("Shift+R")
         desk.tab("Reward")
         desk.comes_to(0)
         desk.press("s", "s")
@@ -46,7 +46,7 @@ def opened(example: At, browser: Browser) -> Iterator[Desk]:
         assert not desk.errors
         # As the next file begins.
         desk.tab("Reward")
-        desk.press("r")
+        desk.press("Shift+R")
         desk.comes_to(0)
 
 

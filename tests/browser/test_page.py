@@ -94,7 +94,7 @@ def test_keys_step_and_reset(calm: Desk) -> None:
     until(lambda: calm.elapsed() == 0, "the reset")
     calm.page.keyboard.press("s")
     until(lambda: calm.elapsed() == 1, "the step")
-    calm.page.keyboard.press("r")
+    calm.page.keyboard.press("Shift+R")
     until(lambda: calm.elapsed() == 0, "the reset")
 
 

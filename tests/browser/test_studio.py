@@ -384,7 +384,7 @@ def test_files_for_opencv_and_ros_say_what_the_page_says(page: Page) -> None:
 
 def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_be_stopped(page: Page) -> None:
     page.evaluate("document.activeElement.blur()")
-    page.keyboard.press("r")
+    page.keyboard.press("Shift+R")
     expect(page.get_by_text("env 0: step 0").first).to_be_visible()
     for step in range(1, 4):
         page.keyboard.press("s")

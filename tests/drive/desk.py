@@ -63,7 +63,7 @@ class Desk:
             expect(timeline).not_to_contain_text(f"env {now[1]}")
 
     def moments_kept(self) -> int:
-        """Steps and resets that the timeline says it has."""
+        """Control steps that the timeline says it has."""
         found = re.search(r"history: (\d+) steps?,", self.page.locator(".wb-timeline").inner_text())
         return 0 if found is None else int(found[1])
 

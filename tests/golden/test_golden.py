@@ -217,7 +217,7 @@ def goes_on_as_recorded(session: Session, path: Path, state: int) -> None:
     assert_close(view.step.poses[1], episode.poses[state])
     for t in range(state, episode.length):
         last = view.timeline.last
-        session.change(sliders=tuple(float(x) for x in episode.action[t]))
+        session.tell(range(episode.action.shape[1]), [float(x) for x in episode.action[t]])
         session.step()
         view = wait_until(session, lambda v, last=last: v.timeline.last > last, "a step")
         assert_close(view.step.poses[1], episode.poses[t + 1])

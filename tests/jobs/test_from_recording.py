@@ -65,7 +65,7 @@ def into(session: Session, run: RecordedRun, everywhere: bool = False) -> Sessio
 
 
 def step_with(session: Session, action: np.ndarray) -> SessionView:
-    session.change(sliders=tuple(float(x) for x in action))
+    session.tell(range(len(action)), [float(x) for x in action])
     return step(session)
 
 

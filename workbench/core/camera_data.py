@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
@@ -84,6 +85,38 @@ def setting_text(value: object) -> str:
     if isinstance(value, tuple):
         return f"({', '.join(map(setting_text, value))})"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+@dataclass(frozen=True)
+class MovedCamera:
+    """A camera whose placement in a recorded episode is not the file's, or is the file's again, from a state on."""
+
+    state: int
+    """0: from the start."""
+    kind: CameraKind
+    name: str
+    used: CameraSettings
+    in_file: CameraSettings
+    """Equal to `used` where the camera was put back."""
+
+
+def moved_cameras_text(moved: Sequence[MovedCamera]) -> str:
+    """``base_camera: position (0.3, 0, 0.6), in the file (0.3, 0, 0.5)``; empty if none was moved."""
+    said = []
+    for one in moved:
+        from_step = f" from step {one.state} on" if one.state else ""
+        values = [
+            f"{what} {setting_text(mine)}, in the file {setting_text(file)}"
+            for what in differences(one.used, one.in_file)
+            for mine, file in [(_value(one.used, what), _value(one.in_file, what))]
+        ]
+        said.append(f"{one.name}{from_step}: {'; '.join(values) or 'as in the file'}")
+    return ". ".join(said)
+
+
+def _value(settings: CameraSettings, what: str) -> object:
+    """The setting that `differences` calls so."""
+    return getattr(settings, "quaternion" if what == "orientation" else what)
 
 
 NOT_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"

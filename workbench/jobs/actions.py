@@ -52,8 +52,10 @@ class ActionChooser:
         self._policy_name = ""
         self._task_folder: Path | None = None
         self._rng = np.random.default_rng(0)
-        self.sliders: tuple[float, ...] = ()
-        """(A,) the action of every env while the source is ``sliders``; with another length the envs hold still."""
+        self._sliders: NDArray[np.float32] | None = None
+        """(N, A) deltas, velocities and the like that sliders were moved to; NaN elsewhere."""
+        self._targets: NDArray[np.float32] | None = None
+        """(N, A) the last action of each env, or where a slider was moved since; NaN from a reset to the first action."""
 
     @property
     def name(self) -> str:
@@ -79,7 +81,7 @@ class ActionChooser:
             TaskError: the policy cannot be imported. `next_action` tries again.
         """
         self._source, self._policy_name, self._task_folder = source, policy or "", task_folder
-        self._policy = None
+        self._policy = self._sliders = None
         if source != "policy" or not self._policy_name:
             return
         with self._imported():
@@ -100,9 +102,54 @@ class ActionChooser:
         low, high = actions.bounds(task.parts)
         if self._source == "zero":
             return _same_for_all(np.clip(0.0, low, high), task)
-        if self._source == "sliders" and len(self.sliders) == len(low):
-            return _same_for_all(np.clip(np.asarray(self.sliders, np.float32), low, high), task)
+        if self._source == "sliders":
+            return self.slider_action(task)
         return actions.hold_action(task.parts, task.num_envs)
+
+    def slider_action(self, task: TaskEnv) -> NDArray[np.float32]:
+        """(N, A) what sliders tell the robots next: targets of joints stay, and what has none and was not moved holds still."""
+        low, high = actions.bounds(task.parts)
+        action = actions.hold_action(task.parts, task.num_envs)
+        is_target = actions.is_target(task.parts)
+        for told, where in ((self._targets, is_target), (self._sliders, ~is_target)):
+            if told is not None:
+                action = np.where(where & ~np.isnan(told), told, action)
+        return np.clip(action, low, high).astype(np.float32)
+
+    def tell(
+        self, task: TaskEnv, env_idx: Sequence[int], dimensions: Sequence[int], values: Sequence[float]
+    ) -> None:
+        """Tell these envs these values of the action, by slider; without any to hold still where they are."""
+        shape = task.num_envs, actions.width(task.parts)
+        if self._sliders is None or self._targets is None:
+            self._sliders = np.full(shape, np.nan, np.float32)
+            self._targets = np.full(shape, np.nan, np.float32)
+        if not dimensions:
+            self._sliders[list(env_idx)] = self._targets[list(env_idx)] = np.nan
+        for told in (self._sliders, self._targets):
+            told[np.ix_(env_idx, dimensions)] = values
+
+    def acted(self, action: NDArray[np.float32]) -> None:
+        """Note the action of a control step, whatever its source."""
+        self._targets = action.copy()
+
+    def begin(
+        self, env_idx: Sequence[int] | None, led: Mapping[int, NDArray[np.float32]] | None = None
+    ) -> None:
+        """Forget the targets of these envs (all if None): they were reset, or put back to where the actions `led`, by env."""
+        if self._targets is None:
+            return
+        self._targets[slice(None) if env_idx is None else list(env_idx)] = np.nan
+        for env, action in (led or {}).items():
+            self._targets[env] = action
+
+    def new_scene(self) -> None:
+        """Forget what all envs were told: there may be another number of them."""
+        self._sliders = self._targets = None
+
+    @property
+    def by_sliders(self) -> bool:
+        return self._source == "sliders"
 
     @contextmanager
     def _imported(self) -> Iterator[Policy]:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import CameraInfo, CameraKey, Picture, PictureDegree
+from workbench.core.camera_data import CameraInfo, CameraKey, CameraSettings, Picture, PictureDegree
 from workbench.core.cameras.report import ObjectToSee
 from workbench.core.env.keywords import HowMade
 from workbench.core.env.step_result import StepResult
@@ -202,6 +202,8 @@ class Stepped:
     capturing."""
     acted_by: str = ""
     """The source of this step's action, for a recording; empty if it is known before the episode."""
+    placed: dict[CameraKey, CameraSettings] = field(default_factory=dict)
+    """The cameras that are placed by hand (only while capturing)."""
     resumed: bool = False
     """The envs have the state that the previous worker left: the result follows from none of this worker's, but nothing
     was reset."""

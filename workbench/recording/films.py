@@ -46,7 +46,11 @@ class Encoding:
 
 
 def write_mp4(
-    path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, encoding: Encoding = Encoding()
+    path: Path,
+    frames: Iterable[NDArray[np.uint8]],
+    fps: float,
+    encoding: Encoding = Encoding(),
+    comment: str = "",
 ) -> int:
     """Write the frames to a new file at `path`; returns how many there were.
 
@@ -54,6 +58,7 @@ def write_mp4(
         path: must not exist.
         frames: (H, W, 3) each, all of one size.
         fps: frames per second.
+        comment: in the file's metadata.
 
     Raises:
         ValueError: there is no frame, or one has another size.
@@ -63,7 +68,7 @@ def write_mp4(
     first = next(coming, None)
     if first is None:
         raise ValueError("There is no picture to make a film of.")
-    with new_file(path) as temporary, FilmWriter(temporary, first.shape, fps, encoding) as film:
+    with new_file(path) as temporary, FilmWriter(temporary, first.shape, fps, encoding, comment) as film:
         film.add(first)
         for frame in coming:
             film.add(frame)
@@ -79,7 +84,9 @@ class FilmWriter:
     As a context manager it closes at the end of the block, and kills ffmpeg when the block raised.
     """
 
-    def __init__(self, path: Path, shape: tuple[int, ...], fps: float, encoding: Encoding) -> None:
+    def __init__(
+        self, path: Path, shape: tuple[int, ...], fps: float, encoding: Encoding, comment: str = ""
+    ) -> None:
         self._shape, self._count = shape, 0
         height, width = shape[:2]
         odd = bool(height % 2 or width % 2)
@@ -101,6 +108,7 @@ class FilmWriter:
         # Every player supports colour at half resolution, which needs an even size.
         command += ["yuv444p" if odd and encoding.exact_size else "yuv420p", "-movflags", "+faststart"]
         command += [] if encoding.key_every is None else ["-g", str(encoding.key_every), "-bf", "0"]
+        command += ["-metadata", f"comment={comment}"] if comment else []
         self._stderr = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
             [*command, "-f", "mp4", str(path)],

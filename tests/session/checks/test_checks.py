@@ -25,12 +25,14 @@ from workbench.session.rescore.background import StoppedBy
 
 FIRST, SECOND = "success-at-reset", "reward-changes"
 GROUPS = ((FIRST,), (SECOND,))
-LOAD = Load("push.py", TaskOptions(), {"push.py": "version 1"})
-NEXT = replace(LOAD, source={"push.py": "version 2"})
+FILE = "/home/me/push.py"
+LOAD = Load("push.py", TaskOptions(), {FILE: "def evaluate(self):\n    return 1\n"})
+NEXT = replace(LOAD, source={FILE: "def evaluate(self):\n    print()\n    return 1\n"})
+MENDED = replace(LOAD, source={FILE: "def evaluate(self):\n    return 2\n"})
 
 
 def finding(rule: str, line: int = 7) -> Finding:
-    return Finding(rule, "stop", f"{rule} is broken", "/home/me/push.py", line, "return 1", "evaluate", 8, 0)
+    return Finding(rule, "stop", f"{rule} is broken", FILE, line, "return 1", "evaluate", 8, 0)
 
 
 def broken(rule: str) -> RuleResult:
@@ -151,6 +153,17 @@ def test_findings_of_the_version_before_stay_until_their_rule_is_checked(
     background.let.release()
     view = ended(checks)
     assert view.before == () and [one.rule for one in view.findings] == [SECOND]
+
+
+def test_a_finding_goes_with_the_line_that_it_is_about(
+    checks: Checks, background: ScriptedBackground
+) -> None:
+    background.comes_to = {FIRST: broken(FIRST)}
+    checks.loaded(LOAD, same_task=True)
+    ended(checks)
+    background.hold()
+    checks.loaded(MENDED, same_task=True)
+    assert checks.view.before == () and checks.view.findings == ()
 
 
 def test_another_task_has_no_findings_of_the_one_before(

@@ -137,12 +137,11 @@ def test_what_was_odd_while_playing_goes_with_the_version_and_comes_back_if_that
 def test_another_scene_begins_another_past_whose_moments_count_on() -> None:
     state = running()
     state.change(selected_env=2)
-    state.change(sliders=(1.0,))
     state.loaded(loaded(report("rebuilt"), num_envs=2), restored=False, stale=False)
     state.stepped(stepped(0, jumped=True, num_envs=2))
     after = view(state)
     assert (after.scene_serial, after.cameras_serial) == (2, 2)
-    assert (after.selected_env, after.settings.sliders) == (1, ())
+    assert after.selected_env == 1
     assert (after.timeline.first, after.timeline.moments) == (4, 1)
 
 

@@ -6,16 +6,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.drive.session import start_over, step, wait_until
+from tests.drive.session import live_session, start_over, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from workbench.jobs.task import TaskOptions
 from workbench.recording.rerun.read import read_properties
 from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
 
 DRAWS = True
@@ -92,16 +94,38 @@ def test_the_same_seed_gives_the_same_start(session: Session) -> None:
     assert other.step_serial < again.step_serial
 
 
-def test_sliders_are_the_action_of_every_env_and_are_kept_in_bounds(session: Session) -> None:
-    settle(session)
-    count = len(session.view().task.actions)
-    session.change(action_source="sliders")
-    session.change(sliders=(5.0,) + (0.25,) * (count - 1))
-    session.step()
-    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
-    assert view.step.action.shape == (2, count)
-    assert np.allclose(view.step.action[:, 0], view.task.actions[0].high)
-    assert np.allclose(view.step.action[:, 1:], 0.25)
+def test_a_slider_moves_one_joint_of_one_env_from_the_targets_that_the_robot_has(
+    child_process: None, tmp_path: Path
+) -> None:
+    with live_session("PushCube-v1", tmp_path, control_mode="pd_joint_pos") as session:
+        session.change(action_source="sliders")
+        start = told(session)
+        assert np.allclose(start[:, :7], session.view().step.qpos[:, :7], atol=1e-5), (
+            "not the middle of the limits"
+        )
+        assert np.allclose(step(session, 3).step.action, start), "untouched, each joint keeps its target"
+        session.tell((0,), (5.0,), (1,))
+        moved = wait_until(session, lambda v: v.told[1, 0] != start[1, 0], "the slider").told
+        others = np.ones(moved.shape, bool)
+        others[1, 0] = False
+        assert moved[1, 0] == pytest.approx(session.view().task.actions[0].high)
+        assert np.array_equal(moved[others], start[others])
+        assert np.allclose(step(session).step.action, moved)
+        session.change(action_source="random")
+        acted = step(session).step.action
+        session.change(action_source="sliders")
+        assert np.allclose(told(session, lambda v: not np.array_equal(v.told, moved)), acted)
+        session.reset((0,))
+        after = told(session, lambda v: v.step.elapsed_steps[0] == 0 and not np.array_equal(v.told, acted))
+        assert np.allclose(after[0, :7], session.view().step.qpos[0, :7], atol=1e-5)
+        assert np.allclose(after[1], acted[1]), "env 1 was not reset"
+
+
+def told(session: Session, reached: Callable[[SessionView], bool] = lambda view: True) -> np.ndarray:
+    """(N, A) what the sliders show."""
+    view = wait_until(session, lambda v: v.told is not None and reached(v), "what the robots are told")
+    assert view.told is not None
+    return view.told
 
 
 def test_holding_still_keeps_the_robot_where_it_is(session: Session) -> None:
@@ -316,4 +340,4 @@ def test_recording_writes_an_episode_that_rerun_verifies(session: Session) -> No
     view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the file")
     assert not view.recording.active and view.recording.problem is None
     assert verify_rrd(view.recording.last_file) is None
-    assert "WorkbenchPushCube-v1" in str(read_properties(view.recording.last_file))
+    assert "WorkbenchPushCube-v1" in str(read_properties(Path(view.recording.last_file)))

@@ -12,7 +12,7 @@ import pytest
 from tests.session.moments import N, stepped, table
 from workbench.core.camera_data import CameraKind, Picture
 from workbench.jobs.task import Restored, Stepped
-from workbench.session.history.history import RESET, SUCCESS
+from workbench.session.history.history import RESET, SUCCESS, WENT_BACK
 from workbench.session.live.timeline import Timeline
 from workbench.session.protocol.messages import CameraRequest, PastPictures, Pictures
 
@@ -99,15 +99,15 @@ def test_a_camera_that_moves_is_asked_again_at_the_same_moment() -> None:
 def test_a_moment_is_pinned_and_left_for_live() -> None:
     timeline = played(5, first_serial=40)
     assert (timeline.at, timeline.shown) == (45, None)
-    timeline.seek_by(-2)
+    timeline.seek_by(0, -2)
     assert timeline.at == 43 and timeline.shown.serial == 43
     timeline.add(moment(6))
     assert timeline.at == 43, "what comes does not move it"
     timeline.seek(0)
     assert timeline.at == 40
-    timeline.seek_by(5)
+    timeline.seek_by(0, 5)
     assert timeline.at == 45 and timeline.shown is not None
-    timeline.seek_by(1)
+    timeline.seek_by(0, 1)
     assert timeline.shown is None and timeline.at == 46
     timeline.seek(46)
     assert timeline.shown is None, "the newest is live"
@@ -155,20 +155,92 @@ def test_a_step_of_the_episode_is_found_through_resets() -> None:
     assert timeline.at == 3
 
 
-def test_a_strip_is_of_one_env_between_two_moments() -> None:
+def test_a_step_back_passes_the_resets_of_other_envs_by() -> None:
+    timeline = played(2)
+    for env in (0, 2):
+        timeline.add(moment(0, (env,)))
+    timeline.add(moment(3))
+    ways = {}
+    for env in range(N):
+        timeline.seek(None)
+        ways[env] = []
+        for _ in range(3):
+            timeline.seek_by(env, -1)
+            ways[env].append(timeline.at)
+    assert ways == {0: [3, 2, 1], 1: [2, 1, 0], 2: [4, 2, 1]}
+    timeline.seek_by(1, 2)
+    assert timeline.at == 5 - 0 and timeline.shown is None
+
+
+def test_steps_are_counted_in_one_way_and_a_reset_is_none() -> None:
+    timeline = Timeline(table(), 10**9, 7)
+    timeline.add(moment(0, (0, 1, 2)))
+    view = timeline.view(0, ())
+    assert (view.steps, view.steps_ago, view.moments) == (0, 0, 1)
+    for number in (1, 2, 3):
+        timeline.add(moment(number))
+    timeline.add(moment(0, (0, 1, 2)))
+    for number in (1, 2):
+        timeline.add(moment(number))
+    curves = timeline.history.steps.curves(0)
+    assert timeline.view(0, ()).steps == curves.serial == 5 and len(timeline.history) == 7
+    timeline.seek_tick(4)
+    view = timeline.view(0, ())
+    assert (view.tick, view.steps_ago) == (4, 1) and timeline.shown.step.elapsed_steps[0] == 1
+    strip = timeline.strip(0, view.first_tick, view.last_tick)
+    assert (strip.low, strip.high) == (0, 5)
+    assert np.isnan(strip.reward[0]) and np.isfinite(strip.reward[1:]).all()
+    # At tick 3 is the last step of the first episode and the reset after it; of the second episode it is the reset.
+    timeline.seek_tick(3)
+    assert timeline.shown.step.elapsed_steps[0] == 3
+    timeline.seek(13)
+    timeline.seek_tick(3, episode_of=0)
+    assert timeline.shown.step.elapsed_steps[0] == 0 and timeline.view(0, ()).steps_ago == 2
+    assert [timeline.tick_of(serial) for serial in timeline.episode(0)] == [3, 5]
+
+
+def test_an_episode_holds_what_was_undone_too() -> None:
+    timeline = played(3)
+    timeline.add(moment(0, (0, 1, 2)))
+    timeline.add(moment(1))
+    timeline.add(moment(3, (0, 1, 2), restored=Restored((0, 1, 2), (0, 1, 2), 3, 4, {})))
+    assert timeline.episode(0) == (0, 6)
+
+
+def test_a_reset_that_the_task_asked_for_is_named_so() -> None:
+    timeline = played(2)
+    over = moment(3)
+    timeline.add(replace(over, step=replace(over.step, truncated=np.array([True, False, True]))))
+    timeline.add(moment(0, (0, 2)))
+    assert timeline.view(0, ()).undo == "reset at the end"
+    timeline.add(moment(0, (1,)))
+    assert timeline.view(1, ()).undo == "reset of env 1"
+
+
+def test_in_the_past_the_table_of_envs_is_of_the_past() -> None:
+    timeline = played(3)
+    timeline.add(moment(0, (1,)))
+    timeline.add(moment(1))
+    assert timeline.env_rows().steps.tolist() == moment(1).step.elapsed_steps.tolist()
+    timeline.seek(2)
+    then = timeline.env_rows()
+    assert then.steps.tolist() == [2, 2, 2]
+    assert [np.isfinite(row).sum() for row in then.rewards] == [2, 2, 2]
+
+
+def test_a_strip_is_of_one_env_between_two_steps() -> None:
     timeline = played(2)
     timeline.add(moment(3, success=(1,)))
     timeline.add(moment(0, (1,), restored=Restored((1,), (2,), 1, None, {})))
     timeline.add(moment(4))
     whole = timeline.strip(1, -10, 99)
-    assert (whole.low, whole.high) == (0, 5)
-    assert [serial for serial, _ in whole.events] == [0, 3, 4]
-    assert dict(whole.events)[3] == SUCCESS and dict(whole.events)[0] == RESET
-    assert whole.branches == ((4, 1),) and whole.segments == ((0, 3), (4, 5))
-    assert len(whole.reward) == 6
-    part = timeline.strip(1, 1, 3)
-    assert (part.low, part.high, part.branches) == (1, 3, ()) and part.segments == ((1, 3),)
-    assert timeline.strip(0, 0, 5).segments == ((0, 5),) and timeline.strip(0, 0, 5).branches == ()
+    assert (whole.low, whole.high) == (0, 4)
+    assert dict(whole.events) == {0: RESET, 3: SUCCESS | WENT_BACK}
+    assert whole.branches == ((3, 1),) and whole.segments == ((0, 3, False), (3, 4, True))
+    assert len(whole.reward) == 5
+    part = timeline.strip(1, 1, 2)
+    assert (part.low, part.high, part.branches) == (1, 2, ()) and part.segments == ((1, 2, False),)
+    assert timeline.strip(0, 0, 5).segments == ((0, 4, False),) and timeline.strip(0, 0, 5).branches == ()
 
 
 @pytest.mark.parametrize(
@@ -203,15 +275,21 @@ def test_a_jump_is_taken_back_in_the_envs_that_it_brought_where_they_are() -> No
     assert timeline.undo(1).origin == 4
 
 
-def test_what_a_going_back_could_not_put_back_is_told_until_the_next_jump() -> None:
+def test_what_a_going_back_could_not_put_back_is_told_of_its_env_and_episode_alone() -> None:
     timeline = played(3)
     put = Restored((1,), (1,), 2, None, {"actor ball": "the snapshot has none"}, how="put there")
     timeline.add(moment(2, (1,), restored=put))
     timeline.add(moment(3))
-    view = timeline.view(0, ())
+    view = timeline.view(1, ())
     assert view.not_carried == ("actor ball: the snapshot has none",) and view.arrived == "put there"
-    timeline.add(moment(0, (0,)))
     assert timeline.view(0, ()).not_carried == () and timeline.view(0, ()).arrived == ""
+    timeline.seek(1)
+    assert timeline.view(1, ()).not_carried == (), "before it went back"
+    timeline.seek(None)
+    timeline.add(moment(0, (0,)))
+    assert timeline.view(1, ()).not_carried, "another env was reset"
+    timeline.add(moment(0, (1,)))
+    assert timeline.view(1, ()).not_carried == ()
 
 
 def test_the_view_is_of_the_moment_that_is_shown() -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +14,18 @@ import numpy as np
 import pytest
 
 from tests.drive.session import TASKS, live_session, start_over, step, wait_until
-from tests.session.studio import BASE
+from tests.session.studio import BASE, camera, moved
 from workbench.authoring.loading.load import load_task
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.report import ObjectSummary
 from workbench.recording.episode.episode import Episode
+from workbench.recording.lerobot.export import ExportOptions, export_lerobot
+from workbench.recording.lerobot.format import WORKBENCH_FILE
+from workbench.recording.maniskill.export import export_maniskill
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.ui.live.status_line import slowed_by
 
 STEPS = 4
 
@@ -242,6 +249,12 @@ def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Sess
     session.save_past((0,))
     view = wait_until(session, lambda view: view.recording.saving.failed, "the refusal")
     assert "its beginning is no longer in memory" in view.recording.saving.message
+    session.change(selected_env=1)
+    assert not session.view().recording.saving.message, "it is of env 0"
+    session.change(selected_env=0)
+    assert session.view().recording.saving.failed
+    step(session)
+    assert not session.view().recording.saving.message, "it is of the moment before"
     session._state.timeline.history.limit = 2**30  # type: ignore[union-attr]
 
 
@@ -264,3 +277,59 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
     wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
     assert session.view().recording.problem is None
     session.stop_recording()
+
+
+def test_what_is_recorded_says_where_a_moved_camera_was_and_where_the_file_has_it(
+    session: Session, tmp_path: Path
+) -> None:
+    """Live, and of the past; as data in the .json, as facts in exports."""
+    in_file = camera(session, BASE).now
+    assert in_file is not None
+    there = replace(in_file, position=(0.31, 0.02, 0.55))
+    count = session.view().recording.episodes_written
+    session.studio.place(BASE, there)
+    wait_until(session, lambda view: moved(view) == {BASE}, "the placement")
+    session.start_recording((0,))
+    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
+    step(session, 2)
+    session.save_past((0,))
+    past = written(session, count + 1)[-1]
+    session.studio.back_to_file(BASE)
+    wait_until(session, lambda view: not moved(view), "the file's placement")
+    step(session, 2)
+    view = wait_until(session, lambda view: view.recording.steps == 4, "the steps")
+    assert view.recording.episodes == 0 and time.time() - view.recording.since < 600
+    session.stop_recording()
+    live = written(session, count + 2)[-1]
+    assert [(m.state, m.name, m.used, m.in_file) for m in live.info.moved_cameras] == [
+        (0, "base_camera", there, in_file),
+        (3, "base_camera", in_file, in_file),
+    ]
+    assert past.info.moved_cameras == live.info.moved_cameras[:1]
+    # As the pictures say, which have a pose each.
+    track = next(track for track in live.cameras if track.info.key == BASE)
+    stood = np.array([(0.31, 0.02, 0.55)] * 3 + [(0.45, 0, 0.6)] * 2)
+    np.testing.assert_allclose(track.pose[:, :3], stood, atol=1e-6)
+    sources = [("live", lambda: live)]
+    export_maniskill(sources, tmp_path / "all.h5")
+    (episode,) = json.loads((tmp_path / "all.json").read_text())["episodes"]
+    export_lerobot(sources, tmp_path / "set", ExportOptions())
+    ours = json.loads((tmp_path / "set" / WORKBENCH_FILE).read_text())["episodes"][0]
+    for exported in (episode, ours):
+        assert [m["used"]["position"] for m in exported["moved_cameras"]] == [
+            [0.31, 0.02, 0.55],
+            list(in_file.position),
+        ]
+
+
+def test_playing_that_recording_makes_slow_says_so(session: Session) -> None:
+    session.change(action_source="random", speed=4.0)
+    session.start_recording()
+    session.play()
+    view = wait_until(session, lambda view: view.recorded_share > 0.5, "the share of the recording")
+    assert view.real_time_factor < 4
+    short, long = slowed_by(view) or ("", "")
+    assert "2 cameras" in short and "2 envs" in long
+    session.stop_recording()
+    wait_until(session, lambda view: view.recorded_share < 0.1, "faster steps")
+    session.pause()

@@ -239,7 +239,7 @@ def test_buttons_name_their_keys_and_every_key_is_listed(opened: Opened) -> None
     told = opened.panels.html("wb-all-keys")
     for button, key in (
         ("Play", "Space"),
-        ("Reset this env", "Shift+R"),
+        ("Reset this env", "Shift+S"),
         ("‹ event", "Shift+Left arrow"),
         ("live", "End"),
     ):

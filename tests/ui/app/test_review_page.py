@@ -203,7 +203,7 @@ def strip_of(shown: Shown) -> dict[str, list[tuple[str, ...]]]:
     """What the strip draws: extents of recordings, marks, and upright lines, with their places in per cent."""
     html = shown.panels.html("wb-timeline")
     extent = r'wb-length" style="left:([-\d.]+)%;width:([-\d.]+)%;background:(#\w+)"'
-    mark = r'wb-mark wb-mark-(\w+)" style="left:([-\d.]+)%" title="([^"]*)"'
+    mark = r'wb-mark wb-mark-(\w+)" style="left:([-\d.]+)%" data-at="-?\d+" title="([^"]*)"'
     return {
         "extents": re.findall(extent, html),
         "marks": re.findall(mark, html),

@@ -21,8 +21,9 @@ from workbench.ui.checks.panel import (
     CHECK_NOW,
     REST,
     STOP_CHECKS,
-    ChecksMark,
     ChecksPanel,
+    FindingsMark,
+    findings_mark,
     status_html,
 )
 from workbench.ui.checks.step_profile import PROFILE, STOP_PROFILE, StepProfilePanel, profile_html
@@ -71,32 +72,32 @@ class RecordedSession:
 class Shown:
     panel: ChecksPanel
     profile: StepProfilePanel
-    mark: ChecksMark
     session: RecordedSession
     panels: Panels
     clock: Clock
+    mark: FindingsMark | None = None
 
     def draw(self, checks: ChecksView, **changes: Any) -> None:
         self.clock.passes()
         view = running(4, checks=checks, **changes)
-        for part in (self.panel, self.profile, self.mark):
+        for part in (self.panel, self.profile):
             part.draw(view)
+        self.mark = findings_mark(view)
 
 
 @pytest.fixture
 def shown(panels: Panels, clock: Clock) -> Shown:
     session = cast(Any, RecordedSession())
-    mark = ChecksMark(panels.server)
     with (tab := panels.server.gui.add_tab_group().add_tab("Checks")):
         panel = ChecksPanel(panels.server, session, tab)
         profile = StepProfilePanel(panels.server, session)
-    return Shown(panel, profile, mark, session, panels, clock)
+    return Shown(panel, profile, session, panels, clock)
 
 
 def test_it_says_what_a_check_is_before_the_first(shown: Shown) -> None:
     shown.draw(ChecksView())
     assert "Not checked so far" in shown.panels.html() and shown.panels.shows(CHECK_NOW)
-    assert not shown.panels.shows(STOP_CHECKS) and shown.panels.html("wb-rules-mark") == ""
+    assert not shown.panels.shows(STOP_CHECKS) and shown.mark is None
     assert "Checks" in shown.panels.folders()
 
 
@@ -132,9 +133,9 @@ def test_a_finding_has_rule_degree_line_code_and_message_escaped_and_the_tab_cou
     assert "3 rules checked in 2.0 s" in shown.panels.html()
     assert "1 stop, 1 kept, 1 not applicable" in shown.panels.html()
     assert "Checks 1" in shown.panels.folders()
-    assert "1 finding" in shown.panels.html("wb-rules-mark")
+    assert shown.mark is not None and shown.mark.count == 1
     shown.draw(replace(DONE, serial=6, results=RESULTS[1:]))
-    assert "Checks" in shown.panels.folders() and shown.panels.html("wb-rules-mark") == ""
+    assert "Checks" in shown.panels.folders() and shown.mark is None
 
 
 def test_what_a_message_has_between_backticks_is_code_and_the_rest_is_as_it_is(shown: Shown) -> None:
@@ -217,7 +218,7 @@ def test_rules_seen_while_playing_are_rows_of_the_same_list(shown: Shown) -> Non
     text = shown.panels.html("wb-checks")
     assert text.index("success-at-reset") < text.index("not-applied")
     assert "while playing once, from the start" in text and "5 times at further lines" in text
-    assert "None" not in text and "2 findings" in shown.panels.html("wb-rules-mark")
+    assert "None" not in text and shown.mark is not None and shown.mark.count == 2
 
 
 def test_outliers_are_rows_of_the_same_list(shown: Shown) -> None:
@@ -227,7 +228,7 @@ def test_outliers_are_rows_of_the_same_list(shown: Shown) -> None:
     text = shown.panels.html("wb-checks")
     for words in ("bodies-stay", "push.py:70", "cube dropped 0.9 m", "40 times and more, first at step 2"):
         assert words in text
-    assert "2 findings" in shown.panels.html("wb-rules-mark")
+    assert shown.mark is not None and shown.mark.count == 2
     shown.draw(DONE)
     assert "bodies-stay" not in shown.panels.html("wb-checks")
 

@@ -88,9 +88,9 @@ def test_a_worker_s_death_says_when_all_is_back(panels: Panels) -> None:
     died = replace(problem("the worker process was killed by SIGSEGV"), stage="worker")
     view = running(2, problem=died, problem_serial=1, state="starting", playing=False)
     banner.draw(view)
-    before = panels.html()
+    while_away = panels.html()
     banner.draw(replace(view, state="paused"))
-    assert panels.html() != before
+    assert panels.html() != while_away
 
 
 def test_the_status_line_says_busy_with_what_and_claims_no_rate() -> None:

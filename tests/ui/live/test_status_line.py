@@ -3,12 +3,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from tests.drive.panels import Panels
-from tests.ui.env_rows import rows_of
 from tests.ui.scenes import EMPTY, PLAN, problem, running
-from workbench.core.capture.outliers import Outlier, OutlierKind
 from workbench.session.live.solver import SolveView
-from workbench.ui.live.status_line import StatusLine, flagged_text, status_values
+from workbench.ui.live.status_line import status_values
 from workbench.ui.widgets.templates import render
 
 
@@ -64,34 +61,6 @@ def test_the_selected_envs_place_in_its_episode_is_said() -> None:
     assert view.step is not None
     assert f"env {view.selected_env}: step {view.step.elapsed_steps[view.selected_env]}" in html(view)
     assert "step" not in html(EMPTY)
-
-
-def test_flagged_envs_stand_in_the_line_while_it_runs_and_a_press_leads_to_the_first(
-    panels: Panels,
-) -> None:
-    """A reward that was NaN in most envs left a green "running"."""
-    lost = Outlier(OutlierKind.REWARD_NOT_FINITE, 3, "the reward is <b>NaN</b>")
-    rows, went = rows_of(outliers={4: (lost,), 2: (lost,)}), []
-    line = StatusLine(panels.server, lambda: rows, lambda: went.append("first"))
-    line.draw(running(6))
-    (standing,) = (html for html in panels.htmls() if "data-press" in html.content)
-    content = standing.content
-    assert (
-        "2 of 6 envs flagged: the reward is &lt;b&gt;NaN" in content
-        and "In env 2, step 3: reward-finite: the reward" in content
-    )
-    assert "wb-running wb-marked" in panels.html()
-    line.draw(running(6, steps_per_second=21.0))
-    assert standing.content is content, "it stays under the finger that presses"
-    panels.press("flagged")
-    assert went == ["first"]
-
-
-def test_no_env_flagged_is_no_mark(panels: Panels) -> None:
-    line = StatusLine(panels.server, lambda: rows_of(outliers={}), lambda: None)
-    line.draw(running(6))
-    assert "data-press" not in panels.html() and "wb-marked" not in panels.html()
-    assert flagged_text(rows_of(outliers={})) is None
 
 
 def test_the_tab_is_called_after_the_task() -> None:

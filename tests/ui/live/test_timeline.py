@@ -121,12 +121,13 @@ def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: EnvM
     assert lived.ends()[0] == -3
     lived.panels.command("Go to the first moment")
     assert lived.past.shown == lived.past.last - 3, "of the episode"
+    assert lived.past.steps_ago == 3
     lived.panels.command("Go to live")
     lived.draw()
     assert lived.panels.control("step to take").options[-2:] == (panel.EVERYTHING, "undo reset of all")
     lived.panels.choose(panel.EVERYTHING)
     lived.draw()
-    assert lived.ends()[0] == -8
+    assert lived.ends()[0] == -7
     lived.panels.command("Go to the first moment")
     assert lived.past.shown == lived.past.first
     lived.panels.command("Go to live")
@@ -152,9 +153,9 @@ def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived
     assert lived.ends() == (-2, 0, -1), "within them: whoever holds the slider is not disturbed"
     lived.session.past.seek(2)
     lived.page.redraw()
-    assert lived.ends() == (-8, -4, -6), "the episode before"
+    assert lived.ends() == (-7, -3, -5), "the episode before"
     lived.draw()
-    assert lived.ends() == (-8, -4, -6)
+    assert lived.ends() == (-7, -3, -5)
 
 
 def test_of_one_env_there_is_one_way_to_go_on() -> None:
@@ -194,11 +195,13 @@ def test_a_value_that_no_slider_has_is_refused(lived: EnvMoment) -> None:
 
 def test_one_moment_alone_has_nothing_to_slide_along(lived: EnvMoment) -> None:
     lived.draw()
-    assert not lived.panels.shows(SLIDER)
+    assert lived.panels.shows(SLIDER), "the panel does not grow at the first step"
+    assert lived.panels.control(SLIDER).disabled
     assert lived.ends() == (-1, 0, 0), "a browser divides by the range"
-    assert "history: 1 step," in lived.strip()
+    assert "history: 0 steps," in lived.strip()
     lived.step(1)
-    assert lived.panels.shows(SLIDER) and lived.ends() == (-1, 0, 0)
+    assert not lived.panels.control(SLIDER).disabled and lived.ends() == (-1, 0, 0)
+    assert "history: 1 step," in lived.strip()
 
 
 def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures(

@@ -11,6 +11,7 @@ from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUC
 from workbench.session.live.timeline import Strip, TimelineView
 from workbench.ui.live.timeline import LINE_HEIGHT as HEIGHT
 from workbench.ui.live.timeline import (
+    MOST_MARKS,
     POINTS,
     megabytes,
     polylines,
@@ -29,18 +30,23 @@ def strip(**changes: object) -> Strip:
         "events": ((100, RESET), (150, SUCCESS | TRUNCATED), (160, RESET), (180, WENT_BACK)),
         "reward": np.linspace(0, 1, 101, dtype=np.float32),
         "branches": ((180, 120),),
-        "segments": ((100, 159), (160, 179), (180, 200)),
+        "segments": ((100, 159, False), (160, 179, False), (180, 200, True)),
     }
     return Strip(**{**values, **changes})  # type: ignore[arg-type]
 
 
 def past(shown: int | None = None) -> TimelineView:
-    return TimelineView(100, 200, shown, 60, 3 * 1024**2, 256 * 1024**2, 101, True, None)
+    at = 200 if shown is None else shown
+    return TimelineView(
+        130, 230, None if shown is None else shown + 30, 100, at, 200, 3 * 1024**2, 256 * 1024**2, 101, True
+    )
 
 
 def marks(html: str) -> list[tuple[float, str, str]]:
     """Per cent from the left, style and words of each."""
-    found = re.findall(r'class="wb-mark wb-mark-(\w+)" style="left:([\d.]+)%" title="([^"]*)"', html)
+    found = re.findall(
+        r'class="wb-mark wb-mark-(\w+)" style="left:([\d.]+)%" data-at="\d+" title="([^"]*)"', html
+    )
     return [(float(place), style, words) for style, place, words in found]
 
 
@@ -83,7 +89,7 @@ def test_a_shown_moment_is_told_in_steps_ago() -> None:
     html = strip_html(strip(), running(4, selected_env=2, timeline=past(163)))
     assert cursor(html) == 63.0 and ">live<" not in html
     assert "37 steps ago" in html and "env 2: step 7 / 50, 0.35 s" in html
-    assert "history: 101 steps, 3.0 of 256 MB" in html
+    assert "history: 100 steps, 3.0 of 256 MB" in html
 
 
 def test_a_moment_outside_the_strip_stays_at_its_edge() -> None:
@@ -92,7 +98,12 @@ def test_a_moment_outside_the_strip_stays_at_its_edge() -> None:
 
 def test_one_moment_alone_can_be_drawn() -> None:
     one = strip(
-        low=100, high=100, events=((100, RESET),), reward=np.zeros(1), branches=(), segments=((100, 100),)
+        low=100,
+        high=100,
+        events=((100, RESET),),
+        reward=np.zeros(1),
+        branches=(),
+        segments=((100, 100, False),),
     )
     html = strip_html(one, running(1, timeline=past()))
     assert "nan" not in html and 'width="-' not in html
@@ -109,9 +120,10 @@ def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
     assert all(0 <= x <= 100 for x, _ in points)
 
 
-def test_where_there_is_no_reward_is_a_gap_and_without_a_change_no_line() -> None:
+def test_where_there_is_no_reward_is_a_gap_and_without_a_change_a_straight_line() -> None:
     assert reward_lines(np.full(10, np.nan, np.float32)) == []
-    assert reward_lines(np.ones(10, np.float32)) == []
+    (line,) = reward_lines(np.ones(10, np.float32))
+    assert {point.split(",")[1] for point in line.split()} == {f"{HEIGHT / 2:.1f}"}
     lines = reward_lines(np.array([np.nan, 1, 2, np.nan, 0], np.float32))
     assert [[point.split(",")[0] for point in line.split()] for line in lines] == [
         ["25.00", "50.00"],
@@ -137,15 +149,14 @@ def test_fail_is_drawn_before_success() -> None:
     assert [style for _, style, _ in marks(html)] == ["fail"]
 
 
-def test_of_very_many_events_the_newest_are_drawn() -> None:
-    events = (
-        (100, REWARD_NONFINITE),
-        (101, FAIL),
-        *((102 + k, RESET) for k in range(97)),
-        *((199, RESET),) * 52,
+def test_of_very_many_events_each_part_of_the_strip_shows_the_worst() -> None:
+    ends = ((tick, (FAIL if tick % 1000 == 0 else TRUNCATED) | RESET) for tick in range(0, 100_000, 50))
+    html = strip_html(
+        strip(low=0, high=100_000, events=tuple(ends), branches=()), running(4, timeline=past())
     )
-    html = strip_html(strip(events=events, branches=()), running(4, timeline=past()))
-    assert len(marks(html)) == 150 and [style for _, style, _ in marks(html)[:2]] == ["fail", "reset"]
+    drawn = marks(html)
+    assert len(drawn) == MOST_MARKS and min(drawn)[0] == 0.0 and max(drawn)[0] > 99
+    assert sum(style == "fail" for _, style, _ in drawn) == 100
     both = strip_html(strip(events=((190, REWARD_NONFINITE | RESET),)), running(4, timeline=past()))
     assert marks(both) == [(90.0, "odd", "reward is NaN or infinite, 10 steps ago")]
 

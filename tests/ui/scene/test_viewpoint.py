@@ -105,3 +105,12 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
         assert np.allclose(shows(399, begins), frame(399 / 720, 720).position), "where it begins came after"
         moved = at + 0.1
         assert np.allclose(shows(300, moved), moved), "the view is the person's"
+        (client,) = server.get_clients().values()
+        for what in ("live", "review"):
+            assert framing.is_new(what)
+            if what == "review":
+                framing.frame_new(frame)
+        assert not np.allclose(client.camera.position, moved)
+        assert framing.is_new("live")
+        framing.frame_new(frame)
+        assert np.allclose(client.camera.position, moved), "back from the review"

@@ -50,6 +50,11 @@ class PlacedCameras:
         """Drop all placements without changing the env."""
         self._placed.clear()
 
+    @property
+    def all(self) -> dict[CameraKey, CameraSettings]:
+        """The settings of each placed camera."""
+        return {key: placed.settings for key, placed in self._placed.items()}
+
     def settings(self, key: CameraKey) -> CameraSettings | None:
         """Of a placed camera; None if it is as the task has it."""
         placed = self._placed.get(key)

@@ -235,10 +235,16 @@ def _dimension_names(controller: Any) -> list[str]:
     return names[:count] if len(names) >= count else [f"{i}" for i in range(count)]
 
 
+def is_target(parts: tuple[ActionPart, ...]) -> NDArray[np.bool_]:
+    """(A,) whether it is a position of a joint, which stays its target until the next action."""
+    columns = [np.full(len(part.names), _is_absolute(part.controller)) for part in parts]
+    return np.concatenate(columns) if columns else np.zeros(0, bool)
+
+
 def _hold(part: ActionPart, num_envs: int) -> NDArray[np.float32]:
     controller: Any = part.controller
     count = len(part.names)
-    if not _is_joint_position(controller) or controller.config.use_delta:
+    if not _is_absolute(controller):
         return np.zeros((num_envs, count), np.float32)
     qpos = controller.qpos
     controlled = getattr(controller, "control_joint_indices", None)
@@ -248,6 +254,10 @@ def _hold(part: ActionPart, num_envs: int) -> NDArray[np.float32]:
         low, high = controller.action_space_low, controller.action_space_high
         qpos = (2 * qpos - (high + low)) / (high - low)
     return np.clip(qpos.cpu().numpy(), part.low, part.high).astype(np.float32)
+
+
+def _is_absolute(controller: Any) -> bool:
+    return _is_joint_position(controller) and not controller.config.use_delta
 
 
 def _is_joint_position(controller: object) -> bool:

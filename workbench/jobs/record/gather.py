@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import Picture
+from workbench.core.camera_data import CameraKey, CameraSettings, Picture
 from workbench.core.capture.recorded_run import STATE, states_of
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.jobs.pool.travel import relocated
@@ -48,6 +48,8 @@ class GatheredEpisode:
     """Names of the env states in its first row."""
     acted_by: str = ""
     """The source of its last action."""
+    placed: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
+    """The cameras that are placed by hand, at its last state."""
     begun: bool = False
     """Whether it has its first state."""
 
@@ -81,6 +83,13 @@ class GatheredEpisode:
         if what and what != self.acted_by:
             self.writer.acted_by(what)
             self.acted_by = what
+
+    def set_placed(self, placed: Mapping[CameraKey, CameraSettings]) -> None:
+        """Set the cameras that are placed by hand from the next state on. Raises RecordingError."""
+        for key in self.placed.keys() | placed.keys():
+            if self.placed.get(key) != placed.get(key):
+                self.writer.placed(key, placed.get(key))
+        self.placed = placed
 
     def take(
         self,
@@ -209,6 +218,7 @@ class EpisodeGatherer:
             self._folder, self._task, env, seed, self.reset_options, self.acted_by, id, self._origin
         )
         try:
+            begun.set_placed(stepped.placed)
             begun.take(self._packer, stepped.step, env, stepped.columns, stepped.captured)
         except BaseException:
             begun.writer.discard()
@@ -233,6 +243,8 @@ class EpisodeGatherer:
                 raise _lost_step(env, episode.steps + 1, elapsed[env])
             if acted_by != episode.acted_by:
                 episode.set_source(acted_by)
+            if stepped.placed != episode.placed:
+                episode.set_placed(stepped.placed)
             episode.writer.append(layout, rows[env], _of_env(captured, env), others_of(others, env))
             episode.steps += 1
             episode.total_reward += reward[env]

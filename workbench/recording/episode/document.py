@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -16,7 +16,7 @@ import numpy as np
 import xxhash
 from msgspec import UNSET, Meta, Struct, UnsetType
 
-from workbench.core.camera_data import CameraInfo, CameraKind, PictureDegree
+from workbench.core.camera_data import CameraInfo, CameraKind, MovedCamera, PictureDegree
 from workbench.core.scene.shapes import BodyKind
 from workbench.machine.files import (
     MOST_SOURCE_BYTES,
@@ -155,6 +155,7 @@ class Description(Struct, frozen=True, kw_only=True):
     """Other files that the task reads, not included: path relative to the task's folder, to hash."""
     acted_by: ActedBy = ()
     pictures: PictureDegree = "exact"
+    moved_cameras: tuple[MovedCamera, ...] = ()
     length: SmallInt
     total_reward: float = msgspec.field(name="return")
     success: bool | None
@@ -201,7 +202,7 @@ class Description(Struct, frozen=True, kw_only=True):
 SHARED = (
     "id", "task", "env_index", "control_dt", "control_mode", "backend", "versions", "env_kwargs", "reset_options",
     "max_episode_steps", "written_at", "recovered", "source_hash", "side_files", "acted_by",
-    "pictures",
+    "pictures", "moved_cameras",
 )  # fmt: skip
 """Fields that `EpisodeInfo` and `Description` share."""
 
@@ -356,6 +357,8 @@ def _names_of(kind: type[Struct]) -> tuple[tuple[str, str], ...]:
 
 
 def _plain(value: object) -> Any:
+    if is_dataclass(value):
+        return vars(value)
     if not isinstance(value, Struct):
         return str(value)
     return msgspec.structs.astuple(value) if value.__struct_config__.array_like else fields_of(value)

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import CameraInfo, PictureDegree
+from workbench.core.camera_data import CameraInfo, MovedCamera, PictureDegree
 from workbench.core.env.step_result import OtherEntry
 from workbench.core.scene.shapes import BodyKind, SceneGeometry
 from workbench.recording.episode.columns import TextTrack, entry_at
@@ -104,6 +104,8 @@ class EpisodeInfo:
     unknown."""
     pictures: PictureDegree = "exact"
     """What degree the pictures of its cameras are of. Recordings of earlier versions are exact."""
+    moved_cameras: tuple[MovedCamera, ...] = ()
+    """Cameras that were placed by hand, in order; empty if all were as in the file."""
     seal: Seal | None = field(default=None, compare=False)
     """Set when read from a recording."""
 

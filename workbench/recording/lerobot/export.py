@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from workbench.recording.episode.document import as_json
 from workbench.recording.episode.episode import Episode, read_whole
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.films import Encoding, FilmWriter
@@ -229,7 +230,13 @@ class _Writer:
         self._episodes.append(entry)
         info = episode.info
         self._from.append(
-            {"id": info.id, "task": info.task, "seed": info.seed, "source_hash": info.source_hash}
+            {
+                "id": info.id,
+                "task": info.task,
+                "seed": info.seed,
+                "source_hash": info.source_hash,
+                **({"moved_cameras": as_json(info.moved_cameras)} if info.moved_cameras else {}),
+            }
         )
         self._made.episodes += 1
         self._made.frames += len(frames.states)

@@ -22,6 +22,7 @@ import rerun.blueprint as rrb
 from rerun.chunk import Chunk, LazyChunkStream
 from rerun.error_utils import catch_and_log_exceptions
 
+from workbench.core.camera_data import moved_cameras_text
 from workbench.recording.episode.description import describe
 from workbench.recording.episode.document import fields_of, json_text
 from workbench.recording.episode.episode import Episode, EpisodeInfo, acted_by_text, movable_bounds
@@ -175,6 +176,8 @@ def properties(episode: Episode) -> dict[str, dict[str, Any]]:
     for name in ("success", "success_once", "fail", "fail_once"):
         plain[name] = bool(described[name])
     plain["acted_by"] = acted_by_text(episode.info.acted_by)
+    if episode.info.moved_cameras:
+        plain["moved_cameras"] = moved_cameras_text(episode.info.moved_cameras)
     for name in ("env_kwargs", "reset_options"):
         plain[name] = json_text(described[name])
     values: dict[str, dict[str, Any]] = {"episode": plain}

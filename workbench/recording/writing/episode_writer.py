@@ -10,10 +10,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from types import MappingProxyType
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import CameraInfo, CameraKind, Picture
+from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, CameraSettings, MovedCamera, Picture
 from workbench.core.env.step_result import OtherEntry
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.episode.columns import TEXT, Layout, TextWriter
@@ -153,6 +154,21 @@ class EpisodeWriter:
         """
         try:
             self._journal.append(JournalEntry("acted", len(self), what.encode()))
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def placed(self, key: CameraKey, used: CameraSettings | None) -> None:
+        """Note where a camera stands from the next state on; None: as in the file.
+
+        Raises:
+            RecordingError: as `append`.
+        """
+        info = self._header.cameras[self._cameras[key]]
+        if info.settings is None:
+            return  # what the file says of it cannot be expressed, and such a camera cannot be placed
+        moved = MovedCamera(self._states, *key, used or info.settings, info.settings)
+        try:
+            self._journal.append(JournalEntry("placed", self._states, msgspec.json.encode(moved)))
         except OSError as error:
             raise self._failed(error) from error
 

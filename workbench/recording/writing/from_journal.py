@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import CameraInfo
+from workbench.core.camera_data import CameraInfo, MovedCamera
 from workbench.core.scene.shapes import SceneGeometry, Visual
 from workbench.recording.episode.columns import (
     BATCH,
@@ -82,7 +82,9 @@ def header_from(text: str, visuals: tuple[Visual, ...]) -> Header:
 def _info_from(data: Mapping[str, Any]) -> EpisodeInfo:
     acted_by = parse_acted_by(data.get("acted_by"))
     pictures = "fast" if data.get("pictures") == "fast" else "exact"
-    return EpisodeInfo(**{**data, "acted_by": acted_by, "pictures": pictures, "seal": None})
+    moved = msgspec.convert(data.get("moved_cameras") or (), tuple[MovedCamera, ...])
+    known = {"acted_by": acted_by, "pictures": pictures, "moved_cameras": moved, "seal": None}
+    return EpisodeInfo(**{**data, **known})
 
 
 def mark_recovered(header: Header) -> Header:
@@ -134,6 +136,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
     """Layout, and consecutive rows in it."""
     seen = [_CameraEntries() for _ in header.cameras]
     acted = list(header.info.acted_by)
+    placed: list[MovedCamera] = []
     texts: list[tuple[int, bytes]] = []
     for place, (kind, number, value) in _complete_states(journal):
         if kind == "row":
@@ -144,6 +147,8 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
             layouts.append(layout_type(value.decode()))
         elif kind == "acted":
             acted.append((number, value.decode()))
+        elif kind == "placed":
+            placed.append(msgspec.json.decode(value, type=MovedCamera))
         elif kind == TEXT:
             texts.append((number, value))
         elif kind.startswith("camera/"):
@@ -165,7 +170,7 @@ def episode_in(journal: JournalReader, header: Header) -> Episode | None:
         return {name[len(prefix) :]: c for name, c in columns.items() if name.startswith(prefix)}
 
     return Episode(
-        info=replace(header.info, acted_by=tuple(acted)),
+        info=replace(header.info, acted_by=tuple(acted), moved_cameras=tuple(placed)),
         geometry=header.geometry,
         segmentation=header.segmentation,
         poses=columns["poses"],

@@ -64,6 +64,7 @@ class Journal:
     - ``header``: JSON; the scene's meshes are in a file next to it (`write_scene`);
     - ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: one or several consecutive rows of that layout;
     - ``acted`` `action`: what chose the actions from this number on, if not what the header names;
+    - ``placed`` `state`: JSON of a camera that was placed by hand, from this state on (`MovedCamera`);
     - ``entry`` `state`: JSON of an entry of ``evaluate()`` that is not a number and changes here (`columns.TextWriter`);
     - ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
 

@@ -245,6 +245,8 @@ class StudioCameras:
         self.lock = threading.Lock()
         self.task: TaskDescription | None = None
         self.selected: CameraKey | None = None
+        self.was_chosen = False
+        """Whether a camera, or none, was chosen."""
         self.placements = Placements() if kept is None else kept.placements.copy()
         self._select_when_loaded = None if kept is None else kept.selected
         self.problem = ""

@@ -83,6 +83,7 @@ class CameraStudio:
     def select(self, key: CameraKey | None) -> None:
         """Select the camera that the page works on."""
         with self._lock:
+            self._cameras.was_chosen = True
             self._cameras.selected = (
                 key if key is None or self._cameras.info(key) is not None else self._cameras.selected
             )
@@ -253,6 +254,7 @@ class CameraStudio:
                 else None,
                 progress=progress,
                 selected=self._cameras.selected,
+                was_chosen=self._cameras.was_chosen,
                 undo=self._cameras.placements.undo_label,
                 redo=self._cameras.placements.redo_label,
                 edit_state=self.file.view,

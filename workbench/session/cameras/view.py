@@ -157,6 +157,8 @@ class StudioView:
 
     cameras: tuple[StudioCamera, ...] = ()
     selected: CameraKey | None = None
+    was_chosen: bool = False
+    """Whether somebody has chosen a camera, or none."""
     undo: str | None = None
     """What `CameraStudio.undo` would undo, as text (``moved base_camera``); None if there is nothing."""
     redo: str | None = None

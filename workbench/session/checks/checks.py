@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -197,12 +197,15 @@ class Checks:
     def _put_begun(self, load: Load, state: ChecksState) -> None:
         """Nothing is known of this version yet."""
         self._of, view = _version(load), self._held.now
-        newer = {finding.key for finding in view.findings}
-        before = (*(finding for finding in view.before if finding.key not in newer), *view.findings)
+        before = {
+            finding.key: finding
+            for finding in (*view.before, *view.findings)
+            if _still_there(finding, load.source)
+        }
         self._held.put(
             ChecksView(
                 state,
-                before=() if state == "off" else before,
+                before=() if state == "off" else tuple(before.values()),
                 total=view.total,
                 after_each_save=view.after_each_save,
             )
@@ -222,6 +225,14 @@ def load_version(process: Background, job: Job, load: Load) -> None:
         if failure.problem is None:
             raise
         raise JobFailed("the version could not be loaded to be checked", failure.problem) from failure
+
+
+def _still_there(finding: Finding, source: Mapping[str, str] | None) -> bool:
+    """Whether the line that it is about stands in this version; true where it is about none."""
+    if source is None or finding.file is None or not finding.code:
+        return True
+    text = source.get(finding.file)
+    return text is None or any(line.strip() == finding.code for line in text.splitlines())
 
 
 def _version(load: Load) -> object:

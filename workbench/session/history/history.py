@@ -192,6 +192,7 @@ class History:
         self._pictured: deque[int] = deque()
         self._jumps: deque[Moment] = deque()
         self._columns = Columns(num_envs, first_serial)
+        self._ticks = Columns(1, first_serial)
         self.steps = StepCurves(num_envs, joints)
 
     # --- events ------------------------------------------------------------------------------------
@@ -317,6 +318,10 @@ class History:
         found = bisect_left(serials, tick, key=lambda serial: self._moments[serial - self.first].tick)
         return serials[min(found, len(serials) - 1)] if serials else self.last
 
+    def ticks(self, low: int, high: int) -> NDArray[np.int64]:
+        """(K,) `Moment.tick` of the moments of these serials, both kept ones and included."""
+        return self._ticks.between("tick", low, high)[:, 0].astype(np.int64)
+
     def snapshot_at(self, serial: int) -> bytes | None:
         """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch at that moment, or None."""
         moment = self.at(serial)
@@ -330,6 +335,14 @@ class History:
     def env_rows(self) -> EnvRows:
         """The table of the envs as it is now."""
         return self._table.rows()
+
+    def rows_at(self, moment: Moment) -> EnvRows:
+        """The table of the envs as it was at a moment."""
+        rewards = np.full((self._num_envs, KEPT_REWARDS), np.nan, np.float32)
+        for env in range(self._num_envs):
+            known = self._rewards_until(env, moment, KEPT_REWARDS)
+            rewards[env, KEPT_REWARDS - len(known) :] = known
+        return replace(moment.rows, rewards=rewards)
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -469,6 +482,7 @@ class History:
     def _write(self, moment: Moment) -> None:
         values = {"event_flags": moment.event_flags, "reward": moment.step.reward}
         self._columns.write(moment.serial, self.first, values)
+        self._ticks.write(moment.serial, self.first, {"tick": np.array([moment.tick])})
 
     def _rewards_until(self, env: int, moment: Moment | None, most: int) -> NDArray[np.float32]:
         """(K,) the newest rewards of this env's episode up to a moment, at most so many, oldest first."""

@@ -47,6 +47,7 @@ from workbench.session.protocol.messages import (
     RulesBroken,
     Settings,
     Status,
+    Told,
 )
 from workbench.session.record.save_past import PastEpisode, SaveRequest, find_episode
 
@@ -157,8 +158,9 @@ class LiveState:
         selected = min(settings.selected_env, task.num_envs - 1)
         self.set(
             scene_serial=self.now.scene_serial + (not drawn),
-            settings=replace(settings, sliders=(), selected_env=selected),
+            settings=replace(settings, selected_env=selected),
             inspection=None,
+            told=None,
         )
         if self.timeline is None or not its_past_stays:
             last = -1 if self.timeline is None else self.timeline.history.last
@@ -214,6 +216,8 @@ class LiveState:
             self._cameras_failed({event.key: event.why})
         elif isinstance(event, Placed):
             self._placed(event)
+        elif isinstance(event, Told):
+            self.set(told=event.action)
         elif isinstance(event, Inspection):
             self.set(inspection=event)
         elif isinstance(event, Status):
@@ -221,6 +225,8 @@ class LiveState:
                 playing=event.playing,
                 steps_per_second=event.steps_per_second,
                 real_time_factor=event.real_time_factor,
+                recorded_share=event.recorded_share,
+                watched_share=event.watched_share,
             )
             if event.activity:
                 self.set(state="loading", activity=event.activity)
@@ -483,7 +489,13 @@ class LiveState:
         view = replace(now, refused=refused, curves=curves, timeline=past, odd=odd, **known)
         if moment is None:
             return view
-        return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))
+        return replace(
+            view,
+            step=moment.step,
+            step_serial=moment.serial,
+            pictures=timeline.pictures(env),
+            told=moment.step.action,
+        )
 
 
 def past_after(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -50,6 +50,7 @@ from workbench.session.protocol.messages import (
     SetCapture,
     Settings,
     SingleStep,
+    Tell,
     WarmUp,
 )
 from workbench.session.record.live import LiveRecorder
@@ -115,7 +116,7 @@ class Session:
             options = replace(kept.options, seed=kept.seed)
         self._state = LiveState(task, options, history_bytes)
         if kept is not None:
-            self._state.set(settings=replace(kept.settings, sliders=(), cameras=()))
+            self._state.set(settings=replace(kept.settings, cameras=()))
         self._shared = SharedState(self._state)
         self._lock, self._notify = self._shared.lock, self._shared.notify
         self._sending_settings = threading.Lock()
@@ -182,7 +183,6 @@ class Session:
     def view(self) -> SessionView:
         """A snapshot; cheap enough for every frame."""
         known = {
-            "recording": replace(self._recorder.status(), saving=self.past_saver.status()),
             "printed": self._printed.view(),
             "vitals": self._worker.vitals,
             "rescored": self.rescorer.rescoring.view,
@@ -193,12 +193,17 @@ class Session:
         with self._lock:
             view = self._state.view(**known)
         env = view.settings.selected_env
-        return replace(view, studio=self.studio.view(view.step, env), solve=self.solver.view(env))
+        saving = self.past_saver.status(_shown(view))
+        recording = replace(self._recorder.status(), saving=saving)
+        return replace(
+            view, recording=recording, studio=self.studio.view(view.step, env), solve=self.solver.view(env)
+        )
 
     def env_rows(self) -> EnvRows | None:
-        """The table of envs; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
+        """The table of envs at the shown moment; None before a task is loaded. Copies some 100 kB for 256 envs: not for
+        every frame."""
         with self._lock:
-            return None if self._state.timeline is None else self._state.timeline.history.env_rows()
+            return None if self._state.timeline is None else self._state.timeline.env_rows()
 
     def wait(self, seen: int, timeout: float) -> int:
         """Block until the counter of changes differs from `seen`; returns the counter."""
@@ -272,6 +277,17 @@ class Session:
         self._policy_file.follow(policy, folder)
         self._notify()
 
+    def tell(
+        self, dimensions: Sequence[int], values: Sequence[float], env_idx: tuple[int, ...] | None = None
+    ) -> None:
+        """Tell envs (all if None) these numbers of their action, while its source is ``sliders``; without any, to hold still."""
+        self.past.seek(None)
+        with self._lock:
+            task = self._state.now.task
+        if task is not None:
+            envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
+            self._send(Tell(envs, tuple(dimensions), tuple(values)))
+
     def _on_policy_saved(self) -> None:
         with self._lock:
             request = self._state.policy_saved()
@@ -293,19 +309,22 @@ class Session:
         if (before == 0) != (count == 0):
             self._send_settings()
 
-    def start_recording(self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False) -> None:
+    def start_recording(
+        self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False, goes_on: bool = False
+    ) -> None:
         """Reset these envs (all if None) and record them until `stop_recording`.
 
         Args:
             next_episode: do not reset; record only the episode of each env that begins with its next reset.
+            goes_on: as `LiveRecorder.start` has it.
         """
         with self._lock:
             task = self._state.now.task
         if task is None:
             return
         envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
-        self.past_saver.drop_message()
-        self._recorder.start(task, envs, one_each=next_episode)
+        self.past_saver.forget()
+        self._recorder.start(task, envs, one_each=next_episode, goes_on=goes_on)
         self._send(SetCapture(envs, from_reset=True))
         if not next_episode:
             self.reset(None if env_idx is None else envs)
@@ -330,8 +349,9 @@ class Session:
         placed = self.studio.placed_cameras()
         with self._lock:
             what = self._state.save_request(env_idx, load, placed, before)
+            at = _shown(self._state.view())
         if isinstance(what, str):
-            self.past_saver.refuse(what)
+            self.past_saver.refuse(what, at)
         else:
             self.past_saver.save(what)
 
@@ -461,6 +481,7 @@ class Session:
         if event.reload is None or event.reload.level != "same":
             # An episode must not mix steps of two versions, nor of two processes.
             self._recorder.stop()
+            self.past_saver.forget()
         with self._lock:
             s = self._state
             restored, stale = self.versions.version_loaded(event.task)
@@ -498,13 +519,13 @@ class Session:
     ) -> None:
         """Continue recording these envs after a version came in."""
         if past == "gone":
-            self.start_recording(env_idx, next_episode=one_each)
+            self.start_recording(env_idx, next_episode=one_each, goes_on=True)
         elif not self._recorder.recording:
             # No reset, which would lose the present moment: recording continues with each env's next episode.
             with self._lock:
                 task = self._state.now.task
             if task is not None:
-                self._recorder.start(task, env_idx, one_each)
+                self._recorder.start(task, env_idx, one_each, goes_on=True)
                 self._send(SetCapture(env_idx, from_reset=True))
 
     def _on_stepped(self, event: Stepped) -> None:
@@ -513,7 +534,6 @@ class Session:
             self.versions.stepped(event)
             planned = self._state.now.settings.action_source == "solve"
         self.solver.stepped(event, planned)
-        self.past_saver.time_passes()
         self._recorder.take(event)
 
     def _on_plan_wanted(self, event: PlanWanted) -> None:
@@ -550,3 +570,8 @@ class Session:
 
     def _send(self, request: Request) -> None:
         self._worker.send(request)
+
+
+def _shown(view: SessionView) -> object:
+    """The version, env and moment that are shown."""
+    return view.task_serial, view.selected_env, view.step_serial, view.timeline.shown

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraKind, Picture
-from workbench.jobs.task import Restored, ShownPictures, Stepped
-from workbench.session.history.env_table import EnvTable
+from workbench.jobs.task import ShownPictures, Stepped
+from workbench.session.history.env_table import EnvRows, EnvTable
 from workbench.session.history.history import EnvMoment, History, Moment, ShownMoment
 from workbench.session.protocol.messages import CameraRequest, DrawPast, Request, Restore
 
@@ -20,22 +20,24 @@ if TYPE_CHECKING:
 
 Scope = Literal["this", "all", "into all"]
 """Which envs go back: the selected one; all, each to its own state; or all to the selected env's state."""
-_MOST_EVENTS = 400
 MOST_STEPS = 400
 """Most control steps that are replayed to go back to a moment."""
 
 
 @dataclass(frozen=True)
 class TimelineView:
-    """State of the time slider. Moments are named by serials, which count up and are never reused."""
+    """State of the time slider. Moments are named by serials, which count up and are never reused; resets are moments too.
+    What a person is told of are control steps: a tick is their number since the envs were built, as on the curves."""
 
     first: int = 0
     last: int = -1
     """The kept moments; `last` is the live one."""
     shown: int | None = None
     """The shown moment; None while live."""
+    first_tick: int = 0
     tick: int = 0
-    """Control steps until the shown moment, as of `Curves`."""
+    last_tick: int = 0
+    """Of the first, the shown and the live moment."""
     used: int = 0
     limit: int = 0
     """Bytes."""
@@ -53,22 +55,32 @@ class TimelineView:
     wants_pictures: bool = False
     """The shown moment lacks pictures of the watched cameras."""
 
+    @property
+    def steps(self) -> int:
+        """Control steps that are kept."""
+        return self.last_tick - self.first_tick
+
+    @property
+    def steps_ago(self) -> int:
+        """Control steps since the shown moment."""
+        return self.last_tick - self.tick
+
 
 @dataclass(frozen=True)
 class Strip:
-    """A part of one env's history, for the strip under the slider."""
+    """A part of one env's history, for the strip under the slider. All places are ticks (see `TimelineView`)."""
 
     low: int
     high: int
-    """Serials, both included."""
+    """Both included."""
     events: tuple[tuple[int, int], ...]
-    """Serial and event flags (`history.RESET` ... added up)."""
+    """Tick and event flags (`history.RESET` ... added up); what happened at one tick is one event."""
     reward: NDArray[np.float32]
-    """(high - low + 1,)"""
+    """(high - low + 1,) after each control step; NaN where there is none."""
     branches: tuple[tuple[int, int], ...]
-    """Serials at which the env went back, each with the serial that it went back to."""
-    segments: tuple[tuple[int, int], ...]
-    """First and last serial of each segment (see `History`)."""
+    """Where the env went back, each with where it went back to."""
+    segments: tuple[tuple[int, int, bool], ...]
+    """First and last tick of each segment (see `History`), and whether it begins with going back."""
 
 
 class Timeline:
@@ -86,8 +98,6 @@ class Timeline:
         self.history = History(table, limit, first_serial, joints)
         self._num_envs = table.rows().num_envs
         self._shown: int | None = None
-        self._jump: Restored | None = None
-        """The last jump; None for a reset."""
         self._entered = 0
         self._requested: tuple[int, int, tuple[CameraRequest, ...]] | None = None
 
@@ -95,8 +105,6 @@ class Timeline:
 
     def add(self, stepped: Stepped) -> Moment:
         moment = self.history.add(stepped)
-        if stepped.reset_mask.any():
-            self._jump = stepped.restored
         if stepped.restored is not None and stepped.restored.number:
             self._entered = stepped.restored.number
         if self._shown is not None and self._shown < self.history.first:
@@ -122,20 +130,32 @@ class Timeline:
         else:
             self._shown = max(serial, self.history.first)
 
-    def seek_by(self, steps: int) -> None:
-        """Go some moments forward (or back, if negative) from the shown one."""
-        self.seek(self.at + steps)
+    def seek_by(self, env: int, steps: int) -> None:
+        """Go some moments of this env forward (or back, if negative) from the shown one: its control steps, resets and
+        jumps back. Those of other envs are passed by."""
+        history, at = self.history, self.at
+        for _ in range(abs(steps)):
+            at += 1 if steps > 0 else -1
+            while (moment := history.at(at)) is not None and moment.jumped.any() and not moment.jumped[env]:
+                at += 1 if steps > 0 else -1
+        self.seek(at)
 
     def seek_step(self, env: int, step: int) -> None:
-        """Go to a control step of the present episode of this env, through its jumps back; or the nearest kept."""
-        episode_backwards = self.history.episode_backwards(env, self.history.last)
+        """Go to a control step of the shown episode of this env, through its jumps back; or the nearest kept."""
+        episode_backwards = self.history.episode_backwards(env, self.history.segment_at(env, self.at)[1])
         serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in episode_backwards}
         if serials:
             self.seek(serials[min(serials, key=lambda known: abs(known - step))])
 
-    def seek_tick(self, tick: int) -> None:
-        """Go to the moment after a control step (`Curves.serial`), or to the nearest kept one."""
-        self.seek(self.history.serial_of_tick(tick))
+    def seek_tick(self, tick: int, episode_of: int | None = None) -> None:
+        """Go to the moment after a control step (`Curves.serial`), or to the nearest kept one.
+
+        Args:
+            episode_of: within the shown episode of this env: at the tick at which it begins there is the last step of the
+                one before, too.
+        """
+        first = self.history.first if episode_of is None else self.episode(episode_of)[0]
+        self.seek(max(self.history.serial_of_tick(tick), first))
 
     def seek_event(self, env: int, direction: int) -> None:
         """Go to the next (1) or previous (-1) event of this env; forward from the last one is live."""
@@ -165,39 +185,97 @@ class Timeline:
         history, moment = self.history, self.shown
         at = moment if moment is not None else history.at(history.last)
         jump = history.last_jump(env)
-        missed, how = ({}, "") if self._jump is None else (self._jump.not_carried, self._jump.how)
+        begin = history.at(history.segment_at(env, self.at)[0]) if at is not None else None
+        # Of the env and the moment that are shown: another env, or a reset since, lacks nothing.
+        came = begin.restored if begin is not None and begin.jumped[env] else None
+        missed, how = ({}, "") if came is None else (came.not_carried, came.how)
         return TimelineView(
             first=history.first,
             last=history.last,
             shown=self._shown,
+            first_tick=self.tick_of(history.first),
             tick=0 if at is None else at.tick,
+            last_tick=self.tick_of(history.last),
             used=history.used,
             limit=history.limit,
             moments=len(history),
             can_continue=moment is not None and moment.snapshot is not None,
-            undo=None if jump is None else _jump_text(jump, history.envs_still_at(jump), self._num_envs),
+            undo=None if jump is None else self._jump_text(jump),
             not_carried=tuple(f"{what}: {why}" for what, why in missed.items()),
             arrived=how,
             entered=self._entered,
             wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras, degree)),
         )
 
+    def env_rows(self) -> EnvRows:
+        """The table of envs at the shown moment."""
+        moment = self.shown
+        return self.history.env_rows() if moment is None else self.history.rows_at(moment)
+
+    def _jump_text(self, jump: Moment) -> str:
+        envs, before = self.history.envs_still_at(jump), self.history.at(jump.serial - 1)
+        if jump.restored is None and before is not None:
+            ended = before.step.terminated | before.step.truncated
+            if ended[jump.jumped].all():
+                return "reset at the end"  # nobody asked for it but the task
+        what = "reset" if jump.restored is None else "jump"
+        if jump.restored is not None and jump.restored.recording:
+            what = "going live"
+        if self._num_envs == 1:
+            return what
+        if len(envs) == self._num_envs:
+            return f"{what} of all"
+        return f"{what} of env {envs[0]}" if len(envs) == 1 else f"{what} of {len(envs)} envs"
+
+    def tick_of(self, serial: int) -> int:
+        """Of a kept moment."""
+        moment = self.history.at(serial)
+        return 0 if moment is None else moment.tick
+
     def strip(self, env: int, low: int, high: int) -> Strip:
-        """The history of one env between two moments, both included."""
+        """The history of one env between two ticks, both included."""
         history = self.history
-        low, high = max(low, history.first), min(high, history.last)
+        ticks = history.ticks(history.first, history.last)
+        low = min(max(low, int(ticks[0])), int(ticks[-1]))
+        high = min(max(high, low), int(ticks[-1]))
+        # Of the moments at one tick the first is the control step that led there; the others are resets and jumps after it.
+        first, end = int(np.searchsorted(ticks, low)), int(np.searchsorted(ticks, high, side="right"))
+        here = slice(first, end)
+        serials, base = (history.first + first, history.first + end - 1), history.first
+        reward = np.full(high - low + 1, np.nan, np.float32)
+        stepped = np.diff(ticks, prepend=ticks[0] - 1)[here] > 0
+        reward[ticks[here][stepped] - low] = history.rewards(env, *serials)[stepped]
+        events: dict[int, int] = {}
+        for serial, flags in history.events(env, *serials):
+            tick = int(ticks[serial - base])
+            events[tick] = events.get(tick, 0) | flags
+
+        def tick_of(serial: int) -> int:
+            return int(ticks[max(serial - base, 0)])
+
+        jumps = dict(history.jumps_back(env))
         return Strip(
             low,
             high,
-            tuple(history.events(env, low, high)[-_MOST_EVENTS:]),
-            history.rewards(env, low, high),
-            tuple(pair for pair in history.jumps_back(env) if low <= pair[0] <= high),
+            tuple(events.items()),
+            reward,
             tuple(
-                (max(first, low), min(last, high))
-                for first, last in history.segments(env)
-                if last >= low and first <= high
+                (tick_of(at), tick_of(origin)) for at, origin in jumps.items() if low <= tick_of(at) <= high
+            ),
+            tuple(
+                (max(begin, low), min(last, high), start in jumps)
+                for start, stop in history.segments(env)
+                for begin, last in [(tick_of(start), tick_of(stop))]
+                if last >= low and begin <= high
             ),
         )
+
+    def episode(self, env: int) -> tuple[int, int]:
+        """Serials of the first and the last moment of this env's episode that contains the shown moment. What lies between,
+        where it went back, is part of the way."""
+        end = self.history.segment_at(env, self.at)[1]
+        begin = min((moment.serial for moment, _ in self.history.episode_backwards(env, end)), default=end)
+        return begin, end
 
     # --- requests to the worker ------------------------------------------------------------------------
 
@@ -272,17 +350,6 @@ class Timeline:
         return tuple(camera for camera in cameras if lacks(camera))
 
 
-def _jump_text(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
-    what = "reset" if jump.restored is None else "jump"
-    if jump.restored is not None and jump.restored.recording:
-        what = "going live"
-    if num_envs == 1:
-        return what
-    if len(envs) == num_envs:
-        return f"{what} of all"
-    return f"{what} of env {envs[0]}" if len(envs) == 1 else f"{what} of {len(envs)} envs"
-
-
 class TimeTravel:
     """The timeline as the page uses it. All methods are thread-safe and return at once."""
 
@@ -305,16 +372,19 @@ class TimeTravel:
         self._seek(lambda timeline: timeline.seek(serial))
 
     def seek_by(self, steps: int) -> None:
-        """Show a moment before (negative) or after the shown one."""
-        self._seek(lambda timeline: timeline.seek_by(steps))
+        """Show a moment of the selected env before (negative) or after the shown one."""
+        env = self._env
+        self._seek(lambda timeline: timeline.seek_by(env, steps))
 
     def seek_step(self, env: int, step: int) -> None:
-        """Show the moment of a step of this env's present episode."""
+        """Show the moment of a step of this env's shown episode."""
         self._seek(lambda timeline: timeline.seek_step(env, step))
 
-    def seek_tick(self, tick: int) -> None:
-        """Show the moment after a control step, counted as the curves count."""
-        self._seek(lambda timeline: timeline.seek_tick(tick))
+    def seek_tick(self, tick: int, in_episode: bool = False) -> None:
+        """Show the moment after a control step, counted as the curves count; of the selected env's shown episode alone if
+        `in_episode`."""
+        env = self._env if in_episode else None
+        self._seek(lambda timeline: timeline.seek_tick(tick, env))
 
     def seek_event(self, direction: int) -> None:
         """Show the next (1) or previous (-1) event of the selected env: reset, success, fail, truncation, jump back."""
@@ -347,10 +417,21 @@ class TimeTravel:
     # --- read ------------------------------------------------------------------------------------
 
     def strip(self, low: int, high: int) -> Strip | None:
-        """The selected env's history between two moments; None before a task is loaded."""
+        """The selected env's history between two ticks; None before a task is loaded."""
         with self._lock:
-            s = self._state
-            return None if s.timeline is None else s.timeline.strip(self._env, low, high)
+            timeline = self._state.timeline
+            if timeline is None or not len(timeline.history):
+                return None
+            return timeline.strip(self._env, low, high)
+
+    def episode(self) -> tuple[int, int] | None:
+        """First and last tick of the selected env's episode that contains the shown moment, also where it went back."""
+        with self._lock:
+            timeline = self._state.timeline
+            if timeline is None or not len(timeline.history):
+                return None
+            begin, end = timeline.episode(self._env)
+            return timeline.tick_of(begin), timeline.tick_of(end)
 
     def segment(self) -> tuple[int, int] | None:
         """First and last serial of the selected env's segment that contains the shown moment."""

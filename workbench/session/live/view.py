@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from workbench.authoring.problem import Problem
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
 from workbench.core.capture.inspection import Inspection
@@ -109,6 +112,8 @@ class SessionView:
     curves: Curves | None = None
     settings: Settings = Settings()
     """Chosen on the page."""
+    told: NDArray[np.float32] | None = None
+    """(N, A) what sliders tell the robots next, of the shown moment what led there; None if unknown."""
     options: TaskOptions = TaskOptions()
     """How the envs are made; the seed is `seed`."""
     options_refused: TaskOptions | None = None
@@ -117,6 +122,9 @@ class SessionView:
     playing: bool = False
     steps_per_second: float = 0.0
     real_time_factor: float = 0.0
+    recorded_share: float = 0.0
+    watched_share: float = 0.0
+    """As `Status` has them."""
     timeline: TimelineView = TimelineView()
     """The history. While one of its moments is shown, `step` and `pictures` are of that moment."""
     busy: Busy | None = None

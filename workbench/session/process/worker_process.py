@@ -37,6 +37,7 @@ from workbench.session.protocol.messages import (
     Reset,
     Settings,
     SingleStep,
+    Tell,
     without_steps,
 )
 
@@ -283,6 +284,11 @@ class WorkerProcess:
 def _replaces(request: Request, before: Request) -> bool:
     if isinstance(request, PlaceCamera):
         return isinstance(before, PlaceCamera) and before.key == request.key
+    if isinstance(request, Tell):
+        return isinstance(before, Tell) and (before.env_idx, before.dimensions) == (
+            request.env_idx,
+            request.dimensions,
+        )
     return isinstance(request, _ONLY_LAST) and type(before) is type(request)
 
 

@@ -107,8 +107,6 @@ class Settings:
     """``module:function`` or ``file.py:function`` when `action_source` is ``policy``; None if not named yet."""
     policy_folder: str | None = None
     """Searched for the policy's file after the current folder."""
-    sliders: tuple[float, ...] = ()
-    """(A,) the action of every env while `action_source` is ``sliders``."""
     plan: PlanOptions = PlanOptions()
     """How actions are planned while `action_source` is ``solve``."""
     solve_all: bool = False
@@ -120,6 +118,17 @@ class Settings:
     """Cameras to draw in the selected env; none while no page is open."""
     pictures: ShownPictures = "auto"
     """What is drawn of them."""
+
+
+@dataclass(frozen=True)
+class Tell:
+    """Tell envs values of their action, while `Settings.action_source` is ``sliders``; what is not named stays."""
+
+    env_idx: tuple[int, ...]
+    dimensions: tuple[int, ...]
+    """Without any they hold still where they are."""
+    values: tuple[float, ...]
+    """One for each dimension, the same for each env."""
 
 
 @dataclass(frozen=True)
@@ -262,6 +271,7 @@ Request = (
     | SingleStep
     | Reset
     | Settings
+    | Tell
     | ReadPolicyAgain
     | FollowPlan
     | PlaceCamera
@@ -461,6 +471,17 @@ class Status:
     """Simulated seconds per wall second; below the chosen speed the machine is the limit."""
     activity: str = ""
     """Long work that delays requests, if any."""
+    recorded_share: float = 0.0
+    watched_share: float = 0.0
+    """0..1 of the time while playing that went into what is recorded with every step, and into pictures for the page."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What sliders tell the robots next, while they are the source of actions; sent whenever it may have changed."""
+
+    action: NDArray[np.float32]
+    """(N, A)."""
 
 
 @dataclass(frozen=True)
@@ -489,6 +510,7 @@ Event = (
     | Inspection
     | Answer
     | Progress
+    | Told
     | Status
     | RulesBroken
 )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import queue
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from workbench.jobs.record.gather import EpisodeFinisher, EpisodeGatherer
+from workbench.jobs.record.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
 from workbench.jobs.task import Stepped, TaskDescription
 from workbench.machine.processes.watched_thread import report_failure, watched_thread
 from workbench.recording.reader.reading import recover_confined, recovered_text
@@ -26,6 +27,10 @@ class RecordingStatus:
 
     active: bool = False
     env_idx: tuple[int, ...] = ()
+    since: float = 0.0
+    """Seconds since the epoch: when it was begun, also where a new version came meanwhile."""
+    episodes: int = 0
+    """That have ended since."""
     waiting: int = 0
     """Envs of these whose episode begins with their next reset."""
     steps: int = 0
@@ -74,6 +79,7 @@ class LiveRecorder:
         self._problem: str | None = None
         self._waiting_bytes = 0
         self._ends_by_itself = False
+        self._since, self._episodes = 0.0, 0
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue()
         """Work of the recorder's thread; None ends it."""
         self.finisher = EpisodeFinisher(on_change, self._recover)
@@ -83,12 +89,26 @@ class LiveRecorder:
 
     # --- the session's side ----------------------------------------------------------------------------
 
-    def start(self, task: TaskDescription, env_idx: Sequence[int], one_each: bool = False) -> None:
-        """Record from each env's next reset on; only the next episode of each if `one_each`."""
+    def start(
+        self, task: TaskDescription, env_idx: Sequence[int], one_each: bool = False, goes_on: bool = False
+    ) -> None:
+        """Record from each env's next reset on.
+
+        Args:
+            one_each: only the next episode of each.
+            goes_on: it is the recording before, with another version of the task.
+        """
         with self._lock:
             self._env_idx, self._problem, self._ends_by_itself = tuple(env_idx), None, one_each
-        gatherer = EpisodeGatherer(task, env_idx, self._folder, self.finisher.finish, one_each=one_each)
+            if not goes_on:
+                self._since, self._episodes = time.time(), 0
+        gatherer = EpisodeGatherer(task, env_idx, self._folder, self._ended, one_each=one_each)
         self._queue.put(partial(self._gather_with, gatherer))
+
+    def _ended(self, episode: GatheredEpisode) -> None:
+        with self._lock:
+            self._episodes += 1
+        self.finisher.finish(episode)
 
     def stop(self) -> None:
         """End the running episodes and write what they have."""
@@ -132,6 +152,8 @@ class LiveRecorder:
             return RecordingStatus(
                 active=bool(self._env_idx),
                 env_idx=self._env_idx,
+                since=self._since,
+                episodes=self._episodes,
                 waiting=len(self._env_idx) - len(under_way) if self._env_idx else 0,
                 steps=sum(episode.steps for episode in under_way),
                 bytes_written=finished.bytes_written + sum(e.writer.bytes_written for e in under_way),

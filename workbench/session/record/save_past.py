@@ -29,8 +29,8 @@ class SaveStatus:
     """Result of the last job that ended."""
     failed: bool = False
     """`message` is an error."""
-    refused: bool = False
-    """It says why nothing can be saved at the shown moment."""
+    refused_at: object = None
+    """What was shown when nothing could be recorded of it: the message holds for that alone. None for any other message."""
     progress: JobProgress | None = None
     """In moments; None while no job runs."""
 
@@ -86,7 +86,10 @@ def find_episode(history: History, env: int, serial: int | None, before: bool = 
     if isinstance(found, PastEpisode) and found.steps == 0 and serial is None:
         found = _episode_before(history, env, found) or found
     if before and isinstance(found, PastEpisode):
-        found = _episode_before(history, env, found) or "there is no episode before it in memory"
+        found = _episode_before(history, env, found)
+        while isinstance(found, PastEpisode) and found.steps == 0:  # it was reset at once
+            found = _episode_before(history, env, found)
+        found = found or "there is no episode before it in memory"
     if isinstance(found, PastEpisode) and found.steps == 0:
         return "the previous episode has no step: it was reset at once" if before else "it has no step yet"
     return found
@@ -156,22 +159,21 @@ class PastSaver:
         self._job_lane.stop()
         self._report("stopped; nothing was saved")
 
-    def refuse(self, why: str) -> None:
-        """Report why nothing can be recorded, until `time_passes`."""
-        self._status = SaveStatus(why, failed=True, refused=True)
-        self._on_change()
+    def refuse(self, why: str, at: object) -> None:
+        """Report why nothing can be recorded of what is shown `at` now."""
+        self._report(why, failed=True, refused_at=at)
 
-    def time_passes(self) -> None:
-        """Drop a refusal: it was of that moment."""
-        if self._status.refused:
-            self._status = SaveStatus()
+    def forget(self) -> None:
+        """Drop the last result: something else is recorded, or another version runs."""
+        if self._status.message:
+            self._report("")
 
-    def drop_message(self) -> None:
-        """Drop the result of the last job: another recording begins."""
-        self._status = SaveStatus()
-
-    def status(self) -> SaveStatus:
-        return replace(self._status, progress=self._job_lane.progress)
+    def status(self, at: object) -> SaveStatus:
+        """Of what is shown `at` now."""
+        status = self._status
+        if status.refused_at not in (None, at):
+            status = SaveStatus()
+        return replace(status, progress=self._job_lane.progress)
 
     def close(self) -> None:
         self._job_lane.close()
@@ -204,6 +206,7 @@ class PastSaver:
                         else:
                             seed, task = seeds[episode.env], _as_played(what.task, episode)
                             writer = GatheredEpisode.of(self._folder, task, episode.env, seed)
+                            writer.set_placed({p.key: p.settings for p in what.placed if p.settings})
                             writers[episode.env] = writer
                         writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
 
@@ -223,7 +226,9 @@ class PastSaver:
         steps = sum(episode.steps for episode in what.episodes)
         unfinished = sum(not episode.ended for episode in what.episodes)
         lost = sum(seeds[episode.env] != episode.seed for episode in what.episodes)
-        kept = f"saved {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
+        envs = what.episodes[0].env if len(what.episodes) == 1 else None
+        which = f"{len(made)} episodes" if envs is None else f"an episode of env {envs}"
+        kept = f"saved {which}, {steps} step{'' if steps == 1 else 's'}"
         earlier = sum(
             _as_played(what.task, episode).source_hash != what.task.source_hash for episode in what.episodes
         )
@@ -254,8 +259,8 @@ class PastSaver:
         if not job.stopped:
             self._report(why, failed=True)
 
-    def _report(self, message: str, failed: bool = False) -> None:
-        self._status = SaveStatus(message, failed)
+    def _report(self, message: str, failed: bool = False, refused_at: object = None) -> None:
+        self._status = SaveStatus(message, failed, refused_at)
         self._on_change()
 
 

@@ -36,6 +36,8 @@ class PastRun:
     """Control steps of its episode before its first moment."""
     serials: NDArray[np.int64]
     """(T + 1,) serials of its moments."""
+    tick: int = 0
+    """Control steps until its first moment, as of `Curves` and the timeline."""
 
     @property
     def name(self) -> str:
@@ -202,7 +204,8 @@ class RescoredPast:
             for table in (self._old, self._new)
         )
         begin = int(self._elapsed[serials[0] - self._serial[0], env])
-        return compare(PastRun(env, begin, serials), old, new, self._drift[rows, env], begin=begin)
+        tick = int(self._tick[serials[0] - self._serial[0]])
+        return compare(PastRun(env, begin, serials, tick), old, new, self._drift[rows, env], begin=begin)
 
     def _write(self, table: dict[str, NDArray[np.float32]], row: int, step: StepResult) -> None:
         for name, value in (("reward", step.reward), *scalar_entries(step.evaluate).items()):

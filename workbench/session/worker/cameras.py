@@ -23,7 +23,7 @@ from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import classes_of, module_of
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core import maniskill_private
-from workbench.core.camera_data import CameraKey, Picture, PictureDegree
+from workbench.core.camera_data import CameraKey, CameraSettings, Picture, PictureDegree
 from workbench.core.cameras.place import PlacedCameras
 from workbench.core.cameras.render import (
     KINDS,
@@ -261,6 +261,11 @@ class WorkerCameras:
         """Place the placed cameras again; call when the scene's cameras may be new ones."""
         if self._task.opened is not None:
             self._placed.put_back(self._task.opened.env.env)
+
+    @property
+    def placed(self) -> dict[CameraKey, CameraSettings]:
+        """The cameras that are placed by hand, as they are drawn now."""
+        return self._placed.all
 
     def forget_placed(self) -> None:
         """Forget all placements: the cameras belong to another version."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.modules import executed_modules
 from workbench.authoring.loading.reference import named_file
 from workbench.authoring.problem import TaskError, treat_ctrl_c_as_error
 from workbench.core.capture.inspect_env import inspect_env
+from workbench.core.env.actions import width
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
@@ -62,6 +64,8 @@ from workbench.session.protocol.messages import (
     Settings,
     SingleStep,
     Status,
+    Tell,
+    Told,
     WarmUp,
 )
 from workbench.session.protocol.questions import (
@@ -87,7 +91,7 @@ from workbench.session.worker.go_back import (
 )
 from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
 from workbench.session.worker.make_scene import SceneEnv, draw_task, registered_ids
-from workbench.session.worker.pacing import Pacer, Rate, throttled
+from workbench.session.worker.pacing import Pacer, Rate, Shares, throttled
 from workbench.session.worker.plans import FollowedPlan, WorkerPlans, envs_to_plan, succeeded
 from workbench.session.worker.process_state import ProcessState, read_process_state
 from workbench.session.worker.reload import Running, load_version, why_new_process
@@ -127,6 +131,7 @@ class Worker:
         self._settings = Settings()
         self._pacer = Pacer(0.05)
         self._rate = Rate()
+        self._shares = Shares()
         self._status_sent = 0.0
         self._rules_sent = 0.0
         self._rules_reported = RulesBroken(())
@@ -142,6 +147,7 @@ class Worker:
             SingleStep: self._single_step,
             Reset: self._reset,
             Settings: self._apply_settings,
+            Tell: self._tell,
             ReadPolicyAgain: self._read_policy_again,
             FollowPlan: self._follow_plan,
             PlaceCamera: self._cameras.place,
@@ -175,7 +181,9 @@ class Worker:
                 self._task.run("stepping", partial(self._task.guarded, self._step_once))
             if self._cameras.placing_due:
                 self._task.run("stepping", self._cameras.place_waiting)
+            began = time.monotonic()
             self._cameras.make(may_block=not self._playing)
+            self._shares.add("watched", time.monotonic() - began, time.monotonic())
             self._send_status(time.monotonic())
             if time.monotonic() - self._rules_sent > _STATUS_PERIOD:
                 self._send_rules()
@@ -327,9 +335,7 @@ class Worker:
         if report is None or not report.carried:
             self._chooser.seed(request.options.seed)
         self._rate.clear()
-        # The sliders belong to the previous scene; the server clears them too.
-        self._settings = replace(self._settings, sliders=())
-        self._chooser.sliders = ()
+        self._chooser.new_scene()
         self._cameras.update_watched()
         self._steps.new_scene()
         send(Loaded(opened.description, opened.first, opened.milliseconds, report, request.options))
@@ -357,6 +363,7 @@ class Worker:
         self._followed.forget()
         self._pacer.start(time.monotonic())
         self._rate.clear()
+        self._shares.clear(time.monotonic())
         self._send_status(None)
 
     def _reset(self, request: Reset) -> None:
@@ -376,7 +383,6 @@ class Worker:
         if new.speed != old.speed:
             self._pacer.speed = new.speed
             self._pacer.start(time.monotonic())
-        self._chooser.sliders = new.sliders
         self._cameras.watch(new.selected_env, new.cameras, new.pictures)
         if (new.action_source, new.solve_all, new.selected_env) != (
             old.action_source,
@@ -393,6 +399,23 @@ class Worker:
             old.policy_folder,
         ):
             self._task.run("importing the policy", self._use_action_source)
+            self._task.guarded(self._send_told)
+
+    def _tell(self, request: Tell) -> None:
+        def tell(opened: OpenedTask) -> None:
+            task = opened.env
+            # The page may have asked before it knew of a version with fewer envs, or of another robot.
+            if max(request.env_idx, default=0) < task.num_envs and max(request.dimensions, default=0) < width(
+                task.parts
+            ):
+                self._chooser.tell(task, request.env_idx, request.dimensions, request.values)
+                self._send_told(opened)
+
+        self._task.guarded(tell)
+
+    def _send_told(self, opened: OpenedTask) -> None:
+        if self._chooser.by_sliders:
+            self._line.send(Told(self._chooser.slider_action(opened.env)))
 
     def _use_action_source(self) -> bool:
         """Set the source of actions as in the settings. Returns whether it can be used."""
@@ -466,6 +489,7 @@ class Worker:
         before = self._last
         with blamed("step", opened.loaded, opened.env):
             step = opened.env.step(action)
+        self._chooser.acted(action)
         self._rate.tick(time.monotonic())
         self._send_step(step, np.zeros(opened.env.num_envs, bool))
         ended = np.flatnonzero(step.terminated | step.truncated)
@@ -494,6 +518,7 @@ class Worker:
         with blamed("reset", opened.loaded, opened.env):
             step = self._reset_with_seeds(opened.env, env_idx, seed)
         self._cameras.put_back()
+        self._chooser.begin(env_idx)
         self._send_step(step, _mask(opened, env_idx), seeds=opened.env.episode_seeds)
         return step
 
@@ -534,6 +559,7 @@ class Worker:
             raise
         finally:
             self._cameras.put_back()
+        self._chooser.begin(restored.env_idx, _led_there(request))
         self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
         self._send_status(None)
 
@@ -555,10 +581,20 @@ class Worker:
             self._cameras.settle()  # the same scene is about to be drawn
         acted_by = "" if restored else self._chooser.name
         event = self._steps.event(
-            self._task.opened, step, reset_mask, seeds, restored, acted_by, resumed, self._cameras.failed
+            self._task.opened,
+            step,
+            reset_mask,
+            seeds,
+            restored,
+            acted_by,
+            resumed,
+            self._cameras.placed,
+            self._cameras.failed,
         )
+        self._shares.add("recorded", self._steps.recording_took, time.monotonic())
         self._cameras.scene_changed()
         self._line.send(event)
+        self._send_told(self._task.opened)
 
     # --- status and findings -----------------------------------------------------------------------
 
@@ -581,7 +617,8 @@ class Worker:
             return
         self._status_sent = moment
         steps = self._rate.per_second(moment) if self._playing else 0.0
-        self._line.send(Status(self._playing, steps, steps * self._pacer.control_dt, activity))
+        shares = [self._shares.of(what, moment) if self._playing else 0.0 for what in ("recorded", "watched")]
+        self._line.send(Status(self._playing, steps, steps * self._pacer.control_dt, activity, *shares))
 
     def _send_rules(self) -> None:
         """Send the rules that the task breaks, if they changed."""
@@ -598,6 +635,14 @@ class Worker:
         if event.rows or self._rules_reported.rows:
             self._line.send(event)
         self._rules_reported = event
+
+
+def _led_there(request: Restore | EnterRecording) -> Mapping[int, NDArray[np.float32]]:
+    """(A,) the action that led to the state that an env is put back to, by env, as far as it is known."""
+    if isinstance(request, Restore):
+        return {env: way.actions[-1] for env, way in request.ways.items() if len(way.actions)}
+    run = request.run
+    return {env: run.action[-1].copy() for env in request.env_idx} if run.length else {}
 
 
 def _mask(opened: OpenedTask, env_idx: tuple[int, ...] | None) -> np.ndarray:

@@ -79,6 +79,33 @@ class Rate:
         self._times.clear()
 
 
+@dataclass
+class Shares:
+    """Which part of the last seconds each kind of work took."""
+
+    window: float = 2.0
+    _spent: deque[tuple[float, str, float]] = field(default_factory=deque)
+    _since: float = -math.inf
+
+    def add(self, what: str, seconds: float, now: float) -> None:
+        """`what` took so long until now."""
+        self._spent.append((now, what, seconds))
+        while now - self._spent[0][0] > self.window:
+            self._spent.popleft()
+
+    def of(self, what: str, now: float) -> float:
+        """0..1 of the window, or of the time since `clear` while that is shorter."""
+        begin = max(now - self.window, self._since)
+        spent = sum(
+            min(seconds, at - begin) for at, name, seconds in self._spent if name == what and at > begin
+        )
+        return min(1.0, spent / max(now - begin, 1e-9))
+
+    def clear(self, now: float) -> None:
+        self._spent.clear()
+        self._since = now
+
+
 def throttled(report: Callable[..., None], seconds: float) -> Callable[..., None]:
     """`report`, called at most every `seconds` and not in the first `seconds`; other calls are dropped."""
     last = time.monotonic()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import CameraKey, Picture
+from workbench.core.camera_data import CameraKey, CameraSettings, Picture
 from workbench.core.cameras.render import recorded_pictures, step_pictures
 from workbench.core.capture.state_columns import read_state_columns
 from workbench.core.drawing import CannotDraw
@@ -35,6 +36,8 @@ class StepEvents:
         self.moment: Snapshot | None = None
         """The batch at the newest event, to restore after a step that was cut short; None if it cannot be copied."""
         self.number = 0
+        self.recording_took = 0.0
+        """Seconds that the newest event took for what is recorded: pictures, states, observations."""
         self._packer: SnapshotPacker | None = SnapshotPacker()
 
     def new_scene(self) -> None:
@@ -70,6 +73,7 @@ class StepEvents:
         restored: Restored | None,
         acted_by: str,
         resumed: bool,
+        placed: dict[CameraKey, CameraSettings],
         on_failed: Callable[[CannotDraw], None],
     ) -> Stepped:
         """The next event; see `Stepped` for the arguments.
@@ -80,9 +84,11 @@ class StepEvents:
         self.number += 1
         captured: tuple[Picture, ...] = ()
         columns: dict[str, NDArray] = {}
+        began = time.monotonic()
         if self.pictures_due(step, reset_mask):
             columns = self._state_columns(opened)
             captured = self._pictures(opened, on_failed)
+        self.recording_took = time.monotonic() - began
         packed = self._packed_snapshot(opened)
         return Stepped(
             step,
@@ -96,6 +102,7 @@ class StepEvents:
             restored,
             columns,
             acted_by,
+            placed if columns or captured else {},
             resumed,
         )
 

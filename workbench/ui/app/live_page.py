@@ -16,11 +16,12 @@ from workbench.authoring.loading.reference import named_file
 from workbench.jobs.task import ShownPictures
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.ui.app.marks import STUDIO, Marks
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.cameras.studio import StudioPanel
 from workbench.ui.checks.panel import TAB as CHECKS
-from workbench.ui.checks.panel import ChecksMark, ChecksPanel
+from workbench.ui.checks.panel import ChecksPanel
 from workbench.ui.checks.solve_seeds import SolveSeedsPanel
 from workbench.ui.checks.step_profile import StepProfilePanel
 from workbench.ui.live.banners import INTERRUPT, NEW_WORKER, RELOAD, RESTART, Banner, BusyBanner
@@ -45,6 +46,7 @@ from workbench.ui.tasks.task_list import OPEN, Chooser, OpenDialog
 from workbench.ui.widgets.editor import editor_link
 from workbench.ui.widgets.hotkeys import Command, add_hints, register
 from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.open_tabs import OpenTabs
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
@@ -100,7 +102,7 @@ class Page:
         self._built: tuple[bool, Looks] | None = None
         self._waits_for_human = False
         stage = stage or Stage(server)
-        self._scene, self._framing = stage.scene, stage.framing
+        self._scene, self._framing, self._view_choice = stage.scene, stage.framing, stage.choice
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH)
@@ -108,16 +110,14 @@ class Page:
         file = named_file(session.reference)
         server.gui.set_panel_label(str(session.reference) if file is None else file.name)
 
-        status = StatusLine(
-            server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged(), clock=clock
-        )
-        self._findings = ChecksMark(server)
+        status = StatusLine(server, clock)
+        # Not the path itself, which may be long.
+        which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
+        self._open_tabs = OpenTabs(server, which)
+        marks = Marks(server, session, self._open_tabs, lambda: self._envs.select_first_flagged())
         self._opening = None if chooser is None else OpenDialog(server, chooser, clock=clock)
         if self._opening is not None:
             self._opening.add_button()
-        # For `tab_stays.js`: not the path itself, which may be long.
-        which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
-        server.gui.add_html(render("which", which=which, anew=False))
         self._in_software = stage.in_software
         self._in_software.ask()
         run_tab, in_tabs = self._add_tabs(dark)
@@ -135,7 +135,7 @@ class Page:
         busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker, self._link)
         floating = self._envs, self._timeline, banner, busy_banner
         opening = () if self._opening is None else (self._opening,)
-        self._parts = Parts((status, self._findings, *in_tabs, *floating, *opening), clock)
+        self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
 
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
@@ -159,7 +159,7 @@ class Page:
             add_hints(server)
             self._run = RunPanel(server, session)
             self._solve = SolvePanel(server, session, self._link)
-            self._view_panel = ViewPanel(server, dark)
+            self._view_panel = ViewPanel(server, dark, self._view_choice)
             version = VersionPanel(server, session, self._link)
             options = EnvOptionsPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
@@ -180,8 +180,10 @@ class Page:
                 studio_shows=lambda: self._studio.shows,
                 clock=clock,
             )
-        with tabs.add_tab("Studio", viser.Icon.CAMERA_PLUS):
-            self._studio = StudioPanel(server, session, self._view_panel, clock)
+        with tabs.add_tab(STUDIO, viser.Icon.CAMERA_PLUS):
+            self._studio = StudioPanel(
+                server, session, self._view_panel, lambda: self._open_tabs.pages_at(STUDIO), clock
+            )
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             reward = [
                 NumbersPanel(server),
@@ -211,6 +213,7 @@ class Page:
             *reward,
             self._rescored,
         ]
+        self._open_tabs.are("Run", "Cameras", STUDIO, "Reward", "Inspect", "Episodes", CHECKS, "Log")
         return run_tab, [*parts, self._inspect, self._record, checks, seeds, profile, log]
 
     def _add_table_of_envs(self) -> None:
@@ -311,7 +314,7 @@ class Page:
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
         if self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size)):
             self._waits_for_human = alone
-            self.frame(view)
+            self._framing.frame_new(lambda aspect, height: self._viewpoint(view, aspect, height))
         if self._waits_for_human and any(kind == "human" for kind, _ in view.pictures):
             # The human camera's place comes with its first picture, after the scene.
             self._waits_for_human = False
@@ -353,6 +356,8 @@ class Page:
     def _commands(self) -> list[Command]:
         session, run, timeline = self._session, self._run, self._timeline
         rescored = self._rescored
+        # A letter alone shows something, plays or steps. What resets, rewinds, writes a file or ends what runs needs
+        # Shift: letters that are typed beside a field are pressed too.
         opening = (
             [] if self._opening is None else [Command(OPEN, self._opening.open, "O", "cmd/ctrl", (OPEN,))]
         )
@@ -361,14 +366,18 @@ class Page:
             Command("Review recordings", self._on_review, "V", buttons=("Review recordings",)),
             Command("Play or pause", run.toggle_play, "space", buttons=("Play", "Pause")),
             Command("One step", session.step, "S", buttons=(STEP,)),
-            Command("Reset all envs", session.reset, "R", buttons=(RESET_ALL,)),
-            Command("Reset the selected env", run.reset_this, "R", "shift", (RESET_THIS,)),
-            Command("Undo the last reset or rewind", session.past.undo, "U", buttons=(UNDO,)),
+            Command("Reset all envs", session.reset, "R", "shift", (RESET_ALL,)),
+            Command("Reset the selected env", run.reset_this, "S", "shift", (RESET_THIS,)),
+            Command("Undo the last reset or rewind", session.past.undo, "U", "shift", (UNDO,)),
             *timeline.commands(),
             Command("Go to the first moment", timeline.go_to_the_first, "home"),
             Command("Go to live", timeline.go_live, "end", buttons=(LIVE,)),
             Command(
-                "Continue from here, in the selected env", timeline.continue_from_shown, "G", buttons=(GO_ON,)
+                "Continue from here, in the selected env",
+                timeline.continue_from_shown,
+                "G",
+                "shift",
+                (GO_ON,),
             ),
             Command("Next episode with a different result", lambda: rescored.go_to_difference(1), "J"),
             Command(
@@ -384,11 +393,11 @@ class Page:
             Command("Next flagged env", lambda: self._envs.select_next("flagged"), "E", "shift"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
             Command("Frame the scene", lambda: self.frame(session.view()), "F"),
-            Command("Start or stop recording", self._record.toggle, "C", buttons=(RECORD, STOP)),
-            Command("Save what I just saw", self._record.save, "C", "shift", (SAVE,)),
-            Command("Show the checks", self._findings.show, "W"),
+            Command("Start or stop recording", self._record.toggle, "C", "shift", (RECORD, STOP)),
+            Command("Save what I just saw", self._record.save, "K", "shift", (SAVE,)),
+            Command("Show the checks", lambda: self._open_tabs.open_everywhere(CHECKS), "W"),
             Command("Reload the file", session.versions.reload, "L", buttons=(AS_NEEDED, RELOAD)),
-            Command("Interrupt the task", session.interrupt, "I", buttons=(INTERRUPT,)),
+            Command("Interrupt the task", session.interrupt, "I", "shift", (INTERRUPT,)),
             Command(
                 "Restart the worker", session.versions.restart_worker, "L", "shift", (RESTART, NEW_WORKER)
             ),

@@ -59,7 +59,7 @@ class RecordingProblems:
         saving = now.saving
         if not saving.failed or saving.message is before.saving.message:
             return
-        if saving.refused:
+        if saving.refused_at is not None:
             tell_all(self._server, "Nothing was saved", saving.message, seconds=REFUSED_SECONDS)
         elif saving.message != now.problem:
             self._on_notice(saving.message)

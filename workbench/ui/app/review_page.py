@@ -101,7 +101,7 @@ class ReviewPage:
             server, place.open_task, lambda asking: self._library.leave_keys(asking), clock
         )
         self._opening.add_button()
-        server.gui.add_html(render("which", which="review", anew=place.wanted is not None))
+        server.gui.add_html(render("which", which="review", anew=place.wanted is not None, says=""))
         place.stage.in_software.ask()
         self._add_way_back()
         review_tab, in_tabs = self._add_tabs(dark)
@@ -151,7 +151,7 @@ class ReviewPage:
             share = sharing.part(server, library, self._library, self._make_way, self._other_unfolded)
         with review_tab:
             going = GoLivePart(server, go_live)
-            self._view_panel = ViewPanel(server, dark)
+            self._view_panel = ViewPanel(server, dark, place.stage.choice)
         return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
 
     def _running(self) -> Running | None:
@@ -402,7 +402,7 @@ class ReviewPage:
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
             Command("Switch between the dark and the light theme", self._view_panel.toggle_dark, "D"),
             Command("Rescore the selected recordings, or the open ones", self._rescore_chosen, "J"),
-            Command("Continue live from here", self._panel.enter_recording, "G", buttons=(GO_LIVE,)),
+            Command("Continue live from here", self._panel.enter_recording, "G", "shift", (GO_LIVE,)),
         ]
         if self._place.session is not None:
             commands.append(Command(BACK, self._go_back, "V", buttons=(BACK,)))
@@ -440,6 +440,8 @@ class ReviewTimeline(TimeBar[ReviewView]):
         super().__init__(server, review, "step of the timeline", does, clock)
         self._drawn: tuple[object, ...] = ()
         self._fixed: dict[str, object] = {}
+        self._fixed_from = 0
+        """The position of the strip's left end, as it was drawn."""
 
     def draw(self, view: ReviewView) -> None:
         if not self._draw_panel(bool(view.opened), view.position):
@@ -452,10 +454,15 @@ class ReviewTimeline(TimeBar[ReviewView]):
             return
         # Only the cursor and the texts follow the position.
         if wanted[1:] != self._drawn[1:]:
-            self._fixed = fixed_values(view)
+            self._fixed, self._fixed_from = fixed_values(view), view.first
         self._drawn = wanted
         one, state = view.opened[view.selected], view.states[view.selected]
-        self._strip.content = render("review_timeline", view=view, one=one, state=state, **self._fixed)
+        self._strip.content = render(
+            "review_timeline", view=view, one=one, state=state, pick=self._pick, **self._fixed
+        )
+
+    def _on_pick(self, offset: int) -> None:
+        self._seeks.seek(self._fixed_from + offset)
 
 
 def walk(playing: bool) -> tuple[str, ...]:

@@ -54,7 +54,7 @@ class _Taken:
 
 
 class CameraGizmo:
-    """One gizmo to move and turn the chosen camera, or two for its eye and its target.
+    """One gizmo to move and turn the chosen camera, or two for its eye and its target, in the view of one page.
 
     viser's gizmo lies along its own axes and knows no steps. For turning about the world's axes it is laid along them
     when it is taken, and its rotation since then is applied to the camera. With steps, the camera jumps while the gizmo
@@ -69,7 +69,7 @@ class CameraGizmo:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        page: viser.ClientHandle,
         placing: Placing,
         snap: Callable[[], Snap],
         own_axes: Callable[[], bool],
@@ -78,17 +78,23 @@ class CameraGizmo:
         self._placing = placing
         self._snap, self._own_axes, self._look_at = snap, own_axes, look_at
         # A fixed size on the screen: in a grid of sixteen envs 10 cm would be a dot.
-        add = partial(server.scene.add_transform_controls, fixed=True, depth_test=False, visible=False)
+        add = partial(page.scene.add_transform_controls, fixed=True, depth_test=False, visible=False)
         self._camera = add("/studio/camera", PIXELS)
         self._eye = add("/studio/eye", PIXELS, disable_rotations=True)
         self._target = add("/studio/target", TARGET_PIXELS, disable_rotations=True)
-        self._line = line_set(server, "/studio/line of sight", SIGHT_COLOUR, 2.0)
+        self._line = line_set(page, "/studio/line of sight", SIGHT_COLOUR, 2.0)
         self._held_at = -1e9
         self._start: _Taken | None = None
         # Async: callbacks in viser's pool of threads would come in any order.
         self._camera.on_update(self._on_camera)
         self._eye.on_update(self._on_point)
         self._target.on_update(self._on_point)
+
+    def remove(self) -> None:
+        """Take it out of the view; a drag ends."""
+        self._line.draw()
+        for handle in (self._camera, self._eye, self._target):
+            handle.remove()
 
     @property
     def held(self) -> bool:

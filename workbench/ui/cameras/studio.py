@@ -80,8 +80,14 @@ class StudioPanel(PagePart[SessionView]):
         server: viser.ViserServer,
         session: Session,
         view_panel: ViewPanel,
+        pages: Callable[[], frozenset[int]],
         clock: Clock = time.monotonic,
     ) -> None:
+        """
+        Args:
+            pages: the pages that have this tab open, by client id.
+        """
+        self._pages = pages
         self._server, self._session, self._view_panel = server, session, view_panel
         self._placing = Placing(session)
         self._keys: tuple[CameraKey, ...] = ()
@@ -112,16 +118,12 @@ class StudioPanel(PagePart[SessionView]):
         self._folders = verdict, compare, self._suggest, CameraExport(server, session)
         self._presses = Presses(server)
         self._presses.when_unfolded(self._on_opened)
-        self._was_opened = self._has_chosen = False
+        self._was_opened = False
         with self._picture.folder:
             self._pick = CameraPick(server, session, self._presses)
-        self._gizmo = CameraGizmo(
-            server,
-            self._placing,
-            snap=lambda: self._snap,
-            own_axes=lambda: self._own_axes,
-            look_at=lambda: self._look_at,
-        )
+        self._gizmos: dict[int, CameraGizmo] = {}
+        """The handles in the view of each page that has this tab open, by client id. On another tab a drag that is meant for
+        the view would move the camera."""
 
     def _on_opened(self) -> None:
         """The tab was opened, perhaps before the task was loaded."""
@@ -130,9 +132,8 @@ class StudioPanel(PagePart[SessionView]):
 
     def _choose_first(self, view: SessionView) -> None:
         """Choose the first sensor camera once the tab was opened. A person may then choose none."""
-        if self._has_chosen or not self._was_opened or view.task is None:
+        if view.studio.was_chosen or not self._was_opened or view.task is None:
             return
-        self._has_chosen = True
         cameras = sorted(view.task.cameras, key=lambda camera: camera.kind != "sensor")
         if cameras and view.studio.selected is None:
             self._session.studio.select(cameras[0].key)
@@ -169,10 +170,27 @@ class StudioPanel(PagePart[SessionView]):
         eye = None if chosen is None else self._placing.frame(chosen).to_view(_placed(chosen))
         covered = self._look.any or (eye is not None and self._is_in_eye(eye))
         self._in_its_eye = covered and not self._look.any
-        self._gizmo.draw(None if covered else camera)
+        self._draw_gizmos(None if covered else camera)
         if chosen is None or eye is None:
             return {}
         return {chosen.key: PlacedFrustum(eye, _placed(chosen), hidden=covered)}
+
+    def _draw_gizmos(self, camera: StudioCamera | None) -> None:
+        clients, pages = self._server.get_clients(), self._pages()
+        for page in self._gizmos.keys() - pages:
+            gizmo = self._gizmos.pop(page)
+            if page in clients:
+                gizmo.remove()
+        for page in pages & clients.keys():
+            if page not in self._gizmos:
+                self._gizmos[page] = CameraGizmo(
+                    clients[page],
+                    self._placing,
+                    snap=lambda: self._snap,
+                    own_axes=lambda: self._own_axes,
+                    look_at=lambda: self._look_at,
+                )
+            self._gizmos[page].draw(camera)
 
     def _is_in_eye(self, pose: Floats) -> bool:
         """Whether a page's viewpoint is at the camera: its frustum, with its picture, would fill that view."""
@@ -402,7 +420,8 @@ class StudioPanel(PagePart[SessionView]):
             keeps_target = self._look_at and moved.position != now.position
             return frame.turned_to(moved, target_of(now)) if keeps_target else moved
 
-        if self._placing.camera is not None:
+        # Not from another tab: nothing there shows that a camera moves.
+        if self._placing.camera is not None and self._pages():
             self._placing.change(control, change)
 
 

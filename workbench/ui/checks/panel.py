@@ -1,8 +1,9 @@
-"""The Checks tab, and the mark of findings below the status line."""
+"""The Checks tab, and what the mark of findings says."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import viser
 
@@ -92,52 +93,29 @@ class ChecksPanel(PagePart[SessionView]):
             self._session.check_now()
 
 
-class ChecksMark(PagePart[SessionView]):
-    """The number of findings below the status line, whichever tab is open; a press opens the Checks tab."""
+@dataclass(frozen=True)
+class FindingsMark:
+    """What the mark of findings says."""
 
-    every = 0.25
-
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
-        self._html = server.gui.add_html("", visible=False)
-        # Not in a folder: viser draws a folder without a label as if its parts stood in the container, and all that
-        # follows the hidden buttons, the tabs too, would be hidden.
-        self._press = Presses(server).id_of("open", lambda client: self._show_at(client))
-        self._opening: dict[int, viser.GuiHtmlHandle] = {}
-        """By page: the element that opened the tab last."""
-
-    def key(self, view: SessionView) -> object:
-        return view.checks.serial, view.rules_serial, view.odd
-
-    def draw(self, view: SessionView) -> None:
-        found = cards(view.checks, view.played)
-        self._html.visible = bool(found)
-        if found:
-            self._html.content = mark_html(found, self._press)
-
-    def show(self) -> None:
-        """Open the Checks tab on every page: a key does not tell on which one it was pressed."""
-        for client in self._server.get_clients().values():
-            self._show_at(client)
-
-    def _show_at(self, client: viser.ClientHandle | None) -> None:
-        if client is None:
-            return
-        before = self._opening.pop(client.client_id, None)
-        if before is not None:
-            before.remove()
-        self._opening[client.client_id] = client.gui.add_html(render("open_tab", tab=TAB))
+    count: int
+    newest: str
+    """Where the worst is, with the number of others."""
+    stops: bool
+    old: bool
+    """All were found before the last change, and that is not checked yet."""
 
 
-def mark_html(found: list[Card], press_id: str) -> str:
-    """The mark: number of findings, and where the worst is."""
+def findings_mark(view: SessionView) -> FindingsMark | None:
+    """The mark of findings; None without any."""
+    found = cards(view.checks, view.played)
+    if not found:
+        return None
     rows = [row.finding for card in found for row in card.rows]
     newest = next((place(finding) for finding in rows if finding.file), "")
     if newest and len(rows) > 1:
         newest += f" and {len(rows) - 1} more"
     stops = any(finding.degree == "stop" for finding in rows)
-    old = all(card.old for card in found)
-    return render("checks_mark", press_id=press_id, count=len(rows), newest=newest, stops=stops, old=old)
+    return FindingsMark(len(rows), newest, stops, all(card.old for card in found))
 
 
 def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) -> str:

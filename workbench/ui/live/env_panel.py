@@ -14,9 +14,9 @@ from workbench.machine.text import number_text
 from workbench.session.history.env_table import EnvRows, Outcome
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.ui.live.moment import MomentPart
 from workbench.ui.live.timeline import polylines
 from workbench.ui.widgets.click_targets import Paged, Presses
-from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 
 Filter = Literal["all", "failed", "running", "flagged"]
@@ -231,14 +231,11 @@ HINTS = {
 }
 
 
-class EnvPanel(PagePart[SessionView]):
+class EnvPanel(MomentPart):
     """The table of envs in the present container. Sorting and filter are the same for all open pages.
 
     While it is folded in every page only a new task is drawn: 64 rows were half of what the panels took while a task played.
     """
-
-    every = 0.3
-    """Faster, numbers of many rows cannot be read."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
@@ -254,6 +251,8 @@ class EnvPanel(PagePart[SessionView]):
         self._pressed = 0
         """Number of presses that change the table."""
         self._is_unfolded = False
+        self._drawn_task = -1
+        """`SessionView.task_serial` when it was drawn last."""
         self._presses.when_unfolded(self.unfold)
 
     def unfold(self) -> None:
@@ -268,9 +267,12 @@ class EnvPanel(PagePart[SessionView]):
         return view.task_serial, view.step_serial if self._is_unfolded else None
 
     def urgent(self, view: SessionView) -> object:
-        return self._is_unfolded, (view.selected_env, self._pressed) if self._is_unfolded else None
+        return super().urgent(view), self._is_unfolded, self._pressed if self._is_unfolded else None
 
     def draw(self, view: SessionView) -> None:
+        if not self._is_unfolded and self._drawn_task == view.task_serial:
+            return
+        self._drawn_task = view.task_serial
         rows = self._session.env_rows()
         content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
         self._handle.content = content

@@ -10,7 +10,7 @@ from workbench.recording.reader.reading import recovered_text
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.record.live import RecordingStatus
-from workbench.ui.widgets.parts import PagePart
+from workbench.ui.live.moment import MomentPart
 from workbench.ui.widgets.templates import counted, render
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
@@ -19,21 +19,19 @@ SAVE_BEFORE = "Save the previous episode"
 STOP, STOP_WAITING, STOP_SAVING = "Stop recording", "Stop waiting", "Stop saving"
 
 
-class RecordPanel(PagePart[SessionView]):
+class RecordPanel(MomentPart):
     """Three buttons, each of which also stops what it began, and their state in words.
 
     *Record* begins a fresh episode, since one without its reset cannot be replayed; *Record the next episode* waits for a
     reset; *Save what I just saw* makes a recording of the past.
     """
 
-    every = 0.2
-
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._button = server.gui.add_button(
             RECORD,
             icon=viser.Icon.PLAYER_RECORD,
-            hint="Reset and record every episode until it is stopped (C)",
+            hint="Reset and record every episode until it is stopped (Shift+C)",
         )
         self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
         self._next = server.gui.add_button(
@@ -46,7 +44,7 @@ class RecordPanel(PagePart[SessionView]):
             SAVE,
             icon=viser.Icon.HISTORY,
             color="gray",
-            hint="Record after the fact: the episode at the shown moment (shift+C)",
+            hint="Record after the fact: the episode at the shown moment (Shift+K)",
         )
         self._before = server.gui.add_button(
             SAVE_BEFORE,
@@ -85,9 +83,8 @@ class RecordPanel(PagePart[SessionView]):
 
     def urgent(self, view: SessionView) -> object:
         recording = view.recording
-        shown = view.task_serial, view.state, view.selected_env, view.timeline.shown, self._which.value
         stand = recording.active, recording.waiting, recording.saving.progress is None
-        return *shown, *stand, view.timeline.moments == 0
+        return super().urgent(view), self._which.value, *stand, view.timeline.moments == 0
 
     def draw(self, view: SessionView) -> None:
         recording, saving = view.recording, view.recording.saving.progress is not None
@@ -120,10 +117,9 @@ def runs_since(view: SessionView) -> int | None:
 
 
 def has_one_before(view: SessionView) -> bool:
-    """Whether the history has moments before a running episode."""
+    """Whether the history has steps before a running episode."""
     steps, past = runs_since(view), view.timeline
-    at = past.last if past.shown is None else past.shown
-    return steps is not None and at - past.first > steps
+    return steps is not None and past.tick - past.first_tick > steps
 
 
 def what_saving_means(view: SessionView, all_envs: bool) -> str:
@@ -145,13 +141,14 @@ def recording_html(recording: RecordingStatus) -> str:
     return render(
         "recording",
         recording=recording,
-        envs=_envs_in_words(recording.env_idx),
+        envs=envs_in_words(recording.env_idx),
         recovered=recovered_text(recording.recovered),
         command=recording.last_file and f"workbench view {shlex.quote(recording.last_file)}",
     )
 
 
-def _envs_in_words(env_idx: tuple[int, ...]) -> str:
-    numbers = ", ".join(str(env) for env in env_idx[:6])
-    more = f" and {len(env_idx) - 6} more" if len(env_idx) > 6 else ""
+def envs_in_words(env_idx: tuple[int, ...], most: int = 6) -> str:
+    """``envs 0, 3 and 5 more``."""
+    numbers = ", ".join(str(env) for env in env_idx[:most])
+    more = f" and {len(env_idx) - most} more" if len(env_idx) > most else ""
     return f"env{'s' if len(env_idx) != 1 else ''} {numbers}{more}"

@@ -18,7 +18,7 @@ from workbench.session.rescore.past import PastRun, RescoredCurve
 from workbench.ui.widgets.line_chart import part_round
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.rescored import RescoredPanel
-from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.templates import counted, render
 
 TITLE = "History, rescored"
 
@@ -78,8 +78,9 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
         env, at = place = _place(verdict)
         kept = at >= self._first
         return {
-            "name": str(env),
-            "hint": "Show this moment" if kept else "This moment is no longer in the history",
+            "name": f"{env}, from {verdict.of.tick}",
+            "hint": f"Env {env}, the episode that began after {counted(verdict.of.tick, 'step')}. "
+            + ("Show the moment" if kept else "The moment is no longer in the history"),
             "selected": self._shown == place,
         }
 

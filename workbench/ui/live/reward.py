@@ -13,9 +13,9 @@ from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.machine.text import mean_text, nonfinite_text, number_text
 from workbench.session.history.curves import REWARD, SUCCESS, Column, Curves, Group, columns_of
 from workbench.session.live.view import SessionView
+from workbench.ui.live.moment import MomentPart
 from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.line_chart import YES_OR_NO, ChartLine, LineChart
-from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render, short_text
 
 HEIGHT, TALL = 150, 170
@@ -40,7 +40,7 @@ Entry = tuple[Group, str]
 """What is chosen: a column, or all parts of an entry of several."""
 
 
-class CurvesPanel(PagePart[SessionView]):
+class CurvesPanel(MomentPart):
     """Curves of the selected env and of the mean over the batch, over all steps: selecting an env keeps its past.
 
     A person chooses which; the choice is kept for each task. A press on a curve shows its step.
@@ -48,8 +48,6 @@ class CurvesPanel(PagePart[SessionView]):
     Args:
         seek: Shows the moment after a control step.
     """
-
-    every = 0.2
 
     def __init__(self, server: viser.ViserServer, seek: Callable[[int], None] = lambda tick: None) -> None:
         self._server, self._seek = server, seek
@@ -368,10 +366,8 @@ def _batch(values: NDArray) -> str:
     return ""
 
 
-class NumbersPanel(PagePart[SessionView]):
+class NumbersPanel(MomentPart):
     """The table of the task's numbers."""
-
-    every = 0.12
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._handle = server.gui.add_html("")

@@ -6,7 +6,7 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +19,20 @@ from workbench.machine.processes.watched_thread import watched_thread
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import EpisodeEnd
+from workbench.ui.live.episodes_panel import ALL_ENVS, THIS_ENV
 from workbench.ui.server.control_values import limit_text
 from workbench.ui.widgets.inputs import Control
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 
+HOLD = "Hold still"
 UNBOUNDED = 1.0
 """A dimension without bounds gets a slider from -1 to 1."""
 
 
 class ActionSliders:
-    """A folder with one slider for each dimension; shown while the source is ``sliders``."""
+    """A folder with one slider for each dimension, shown while the source is ``sliders``: what the selected env's robot is
+    told. A slider that is moved tells that dimension alone, in the env or envs that the folder names."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server = server
@@ -38,10 +41,22 @@ class ActionSliders:
         self._controls: list[Control[viser.GuiSliderHandle, float]] = []
         self._folder = server.gui.add_folder(None, visible=False)
         with self._folder:
-            self._centre = server.gui.add_button("Centre all", color="gray")
-        self._centre.on_click(lambda _: self._send_centre())
+            self._which = server.gui.add_dropdown(
+                "Moves",
+                (THIS_ENV, ALL_ENVS),
+                initial_value=THIS_ENV,
+                hint="Whose robot a slider moves. The sliders show what the robot of the selected env is told.",
+            )
+            self._hold = server.gui.add_button(
+                HOLD, color="gray", hint="Each joint stops where it is; the sliders follow"
+            )
+        self._hold.on_click(lambda _: session.tell((), (), self._envs))
 
-    def build(self, dimensions: tuple[ActionDimension, ...], values: tuple[float, ...]) -> None:
+    @property
+    def _envs(self) -> tuple[int, ...] | None:
+        return None if self._which.value == ALL_ENVS else (self._session.view().selected_env,)
+
+    def build(self, dimensions: tuple[ActionDimension, ...]) -> None:
         """Make the sliders of this action space, unless they exist (a reload keeps them)."""
         if dimensions == self._dimensions:
             return
@@ -51,7 +66,6 @@ class ActionSliders:
         with self._folder:
             for number, dimension in enumerate(dimensions):
                 low, high = slider_bounds(dimension)
-                start = values[number] if number < len(values) else (low + high) / 2
                 self._controls.append(
                     Control(
                         self._server.gui.add_slider(
@@ -59,30 +73,27 @@ class ActionSliders:
                             min=low,
                             max=high,
                             step=(high - low) / 200,
-                            initial_value=min(max(start, low), high),
+                            initial_value=(low + high) / 2,
                         ),
-                        send=lambda _: self._send(),
+                        send=partial(self._send, number),
                     )
                 )
 
-    def draw(self, shown: bool, values: tuple[float, ...]) -> None:
-        self._folder.visible = shown
-        if shown and len(values) == len(self._controls):
-            for control, value in zip(self._controls, self._in_bounds(values), strict=True):
-                control.show(value)
-
-    def _send(self) -> None:
-        # The newest value of each: two sliders moved at once arrive in any order.
-        self._session.change(sliders=tuple(self._in_bounds(c.handle.value for c in self._controls)))
-
-    def _in_bounds(self, values: Iterable[float]) -> Iterator[float]:
-        """Clamp to the sliders: a browser's sum of steps may pass the end, and a policy's action may lie outside."""
-        for dimension, value in zip(self._dimensions, values, strict=True):
+    def draw(self, view: SessionView) -> None:
+        self._folder.visible = view.settings.action_source == "sliders" and bool(self._dimensions)
+        several = view.task is not None and view.task.num_envs > 1
+        self._which.visible = several
+        if not self._folder.visible or view.told is None:
+            return
+        told = view.told[min(view.selected_env, len(view.told) - 1)]
+        for control, dimension, value in zip(self._controls, self._dimensions, told, strict=False):
             low, high = slider_bounds(dimension)
-            yield min(max(value, low), high)
+            # A policy's action may lie outside.
+            # Three digits: the field beside the slider has no place for more.
+            control.show(min(max(float(f"{value:.3g}"), low), high))
 
-    def _send_centre(self) -> None:
-        self._session.change(sliders=tuple(sum(slider_bounds(d)) / 2 for d in self._dimensions))
+    def _send(self, number: int, value: float) -> None:
+        self._session.tell((number,), (value,), self._envs)
 
 
 def slider_bounds(dimension: ActionDimension) -> tuple[float, float]:
@@ -271,7 +282,7 @@ class RunPanel(PagePart[SessionView]):
             several = view.task.num_envs > 1
             self._env_folder.visible = several
             self._env.handle.max = max(1, view.task.num_envs - 1)
-            self._sliders.build(view.task.actions, view.settings.sliders)
+            self._sliders.build(view.task.actions)
         self._draw_play(view.playing, can_act)
         # viser cannot disable a group of buttons, so it is hidden.
         self._transport.visible = can_act
@@ -287,7 +298,7 @@ class RunPanel(PagePart[SessionView]):
         self._policy.handle.visible = policy_wanted
         self._policy_hint.visible = policy_wanted and not view.settings.policy
         self._draw_found(view.settings.policy if policy_wanted else None, policy_wanted)
-        self._sliders.draw(view.settings.action_source == "sliders", view.settings.sliders)
+        self._sliders.draw(view)
 
     def _draw_play(self, playing: bool, can_act: bool) -> None:
         self._play.label = "Pause" if playing else "Play"

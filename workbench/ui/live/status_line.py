@@ -1,23 +1,19 @@
-"""The status line above the tabs, and the mark of flagged envs."""
+"""The status line above the tabs."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 
-import numpy as np
 import viser
 
 from workbench.jobs.task import TaskDescription
-from workbench.session.history.env_table import EnvRows
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
-from workbench.ui.live.env_panel import first_flagged, mask
-from workbench.ui.live.timeline import step_in_words
+from workbench.ui.live.moment import MomentPart
+from workbench.ui.live.timeline import ago_in_words, step_in_words
 from workbench.ui.live.version_panel import took
-from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.parts import Clock
 from workbench.ui.widgets.templates import counted, place, render
 
 NEWS = 6.0
@@ -37,38 +33,25 @@ STATE_WORDS = {
 }
 
 
-class StatusLine(PagePart[SessionView]):
-    """State, task, activity and speed of the session, and the mark of flagged envs.
+class StatusLine(MomentPart):
+    """State, task, activity and speed of the session, and the selected env's step."""
 
-    Args:
-        env_rows: The table of envs; None before there is a task.
-        on_flagged: Called when the mark of flagged envs is pressed.
-    """
-
-    every = 0.25
-    """Rates that change faster cannot be read."""
-
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        env_rows: Callable[[], EnvRows | None],
-        on_flagged: Callable[[], None],
-        clock: Clock = time.monotonic,
-    ) -> None:
-        self._env_rows, self._on_flagged = env_rows, on_flagged
+    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         self._handle = server.gui.add_html("")
-        # An element of its own: the line above is replaced four times a second, and a press on it would be lost.
-        self._flagged_mark = server.gui.add_html("", visible=False)
-        # At the end of the panel, after the tabs: everything after it is hidden.
-        self._presses = Presses(server)
         self._clock = clock
         self._task_serial = 0
         self._loaded_at = -math.inf
 
     def urgent(self, view: SessionView) -> object:
         busy = view.busy and (view.busy.doing, f"{view.busy.seconds:.0f}")
-        at = view.task_serial, view.problem_serial, view.timeline.shown is None
-        return busy, view.state, view.stale, view.activity, self._is_fresh(view), *at
+        return (
+            super().urgent(view),
+            busy,
+            view.stale,
+            view.activity,
+            self._is_fresh(view),
+            view.problem_serial,
+        )
 
     def _is_fresh(self, view: SessionView) -> bool:
         """Whether a new version came less than `NEWS` seconds ago."""
@@ -79,38 +62,14 @@ class StatusLine(PagePart[SessionView]):
         return self._clock() - self._loaded_at < NEWS
 
     def draw(self, view: SessionView) -> None:
-        rows = self._env_rows()
-        flagged = None if rows is None else flagged_text(rows)
-        self._handle.content = render(
-            "status_line", **status_values(view, self._is_fresh(view), marked=flagged is not None)
-        )
-        self._flagged_mark.visible = flagged is not None
-        if flagged is not None:
-            text, hint = flagged
-            press = self._presses.id_of("flagged", lambda _: self._on_flagged())
-            self._flagged_mark.content = render("flagged_mark", text=text, hint=hint, press_id=press)
+        self._handle.content = render("status_line", **status_values(view, self._is_fresh(view)))
 
 
-def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
-    """Number of flagged envs and the reason of the first, as label and hint; None without flagged envs."""
-    count = int(np.count_nonzero(mask(rows, "flagged")))
-    env = first_flagged(rows)
-    if env is None:
-        return None
-    outlier = (rows.outliers.get(env) or rows.last.outliers[env])[0]
-    when = f"step {outlier.step}" + ("" if env in rows.outliers else " of the previous episode")
-    envs = "" if rows.num_envs == 1 else f"{count} of {rows.num_envs} envs "
-    press = "Click to see it" if env in rows.outliers else "Click to select it"
-    hint = f"In env {env}, {when}: {outlier.text}. {press}; the table of envs (B) has them all."
-    return f"⚑ {envs}flagged: {outlier.reason}", hint
-
-
-def status_values(view: SessionView, fresh: bool = False, marked: bool = False) -> dict[str, object]:
+def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
     """The values of the template.
 
     Args:
         fresh: a new version has just come.
-        marked: there is a mark below the line.
     """
     task = view.task
     # While the renderer works, the session's activity says more than "busy".
@@ -128,10 +87,12 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
         "activity": (view.solve.activity if starting else view.activity) if busy is None else _doing(busy),
         "news": _news(view) if fresh else "",
         "at": step_in_words(view),
+        "ago": ago_in_words(view.timeline),
         "moving": moving and not planning,
         "plan": view.solve.plan if planning and not starting else None,
         "behind": moving and slow,
-        "marked": marked,
+        "why_slow": slowed_by(view) if moving and slow else None,
+        "recording": view.recording.active,
         "robot": "" if task is None else robot_text(task),
     }
 
@@ -145,6 +106,27 @@ def robot_text(task: TaskDescription) -> str:
         counted(count, "action") if count else "",
     )
     return " · ".join(part for part in parts if part)
+
+
+SLOWS = 0.3
+"""Least part of the time that is named as what makes playing slow."""
+
+
+def slowed_by(view: SessionView) -> tuple[str, str] | None:
+    """What of recording and watching takes most of the time while playing, measured: short, and in full; None for neither."""
+    task, recorded, watched = view.task, view.recorded_share, view.watched_share
+    if task is None or max(recorded, watched) < SLOWS:
+        return None
+    rate = f"{counted(round(view.steps_per_second), 'step')} a second"
+    if recorded >= watched:
+        cameras = counted(len(task.cameras) if task.can_render else 0, "camera")
+        envs = counted(len(view.recording.env_idx), "env")
+        what = f"recording {cameras} of {envs} in every step takes {recorded:.0%} of the time"
+        advice = "Save what I just saw (Episodes) records afterwards, and costs nothing while playing."
+        return f"{cameras} recorded in every step", f"{rate}: {what}. {advice}"
+    cameras = counted(len(view.settings.cameras), "camera")
+    what = f"drawing the {cameras} that this page shows takes {watched:.0%} of the time"
+    return f"{cameras} drawn for the page", f"{rate}: {what}. Untick them on the Cameras tab."
 
 
 def _state(view: SessionView, busy: Busy | None) -> str:

@@ -13,28 +13,30 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.machine.text import number_text
 from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.live.session import Session
-from workbench.session.live.timeline import Scope, Strip
+from workbench.session.live.timeline import Scope, Strip, TimelineView
 from workbench.session.live.view import SessionView
+from workbench.ui.live.moment import MomentPart
 from workbench.ui.server.control_values import name_control
+from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.hotkeys import Command
 from workbench.ui.widgets.inputs import Control
-from workbench.ui.widgets.parts import Clock, DrawDue, PagePart
-from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.templates import counted, render
 
 GAP = 12
 """Pixels between floating panels and the view's edges; the same in ``view_width.js``."""
 WIDEST = 760
 HEIGHT = 205
 """Pixels of the view that it covers; framing a scene leaves them out."""
-REDRAW_EVERY = 0.2
 RANGE_EVERY = 0.5
 """Seconds. A slider whose ends move at every step cannot be held."""
 STANDS_STILL = 0.35
 """Seconds at one moment until its pictures are drawn; with less, every drag would draw some."""
 LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
-EPISODE, EVERYTHING = "zoom in", "zoom out"
+EPISODE, EVERYTHING = "this episode", "all episodes"
 SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
 GO_ON = "Continue from here"
 UNDO = "undo"
@@ -87,6 +89,8 @@ class TimeBar(PagePart[View]):
             self._add_rows(gui)
             self._walk: viser.GuiButtonGroupHandle = gui.add_button_group("", tuple(self._does))
             name_control(self._walk, "step to take")
+            self._pick = Presses(server).number_id("place on the strip", self._on_pick)
+            """Id of the input that gets what of the strip is pressed, counted from its left end."""
         self._walk.on_click(lambda event: self._on_walk(event.target.value))
         # Across the bottom of the view: viser docks panels at the sides only.
         self._panel.float(x=GAP, y=-GAP, width=WIDEST)
@@ -120,10 +124,15 @@ class TimeBar(PagePart[View]):
 
     def _on_slider(self, value: int) -> None:
         self._before_slider = self._shown
-        self._seeks.seek(self._place_of(value))
+        self._seek(value)
 
-    def _place_of(self, value: int) -> int | None:
-        return value
+    def _seek(self, value: int) -> None:
+        """Show what lies at this value of the slider."""
+        self._seeks.seek(value)
+
+    def _on_pick(self, offset: int) -> None:
+        """The strip was pressed, so far from its left end."""
+        raise NotImplementedError
 
     def _on_walk(self, name: str) -> None:
         next(does for label, does in self._does.items() if name.startswith(label))()
@@ -141,14 +150,14 @@ class TimeBar(PagePart[View]):
 
     def _set_ends(self, low: int, high: int) -> None:
         handle = self._slider.handle
-        # Never an empty range: the browser divides by it.
-        handle.min, handle.max, handle.visible = min(low, high - 1), high, low < high
+        # Never an empty range: the browser divides by it. Disabled, not hidden: the panel would grow at the first step.
+        handle.min, handle.max, handle.disabled = min(low, high - 1), high, low >= high
 
 
-class TimelinePanel(TimeBar[SessionView]):
-    """The live page's timeline. It counts backwards: 0 is live and -37 is 37 steps ago, so that the slider rests at its
-    right end while the simulation runs and nothing is sent. Dragging shows moments that the session has in memory; the
-    worker draws pictures only after a while at one moment.
+class TimelinePanel(TimeBar[SessionView], MomentPart):
+    """The live page's timeline. It counts control steps backwards: 0 is live and -37 is 37 steps ago, so that the slider
+    rests at its right end while the simulation runs and nothing is sent. Dragging shows moments that the session has in
+    memory; the worker draws pictures only after a while at one moment.
     """
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
@@ -159,11 +168,14 @@ class TimelinePanel(TimeBar[SessionView]):
         self._travel.on_click(lambda event: self._on_travel(event.target.value))
         self._episode_only = False
         self._range = (0, 0)
-        """Serials of the slider's ends."""
+        """Ticks of the slider's ends."""
+        self._strip_from = 0
+        """Tick of the strip's left end, as it was drawn."""
         self._newest = 0
-        """The serial that the slider shows as 0."""
+        """The tick that the slider shows as 0."""
         self._range_at = -math.inf
-        self._strip_due = DrawDue(REDRAW_EVERY, clock)
+        self._strip_of: object = None
+        """What the strip was drawn for."""
         self._stood: tuple[object, float] = (None, 0.0)
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
@@ -180,13 +192,22 @@ class TimelinePanel(TimeBar[SessionView]):
 
     def go_to_the_first(self) -> None:
         """Go to the left end of the slider, where a slider with the focus goes too."""
-        self._session.past.seek(self._range[0] if self._episode_only else 0)
+        if self._episode_only:
+            self._session.past.seek_tick(self._range[0], in_episode=True)
+        else:
+            self._session.past.seek(0)
 
     def continue_from_shown(self) -> None:
         self._session.past.continue_from_shown("this")
 
-    def _place_of(self, value: int) -> int | None:
-        return None if value == 0 else self._newest + value
+    def _seek(self, value: int) -> None:
+        if value == 0:
+            self._session.past.seek(None)
+        else:
+            self._session.past.seek_tick(self._newest + value, self._episode_only)
+
+    def _on_pick(self, offset: int) -> None:
+        self._session.past.seek_tick(self._strip_from + offset, self._episode_only)
 
     def _zoom(self, episode_only: bool) -> None:
         self._episode_only, self._range_at = episode_only, -math.inf
@@ -198,6 +219,9 @@ class TimelinePanel(TimeBar[SessionView]):
 
     # --- drawing -----------------------------------------------------------------------------------
 
+    def urgent(self, view: SessionView) -> object:
+        return super().urgent(view), self._episode_only
+
     def draw(self, view: SessionView) -> None:
         there = view.task is not None and view.timeline.moments > 0
         if self._draw_panel(there, view.timeline.shown):
@@ -208,18 +232,18 @@ class TimelinePanel(TimeBar[SessionView]):
 
     def _draw_slider(self, view: SessionView) -> None:
         past, now = view.timeline, self._clock()
-        moved = past.shown is not None and not self._range[0] <= past.shown <= self._range[1]
+        moved = past.shown is not None and not self._range[0] <= past.tick <= self._range[1]
         if now - self._range_at >= RANGE_EVERY or moved:
             self._range_at = now
-            segment = self._session.past.segment() if self._episode_only else None
-            self._range = (past.first, past.last) if segment is None else segment
-            self._newest = past.last
-            self._set_ends(*(serial - self._newest for serial in self._range))
-        self._slider.show(0 if past.shown is None else past.shown - self._newest)
+            episode = self._session.past.episode() if self._episode_only else None
+            self._range = (past.first_tick, past.last_tick) if episode is None else episode
+            self._newest = past.last_tick
+            self._set_ends(*(tick - self._newest for tick in self._range))
+        self._slider.show(0 if past.shown is None else past.tick - self._newest)
 
     def _draw_buttons(self, view: SessionView) -> None:
         past = view.timeline
-        # Buttons of a group cannot be disabled, so those that would do nothing are left out.
+        # viser's buttons of a group cannot be disabled, so those that would do nothing are left out.
         undo = () if past.undo is None else (f"{UNDO} {past.undo}",)
         self._walk.options = (*WALK[:-1], EVERYTHING if self._episode_only else EPISODE, *undo)
         travel = continue_labels(view) if past.can_continue else ()
@@ -232,13 +256,15 @@ class TimelinePanel(TimeBar[SessionView]):
 
     def _draw_strip(self, view: SessionView) -> None:
         past = view.timeline
-        wanted = (past.first, past.last, past.shown, view.selected_env, self._range, view.playing)
-        if not self._strip_due.is_due(wanted):
+        wanted = (past.first, past.last, past.shown, view.selected_env, self._range)
+        if wanted == self._strip_of:
             return
+        self._strip_of = wanted
         low, high = self._range
         strip = self._session.past.strip(low, high)
         if strip is not None:
-            self._strip.content = strip_html(strip, view)
+            self._strip_from = strip.low
+            self._strip.content = strip_html(strip, view, self._pick)
 
     def _ask_for_pictures(self, view: SessionView) -> None:
         at = (view.timeline.shown, view.selected_env)
@@ -279,7 +305,8 @@ NAMES = {
     "other": "other event",
 }
 """Legend of the styles."""
-MOST_MARKS = 150
+MOST_MARKS = 250
+"""Places of the strip that have a mark each: what is nearer together cannot be told apart."""
 
 
 def strip_values(
@@ -302,23 +329,54 @@ def strip_values(
     return {"place": place, "lines": reward_lines(reward), "kinds": kinds}
 
 
-def strip_html(strip: Strip, view: SessionView) -> str:
-    """The strip of one env with its shown moment."""
-    marks = [
-        (serial, next(style for flag, style in FLAGS.items() if flags & flag))
-        for serial, flags in strip.events[-MOST_MARKS:]
-    ]
+def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
+    """Tick, style and name of each mark. Of several events that fall on one place the first of `FLAGS` is drawn."""
+    rank, names = list(FLAGS), dict(strip.branches)
+    marks: dict[int, tuple[int, int, str]] = {}
+    for tick, flags in strip.events:
+        flag = next(flag for flag in rank if flags & flag)
+        place = MOST_MARKS * (tick - strip.low) // (strip.high - strip.low + 1)
+        if place not in marks or rank.index(flag) < rank.index(marks[place][1]):
+            name = NAMES[FLAGS[flag]]
+            if flag == WENT_BACK:
+                name = (
+                    f"went back {counted(tick - names[tick], 'step')}"
+                    if tick in names
+                    else "from a recording"
+                )
+            marks[place] = tick, flag, name
+    return [(tick, FLAGS[flag], name) for tick, flag, name in marks.values()]
+
+
+def strip_html(strip: Strip, view: SessionView, pick: str = "") -> str:
+    """The strip of one env with its shown moment.
+
+    Args:
+        pick: id of the input that gets the tick of a press.
+    """
+    marks, finite = marks_of(strip), strip.reward[np.isfinite(strip.reward)]
     return render(
         "timeline",
         strip=strip,
+        pick=pick,
         past=view.timeline,
         marks=marks,
-        origins=dict(strip.branches),
-        names=NAMES,
+        ago=ago_in_words(view.timeline),
         where=where(view),
+        span=[_number(float(value)) for value in (finite.min(), finite.max())] if len(finite) else None,
         megabytes=megabytes,
-        **strip_values(strip.low, strip.high, strip.reward, {style for _, style in marks}),
+        **strip_values(strip.low, strip.high, strip.reward, {style for _, style, _ in marks}),
     )
+
+
+def _number(value: float) -> str:
+    return number_text(value, ".3g")
+
+
+def ago_in_words(past: TimelineView) -> str:
+    """``7 steps ago``, of the shown moment."""
+    # An episode's last step is at the tick of the reset that follows it.
+    return f"{counted(past.steps_ago, 'step')} ago" if past.steps_ago else "before the last reset"
 
 
 def step_in_words(view: SessionView) -> str:
@@ -340,12 +398,14 @@ def where(view: SessionView) -> str:
 
 
 def reward_lines(reward: NDArray[np.float32]) -> list[str]:
-    """SVG polylines of the finite rewards over x 0..100 and y 0..`LINE_HEIGHT` (greatest on top), with gaps; empty
-    without two different values."""
+    """SVG polylines of the finite rewards over x 0..100 and y 0..`LINE_HEIGHT` (greatest on top), with gaps. One value
+    alone is a line in the middle."""
     finite = reward[np.isfinite(reward)]
-    if not len(finite) or finite.min() == finite.max():
+    if not len(finite):
         return []
     low, high = float(finite.min()), float(finite.max())
+    if low == high:
+        low, high = low - 1.0, high + 1.0
     known = np.where(np.isfinite(reward), reward, np.nan)
     if len(known) <= POINTS:
         places, values = np.arange(len(known)), known
@@ -353,7 +413,7 @@ def reward_lines(reward: NDArray[np.float32]) -> list[str]:
         edges = np.linspace(0, len(known), POINTS // 2 + 1).astype(int)[:-1]
         values = np.stack([np.fmin.reduceat(known, edges), np.fmax.reduceat(known, edges)], 1).reshape(-1)
         places = np.repeat(edges, 2)
-    x = 100 * places / (len(known) - 1)
+    x = 100 * places / max(len(known) - 1, 1)
     y = LINE_HEIGHT * (1 - (values - low) / (high - low))
     return polylines([None if np.isnan(b) else f"{a:.2f},{b:.1f}" for a, b in zip(x, y, strict=True)])
 

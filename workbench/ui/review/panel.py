@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import viser
 
+from workbench.core.camera_data import moved_cameras_text
 from workbench.jobs.from_recording import ChangesOnDisk, recorded_version
 from workbench.recording.episode.episode import acted_by_text
 from workbench.session.review.review import MOST_COMPARED, SPEEDS, Review
@@ -52,7 +53,7 @@ class ReviewPanel(PagePart[ReviewView]):
             icon=viser.Icon.PLAYER_TRACK_NEXT,
             color="gray",
             visible=False,
-            hint="Restores the shown state in the live env, with the current code (G).",
+            hint="Restores the shown state in the live env, with the current code (Shift+G).",
         )
         self._live.on_click(lambda _: self.enter_recording())
         self._speed = Control(
@@ -182,6 +183,7 @@ def facts_html(chosen: Opened, changed: str) -> str:
         changed=changed,
         most=MOST_OF_CODE,
         acted_by=acted_by_text(info.acted_by),
+        moved=moved_cameras_text(info.moved_cameras),
         assignments=assignments,
         local_time=local_time,
     )

@@ -215,7 +215,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         return {
             # Its colour, if it is one of several open recordings.
             "badge": opened.index(verdict.of.id) if len(opened) > 1 and verdict.of.id in opened else None,
-            "name": f"seed {verdict.seed}" if verdict.seed >= 0 else verdict.of.name[-24:],
+            "name": f"seed {verdict.seed}" if verdict.seed >= 0 else _end_of(verdict.of.name),
             "hint": f"{verdict.of.name}. Click to open it"
             + (f" at step {at}, the first that differs" if at is not None else ""),
             "selected": verdict.of.id == self._selected,
@@ -244,3 +244,8 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
             f"reward of {name}, then and now",
             *(values[part] for values in (steps, chosen.old_reward, chosen.new_reward)),
         )
+
+
+def _end_of(name: str) -> str:
+    """Its end, which tells recordings of a task apart."""
+    return name if len(name) <= 24 else f"…{name[-23:]}"

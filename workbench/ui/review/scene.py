@@ -247,7 +247,7 @@ class ReviewIn3D:
         # The live page uses the same key: switching between the two for one task keeps the view.
         task = view.opened[0].episode.info.task
         if self._framing.is_new((task, len(view.opened) if in_grid else 1, size)):
-            self.frame()
+            self._framing.frame_new(self._viewpoint)
 
     def _draw_frustums(
         self,

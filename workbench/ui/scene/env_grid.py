@@ -217,7 +217,9 @@ class InView:
                 setattr(self.handle, name, value)
 
 
-def line_set(server: viser.ViserServer, name: str, colour: tuple[int, int, int], thickness: float) -> InView:
+def line_set(
+    server: viser.ViserServer | viser.ClientHandle, name: str, colour: tuple[int, int, int], thickness: float
+) -> InView:
     """Line segments (K, 2, 3), metres in the view, `thickness` pixels wide."""
     more = {"colors": colour, "thickness": thickness, "thickness_units": "screen"}
     return InView(partial(server.scene.add_line_segments, name, **more), "points")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,6 +117,10 @@ Frame = Callable[[float, float], Viewpoint]
 """Gives the viewpoint for a view of this aspect (width over height) and height in pixels."""
 
 
+MOST_LEFT = 8
+"""Scenes whose viewpoints are remembered."""
+
+
 class Framing:
     """Points the open pages at the scene until a person has moved the view.
 
@@ -127,12 +131,36 @@ class Framing:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._pointed: dict[int, tuple[np.ndarray, float]] = {}
-        self._framed: object = None
+        self._framed: Hashable = None
+        self._left: dict[Hashable, dict[int, tuple[NDArray, NDArray]]] = {}
+        """By what was framed: position and look-at of the pages, by client id, on which a person had moved the view."""
+        self._came_back: frozenset[int] = frozenset()
+        """Pages that look again from where they did when the framed thing was left."""
 
-    def is_new(self, what: object) -> bool:
-        """Whether this differs from the last call's: then it has to be framed."""
-        new, self._framed = what != self._framed, what
-        return new
+    def is_new(self, what: Hashable) -> bool:
+        """Whether this differs from the last call's: then it has to be framed. Where a person had moved the view of it
+        before, the page looks from there again, and `frame` leaves it so."""
+        if what == self._framed:
+            return False
+        clients = self._server.get_clients()
+        if self._framed is not None:
+            self._left[self._framed] = {
+                number: (np.array(client.camera.position), np.array(client.camera.look_at))
+                for number, client in clients.items()
+                if not self._is_untouched(client)
+            }
+            while len(self._left) > MOST_LEFT:
+                del self._left[next(iter(self._left))]
+        self._framed = what
+        back = {} if what is None else self._left.pop(what, {})
+        self._came_back = frozenset(back.keys() & clients.keys())
+        for number in self._came_back:
+            clients[number].camera.position, clients[number].camera.look_at = back[number]
+        return True
+
+    def frame_new(self, frame: Frame) -> None:
+        """Point every open page at what is new, but for those that came back to where they looked from, and those to come."""
+        self.frame(frame, but=self._came_back)
 
     def follow(self) -> int:
         """Forget closed pages; returns the number of open ones."""
@@ -146,13 +174,13 @@ class Framing:
         """The open pages that were pointed at the scene."""
         return frozenset(self._pointed)
 
-    def frame(self, frame: Frame, untouched_only: bool = False) -> None:
+    def frame(self, frame: Frame, untouched_only: bool = False, but: Set[int] = frozenset()) -> None:
         """Point every open page (or only untouched ones), and those to come."""
         usual = frame(USUAL_ASPECT, USUAL_HEIGHT)
         self._server.initial_camera.position = usual.position
         self._server.initial_camera.look_at = usual.look_at
-        for client in self._server.get_clients().values():
-            if not untouched_only or self._is_untouched(client):
+        for number, client in self._server.get_clients().items():
+            if number not in but and (not untouched_only or self._is_untouched(client)):
                 self._point(client, frame)
 
     def frame_untouched(self, frame: Frame) -> None:
@@ -228,12 +256,15 @@ class Stage:
         self.scene = SceneView(server, clock)
         self.framing = Framing(server)
         self.in_software = InSoftware(server, clock)
+        self.choice = ViewChoice()
 
     def clear(self) -> None:
         """Remove everything of a page but the bodies and lights."""
         # Callbacks first: a click that comes now has no page to answer it.
         self._server.scene.remove_click_callback("all")
         remove_nodes_but(self._server, (*BODIES, "/lights"))
+        for client in self._server.get_clients().values():
+            remove_nodes_but(client, ())
 
 
 # --- The View panel: all envs or one, detail, dark or light ------------------------------------
@@ -246,22 +277,38 @@ DARK, LIGHT = "dark", "light"
 BRAND = (28, 112, 190)
 
 
+@dataclass
+class ViewChoice:
+    """What a person chose in the View panel. A page is made anew with each change to the review and back."""
+
+    show: str = ALL
+    detail: str = "normal"
+
+
 class ViewPanel(PagePart[SessionView]):
-    def __init__(self, server: viser.ViserServer, dark: bool = True) -> None:
+    def __init__(
+        self, server: viser.ViserServer, dark: bool = True, choice: ViewChoice | None = None
+    ) -> None:
         self._server = server
+        self._choice = choice = choice or ViewChoice()
         with server.gui.add_folder("View"):
-            self._show = server.gui.add_dropdown("Show", (ALL, ONE), initial_value=ALL, visible=False)
+            self._show = server.gui.add_dropdown("Show", (ALL, ONE), initial_value=choice.show, visible=False)
             self._detail = server.gui.add_dropdown(
                 "Detail",
                 tuple(DETAILS),
-                initial_value="normal",
+                initial_value=choice.detail,
                 hint="How finely shapes are drawn. Choose coarse if the view is slow.",
             )
             self._theme = server.gui.add_dropdown(
                 "Theme", (DARK, LIGHT), initial_value=DARK if dark else LIGHT
             )
+        self._show.on_update(lambda _: self._remember())
+        self._detail.on_update(lambda _: self._remember())
         self._theme.on_update(lambda _: self._apply_theme())
         self._apply_theme()
+
+    def _remember(self) -> None:
+        self._choice.show, self._choice.detail = self._show.value, self._detail.value
 
     @property
     def only_selected(self) -> bool:

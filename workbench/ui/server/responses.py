@@ -232,10 +232,6 @@ def content_type(name: str) -> str:
 
 
 HANDLERS = (
-    "wb.press(event)",
-    "wb.choose(event,this)",
-    "wb.place(event)",
-    "wb.copy(event)",
     "wb.intoSight(this)",
     "wb.follow(this)",
     "wb.openTab(this)",

@@ -19,7 +19,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL.PngImagePlugin import PngInfo
 
+from workbench.core.camera_data import moved_cameras_text
 from workbench.jobs.pool.deal import Deal, ItemQueue, PoolError, Work
 from workbench.jobs.pool.processes import Processes
 from workbench.machine.files import new_file
@@ -168,7 +170,8 @@ def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: 
             path = wanted.folder / file_name("film", name, camera)
             seen = (enlarged(picture) for picture in frames(episode, camera_of(episode, camera)))
             told = _part(on_progress, number, len(cameras))
-            write_mp4(path, _counted(seen, episode, f"{name}: {camera}", told), fps)
+            counting = _counted(seen, episode, f"{name}: {camera}", told)
+            write_mp4(path, counting, fps, comment=_moved(episode))
             paths.append(path)
         return paths
     path = wanted.folder / file_name(wanted.what, name)
@@ -183,8 +186,16 @@ def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: 
         with _reading():
             sheet = contact_sheet(episode)
         with new_file(path) as temporary:
-            sheet.save(temporary, format="PNG")
+            about = PngInfo()
+            about.add_itxt("Comment", _moved(episode))
+            sheet.save(temporary, format="PNG", pnginfo=about)
     return [path]
+
+
+def _moved(episode: Episode) -> str:
+    """Which cameras were moved by hand while it was recorded; empty if none."""
+    moved = moved_cameras_text(episode.info.moved_cameras)
+    return moved and f"Cameras moved by hand: {moved}"
 
 
 def _dataset(wanted: MakeRequest, on_progress: OnProgress) -> Made:

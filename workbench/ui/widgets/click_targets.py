@@ -14,9 +14,9 @@ from workbench.ui.server.viser_private import element_id
 from workbench.ui.widgets.templates import render
 
 PLACE_STEPS = 10_000
-"""Steps from one border of a picture to the other, as ``placeable.html`` counts them."""
+"""Steps from one border of a picture to the other, as ``pressed.js`` counts them."""
 NUMBERS = 10**8
-"""What ``choosable.html`` sends is below this."""
+"""What ``pressed.js`` sends of a row or a place is below this."""
 MOST_SECONDS_BEFORE = 0.5
 """How long an action of a page waits for the action before it."""
 _LAST = 1e6
@@ -47,10 +47,10 @@ class Presses:
     """The hidden buttons and inputs of one container. Make it inside the container.
 
     viser's HTML is one-way, and its buttons cannot be rows of a table. So a row carries the id of a hidden viser button
-    (``.wb-presses`` in page.css), and two handlers on the table press that button (``pressable.html``). The server
+    (``.wb-presses`` in page.css) in ``data-press``, and ``pressed.js`` presses that button. The server
     learns no more than "this button was pressed".
 
-    A position in a picture (``placeable.html``) and a row of a long table with shift or control (``choosable.html``)
+    A position in a picture (``data-place``) and a row of a long table with shift or control (``data-numbers``)
     are whole numbers written into a hidden number input, with a counter, since an input whose value stays the same
     sends nothing. The Tab key reaches such parts, and Enter or Space presses them (``pressed_by_key.js``).
 
@@ -102,12 +102,16 @@ class Presses:
         self._server.gui.add_html(render("in_software", id=pressed), order=_LAST + 2)
 
     def number_id(self, key: Hashable, pressed: Callable[[int], None]) -> str:
-        """The id to put into ``data-numbers`` around ``choosable.html``; the same key always gives the same input.
+        """The id to put into ``data-numbers`` around the rows; the same key always gives the same input.
 
         Args:
             pressed: called with the number that was pressed, below `NUMBERS`, on a thread, in turn.
         """
-        return self._typed(key, lambda sent: pressed(sent % NUMBERS))
+        return self._typed(key, lambda sent, _: pressed(sent % NUMBERS))
+
+    def number_of_page_id(self, key: Hashable, pressed: Callable[[viser.ClientHandle, int], None]) -> str:
+        """As `number_id`; `pressed` gets the page, too."""
+        return self._typed(key, lambda sent, client: pressed(client, sent % NUMBERS))
 
     def place_id(self, key: Hashable, pressed: Callable[[float, float], None]) -> str:
         """The id to put into ``data-place``; the same key always gives the same input.
@@ -116,9 +120,9 @@ class Presses:
             pressed: called with column and row in the picture, (0, 0) at its upper left corner and (1, 1) at its
                 lower right one, on a thread, in turn.
         """
-        return self._typed(key, lambda sent: pressed(*place_of(sent)))
+        return self._typed(key, lambda sent, _: pressed(*place_of(sent)))
 
-    def _typed(self, key: Hashable, take: Callable[[int], None]) -> str:
+    def _typed(self, key: Hashable, take: Callable[[int, viser.ClientHandle], None]) -> str:
         """The id of a hidden number input; `take` gets what is written into it."""
         if key not in self._ids:
             with self._folder:
@@ -129,7 +133,7 @@ class Presses:
                 # Read now, before the next message changes it: a double click on a recording sends three.
                 sent, client = event.target.value, event.client
                 if client is not None:
-                    await in_turn(client, lambda: take(sent))
+                    await in_turn(client, lambda: take(sent, client))
 
             number.on_update(typed)
             self._ids[key] = element_id(number)
@@ -175,6 +179,6 @@ def _in_words(key: Hashable) -> str:
 
 
 def place_of(number: int) -> tuple[float, float]:
-    """Column and row in 0..1 of what ``placeable.html`` sends."""
+    """Column and row in 0..1 of what ``pressed.js`` sends of a place."""
     place = number % PLACE_STEPS**2
     return (place // PLACE_STEPS) / (PLACE_STEPS - 1), (place % PLACE_STEPS) / (PLACE_STEPS - 1)

@@ -128,10 +128,10 @@ class LineChart:
                 series,
                 title=title,
                 scales=scales,
-                axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
+                axes=(uplot.Axis(size=30), uplot.Axis(size=56)),
                 legend=uplot.Legend(show=True),
                 height=self._height,
-                padding=(6, 12, 0, 0),
+                padding=(6, 22, 0, 0),
                 # All of them at the same position of the folder.
                 order=self._order,
                 visible=False,

@@ -21,6 +21,9 @@ class PagePart(Generic[View]):
 
     every: ClassVar[float] = 0.0
     """Seconds."""
+    of_the_moment: ClassVar[bool] = False
+    """It shows numbers of the shown moment. Such parts are drawn together, from one view: while a task plays, a page whose
+    parts are drawn at rates of their own shows several moments at once."""
 
     def key(self, view: View) -> object:
         """What it shows of the view; equal keys mean equal drawings."""
@@ -47,14 +50,17 @@ class DrawDue:
         self._drawn: tuple[object, object, float] | None = None
         """Key, urgent, and when."""
 
+    def drawn(self, key: object, urgent: object = None) -> None:
+        """Remember this as drawn."""
+        self._drawn = key, urgent, self._clock()
+
     def is_due(self, key: object, urgent: object = None) -> bool:
         """Whether to draw now; if so, remembers this as drawn."""
-        now = self._clock()
         if self._drawn is not None:
             drawn, was_urgent, at = self._drawn
-            if urgent == was_urgent and (key == drawn or now - at < self._every):
+            if urgent == was_urgent and (key == drawn or self._clock() - at < self._every):
                 return False
-        self._drawn = key, urgent, now
+        self.drawn(key, urgent)
         return True
 
 
@@ -72,6 +78,9 @@ class Parts(Generic[View]):
         self._parts.append((part, DrawDue(part.every, self._clock)))
 
     def draw(self, view: View) -> None:
-        for part, due in self._parts:
-            if due.is_due(part.key(view), part.urgent(view)):
+        due = [is_due.is_due(part.key(view), part.urgent(view)) for part, is_due in self._parts]
+        together = any(now and part.of_the_moment for now, (part, _) in zip(due, self._parts, strict=True))
+        for now, (part, is_due) in zip(due, self._parts, strict=True):
+            if now or (together and part.of_the_moment):
+                is_due.drawn(part.key(view), part.urgent(view))
                 part.draw(view)

@@ -1,0 +1,148 @@
+"""Whatever on the page says that it can be pressed does something when it is pressed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Locator, Page, expect
+
+from tests.drive.page import TASK, close_notice, new_page, open_tab, open_workbench
+from tests.drive.waiting import until
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+COUNTED = """
+window.asked = 0;
+const post = Worker.prototype.postMessage;
+Worker.prototype.postMessage = function (message, ...rest) {
+    // Not what viser sends by itself: where it looks from.
+    if (message?.type === "send" && /Gui|Command/.test(message.message?.type)) window.asked += 1;
+    return post.call(this, message, ...rest);
+};
+"""
+PRESSED = "[data-press], [data-copy], [data-place], [data-pick], [data-numbers] [data-row]"
+MOST = 150
+LIVE = ("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Checks", "Log")
+REVIEW = ("Review", "Cameras", "Share")
+
+
+@dataclass
+class Board:
+    page: Page
+    pressed: set[str]
+
+    def unfold_all(self) -> None:
+        """Folds are opened by their headings."""
+        for name in (
+            "How the envs are made",
+            "Keys",
+            "Choose curves",
+            "Measure",
+            "Export",
+            "Solve many seeds",
+        ):
+            heading = self.page.get_by_text(name, exact=True)
+            if heading.count() and heading.first.is_visible():
+                heading.first.click()
+                self.page.wait_for_timeout(300)
+
+    def next_one(self) -> tuple[str, Locator] | None:
+        """A part that is seen and was not pressed yet."""
+        for part in self.page.locator(PRESSED).all():
+            if not part.is_visible():
+                continue
+            key = part.evaluate(
+                "p => [...Object.entries(p.dataset)].map(String).join() + p.textContent.slice(0, 20)"
+            )
+            if key not in self.pressed:
+                self.pressed.add(key)
+                return key, part
+        return None
+
+    def press(self, part: Locator) -> bool:
+        """Whether the server was asked for something, or a text was copied."""
+        before = self.page.evaluate("asked")
+        part.scroll_into_view_if_needed()
+        box = part.bounding_box()
+        if box is None:
+            return False
+        self.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + min(box["height"] / 2, 10))
+        self.page.wait_for_timeout(60)
+        return self.page.evaluate("asked") > before or part.inner_text() == "copied"
+
+    def press_all(self, where: str) -> list[str]:
+        """What was pressed and did nothing, as text."""
+        dead: list[str] = []
+        for _ in range(MOST):
+            found = self.next_one()
+            if found is None:
+                return dead
+            key, part = found
+            what = part.inner_text()[:40]
+            # Twice: what is drawn anew at that moment moves away from under the mouse.
+            did = self.press(part) or not part.is_visible() or self.press(part)
+            if self.page.locator(".mantine-Modal-overlay").count():
+                self.page.keyboard.press("Escape")
+            if not did:
+                dead.append(f"{where}: {what!r} ({key[:60]})")
+        raise AssertionError(f"{where} has no end of parts to press")
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Board]:
+    folder = tmp_path_factory.mktemp("author")
+    file = Path(folder / TASK.name)
+    file.write_text(TASK.read_text())
+    given = (str(file), "--num-envs", "2", "--env", "control_mode=pd_joint_pos", "--no-spare")
+    with open_workbench(*given, cwd=folder) as opened:
+        page, errors = new_page(browser, 1280, 1400, drawn=False)
+        page.add_init_script(COUNTED)
+        page.goto(opened.url)
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+        close_notice(page)
+        yield Board(page, set())
+        assert not errors
+        page.close()
+
+
+def test_the_envs_are_made_again_as_the_task_makes_them(board: Board) -> None:
+    page = board.page
+    status = page.locator(".wb-status")
+    expect(status).to_contain_text("pd_joint_pos")
+    page.get_by_text("How the envs are made", exact=True).click()
+    page.locator(".wb-env-options [data-press]").click()
+    expect(status).to_contain_text("pd_joint_delta_pos")
+
+
+def test_every_part_of_the_live_page_does_something(board: Board) -> None:
+    page = board.page
+    page.keyboard.press("Shift+C")
+    for _ in range(2):
+        page.keyboard.press("s")
+    expect(page.locator(".wb-timeline")).to_contain_text("step 2 ")
+    page.keyboard.press("b")
+    dead: list[str] = []
+    for tab in LIVE:
+        open_tab(page, tab)
+        board.unfold_all()
+        dead += board.press_all(tab)
+    assert len(board.pressed) > 30 and dead == []
+
+
+def test_every_part_of_the_review_does_something(board: Board) -> None:
+    page = board.page
+    page.keyboard.press("v")
+    rows = page.locator(".wb-library [data-row]")
+    until(lambda: rows.count() > 0, "a recording")
+    rows.first.click()
+    page.keyboard.press("Enter")
+    expect(page.locator(".wb-facts")).to_be_visible()
+    before, dead = len(board.pressed), board.press_all("Library")
+    for tab in page.get_by_role("tab").all_inner_texts():
+        if re.sub(r" \d+$", "", tab) in REVIEW:
+            open_tab(page, tab)
+            dead += board.press_all(tab)
+    assert len(board.pressed) > before + 5 and dead == []

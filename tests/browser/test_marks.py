@@ -1,0 +1,132 @@
+"""What is recorded, and a camera that stands elsewhere than in the file, is in sight on every tab; letters alone change neither."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Locator, expect
+
+from tests.browser.conftest import RECORDINGS, At
+from tests.drive.desk import Desk
+from tests.drive.studio import HEIGHT, WIDTH, end_of_the_left_arrow, numbers
+from tests.drive.waiting import until
+
+pytestmark = pytest.mark.browser
+TABS = ("Cameras", "Studio", "Reward", "Inspect", "Episodes", "Checks", "Log", "Run")
+
+
+@pytest.fixture(scope="module")
+def desk(example: At, browser: Browser) -> Iterator[Desk]:
+    with example(browser, WIDTH, HEIGHT) as desk:
+        desk.tab("Run")
+        yield desk
+        assert not desk.errors
+
+
+def in_sight_on_every_tab(desk: Desk, mark: Locator) -> None:
+    """Also where the panel is scrolled to its end."""
+    desk.tab("Run")  # before the Studio was ever opened
+    desk.page.mouse.move(WIDTH - 150, HEIGHT - 100)
+    desk.page.mouse.wheel(0, 3000)
+    expect(desk.page.get_by_text("Theme", exact=True)).to_be_in_viewport()
+    expect(mark).to_be_in_viewport(ratio=1)
+    desk.page.mouse.wheel(0, -3000)
+    for tab in TABS:
+        desk.tab(tab)
+        expect(mark).to_be_visible()
+
+
+def test_letters_typed_beside_a_field_reset_and_record_nothing(desk: Desk) -> None:
+    desk.tab("Reward")
+    desk.press("Shift+R", "s", "s")
+    desk.comes_to(2)
+    desk.leave_inputs()
+    desk.press(*"ricug")
+    desk.press("s")
+    desk.comes_to(3)
+    expect(desk.page.locator(".wb-sight-rec")).to_have_count(0)
+
+
+def test_recording_is_in_sight_on_every_tab_and_in_the_title(desk: Desk) -> None:
+    mark = desk.page.locator(".wb-sight-rec")
+    desk.tab("Reward")
+    desk.press("Shift+C")
+    expect(mark).to_have_text(re.compile(r"REC\s+env 0 · 0 episodes · since \d\d:\d\d · stop"))
+    expect(desk.page).to_have_title(re.compile("REC"))
+    desk.press("n")
+    expect(desk.page.get_by_role("columnheader", name="env 1")).to_be_visible()
+    expect(mark).to_have_attribute("title", re.compile("Env 1, which is selected, is not recorded"))
+    in_sight_on_every_tab(desk, mark)
+    desk.press("p", "s", "s", "Shift+R")
+    expect(mark).to_contain_text("1 episode ")
+    mark.get_by_text("stop").click()
+    expect(mark).to_have_count(0)
+    expect(desk.page).not_to_have_title(re.compile("REC"))
+
+
+def test_a_moved_camera_is_in_sight_until_it_is_put_back(desk: Desk) -> None:
+    mark = desk.page.locator(".wb-sight-moved")
+    desk.tab("Studio")
+    until(lambda: end_of_the_left_arrow(desk.page) is not None, "the handles")
+    x, y = end_of_the_left_arrow(desk.page) or (0.0, 0.0)
+    expect(mark).to_have_count(0)
+    # On another tab there is no handle: what is dragged there is the view.
+    desk.tab("Run")
+    until(lambda: end_of_the_left_arrow(desk.page) is None, "a view without handles")
+    desk.page.mouse.move(x, y)
+    desk.page.mouse.down()
+    desk.page.mouse.move(x + 40, y, steps=4)
+    desk.page.mouse.up()
+    desk.press("Alt+ArrowUp")
+    desk.tab("Studio")
+    until(lambda: numbers(desk.page, "Position") == [0.45, 0, 0.6], "where the file has it")
+    desk.leave_inputs()
+    desk.press("Alt+ArrowUp")
+    expect(mark).to_contain_text("camera moved: base_camera")
+    in_sight_on_every_tab(desk, mark)
+    # Nor after the review, to which and from which all of the page is made anew.
+    desk.press("v")
+    expect(desk.page.get_by_text("Library", exact=True).first).to_be_visible()
+    desk.press("v")
+    expect(mark).to_be_visible()
+    assert end_of_the_left_arrow(desk.page) is None
+    text = desk.file.read_text()
+    mark.get_by_text("save").click()
+    expect(desk.page.locator(".wb-diff-add")).to_be_visible()
+    assert desk.file.read_text() == text
+    desk.button("Discard the change").click()
+    mark.get_by_text("undo").click()
+    expect(mark).to_have_count(0)
+    until(lambda: numbers(desk.page, "Position") == [0.45, 0, 0.6], "where the file has it")
+
+
+def test_a_recording_of_a_moved_camera_says_so_in_the_review(desk: Desk) -> None:
+    page = desk.page
+    desk.tab("Studio")
+    until(lambda: numbers(page, "Position") == [0.45, 0, 0.6], "the camera")
+    desk.leave_inputs()
+    desk.press("Alt+ArrowUp")
+    expect(page.locator(".wb-sight-moved")).to_be_visible()
+    folder = desk.file.parent / RECORDINGS
+    before = set(folder.glob("*.json"))
+    desk.press("Shift+C", "s", "s")
+    expect(page.locator(".wb-timeline")).to_contain_text("step 2")
+    desk.press("Shift+C")
+    (file,) = until(lambda: set(folder.glob("*.json")) - before, "the files")
+    (moved,) = json.loads(file.read_text())["workbench"]["moved_cameras"]
+    assert (
+        moved["in_file"]["position"] == pytest.approx([0.45, 0, 0.6]) and moved["used"]["position"][2] > 0.605
+    )
+    desk.press("v")
+    expect(page.get_by_role("tab", name="Review")).to_be_visible()
+    if not page.locator(".wb-library tbody").count():
+        desk.press("b")
+    page.locator(".wb-library tbody").first.click()
+    desk.press("Enter")
+    expect(page.locator(".wb-facts")).to_contain_text(re.compile(r"camera moved\s*base_camera: position"))
+    desk.press("v")
+    page.locator(".wb-sight-moved").get_by_text("undo").click()
+    expect(page.locator(".wb-sight-moved")).to_have_count(0)

@@ -1,0 +1,54 @@
+"""The row of marks above the tabs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+from tests.drive.panels import Panels
+from tests.ui.env_rows import rows_of
+from tests.ui.scenes import running
+from workbench.core.capture.outliers import Outlier, OutlierKind
+from workbench.session.history.env_table import EnvRows
+from workbench.ui.app.marks import Marks, flagged_text
+from workbench.ui.widgets.open_tabs import OpenTabs
+
+
+@dataclass
+class OneTable:
+    rows: EnvRows
+
+    def env_rows(self) -> EnvRows:
+        return self.rows
+
+    def stop_recording(self) -> None:
+        raise AssertionError("nothing is recorded")
+
+
+def marks(panels: Panels, rows: EnvRows, went: list[str]) -> Marks:
+    tabs = OpenTabs(panels.server, "push")
+    return Marks(panels.server, cast(Any, OneTable(rows)), tabs, lambda: went.append("first"))
+
+
+def test_flagged_envs_are_in_sight_and_a_press_leads_to_the_first(panels: Panels) -> None:
+    """A reward that was NaN in most envs left a green "running"."""
+    lost = Outlier(OutlierKind.REWARD_NOT_FINITE, 3, "the reward is <b>NaN</b>")
+    rows, went = rows_of(outliers={4: (lost,), 2: (lost,)}), list[str]()
+    row = marks(panels, rows, went)
+    row.draw(running(6))
+    (standing,) = (html for html in panels.htmls() if "wb-sight-flagged" in html.content)
+    content = standing.content
+    assert (
+        "2 of 6 envs flagged: the reward is &lt;b&gt;NaN" in content
+        and "In env 2, step 3: reward-finite: the reward" in content
+    )
+    row.draw(running(6, steps_per_second=21.0))
+    assert standing.content is content, "it stays under the finger that presses"
+    panels.press("flagged")
+    assert went == ["first"]
+
+
+def test_no_env_flagged_is_no_mark(panels: Panels) -> None:
+    marks(panels, rows_of(outliers={}), []).draw(running(6))
+    assert "wb-sight" not in panels.html()
+    assert flagged_text(rows_of(outliers={})) is None

@@ -1,0 +1,136 @@
+"""The marks that stay in sight on every tab: recording, a camera moved by hand, findings, flagged envs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import viser
+
+from workbench.core.camera_data import CameraKey
+from workbench.session.cameras.view import EditRequest
+from workbench.session.history.env_table import EnvRows
+from workbench.session.live.session import Session
+from workbench.session.live.view import SessionView
+from workbench.ui.checks.panel import TAB as CHECKS
+from workbench.ui.checks.panel import findings_mark
+from workbench.ui.live.env_panel import first_flagged, mask
+from workbench.ui.live.episodes_panel import envs_in_words
+from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.open_tabs import OpenTabs
+from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.templates import counted, render
+
+STUDIO = "Studio"
+
+
+class Marks(PagePart[SessionView]):
+    """One row between the status line and the tabs, of an element of its own: the line is written four times a second, and
+    a press on it would be lost.
+
+    Args:
+        server: The page.
+        session: The session.
+        tabs: Opens the tab that a mark is about.
+        on_flagged: Called when the mark of flagged envs is pressed.
+    """
+
+    every = 0.25
+
+    def __init__(
+        self, server: viser.ViserServer, session: Session, tabs: OpenTabs, on_flagged: Callable[[], None]
+    ) -> None:
+        self._session, self._tabs = session, tabs
+        self._html = server.gui.add_html("")
+        # At the end of the panel, after the tabs: everything after it is hidden.
+        presses = Presses(server)
+        self._stop = presses.id_of("stop recording", lambda _: session.stop_recording())
+        self._undo = presses.id_of("undo the camera's move", lambda _: self._put_back())
+        self._save = presses.id_of("save the camera's move", self._show_change)
+        self._findings = presses.id_of("open", lambda client: tabs.open(CHECKS, client))
+        self._flagged = presses.id_of("flagged", lambda _: on_flagged())
+
+    def urgent(self, view: SessionView) -> object:
+        recording = view.recording
+        return recording.active, recording.env_idx, recording.episodes, moved_cameras(view)
+
+    def draw(self, view: SessionView) -> None:
+        rows = self._session.env_rows()
+        flagged = None if rows is None else flagged_text(rows)
+        self._html.content = render(
+            "marks",
+            rec=recording_mark(view, self._stop),
+            moved=moved_mark(view, self._undo, self._save),
+            findings=findings_mark(view),
+            findings_press=self._findings,
+            flagged=flagged and {"text": flagged[0], "hint": flagged[1], "press": self._flagged},
+        )
+
+    def _put_back(self) -> None:
+        for key in moved_cameras(self._session.view()):
+            self._session.studio.back_to_file(key)
+
+    def _show_change(self, client: viser.ClientHandle | None) -> None:
+        """Show how the file would change; nothing is written before that was read."""
+        moved = moved_cameras(self._session.view())
+        if not moved:
+            return
+        self._session.studio.select(moved[0])
+        self._session.studio.file.plan(EditRequest("edit", moved[0]))
+        self._tabs.open(STUDIO, client)
+
+
+def moved_cameras(view: SessionView) -> tuple[CameraKey, ...]:
+    """The cameras that are not where the file has them."""
+    return tuple(camera.key for camera in view.studio.cameras if camera.moved)
+
+
+def moved_mark(view: SessionView, undo: str, save: str) -> dict[str, str] | None:
+    """The mark of moved cameras; None if all are as in the file."""
+    moved = [name for _, name in moved_cameras(view)]
+    if not moved:
+        return None
+    names, one = ", ".join(moved), len(moved) == 1
+    what = "camera moved" if one else "cameras moved"
+    hint = (
+        f"{names} {'is' if one else 'are'} not where the file says, in every env and in all that is recorded."
+    )
+    return {"what": what, "names": names, "undo": undo, "save": save, "hint": hint}
+
+
+def recording_mark(view: SessionView, stop: str) -> dict[str, object] | None:
+    """The mark of a recording; None while none runs."""
+    recording = view.recording
+    if not recording.active:
+        return None
+    count = 1 if view.task is None else view.task.num_envs
+    # Nothing that changes with each step: the mark would be another element whenever somebody presses it.
+    hint = f"Recording {envs_in_words(recording.env_idx)}."
+    if recording.waiting:
+        hint += f" {counted(recording.waiting, 'env')} of them {'begins' if recording.waiting == 1 else 'begin'} with the next reset."
+    if view.selected_env not in recording.env_idx:
+        hint += f" Env {view.selected_env}, which is selected, is not recorded."
+    return {
+        "envs": f"all {count} envs"
+        if len(recording.env_idx) == count > 1
+        else envs_in_words(recording.env_idx, 2),
+        "episodes": recording.episodes,
+        "since": time.strftime("%H:%M", time.localtime(recording.since)),
+        "stop": stop,
+        "hint": hint,
+    }
+
+
+def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
+    """Number of flagged envs and the reason of the first, as label and hint; None without flagged envs."""
+    count = int(np.count_nonzero(mask(rows, "flagged")))
+    env = first_flagged(rows)
+    if env is None:
+        return None
+    outlier = (rows.outliers.get(env) or rows.last.outliers[env])[0]
+    when = f"step {outlier.step}" + ("" if env in rows.outliers else " of the previous episode")
+    envs = "" if rows.num_envs == 1 else f"{count} of {rows.num_envs} envs "
+    press = "Click to see it" if env in rows.outliers else "Click to select it"
+    hint = f"In env {env}, {when}: {outlier.text}. {press}; the table of envs (B) has them all."
+    return f"⚑ {envs}flagged: {outlier.reason}", hint

@@ -1,0 +1,17 @@
+"""Parts of the live page that show numbers of the shown moment."""
+
+from __future__ import annotations
+
+from workbench.session.live.view import SessionView
+from workbench.ui.widgets.parts import PagePart
+
+
+class MomentPart(PagePart[SessionView]):
+    """Drawn with all others of its kind, from one view."""
+
+    of_the_moment = True
+    every = 0.2
+    """Faster, numbers of many rows cannot be read."""
+
+    def urgent(self, view: SessionView) -> object:
+        return view.task_serial, view.state, view.playing, view.selected_env, view.timeline.shown
