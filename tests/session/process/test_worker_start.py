@@ -76,7 +76,7 @@ def test_workers_are_forks_that_end_apart_from_each_other_and_say_how(forks: Wor
     assert one.exit_code() == -signal.SIGSEGV and "Segmentation fault" in one.crash_report()
     one.stop(0)
     assert listens(other)
-    other.stop()
+    other.stop(grace=30)
     assert other.exit_code() == 0 and not workers_of(psutil.Process())
 
 
