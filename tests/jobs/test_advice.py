@@ -60,7 +60,6 @@ def test_a_save_that_works_with_one_env_alone_is_told_the_option_too(tmp_path: P
             problem = caught.value.problem
             assert ("--num-envs 1" in problem.message) is told
             assert (problem.file, problem.code) == (str(file), line.strip())
-            assert opened.env.step(None if not opened.env.parts else opened.first.action) is not None
         written(tmp_path, GOOD + "        lifted = lifted & True\n")
         again, report = load_version(request, running)
         assert again.env.env is opened.env.env and report is not None and report.level == "patched"

@@ -302,7 +302,8 @@ def test_demonstrations_are_replayed_from_their_own_seeds(
     (replayed,) = read_all(done)
     assert done.start_corrected == 0
     assert_same(replayed, read_all(recorded)[1])
-    assert replayed.info.acted_by == ((0, f"file {demonstration.name}, traj_0"),)
+    ((begins, source),) = replayed.info.acted_by
+    assert begins == 0 and demonstration.name in source
 
 
 @pytest.mark.parametrize(
@@ -438,7 +439,7 @@ def test_a_rule_that_the_task_breaks_is_told_once_by_however_many_processes(
 
 def test_a_keyword_that_the_task_does_not_take_is_named(tmp_path: Path) -> None:
     options = TaskOptions(num_envs=1, env_kwargs={"colour": "red"})
-    with pytest.raises(TaskError, match="unexpected keyword argument 'colour'"):
+    with pytest.raises(TaskError, match="'colour'"):
         record(RecordOptions("PickCube-v1", tmp_path / "out", options=options))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
+from mani_skill.utils.structs.link import Link
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import TaskError
@@ -19,7 +20,7 @@ from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
 from workbench.checks.results import Seen
 from workbench.core.broken_rule import Place
 from workbench.core.env.actions import random_action
-from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of, tool_of
+from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of
 from workbench.core.scene.scene_index import SceneIndex, joints_of_scene, present_states, scene_index
 from workbench.machine.text import listed, of
 
@@ -312,8 +313,8 @@ def see_outside_reach(checkup: Checkup) -> Iterator[Seen]:
         raise NotKnown("it has several robots: which one is to touch what is not known")
     if not _is_fixed(robots[0].robot):
         raise NotApplicable("its robot moves around")
-    tool = tool_of(robots[0])
-    if tool is None:
+    tool = getattr(robots[0], "tcp", None)  # what a property of the author's raises is told
+    if not isinstance(tool, Link):
         raise NotKnown("its robot has no tcp, whose reach is measured")
     base, reach = _reach(checkup, robots[0].robot, tool)
     index, poses = scene_index(task.env), checkup.starts.poses[0]
