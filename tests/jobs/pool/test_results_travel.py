@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import convert, inspect
 
-from tests.machine.processes.test_wire import of_schema, same
+from tests.drive.messages import of_schema, same
 from workbench.checks.by_hook.run import as_sent
 from workbench.checks.results import RuleResult, Seen
 from workbench.jobs.check.plan import CheckUpdate, Outcome
