@@ -102,7 +102,8 @@ def test_a_pose_that_was_set_and_not_applied_is_in_the_picture(in_one_state: tup
         after = cube_pixels(env, seen(env)["segmentation"])
         env.step(torch.zeros(env.action_space.shape, device=env.device))
         again = cube_pixels(env, seen(env)["segmentation"])
-        assert all(before) and after[0] and not after[1] and all(again), "hidden, and back with the next step"
+        assert all(before) and after[0] and not after[1]
+        assert bool(again[1]) == (env.device.type == "cuda"), "on a GPU physics never sees the write"
         counted.append(after)
     assert counted[0][0] == pytest.approx(counted[1][0], rel=0.1)
 
