@@ -15,6 +15,7 @@ from workbench.session.worker.reload import Running, load_version
 
 KWARGS = {"render_backend": "none"}
 FOR_ONE = "        lifted = float(self.cube.pose.p[:, 2]) > 0.1\n"
+FIRST_ROW = "        lifted = self.cube.pose.p[:1, 2] > 0.1\n"
 GOOD = "        lifted = self.cube.pose.p[:, 2] > 0.1\n"
 WRONG = "        lifted = self.cuube\n"
 
@@ -27,8 +28,9 @@ def written(folder: Path, line: str) -> Path:
     return file
 
 
-def test_a_task_that_is_written_for_one_env_is_told_the_option(tmp_path: Path) -> None:
-    file = written(tmp_path, FOR_ONE)
+@pytest.mark.parametrize(("line", "code"), [(FOR_ONE, FOR_ONE), (FIRST_ROW, "    def evaluate(self):\n")])
+def test_a_task_that_is_written_for_one_env_is_told_the_option(line: str, code: str, tmp_path: Path) -> None:
+    file = written(tmp_path, line)
     for several in (
         lambda: open_task(str(file), TaskOptions(4, env_kwargs=KWARGS)),
         lambda: load_version(Load(str(file), TaskOptions(4, env_kwargs=KWARGS)), None),
@@ -37,7 +39,7 @@ def test_a_task_that_is_written_for_one_env_is_told_the_option(tmp_path: Path) -
             several()
         problem = caught.value.problem
         assert "--num-envs 1" in problem.message
-        assert (problem.file, problem.code) == (str(file), FOR_ONE.strip())
+        assert (problem.file, problem.code) == (str(file), code.strip())
     open_task(str(file), TaskOptions(1, env_kwargs=KWARGS)).env.close()
 
 

@@ -25,7 +25,7 @@ from workbench.authoring.problem import (
 )
 from workbench.checks.evidence.places import rules_of_outliers
 from workbench.core.backends import BackendUnavailable, find_renderer, unused_gpu_text
-from workbench.core.broken_rule import NeedsOneEnv, class_is_installed, in_brackets, warn_of
+from workbench.core.broken_rule import BrokenRule, NeedsOneEnv, class_is_installed, in_brackets, warn_of
 from workbench.core.camera_data import CameraInfo
 from workbench.core.cameras.render import (
     findings_of_shaders,
@@ -129,6 +129,8 @@ _MOST_TRIED = 8
 def _may_be_of_the_batch(error: TaskError) -> bool:
     """Whether it is what torch, numpy or a check says of a wrong shape, and does not already say what to do."""
     cause = error.__cause__
+    if isinstance(cause, BrokenRule):
+        return True
     if isinstance(cause, CoreRefusal | BackendUnavailable):
         return False
     return error.problem.stage == "returns" or isinstance(
