@@ -15,7 +15,7 @@ from workbench.session.worker.reload import Running, load_version
 
 KWARGS = {"render_backend": "none"}
 FOR_ONE = "        lifted = float(self.cube.pose.p[:, 2]) > 0.1\n"
-FIRST_ROW = "        lifted = self.cube.pose.p[:1, 2] > 0.1\n"
+FIRST_ROW = '        return {"success": self.cube.pose.p[:1, 2] > 0.1}\n'
 GOOD = "        lifted = self.cube.pose.p[:, 2] > 0.1\n"
 WRONG = "        lifted = self.cuube\n"
 
