@@ -72,7 +72,9 @@ def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_pa
             both.reset(options={"env_idx": torch.tensor([1])})
     both.close()
     path = tmp_path / "theirs" / "run.h5"
-    theirs = [read_maniskill(path, name) for name in h5py.File(path)]
+    with h5py.File(path) as file:
+        names = [*file]
+    theirs = [read_maniskill(path, name) for name in names]
     read = episodes_in(tmp_path / "ours")
     assert sorted(e.length for e in read) == sorted(e.length for e in theirs) == [2, 3, 5]
     for one in read:

@@ -65,14 +65,13 @@ def test_a_refusal_of_the_core_that_the_task_caught_is_told_before_the_error_tha
 
     def moved(self):
         self.cube.set_pose(Pose.create_from_pq(torch.full((1, 3), torch.nan)))
-        self.scene._gpu_apply_all()
 """
     file = edited(tmp_path, (RESET, caught))
     told = check("task.py")
     assert told["line"] == line_of(file, "self.places[0]") and told["file"] == "task.py"
     said = told["message"]
     refused, swallowed = (
-        f"task.py:{line_of(file, words)}" for words in ("self.scene._gpu_apply_all()", "self.moved()")
+        f"task.py:{line_of(file, words)}" for words in ("torch.full((1, 3), torch.nan)", "self.moved()")
     )
     assert said.index(refused) < said.index(swallowed) < said.index("IndexError"), said
     assert "NaN" in said

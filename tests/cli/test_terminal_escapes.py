@@ -176,7 +176,7 @@ def test_a_row_of_the_library_is_told_as_text(child_process: None, tmp_path: Pat
         (row,) = library.view().rows
     finally:
         library.close()
-    told = cells(row, {}, datetime.datetime.now(datetime.timezone.utc))
+    told = cells(row, None, datetime.datetime.now(datetime.timezone.utc))
     said = "".join((told["task"], told["about"], row.name, row.problem or "", row.note, *row.tags))
     assert harmful(said) == set() and "\u202e" not in said and "]0;owned" in said
 

@@ -53,7 +53,9 @@ def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServ
             session.start_recording()
             until(lambda number=number: tells(number), "the notice")
         # What is refused at a moment is told too, and not kept for the moments after it.
+        begun = session.view().timeline.moments
         session.reset()
+        wait_until(session, lambda view: view.timeline.moments > begun, "the reset")
         session.save_past(before=True)
         assert session.view().recording.saving.failed
         session.step()
