@@ -414,6 +414,8 @@ def _task(
 ) -> LoadedTask:
     spec = None if env_id is None else registry.environment(env_id)
     limit, kwargs = (None, {}) if spec is None else (spec.max_episode_steps, dict(spec.default_kwargs))
+    if spec is None and (of_gymnasium := registry.gymnasium_spec_of(cls)) is not None:
+        env_id, limit, kwargs = of_gymnasium.id, of_gymnasium.max_episode_steps, dict(of_gymnasium.kwargs)
     return LoadedTask(
         cls,
         env_id or cls.__name__,
