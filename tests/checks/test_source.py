@@ -42,7 +42,7 @@ def test_an_id_of_gymnasium_alone(checked: Checked) -> None:
     text = EXAMPLE.read_text().replace(REGISTERED, "") + register
     try:
         finding = the_finding(checked("registered", text=text))
-        file = finding.file
+        file = str(finding.file)
         loaded = load_task(file)
     finally:
         gymnasium.registry.pop("AtGymnasium-v1", None)
