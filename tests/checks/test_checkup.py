@@ -42,6 +42,31 @@ def test_a_task_that_raises_with_a_renderer_too_is_told_once(renderer: None, tmp
     assert {result.state for result in results if result.rule != "runs"} == {"not_known"}
 
 
+def test_what_fails_for_want_of_a_renderer_is_no_cause_of_what_fails_with_one(
+    renderer: None, tmp_path: Path
+) -> None:
+    file, built = tmp_path / "task.py", 'self.cube = builder.build(name="cube")\n'
+    looks = "self.cube._objs[0].find_component_by_type(sapien.render.RenderBodyComponent).compute_global_aabb_tight()"
+    text = EXAMPLE.read_text()
+    assert built in text
+    file.write_text(text.replace(built, f"{built}        {looks}\n        raise ValueError('mine')\n"))
+    loaded = load_task(str(file))
+    checkup = Checkup(loaded, num_envs=2, seeds=2)
+    try:
+        (result,) = [
+            one
+            for one in results_of(checkup, dict.fromkeys(RULES, "off") | {"runs": "warn"})
+            if one.rule == "runs"
+        ]
+    finally:
+        checkup.close()
+        undo_load(loaded)
+    assert (
+        "ValueError: mine" in the_finding(result).message
+        and "AttributeError" not in the_finding(result).message
+    )
+
+
 def test_a_loop_in_the_source_is_told_where_the_task_cannot_be_built(checked: Checked) -> None:
     at = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
     loop = "        for i in range(self.num_envs): pass\n"

@@ -69,6 +69,17 @@ def test_the_worst_of_all_parts_is_told() -> None:
     assert over_seeds([*parts, held], "warn").state == "not_known"
 
 
+def test_a_rope_that_falls_is_one_finding() -> None:
+    def link(number: int, metres: float, *seeds: int) -> Seen:
+        name = ("body", f"rope/link_{number}", "rope")
+        return Seen(name, PLACE, seeds=seeds, size=metres, texts=(f"falls {metres:.2f} m",))
+
+    rows = Seen(("loose", "rope")), Seen(tried=32), link(0, 0.1, 1, 2), link(1, 0.3, 2), link(2, 0.2, 5)
+    (finding,) = over_seeds([result("falls-at-reset", *rows)], "warn").findings
+    assert finding.message.startswith("rope/link_1 falls 0.30 m") and "1 of 32 seeds" in finding.message
+    assert finding.count == 3 and "2 more links of rope" in finding.message
+
+
 def test_what_changes_between_parts_is_not_constant() -> None:
     def rewards(most: float, least: float) -> RuleResult:
         return result("reward-changes", Seen(place=PLACE, tried=50, numbers=(most, least), texts=("0",)))

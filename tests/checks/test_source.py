@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import gymnasium
 import pytest
 
-from tests.checks.checked import Checked, check_rule, the_finding
+from tests.checks.checked import EXAMPLE, Checked, check_rule, the_finding
+from workbench.authoring.loading.load import load_task, undo_load
 
 REGISTERED = '@register_env("WorkbenchPushCube-v1", max_episode_steps=50)'
 RESET = "            b = len(env_idx)\n"
@@ -29,6 +31,24 @@ def test_a_class_without_an_id(checked: Checked) -> None:
     finding = the_finding(checked("registered", (REGISTERED, "")))
     assert finding.code.startswith("class PushCubeEnv") and '@register_env("PushCube-v1"' in finding.message
     assert checked("versioned-id", (REGISTERED, "")).state == "not_applicable"
+
+
+def test_an_id_of_gymnasium_alone(checked: Checked) -> None:
+    """As gym.make takes it, with its limit."""
+    register = (
+        "import gymnasium\n"
+        'gymnasium.register("AtGymnasium-v1", entry_point=f"{__name__}:PushCubeEnv", max_episode_steps=30)\n'
+    )
+    text = EXAMPLE.read_text().replace(REGISTERED, "") + register
+    try:
+        finding = the_finding(checked("registered", text=text))
+        file = str(finding.file)
+        loaded = load_task(file)
+    finally:
+        gymnasium.registry.pop("AtGymnasium-v1", None)
+    assert '@register_env("AtGymnasium-v1", max_episode_steps=30)' in finding.message
+    assert (loaded.env_id, loaded.max_episode_steps) == ("AtGymnasium-v1", 30)
+    undo_load(loaded)
 
 
 def test_an_id_without_a_version(checked: Checked) -> None:

@@ -14,7 +14,7 @@ _TABLE = (
         "registered",
         "warn",
         "The class inherits BaseEnv and is registered with @register_env.",
-        "gym.make, ManiSkill's own commands and trainers cannot make it.",
+        "ManiSkill's own commands and trainers, and its time limit for many envs, do not know it; without any id, gym.make cannot make it.",
         "class",
     ),
     Rule(

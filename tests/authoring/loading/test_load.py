@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import gc
-import importlib
+import importlib.metadata
 import inspect
 import linecache
 import os
+import platform
 import sys
 import traceback
 import weakref
@@ -420,6 +421,18 @@ def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_r
         ),
         ("import healper\n", "import", "there is helper.py in the file's folder", "import healper"),
         ("from helper import NOTHING\n", "import", "ImportError", "from helper import NOTHING"),
+        (
+            "from typing import gone\n",
+            "import",
+            f"Python {platform.python_version()}",
+            "from typing import gone",
+        ),
+        (
+            "from mani_skill.utils import gone\n",
+            "import",
+            f"mani_skill {importlib.metadata.version('mani_skill')}",
+            "from mani_skill.utils import gone",
+        ),
         ("exit()\n", "import", "__main__", "exit()"),
         (
             "import sys; sys.exit('no display')\n",

@@ -119,6 +119,27 @@ def test_a_robot_of_the_authors_own_with_a_wrong_path_is_told_so(tmp_path: Path)
         batched(Task)
 
 
+def test_a_relative_path_of_a_robot_is_told_as_it_was_looked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    class Arm(Panda):
+        uid = "arm_with_a_relative_path"
+        urdf_path = "robots/arm.urdf"
+
+    class Task(BaseEnv):
+        SUPPORTED_ROBOTS = None  # type: ignore[assignment]  # any
+
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            robot: Any = Arm
+            super().__init__(*args, robot_uids=robot, **kwargs)
+
+    with pytest.raises(MissingAssets) as caught:
+        batched(Task)
+    assert str(tmp_path / "robots/arm.urdf") in str(caught.value)
+
+
 def test_robots_are_those_asked_for_or_the_constructors_default() -> None:
     push, gated_server = REGISTERED_ENVS["PushCube-v1"].cls, REGISTERED_ENVS["PickCubeWidowXAI-v1"].cls
     assert robots_of(push, {}) == "panda"

@@ -6,10 +6,12 @@ import dataclasses
 import difflib
 import importlib
 import inspect
+import platform
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -414,6 +416,8 @@ def _task(
 ) -> LoadedTask:
     spec = None if env_id is None else registry.environment(env_id)
     limit, kwargs = (None, {}) if spec is None else (spec.max_episode_steps, dict(spec.default_kwargs))
+    if spec is None and (of_gymnasium := registry.gymnasium_spec_of(cls)) is not None:
+        env_id, limit, kwargs = of_gymnasium.id, of_gymnasium.max_episode_steps, dict(of_gymnasium.kwargs)
     return LoadedTask(
         cls,
         env_id or cls.__name__,
@@ -486,6 +490,11 @@ def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
         message = f"{message}; {_module_hint(exc.name, finder)}"
     elif isinstance(exc, ImportError) and (file := _named_like(exc.name, finder)) is not None:
         message = f"{message}; {named_like_library_text(file)}"
+    elif isinstance(exc, ImportError) and (installed := _installed(exc.name)) is not None:
+        message = (
+            f"{message}; installed here is {installed}: write what that has, or install the version that the file was "
+            "written for"
+        )
     elif isinstance(exc, OSError) and exc.filename == str(finder.file) and problem.file is None:
         message = f"{finder.file} cannot be read: {exc.strerror}; is it being written just now?"
     if problem.file is None:
@@ -505,6 +514,15 @@ def _named_like(name: str | None, finder: AuthorFinder) -> Path | None:
     """The author's file that has the name of the library `name`."""
     top = (name or "").partition(".")[0]
     return next((file for file in files_named_like_libraries(finder.search_folder) if file.stem == top), None)
+
+
+def _installed(name: str | None) -> str | None:
+    """The package that the module `name` is of, or Python, with its version; None for a module of the author's."""
+    top = (name or "").partition(".")[0]
+    if top in sys.stdlib_module_names:
+        return f"Python {platform.python_version()}"
+    of = packages_distributions().get(top)
+    return f"{of[0]} {version(of[0])}" if of else None
 
 
 def _module_hint(name: str, finder: AuthorFinder) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import mani_skill.envs  # noqa: F401  (registers the built-in tasks, which a file may replace)
+from gymnasium.envs.registration import EnvSpec as GymnasiumSpec
 from gymnasium.envs.registration import registry as gymnasium_registry
 from mani_skill import agents
 from mani_skill.agents import registration as agent_registration
@@ -94,6 +95,12 @@ def environment(env_id: str) -> EnvSpec | None:
 def id_of(cls: type) -> str | None:
     """The id that a class is registered under; None if it is under none."""
     return next((name for name in environment_ids() if REGISTERED_ENVS[name].cls is cls), None)
+
+
+def gymnasium_spec_of(cls: type) -> GymnasiumSpec | None:
+    """What a class is registered as with gymnasium's own `register`, which ManiSkill's table does not know."""
+    ways = (cls, f"{cls.__module__}:{cls.__qualname__}")
+    return next((spec for spec in gymnasium_registry.values() if spec.entry_point in ways), None)
 
 
 def environment_ids() -> list[str]:

@@ -238,15 +238,22 @@ def falls_at_reset(rows: Sequence[Seen]) -> Iterator[Found | Note]:
         raise NotApplicable("nothing but its robot moves freely")
     if loose <= wanted:
         raise NotKnown(f"{listed(sorted(loose))} moves from the start, or touches the robot then")
+    # One rope has many links that fall: a finding for each owner, of the body that moves furthest.
+    bodies_of: dict[str, list[Seen]] = {}
     for row in together((row for row in rows if row.names[:1] == ("body",)), worst=True):
-        _, name, owner = row.names
-        if owner in wanted:
-            continue
+        if row.names[2] not in wanted:
+            bodies_of.setdefault(row.names[2], []).append(row)
+    for owner, bodies in bodies_of.items():
+        worst, seeds = (
+            max(bodies, key=lambda row: row.size),
+            sorted({seed for row in bodies for seed in row.seeds}),
+        )
+        more = f" {len(bodies) - 1} more links of {owner} move too." if len(bodies) > 1 else ""
         yield Found(
-            f"{name} {row.texts[0]} in the first second of {of(len(row.seeds), tried(rows), 'seed')} "
-            f"(seed {listed(row.seeds)}) while the robot holds still. Place it where it rests.",
-            row.place,
-            len(row.seeds),
+            f"{worst.names[1]} {worst.texts[0]} in the first second of {of(len(worst.seeds), tried(rows), 'seed')} "
+            f"(seed {listed(worst.seeds)}) while the robot holds still.{more} Place it where it rests.",
+            worst.place,
+            len(seeds),
         )
 
 
@@ -337,7 +344,7 @@ def outside_reach(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     """Of bodies that are within reach at some seeds, and beyond at others."""
     bodies = together(rows, worst=True)
     if not bodies:
-        raise NotApplicable("nothing in it moves freely")
+        raise NotApplicable("no actor of it moves freely")
     for row in bodies:
         if 0 < len(row.seeds) < row.tried:
             yield Found(

@@ -46,12 +46,16 @@ _GUARDS = {
 
 def registered(checkup: Checkup) -> Iterator[Found | Note]:
     """In ManiSkill's table."""
-    if _spec(checkup) is None:
-        yield Found(
-            f'{checkup.loaded.class_name} has no id: write @register_env("{_suggested_id(checkup)}", '
-            "max_episode_steps=100) above the class.",
-            checkup.places.task,
-        )
+    if _spec(checkup) is not None:
+        return
+    other = registry.gymnasium_spec_of(checkup.loaded.cls)
+    has = "has no id" if other is None else f"is registered as {other.id} with gymnasium alone"
+    env_id, limit = (_suggested_id(checkup), None) if other is None else (other.id, other.max_episode_steps)
+    yield Found(
+        f'{checkup.loaded.class_name} {has}: write @register_env("{env_id}", max_episode_steps={limit or 100}) above the '
+        f"class{'' if other is None else ' in place of it'}.",
+        checkup.places.task,
+    )
 
 
 def versioned_id(checkup: Checkup) -> Iterator[Found | Note]:
@@ -233,7 +237,7 @@ def _spec(checkup: Checkup) -> Any:
 
 def _needs_id(checkup: Checkup) -> None:
     if _spec(checkup) is None:
-        raise NotApplicable("it is not registered")
+        raise NotApplicable("it is not registered with @register_env")
 
 
 def _suggested_id(checkup: Checkup) -> str:

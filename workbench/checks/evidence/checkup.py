@@ -254,15 +254,9 @@ class Checkup:
         """`num_envs` envs, which check the rules of GPU simulation, without a renderer unless the task needs one to be
         built. Whoever uses it resets it first."""
         with noting_builds(self.builds, self.merges, self.files):
-            try:
-                made = self._made(self.num_envs, False, "warn", {})
-            except TaskError as error:
-                # What a task wants of a renderer can fail in many ways: only trying says whether that was it.
-                if isinstance(error.__cause__, (MissingAssets, ImportError)):
-                    raise
-                if not self._may_render:
-                    why = f"{error.problem.message} ({self._why_no_renderer})"
-                    raise TaskError(replace(error.problem, message=why)) from error
+            made = self._without_renderer()
+            # Outside of any `except`: what fails for want of a renderer is no cause of what fails with one.
+            if made is None:
                 for noted in (self.findings, self.builds, self.merges):
                     noted.clear()
                 made = self._made(self.num_envs, True, "warn", {})
@@ -270,6 +264,19 @@ class Checkup:
         self._open.append(made)
         self._rules = made.broken_rules
         return made
+
+    def _without_renderer(self) -> TaskEnv | None:
+        """None where the build fails and another one, with a renderer, may succeed."""
+        try:
+            return self._made(self.num_envs, False, "warn", {})
+        except TaskError as error:
+            # What a task wants of a renderer can fail in many ways: only trying says whether that was it.
+            if isinstance(error.__cause__, (MissingAssets, ImportError)):
+                raise
+            if not self._may_render:
+                why = f"{error.problem.message} ({self._why_no_renderer})"
+                raise TaskError(replace(error.problem, message=why)) from error
+        return None
 
     @property
     def silenced(self) -> list[Silenced]:

@@ -160,9 +160,16 @@ def _no_robot_file(task: str, robot: type, path: Path | None) -> MissingAssets:
     place = place_of_robot_file(robot)
     return MissingAssets(
         f"{task}: the file of the robot {robot.__name__}, {path}, does not exist{in_brackets(place)}, and ManiSkill has no "
-        "download for it.",
+        f"download for it. {_how_to_name(path)}",
         place=place,
     )
+
+
+def _how_to_name(path: Path | None) -> str:
+    """What to do about a robot's file that is not there. A relative path begins where the program was started."""
+    if path is None or path.is_absolute():
+        return "Put it there, or name the file that you have."
+    return f"A relative path is looked for where the program was started: there is no {path.absolute()}. Name the whole path."
 
 
 def _named_by(error: Exception) -> list[str]:
