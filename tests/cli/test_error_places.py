@@ -86,6 +86,31 @@ def test_a_refusal_of_the_core_that_the_task_caught_is_told_before_the_error_tha
     assert "NaN" not in check("task.py")["message"]
 
 
+@pytest.mark.parametrize(
+    ("line", "without"),
+    [
+        (
+            "    def _initialize_episode(self, env_idx, options):\n",
+            "    def _initialize_episode(self, env_idx):\n",
+        ),
+        (
+            "    def evaluate(self):\n",
+            "    def get_obs(self, info=None):\n        return super().get_obs(info)\n\n    def evaluate(self):\n",
+        ),
+    ],
+)
+def test_a_method_that_lacks_an_argument_is_told_at_its_def(
+    line: str, without: str, tmp_path: Path, check: Check
+) -> None:
+    text = (TASKS / "minimal.py").read_text()
+    head = line.split("(")[0]
+    given = next(each for each in text.splitlines(keepends=True) if each.startswith(head))
+    file = edited(tmp_path, (given, without))
+    told = check("task.py")
+    assert told["line"] == line_of(file, without.split("\n")[0]) and told["file"] == "task.py"
+    assert "TypeError" in told["message"]
+
+
 def test_the_first_exception_of_a_chain_is_told_with_its_line(tmp_path: Path, check: Check) -> None:
     chain = """
         try:

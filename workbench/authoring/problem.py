@@ -170,6 +170,8 @@ def problem_from_exception(
     noted = next((n.place for n in notes if n.place and not n.before and _is_authors(n.place[0], own)), None)
     if noted is not None and not _is_raised_at(source, place):
         place = noted[:2]
+    if place is None and cls is not None:
+        place = _override_of_other_arguments(source, cls, own)
     if place is None:
         hooks = () if stage_found in ("build", "step") else hooks_of(stage_found)
         found = None if cls is None else hook_definition(cls, hooks, own_files)
@@ -365,6 +367,38 @@ def _place_in(exc: BaseException, own: Collection[str]) -> _Line | None:
             below = [inner for inner, _ in frames[i + 1 :]]
             return None if _hands_on(frame, below) else (frame.f_code.co_filename, line)
     return None
+
+
+def _override_of_other_arguments(exc: BaseException, cls: type, own: Collection[str]) -> _Line | None:
+    """The author's method that does not take what the method takes that it overrides, if `exc` was raised by a call of it:
+    Python raises that TypeError in the caller."""
+    frames = [frame for frame, _ in tracebacks.walk_tb(exc.__traceback__)]
+    if not isinstance(exc, TypeError) or not frames:
+        return None
+    for name in frames[-1].f_code.co_names:
+        owners = [vars(base)[name] for base in cls.__mro__ if name in vars(base)]
+        place = definition_line(owners[0]) if len(owners) > 1 else None
+        if place is not None and place[0] in own and not _takes(owners[0], owners[-1]):
+            return place
+    return None
+
+
+def _takes(method: object, overridden: object) -> bool:
+    """Whether a method can be called with all arguments of the one that it overrides, by name or in order."""
+    try:
+        mine, theirs = inspect.signature(method), inspect.signature(overridden)  # type: ignore[arg-type]
+    except (TypeError, ValueError):  # no function
+        return True
+    named = [p.name for p in theirs.parameters.values() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)][
+        1:
+    ]
+    for args, kwargs in (([None] * len(named), {}), ([], dict.fromkeys(named))):
+        try:
+            mine.bind(None, *args, **kwargs)
+            return True
+        except TypeError:
+            continue
+    return False
 
 
 def _innermost(exc: BaseException, fits: Callable[[str], bool]) -> _Line | None:

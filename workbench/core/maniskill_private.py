@@ -296,8 +296,9 @@ def install_base_env_hooks() -> None:
     """
     stock_init, stock_setup = BaseEnv.__init__, BaseEnv._setup_scene
 
+    # Named as the stock one: by this name of a frame an error is not put to a call of super().__init__().
     @wraps(stock_init)
-    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
         defaults, fixed = self.__dict__.pop(_BASE_ARGUMENTS, ({}, {}))
         stock_init(self, *args, **{**defaults, **kwargs, **fixed})
 
@@ -306,7 +307,7 @@ def install_base_env_hooks() -> None:
         make = getattr(self, "_make_scene", None)
         stock_setup(self) if make is None else make()
 
-    BaseEnv.__init__ = init  # type: ignore[method-assign]
+    BaseEnv.__init__ = __init__  # type: ignore[method-assign]
     BaseEnv._setup_scene = setup_scene  # type: ignore[method-assign]
 
 
