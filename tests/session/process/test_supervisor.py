@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -240,6 +241,32 @@ def test_a_load_waits_for_short_work_only() -> None:
         one.until(lambda: "mended" in one.said, "the load")
         assert "interrupted" in one.said and one.deaths == []
         one.until(lambda: not one.worker.load_pending, "that it was taken up")
+
+
+def test_a_save_while_the_first_requests_of_the_next_worker_are_made_is_loaded_after_them() -> None:
+    with minded() as one:
+
+        def saved_meanwhile() -> list[Request]:
+            one.greeted += 1
+            requests = [do(f"say hello {one.greeted}"), load("brought back")]
+            one.worker.send(replace(load("saved"), number=7))
+            return requests
+
+        one.worker._first_requests = saved_meanwhile
+        os.kill(one.worker.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        one.until(lambda: "saved" in one.said, "the load of what was saved")
+        assert "brought back" not in one.said[one.said.index("saved") :]
+
+        def has_it() -> list[Request]:
+            one.worker.send(replace(load("again"), number=8))
+            return [replace(load("again"), number=8)]
+
+        one.worker._first_requests = has_it
+        os.kill(one.worker.pid, signal.SIGKILL)  # type: ignore[arg-type]
+        one.until(lambda: "again" in one.said, "the load")
+        one.worker.send(do("say the end"))
+        one.until(lambda: "the end" in one.said, "the end")
+        assert one.said.count("again") == 1
 
 
 @pytest.mark.slow

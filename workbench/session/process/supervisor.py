@@ -224,6 +224,10 @@ class Supervisor:
         self._hands_over = False
         self._pressed: list[Request] = []
         """Waits for the next worker."""
+        self._begun = False
+        """The worker has its first requests."""
+        self._late: Load | None = None
+        """Asked for before that, perhaps too late to be among them."""
         self._deaths = 0
         self._interrupted: tuple[int, float] | None = None
         self._lives = 0
@@ -251,10 +255,14 @@ class Supervisor:
         return self._load_sent is not None
 
     def send(self, request: Request) -> None:
-        """Send to the current worker. While one hands over to the next, what a person pressed waits. Everything else that is
-        sent between two workers is lost; `first_requests` must include its effect."""
+        """Send to the current worker. While one hands over to the next, what a person pressed waits, and so does a load that
+        came too late for the `first_requests` of the next. Everything else that is sent between two workers is lost;
+        `first_requests` must include its effect."""
         with self._condition:
             worker = self._worker
+            if isinstance(request, Load) and not self._begun:
+                self._late = request
+                return
             if isinstance(request, Load) and self._load_sent is None:
                 self._load_sent = time.monotonic()
             if self._hands_over:
@@ -308,7 +316,7 @@ class Supervisor:
             # Not in a new thread: the kernel ends a worker with the thread that started it.
             report_failure("The thread that supervises the worker failed and is started again", error)
             with self._condition:
-                worker, self._worker = self._worker, None
+                worker, self._worker, self._begun = self._worker, None, False
                 self._deaths += 1
                 gives_up = self._deaths >= _MOST_DEATHS
             if worker is not None:
@@ -343,9 +351,13 @@ class Supervisor:
         if not any(isinstance(request, Load) for request in requests):
             # No version to bring back: the mended file, which comes next, finds shaders and imports ready.
             requests.append(Call(0, self._warm_up))
+        first = max((request.number for request in requests if isinstance(request, Load)), default=0)
         with self._condition:
             requests += self._pressed
-            self._pressed, self._hands_over = [], False
+            if self._late is not None and self._late.number > first:
+                requests.append(self._late)
+                self._load_sent = time.monotonic()
+            self._pressed, self._late, self._hands_over, self._begun = [], None, False, True
             for request in requests:
                 worker.send(request)
         state = _WorkerState()
@@ -374,7 +386,7 @@ class Supervisor:
         report, beat = worker.crash_report(), worker.beat()  # both files outlive the process
         worker.stop(grace=0.0)
         with self._condition:
-            self._worker = None
+            self._worker, self._begun = None, False
             if self._replace_asked:
                 state.end = End.ASKED
             self._deaths += state.end is End.DIED
@@ -401,7 +413,7 @@ class Supervisor:
                 self._spare.begin_soon()
             if hands_over(event):
                 with self._condition:
-                    self._hands_over = True
+                    self._hands_over, self._begun = True, False
             if event is not None:
                 self._on_event(event)
             if hands_over(event):
