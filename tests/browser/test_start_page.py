@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.drive.page import TASK, Opened, close_notice, open_workbench, page_at, picture_of_view
+from tests.drive.waiting import until
 from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.machine.maniskill_installed import installed_maniskills
 from workbench.session.tasks.registered import LIST_FILE
@@ -252,6 +253,11 @@ def test_a_new_task_is_created_with_the_mouse_and_opens(
         assert errors == []
 
 
+def colours(page: Page) -> int:
+    """How many the 3-D view has."""
+    return len(np.unique(view_of(page).reshape(-1, 3), axis=0))
+
+
 def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_once_mended(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
@@ -260,7 +266,7 @@ def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_o
         open_list(page)
         row(page, "sub/small.py").click()
         runs(page, "WorkbenchMinimal-v1")
-        assert len(np.unique(view_of(page).reshape(-1, 3), axis=0)) > 100, "the task is seen"
+        until(lambda: colours(page) > 100, "the task is seen")
         file.write_text(
             "from x import y\n\nclass Task(BaseEnv):\n    def evaluate(self)\n        return {}\n"
         )
@@ -271,7 +277,7 @@ def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_o
         banner = page.locator(".wb-banner")
         expect(banner).to_contain_text("torn.py:4", timeout=PATIENT)
         expect(page.get_by_text("torn.py", exact=True)).to_be_visible()
-        assert len(np.unique(view_of(page).reshape(-1, 3), axis=0)) < 100, "an empty view"
+        until(lambda: colours(page) < 100, "an empty view")
         started.wait_for_line(r"torn\.py:4")
         shutil.copy(TASK, file)
         runs(page, "WorkbenchPushCube-v1")
