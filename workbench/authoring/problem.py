@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TypeGuard
 
-from workbench.core.error_notes import CoreRefusal, Note, chain_of, notes_of
+from workbench.core.error_notes import CoreRefusal, ErrorNote, chain_of, notes_of
 from workbench.machine.library_files import is_installed
 
 HOOK_STAGES: dict[str, str] = {
@@ -166,7 +166,7 @@ def problem_from_exception(
     stage_found = stage if stage in ("import", "syntax", "policy", "worker") else _stage_of(chain, stage)
     places = [(link, place) for link in chain if (place := _place_in(link, own)) is not None]
     source, place = places[0] if places else (exc, None)
-    notes = [note if isinstance(note, Note) else Note(note) for note in notes_of(exc)]
+    notes = [note if isinstance(note, ErrorNote) else ErrorNote(note) for note in notes_of(exc)]
     noted = next((n.place for n in notes if n.place and not n.before and _is_authors(n.place[0], own)), None)
     if noted is not None and not _is_raised_at(source, place):
         place = noted[:2]

@@ -17,7 +17,7 @@ _MOST_REFUSALS = 3
 _MOST_LETTERS = 400
 
 
-class Note(str):
+class ErrorNote(str):
     """A fact about an error. Python prints it below the error.
 
     ``before``: it tells of an earlier error. ``place``: the line at fault where no line of the author's is on the traceback.
@@ -26,7 +26,7 @@ class Note(str):
     before: bool
     place: Place | None
 
-    def __new__(cls, text: str, place: Place | None = None, before: bool = False) -> Note:
+    def __new__(cls, text: str, place: Place | None = None, before: bool = False) -> ErrorNote:
         note = super().__new__(cls, text)
         note.place, note.before = place, before
         return note
@@ -123,7 +123,7 @@ def chain_of(error: BaseException, suppressed: bool = False) -> Iterator[BaseExc
         link = link.__cause__ or (None if hides else link.__context__)
 
 
-def _caught_note(refusal: CoreRefusal) -> Note | None:
+def _caught_note(refusal: CoreRefusal) -> ErrorNote | None:
     """None for one that was never raised."""
     frames = [(frame.filename, frame.lineno or 1, frame.name) for frame in extract_tb(refusal.__traceback__)]
     if not frames:
@@ -133,7 +133,7 @@ def _caught_note(refusal: CoreRefusal) -> Note | None:
     text = " ".join(str(refusal).split())
     text = text if len(text) <= _MOST_LETTERS else text[: _MOST_LETTERS - 1] + "…"
     where = "there" if at[:2] == caught[:2] else f"at {_text_of(caught)}"
-    return Note(f"Before this, {_text_of(at)} was refused, and caught {where}: {text}", at, before=True)
+    return ErrorNote(f"Before this, {_text_of(at)} was refused, and caught {where}: {text}", at, before=True)
 
 
 def _text_of(place: Place) -> str:

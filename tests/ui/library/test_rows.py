@@ -14,7 +14,7 @@ from workbench.ui.library.rows import (
     COLUMNS,
     SECOND_LINE,
     Column,
-    Running,
+    OpenVersion,
     cells,
     chosen,
     in_words,
@@ -113,7 +113,7 @@ def test_no_row_is_lost_by_sorting(facts: list[dict[str, Any]], column: Column, 
     rows = [row(str(k), **values) for k, values in enumerate(facts)]
     assert sorted(ids(ordered(rows, column, descending))) == sorted(ids(rows))
     for one in rows:
-        cells(one, Running(one.task, "aa"), NOW)
+        cells(one, OpenVersion(one.task, "aa"), NOW)
 
 
 def test_another_version_of_the_source_than_the_open_tasks_is_marked() -> None:
@@ -124,7 +124,7 @@ def test_another_version_of_the_source_than_the_open_tasks_is_marked() -> None:
         row("d", source_hash="older", written=0.5, task="Pick-v1"),
         row("e"),
     ]
-    said = [cells(one, Running(rows[0].task, "as it is now"), NOW) for one in rows]
+    said = [cells(one, OpenVersion(rows[0].task, "as it is now"), NOW) for one in rows]
     assert [one["other_version"] for one in said] == [True, True, False, False, False]
     assert [one["version"] for one in said] == ["old0123", "of a bu", "as it i", "older", ""]
     assert not any(cells(one, None, NOW)["other_version"] for one in rows)

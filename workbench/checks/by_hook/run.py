@@ -133,7 +133,7 @@ def _checked(rule: str, check: Check, checkup: Checkup, degree: Degree, rows: li
 
 
 @dataclass(frozen=True)
-class Ended:
+class LookEnd:
     """How looking at a rule ended, without regard to what was found."""
 
     state: State = "kept"
@@ -141,17 +141,17 @@ class Ended:
     problem: Problem | None = None
 
 
-def ended_as(look: Callable[[], None]) -> Ended:
+def ended_as(look: Callable[[], None]) -> LookEnd:
     """Call it, and say how it ended. Other exceptions pass."""
     try:
         look()
     except NotApplicable as reason:
-        return Ended("not_applicable", str(reason))
+        return LookEnd("not_applicable", str(reason))
     except NotKnown as reason:
-        return Ended("not_known", str(reason))
+        return LookEnd("not_known", str(reason))
     except TaskError as error:
-        return Ended("not_known", str(error), error.problem)
-    return Ended()
+        return LookEnd("not_known", str(error), error.problem)
+    return LookEnd()
 
 
 def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
@@ -183,7 +183,7 @@ def _is_of_task(error: Exception, checkup: Checkup) -> bool:
     return False
 
 
-def _ended(result: RuleResult, ended: Ended) -> RuleResult:
+def _ended(result: RuleResult, ended: LookEnd) -> RuleResult:
     """The result, where looking at it ended so: what was found counts most."""
     if result.state != "kept":
         # That the task raised then is told too: not all was looked at.
@@ -228,7 +228,7 @@ def over_seeds(results: Sequence[RuleResult], degree: Degree) -> RuleResult:
     whole = _ended(result_of(rule, degree, seen, rows), ended)
     if short:
         worst = merged(short)
-        whole = _ended(whole, Ended(worst.state, worst.why, worst.problem))
+        whole = _ended(whole, LookEnd(worst.state, worst.why, worst.problem))
     return replace(whole, seconds=seconds)
 
 
@@ -288,7 +288,7 @@ def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResu
     for rule in core_rules_of(degrees):
         of_rule = ended
         if rule in not_applicable:
-            of_rule = Ended("not_applicable", not_applicable[rule])
+            of_rule = LookEnd("not_applicable", not_applicable[rule])
         elif error is None and rule in _OF_SEVERAL:
             of_rule = ended_as(checkup.require_several)
         results.append(_ended(RuleResult(rule, "kept"), of_rule))

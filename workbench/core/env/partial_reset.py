@@ -15,7 +15,7 @@ from mani_skill.utils.structs import Pose
 from workbench.core.broken_rule import find_assignment
 from workbench.core.env.kept_rows import KeptRows
 from workbench.core.env_numbers import env_numbers, envs_of_batch
-from workbench.core.error_notes import CoreRefusal, Note
+from workbench.core.error_notes import CoreRefusal, ErrorNote
 from workbench.core.maniskill_private import agents, drawing_from, set_episode_seeds, task_class
 
 
@@ -148,9 +148,11 @@ def note_what_was_reset(env: Any, untouched: list[int]) -> Iterator[None]:
     except CoreRefusal:
         raise  # its text says what it is about
     except Exception as error:
-        error.add_note(Note(f"Envs {chosen} of {env.num_envs} were being reset."))
+        error.add_note(ErrorNote(f"Envs {chosen} of {env.num_envs} were being reset."))
         for path in (path for path, envs in rows.changed_envs().items() if not envs):
             place = find_assignment(task_class(env), path)
             at = "" if place is None else f" ({Path(place[0]).name}:{place[1]})"
-            error.add_note(Note(f"self.{path}: {env.num_envs} rows before the reset, {len(chosen)} now{at}."))
+            error.add_note(
+                ErrorNote(f"self.{path}: {env.num_envs} rows before the reset, {len(chosen)} now{at}.")
+            )
         raise

@@ -22,7 +22,7 @@ from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.controllers.base_controller import BaseController
 
 from workbench.core.broken_rule import in_brackets, place_of_class
-from workbench.core.error_notes import CoreRefusal, Note, Place, chain_of
+from workbench.core.error_notes import CoreRefusal, ErrorNote, Place, chain_of
 from workbench.machine.parse_python import parse_python
 
 _LOADERS = tuple(
@@ -59,7 +59,7 @@ def place_of_robot_file(cls: type) -> Place | None:
     return _find_line(cls, lambda node: _gives(node, name))
 
 
-def _note(error: BaseException) -> Note | None:
+def _note(error: BaseException) -> ErrorNote | None:
     frames = [frame for frame, _ in walk_tb(error.__traceback__)][::-1]
     robot = next((agent for frame in frames if (agent := _self(frame, BaseAgent)) is not None), None)
     controller = next(
@@ -73,7 +73,7 @@ def _note(error: BaseException) -> Note | None:
         return (
             None
             if robot is None
-            else Note(f"The robot is {type(robot).__name__}{in_brackets(named)}.", named)
+            else ErrorNote(f"The robot is {type(robot).__name__}{in_brackets(named)}.", named)
         )
     part = _part_at_fault([frame for frame in frames if frame.f_code.co_filename.startswith(_LOADERS)])
     line = _line_of(error, part, path)
@@ -84,7 +84,7 @@ def _note(error: BaseException) -> Note | None:
     if robot is not None:
         named = place_of_robot_file(type(robot)) or named
         text += f". {type(robot).__name__} names it{in_brackets(named)}"
-    return Note(f"{text}.", named)
+    return ErrorNote(f"{text}.", named)
 
 
 def _file_argument(frame: FrameType) -> Any:
@@ -188,7 +188,7 @@ def _missing_mesh(frames: list[FrameType], path: Path) -> Iterator[str]:
             return
 
 
-def _controller_note(controller: Any, robot: Any) -> Note | None:
+def _controller_note(controller: Any, robot: Any) -> ErrorNote | None:
     names = getattr(getattr(controller, "config", None), "joint_names", None)
     articulation = getattr(controller, "articulation", None)
     if articulation is None:
@@ -204,7 +204,7 @@ def _controller_note(controller: Any, robot: Any) -> Note | None:
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}"
         text += f": the robot has no active joint {name!r}; {hint}"
-    return Note(text, place)
+    return ErrorNote(text, place)
 
 
 def _gives(node: ast.AST, name: str) -> bool:

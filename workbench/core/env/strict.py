@@ -29,7 +29,7 @@ from workbench.core.env.evaluate_entries import (
 )
 from workbench.core.env.kept_rows import ResetWatch
 from workbench.core.env.partial_reset import TARGET_FLAGS, untouched_envs, without_target_flags
-from workbench.core.error_notes import CoreRefusal, Note
+from workbench.core.error_notes import CoreRefusal, ErrorNote
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.simulation.strict_system import StrictCpuSystem
 
@@ -193,7 +193,7 @@ class StrictMixin:
 
     @contextmanager
     def _noting_rows(self, info: Any, obs: Any = None) -> Iterator[None]:
-        """Note what has no row for each env in what ``evaluate`` and ``_get_obs_extra`` returned to a hook that fails with it."""
+        """ErrorNote what has no row for each env in what ``evaluate`` and ``_get_obs_extra`` returned to a hook that fails with it."""
         try:
             yield
         except CoreRefusal:
@@ -211,7 +211,7 @@ class StrictMixin:
                 ):
                     place = find_entry(self._workbench_task, hook, name.rpartition("/")[2])
                     error.add_note(
-                        Note(
+                        ErrorNote(
                             f"{hook}() returned {name!r} as a {what}, for {self.num_envs} envs{in_brackets(place)}."
                         )
                     )

@@ -20,7 +20,7 @@ from workbench.ui.app.go_live import GoLivePart
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.library.listing import Action
 from workbench.ui.library.panel import LibraryPanel
-from workbench.ui.library.rows import Running
+from workbench.ui.library.rows import OpenVersion
 from workbench.ui.live.timeline import (
     LAST_EVENT,
     LAST_STEP,
@@ -154,10 +154,10 @@ class ReviewPage:
             self._view_panel = ViewPanel(server, dark, place.stage.choice)
         return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
 
-    def _running(self) -> Running | None:
+    def _running(self) -> OpenVersion | None:
         session = self._place.session
         task = None if session is None else session.view().task
-        return None if task is None else Running(task.env_id, task.source_hash)
+        return None if task is None else OpenVersion(task.env_id, task.source_hash)
 
     def _add_library(self, library: Library) -> None:
         """The table of recordings, in a panel of its own."""

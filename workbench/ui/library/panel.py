@@ -22,7 +22,7 @@ from workbench.ui.library.rows import (
     MEANS,
     SECOND_LINE,
     Column,
-    Running,
+    OpenVersion,
     cells,
     chosen,
     count_recordings,
@@ -66,7 +66,7 @@ class LibraryPanel(PagePart[object]):
         library: Library,
         on_open: Callable[[tuple[str, ...]], None],
         clock: Clock = time.monotonic,
-        running: Callable[[], Running | None] = lambda: None,
+        running: Callable[[], OpenVersion | None] = lambda: None,
     ) -> None:
         self._server, self._library, self._running = server, library, running
         self._folder = os.fsencode(library.folder).decode(errors="replace")

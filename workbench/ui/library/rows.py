@@ -32,7 +32,7 @@ HINTS: dict[Column, str] = {
 
 
 @dataclass(frozen=True)
-class Running:
+class OpenVersion:
     """The version of the open task."""
 
     task: str
@@ -141,7 +141,7 @@ def _key(row: LibraryRow, column: Column) -> float | str | None:
     return text.lower() or None
 
 
-def cells(row: LibraryRow, running: Running | None, now: datetime.datetime) -> dict[str, Any]:
+def cells(row: LibraryRow, running: OpenVersion | None, now: datetime.datetime) -> dict[str, Any]:
     """The texts of a row's cells.
 
     Args:
