@@ -361,6 +361,26 @@ def test_pictures_of_every_camera_are_recorded(renderer: None, tmp_path: Path) -
     assert depth is not None and depth[0].shape == (128, 128)
 
 
+def test_an_episode_of_a_robot_alone_ends_by_itself(tmp_path: Path) -> None:
+    robot = f"{TASKS / 'own_robot.py'}:PenArm"
+    (episode,) = read_all(record(RecordOptions(robot, tmp_path, 1, options=TaskOptions(1, env_kwargs=PLAIN))))
+    assert 1 < len(episode.action) <= 1000
+
+
+def test_a_material_of_the_files_own_module_takes_no_pictures_from_its_recordings(tmp_path: Path) -> None:
+    text = (TASKS / "push_cube.py").read_text()
+    (tmp_path / "own.py").write_text(
+        f"{text}\n\nimport sapien.render\nBLUE = sapien.render.RenderMaterial()\n"
+    )
+    asked = ("record", "own.py", "--episodes", "1", "--max-steps", "1", "--num-envs", "1")
+    # In a process of its own: SAPIEN refuses the renderer only where the material is there first.
+    subprocess.run(
+        [sys.executable, "-m", "workbench.cli.main", *asked], cwd=tmp_path, check=True, timeout=120
+    )
+    (recorded,) = (tmp_path / "recordings").glob("*.rrd")
+    assert read_episode(recorded).cameras
+
+
 def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
     broken = tmp_path / "broken.py"
     text = (TASKS / "minimal.py").read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -61,14 +62,34 @@ def find_renderer() -> Renderer | None:
     """What SAPIEN renders with, or None when it finds no device.
 
     Cached: a process can have one render device only, and a second one under another name raises.
+
+    Raises:
+        BackendUnavailable: there is one, held under another name by a material that was made before it was asked for.
     """
     for device in ("cuda", "cpu") if torch.cuda.is_available() else ("cpu",):
         try:
-            sapien.render.RenderSystem(sapien.Device(device))
+            _render_system(device)
         except RuntimeError:
             continue
-        return Renderer("gpu" if device == "cuda" else "cpu", _device_summary())
+        return Renderer("gpu" if device == "cuda" else "cpu", _device_summary() or "unknown device")
+    if (name := _device_summary()) is not None:
+        raise BackendUnavailable(
+            f"SAPIEN's renderer on {name} is held under another name by a material or texture that was made before any env: "
+            "make it while the scene is built, in _load_scene."
+        )
     return None
+
+
+def _render_system(device: str) -> sapien.render.RenderSystem:
+    """One on a device that is called ``cpu``, ``cuda`` or ``cuda:1``; RuntimeError if there is no such device.
+
+    While a material is alive that was made without one, of a build that failed say, SAPIEN refuses the device by its name.
+    """
+    try:
+        return sapien.render.RenderSystem(sapien.Device(device))
+    except RuntimeError:
+        gc.collect()
+        return sapien.render.RenderSystem(sapien.Device(device))
 
 
 @lru_cache(maxsize=1)
@@ -77,16 +98,20 @@ def why_no_ray_tracing() -> str | None:
     return known_render_device(install=False).why_no_ray_tracing
 
 
-def _device_summary() -> str:
-    """The first supported device of a report of blocks ``GPU: name``, ``Supported: 1`` ..."""
-    name = "unknown device"
-    for line in sapien.render.get_device_summary().splitlines():
+def _device_summary() -> str | None:
+    """The first supported device of a report of blocks ``GPU: name``, ``Supported: 1`` ..., or None."""
+    try:
+        report = sapien.render.get_device_summary()
+    except RuntimeError:  # no Vulkan driver
+        return None
+    name = None
+    for line in report.splitlines():
         key, _, value = line.strip().partition(":")
         if key == "GPU":
             name = value.strip()
         elif key == "Supported" and value.strip() == "1":
             return name
-    return name
+    return None
 
 
 def choose_backend(wanted: Backend, render: bool) -> ChosenBackend:
@@ -161,7 +186,7 @@ def keep_render_device(device: str) -> None:
     if name in _kept:
         return
     try:
-        _kept[name] = sapien.render.RenderSystem(sapien.Device(name))
+        _kept[name] = _render_system(name)
     except RuntimeError as error:
         raise RuntimeError(
             f"SAPIEN cannot render on {name!r}: {error}. It needs a Vulkan driver: a GPU's own, or Mesa's "

@@ -24,7 +24,7 @@ from workbench.authoring.problem import (
     shorten,
 )
 from workbench.checks.evidence.places import rules_of_outliers
-from workbench.core.backends import BackendUnavailable, find_renderer, unused_gpu_text
+from workbench.core.backends import BackendUnavailable, find_renderer, keep_render_device, unused_gpu_text
 from workbench.core.broken_rule import BrokenRule, NeedsOneEnv, class_is_installed, in_brackets, warn_of
 from workbench.core.camera_data import CameraInfo
 from workbench.core.cameras.render import (
@@ -194,6 +194,9 @@ def import_task(
 ) -> LoadedTask:
     """Import a task's class, with `source` in place of the files on disk if given. Raises TaskError."""
     opening.on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
+    if "render_backend" not in options.env_kwargs and (renderer := find_renderer()) is not None:
+        # SAPIEN refuses it while a material of the author's is alive, of their module or of a build that failed.
+        keep_render_device(renderer.render_backend)
     import_modules(options.imports)
     loaded = load_task(reference, source=source)
     opening.clock.lap("import")

@@ -453,7 +453,9 @@ def _task_in(module: ModuleType, requested: str | None, load: _Load) -> LoadedTa
         named_like_libraries=hidden_by_libraries(finder.file, finder.search_folder),
         **_source_fields(finder),
     )
-    return dataclasses.replace(task, default_kwargs={**task.default_kwargs, **chosen.kwargs})
+    task = dataclasses.replace(task, default_kwargs={**task.default_kwargs, **chosen.kwargs})
+    # The limit of the scene for looking, 200,000 steps, is no length of an episode.
+    return task if task.robot is None else dataclasses.replace(task, max_episode_steps=None)
 
 
 def _source_fields(finder: AuthorFinder) -> dict[str, Any]:

@@ -17,7 +17,6 @@ from workbench.authoring.problem import Problem, TaskError
 from workbench.checks.by_hook.run import CORE, check_core, check_rule, findings_of
 from workbench.checks.evidence.checkup import CheckEnded, Checkup
 from workbench.checks.rules import degree_of_each
-from workbench.core.backends import find_renderer, keep_render_device
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.step_result import StepResult
@@ -35,9 +34,6 @@ def check_items(what: CheckOptions, queue: ItemQueue) -> None:
     torch.set_num_threads(1)  # see workbench.session.worker.loop.work
     here = CurrentFolder()  # the task may change it
     with here.again(), ExitStack() as stack:
-        if "render_backend" not in what.options.env_kwargs and (renderer := find_renderer()) is not None:
-            # SAPIEN refuses it while a material of a build that failed is alive.
-            keep_render_device(renderer.render_backend)
         runs, _ = find_actions(what.actions, what.task)
         opening = Opening(lambda activity: queue.send_update(CheckUpdate(activity=activity)))
         loaded = import_task(what.task, what.options, None, opening)
