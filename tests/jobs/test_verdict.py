@@ -139,7 +139,7 @@ def test_without_recorded_rewards_there_is_nothing_to_compare_them_with() -> Non
     found = compare(0, said([], success=[0] * 5), said(success=[0, 0, 0, 0, 1]))
     assert found.differing == ("success",) and found.largest == 0
     assert np.isnan(found.old_reward).all() and len(found.old_reward) == 4
-    assert verdict_text.returns_text(found) == "none → 6"
+    assert verdict_text.returns_text(found) == "no reward → 6"
 
 
 def test_it_is_compared_as_far_as_it_is_said_now() -> None:

@@ -137,13 +137,14 @@ def looked_at(
     return min(parted, default=None)
 
 
-def test_the_newest_run_is_judged_first_and_each_begins_with_a_jump_of_all() -> None:
+def test_the_run_in_sight_is_judged_first_then_the_newest_and_each_begins_with_a_jump_of_all() -> None:
     old, _, _ = drawn(0, 9, 2)
     jumped = np.zeros((9, 2), bool)
     jumped[[0, 6]] = True
     jumped[3, 1] = True
     rescored = RescoredPast(recorded(old, jumped))
     assert rescored.runs() == [range(6, 9), range(6)]
+    assert RescoredPast(recorded(old, jumped), seen=4).runs() == [range(6), range(6, 9)]
     jump = rescored.moment_to_rescore(3)
     assert jump.snapshot is not None and jump.env_idx == (1,) and jump.action is None
     assert rescored.moment_to_rescore(4).snapshot is None

@@ -490,7 +490,7 @@ class Session:
             what_to_do = rescore_after_load(past, self.rescorer.rescoring.view)
             rescored = None
             if what_to_do == "rescore" and s.timeline is not None:
-                rescored = RescoredPast(s.timeline.history)
+                rescored = RescoredPast(s.timeline.history, s.timeline.at)
             s.loaded(event, restored=restored, stale=stale)
             level = None if event.reload is None else event.reload.level
             placed = self.studio.loaded(event.task, level)

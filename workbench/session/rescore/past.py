@@ -72,8 +72,13 @@ class RescoredPast:
     (see `core.snapshots.snapshot`).
     """
 
-    def __init__(self, history: History) -> None:
-        """Take the moments of `history`, up to the first jump without a snapshot."""
+    def __init__(self, history: History, seen: int | None = None) -> None:
+        """Take the moments of `history`, up to the first jump without a snapshot.
+
+        Args:
+            seen: serial of the moment that the page shows; its run is replayed first.
+        """
+        self._seen = seen
         self._moments: list[Moment] = []
         for moment in history.between(history.first, history.last):
             if moment.snapshot is None and (not self._moments or moment.jumped.any()):
@@ -114,13 +119,15 @@ class RescoredPast:
         return int((self._is_step & self._rescored).sum())
 
     def runs(self) -> list[range]:
-        """Rows to be replayed in order; each run begins with a jump of all envs. The newest run comes first.
+        """Rows to be replayed in order; each run begins with a jump of all envs. First the run in sight, then the newest.
 
-        People mostly look at the newest, and a history may hold minutes of simulation.
+        A history may hold minutes of simulation.
         """
         begins = [int(row) for row in np.flatnonzero(self._jumped.all(axis=1))]
         ends = [*begins[1:], len(self._serial)]
-        return [range(begin, end) for begin, end in zip(begins, ends, strict=True)][::-1]
+        newest_first = [range(begin, end) for begin, end in zip(begins, ends, strict=True)][::-1]
+        seen = -1 if self._seen is None else int(self._serial.searchsorted(self._seen))
+        return sorted(newest_first, key=lambda rows: seen not in rows)
 
     @property
     def num_envs(self) -> int:

@@ -60,7 +60,7 @@ def _reward_change(verdict: Verdict[Any]) -> str:
 
 def returns_text(verdict: Verdict[Any]) -> str:
     if math.isnan(verdict.returns[0]) and np.isnan(verdict.old_reward).all():
-        return f"none → {number_text(verdict.returns[1])}"
+        return f"no reward → {number_text(verdict.returns[1])}"
     return _was_now(*map(number_text, verdict.returns))
 
 

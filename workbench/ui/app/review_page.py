@@ -169,7 +169,7 @@ class ReviewPage:
         self._library.add_action(
             Action(
                 "Side by side",
-                "Show them side by side (Shift Enter)",
+                "Show them side by side (Shift+Enter)",
                 self._open_side_by_side,
                 MOST_OPEN,
                 "Open the selected recordings side by side",

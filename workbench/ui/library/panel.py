@@ -93,7 +93,7 @@ class LibraryPanel(PagePart[object]):
             ),
             Action(
                 "Note",
-                "Edit its note (Shift T)",
+                "Edit its note (Shift+T)",
                 self._edits.ask_note,
                 reads=False,
                 named="Edit the note of the selected recordings",
