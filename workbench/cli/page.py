@@ -31,7 +31,7 @@ from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reader.reading import start_reading
 from workbench.session.live.session import HISTORY_BYTES, KeptWork, Session
 from workbench.session.process.supervisor import WorkerOptions
-from workbench.session.protocol.messages import Event, Loaded, LoadFailed, Loading
+from workbench.session.protocol.messages import Event, Loaded, LoadFailed
 from workbench.session.tasks.recents import RecentTasks
 from workbench.ui.app.open_task import Choices
 from workbench.ui.app.workplace import Which, Workplace
@@ -63,21 +63,19 @@ def open_in_terminal(
         return gated_server
     requests = _PageRequests()
     waits_for_a_file = named_file(task) is not None
-    begun = 0
-    if waits_for_a_file:
+    shown = waits_for_a_file
+    if shown:
         requests.show_address()
 
     def on_event(event: Event) -> None:
-        nonlocal begun
+        nonlocal shown
         print_event(event)
         # A broken file can be fixed and saved; an env id that fails has nothing to wait for, and gets no page.
-        if not waits_for_a_file:
-            if isinstance(event, LoadFailed) and not event.kept:
-                requests.end(1)
-            elif isinstance(event, Loading):
-                begun += 1
-                if begun == 2:  # the first step has found that the id exists
-                    requests.show_address()
+        if not waits_for_a_file and isinstance(event, LoadFailed) and not event.kept:
+            requests.end(1)
+        elif not shown and isinstance(event, Loaded):
+            shown = True
+            requests.show_address()
 
     how = _HowToOpen(recordings, worker, history_bytes, RecentTasks(), pictures)
     if waits_for_a_file:

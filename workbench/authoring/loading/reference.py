@@ -115,6 +115,8 @@ def check_task_file(file: Path) -> None:
             inside = f", for example {' or '.join(names)}" if names else " (there is none in it)"
             raise task_error(f"{file} is a folder; name a .py file in it{inside}")
         if not file.exists():
+            if file.is_symlink():
+                raise task_error(f"{file} is a link to {file.readlink()}, which leads to no file")
             raise _missing(file)
         if not file.is_file():
             # Reading a pipe may never end, and a device may have no end.

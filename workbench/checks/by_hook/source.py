@@ -63,7 +63,11 @@ def versioned_id(checkup: Checkup) -> Iterator[Found | Note]:
     _needs_id(checkup)
     env_id = checkup.loaded.env_id
     if re.search(r"-v\d+$", env_id) is None:
-        yield Found(f"the id {env_id!r} has no version: write {env_id + '-v1'!r}.", _decorator(checkup))
+        versioned = re.sub(r"-v[\d.]*$", "", env_id) + "-v1"
+        yield Found(
+            f"the id {env_id!r} has no version, a whole number after -v: write {versioned!r}.",
+            _decorator(checkup),
+        )
 
 
 def time_limit(checkup: Checkup) -> Iterator[Found | Note]:

@@ -72,6 +72,8 @@ class RecordBar:
         self.stop_requested = False
         self._began: float | None = None
         """When the first episode began."""
+        self._said = time.monotonic()
+        """When something was last printed that is no bar."""
 
     def __enter__(self) -> RecordBar:
         self._before = signal.signal(signal.SIGINT, self._on_signal)
@@ -90,6 +92,14 @@ class RecordBar:
     def describe(self, text: str, kept: int | None = None) -> None:
         self._bar.update(self._row, description=text, completed=kept)
 
+    def _say(self, line: str) -> None:
+        """Where there is no terminal: a bar in a file or a pipe is drawn once, at the end, and a log would say nothing for
+        hours.
+        """
+        if not err.is_terminal:
+            self._said = time.monotonic()
+            err.print(escape(line), soft_wrap=True)
+
     def show(self, now: RecordProgress) -> None:
         if now.was_there:
             # Else the time left would be told by how fast they were read.
@@ -102,13 +112,18 @@ class RecordBar:
             rate = f"{now.steps / seconds:.0f} steps a second"
             at = "" if self._first_seed is None else underway_text(now.by_seed(self._first_seed), now.limit)
             failed = sum(len(failure.numbers) for failure in now.failures)
-            self.describe(f"{self._doing}, {at or rate}" + (f", {failed} failed" if failed else ""))
-        if now.over is not None and not err.is_terminal:
-            # A bar in a file or a pipe is drawn once, at the end: a job's log would say nothing for hours.
+            doing = f"{self._doing}, {at or rate}" + (f", {failed} failed" if failed else "")
+            self.describe(doing)
+            if time.monotonic() - self._said > _SAY_EVERY:
+                self._say(doing)
+        if now.over is not None:
             number, kept = now.over
             named = self._named(number) if self._first_seed is None else f"seed {self._first_seed + number}"
-            line = f"{named}: {_ended_text(kept)}, {now.kept} of {self._total} kept"
-            err.print(escape(line), soft_wrap=True)
+            self._say(f"{named}: {_ended_text(kept)}, {now.kept} of {self._total} kept")
+
+
+_SAY_EVERY = 30.0
+"""Seconds after which a log is told again how far it is."""
 
 
 def _ended_text(kept: Written | None) -> str:
