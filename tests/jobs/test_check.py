@@ -14,7 +14,7 @@ from workbench.authoring.problem import TaskError
 from workbench.checks.results import RuleResult, merged
 from workbench.checks.rules import RULES
 from workbench.core.rules import Finding
-from workbench.jobs.check.plan import CheckOptions, Outcome
+from workbench.jobs.check.plan import CheckOptions, ItemOutcome
 from workbench.jobs.check.run import CheckReport, check, report_of
 from workbench.jobs.pool.deal import Shard, ThisProcess
 from workbench.jobs.pool.job_file import JobFile, Kept, job_of, read_parts
@@ -283,7 +283,7 @@ def test_parts_of_a_job_are_put_together_and_a_job_goes_on_where_it_was(tmp_path
         assert part.missing == (2, 3)[number - 1]
         file.close()
     kept = read_parts(files)
-    assert told(report_of(what, kept.results(Outcome))) == told(whole)
+    assert told(report_of(what, kept.results(ItemOutcome))) == told(whole)
 
     file = JobFile(files[0], job_of("check", task, what, ("workers",)))
     seen: list[str] = []

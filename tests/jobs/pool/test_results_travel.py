@@ -15,7 +15,7 @@ from msgspec import convert, inspect
 from tests.drive.messages import of_schema, same
 from workbench.checks.by_hook.run import as_sent
 from workbench.checks.results import RuleResult, Seen
-from workbench.jobs.check.plan import CheckUpdate, Outcome
+from workbench.jobs.check.plan import CheckUpdate, ItemOutcome
 from workbench.jobs.pool.deal import Deal, Work
 from workbench.jobs.pool.worker import MESSAGES, Listener, Message, WorkerQueue
 from workbench.jobs.record.episodes import RecordUpdate, Written
@@ -24,7 +24,7 @@ from workbench.machine.processes.wire import MessageSocket, Unreadable
 from workbench.planning.report import SolveReport
 
 KINDS = (
-    Outcome,
+    ItemOutcome,
     CheckUpdate,
     RuleResult,
     Written,

@@ -28,7 +28,7 @@ from workbench.cli.jobs.sweep import write_reports as write_sweep_reports
 from workbench.cli.terminal.output import Exit, print_text, refuse
 from workbench.cli.terminal.output import out as out_console
 from workbench.core.rules import FailOn
-from workbench.jobs.check.plan import CheckOptions, Outcome
+from workbench.jobs.check.plan import CheckOptions, ItemOutcome
 from workbench.jobs.check.run import report_of as check_report_of
 from workbench.jobs.pool.job_file import JobFileError, JobParts, read_parts, write_whole
 from workbench.jobs.record.episodes import RecordOptions, Written
@@ -173,7 +173,7 @@ def _with_missing(code: int, missing: int, what: str, names: Iterable[str] = ())
 
 def _print_check(merged: JobParts, output: MergeOutput) -> int:
     what = merged.requested(CheckOptions)
-    report = check_report_of(what, merged.results(Outcome))
+    report = check_report_of(what, merged.results(ItemOutcome))
     said = Reported(report, what, Path.cwd(), output.fail_on)
     write_check_reports(said, CheckOutput(json_file=output.json_file, junit=output.junit, sarif=output.sarif))
     print_check(said)

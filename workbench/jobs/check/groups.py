@@ -22,7 +22,7 @@ from workbench.core.env.assets import require_assets, robots_of
 from workbench.core.env.step_result import StepResult
 from workbench.core.env.task_env import TaskEnv, given_arguments
 from workbench.jobs.actions import STEPS_WITHOUT_LIMIT, RecordActionChooser, find_actions, plain_chooser
-from workbench.jobs.check.plan import CheckedTask, CheckOptions, CheckUpdate, Item, Outcome, plan_of
+from workbench.jobs.check.plan import CheckedTask, CheckOptions, CheckUpdate, Item, ItemOutcome, plan_of
 from workbench.jobs.open_task import Opening, import_task
 from workbench.jobs.pool.deal import Chunk, ItemQueue
 from workbench.jobs.replay import begin_run
@@ -116,14 +116,14 @@ class _Worker:
         )
         return self._checkup
 
-    def _checked(self, item: Item, checkup: Checkup, task: CheckedTask | None) -> Outcome:
+    def _checked(self, item: Item, checkup: Checkup, task: CheckedTask | None) -> ItemOutcome:
         known, silenced = len(checkup.findings), len(checkup.silenced)
         if item.group is CORE:
             results = check_core(checkup, self._degrees)
         else:
             (rule,) = item.rules
             results = check_rule(rule, item.group.checks[rule], checkup, self._degrees)
-        return Outcome(
+        return ItemOutcome(
             tuple(results),
             findings_of(checkup, known),
             tuple(checkup.silenced[silenced:]),

@@ -60,7 +60,7 @@ class CheckUpdate:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ItemOutcome:
     """What an item came to: a rule for one part of the seeds, or all rules of GPU simulation."""
 
     results: tuple[RuleResult, ...]

@@ -19,7 +19,7 @@ from workbench.jobs.check.plan import (
     CheckedTask,
     CheckOptions,
     CheckUpdate,
-    Outcome,
+    ItemOutcome,
     degrees_of_request,
     plan_of,
 )
@@ -106,14 +106,14 @@ def check(
         workers = min(cores if what.workers is None else what.workers, plan.chunks)
         executor = ThisProcess() if workers == 1 else Processes(workers)
     found = _Results(what, on_activity, on_result, on_progress)
-    deal: Deal[Outcome, CheckUpdate] = Deal(
+    deal: Deal[ItemOutcome, CheckUpdate] = Deal(
         plan.items, found.take, found.hear, stop, chunk=plan.chunk, tries=_TRIES, on_failure=found.fail
     )
     needed = needed_by(what.task, what.actions, what.options.imports)
     work = Work(
         check_items,
         what,
-        result=Outcome,
+        result=ItemOutcome,
         update=CheckUpdate,
         name="that checks",
         folders=needed.folders,
@@ -124,7 +124,7 @@ def check(
     return found.report(began, stop())
 
 
-def report_of(what: CheckOptions, known: Mapping[int, Outcome]) -> CheckReport:
+def report_of(what: CheckOptions, known: Mapping[int, ItemOutcome]) -> CheckReport:
     """The report of a check of which these items are known. Runs nothing. Raises ValueError as `degrees_of_request`."""
     found = _Results(what)
     for number in sorted(known):
@@ -147,7 +147,7 @@ class _Results:
         self._on_activity, self._on_result, self._on_progress = on_activity, on_result, on_progress
         self._task: CheckedTask | None = None
         self._started = 0.0
-        self._outcomes: dict[int, Outcome] = {}
+        self._outcomes: dict[int, ItemOutcome] = {}
 
     def hear(self, update: CheckUpdate) -> None:
         if update.task is not None:
@@ -155,7 +155,7 @@ class _Results:
         if update.activity:
             self._on_activity(update.activity)
 
-    def take(self, number: int, outcome: Outcome) -> None:
+    def take(self, number: int, outcome: ItemOutcome) -> None:
         if outcome.task is not None:
             self._see_task(outcome.task)
         self._outcomes[number] = outcome
@@ -172,7 +172,7 @@ class _Results:
             raise TaskError(failure.problem)
         for number in failure.numbers:
             rules = self._plan.items[number].rules
-            self.take(number, Outcome(tuple(failed(rule, failure.problem) for rule in rules)))
+            self.take(number, ItemOutcome(tuple(failed(rule, failure.problem) for rule in rules)))
 
     def _see_task(self, task: CheckedTask) -> None:
         if self._task is None:
@@ -181,7 +181,7 @@ class _Results:
     def report(self, began: float | None, stopped: bool) -> CheckReport:
         # Stopped before the task was imported: nothing is known of it.
         task = self._task or CheckedTask("", "", None)
-        by_part: dict[int, list[Outcome]] = {}
+        by_part: dict[int, list[ItemOutcome]] = {}
         for number in sorted(self._outcomes):
             by_part.setdefault(self._plan.items[number].part, []).append(self._outcomes[number])
         of_rule: dict[str, list[RuleResult]] = {}
@@ -213,7 +213,7 @@ class _Results:
             rule for rule in RULES if rule in what.ignore and (not what.select or rule in what.select)
         )
 
-    def _of_part(self, outcomes: Sequence[Outcome]) -> dict[str, RuleResult]:
+    def _of_part(self, outcomes: Sequence[ItemOutcome]) -> dict[str, RuleResult]:
         """The result of each rule for one part of the seeds."""
         earliest: dict[object, Finding] = {}
         for finding in (finding for outcome in outcomes for finding in outcome.findings):
