@@ -56,6 +56,7 @@ def test_its_rule_is_broken_at_its_line_and_no_other(name: str, renderer: None) 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)  # it plans for eight seeds
 @pytest.mark.parametrize("name", WHEN_SOLVED)
 def test_its_rule_is_broken_where_it_is_solved_and_no_other(name: str) -> None:
     rule, line = WHEN_SOLVED[name]
