@@ -97,8 +97,9 @@ def test_an_odd_env_is_flagged_with_its_reason_and_found_by_the_filter(page: Pag
     until(lambda: selected(page) == [4], "the flagged env selected by its key")
     press(page, "tr[data-env='0']")
     until(lambda: selected(page) == [0], "another env")
-    assert f"1 of {ENVS} envs flagged: cube_height is NaN" in page.locator(".wb-marks").inner_text()
-    press(page, ".wb-marks [data-press]")
+    mark = page.locator(".wb-marks .wb-sight-flagged")
+    assert "cube_height is NaN" in f"{mark.inner_text()} {mark.get_attribute('title')}"
+    press(page, ".wb-marks .wb-sight-flagged")
     until(lambda: selected(page) == [4], "the flagged env selected by the mark above the tabs")
 
 
@@ -142,7 +143,7 @@ def test_the_selected_env_is_read_out_and_changes_are_marked(page: Page) -> None
     until(lambda: cell(page, 0, 2) == "1", "the step")
     until(lambda: page.locator(".wb-leaves .wb-changed").count() > 0, "changed numbers")
     show(page, "contacts")
-    expect(page.get_by_text("by table-workspace")).to_be_visible()
+    expect(page.locator(".wb-inspect").get_by_text("table-workspace").first).to_be_visible()
 
 
 def test_a_pose_is_copied(page: Page) -> None:

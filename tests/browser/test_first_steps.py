@@ -68,7 +68,7 @@ def test_a_question_mark_lists_the_keys_which_rest_meanwhile(desk: Desk) -> None
 
 
 def test_the_tooltip_of_a_button_names_its_key(desk: Desk) -> None:
-    for name, key in (("Play", "Space"), ("Reset this env", "Shift R"), ("‹ step", "←")):
+    for name, key in (("Play", "Space"), ("Reset this env", "Shift+S"), ("‹ step", "Left arrow")):
         desk.button(name).hover()
         expect(desk.button(name)).to_have_attribute("title", f"{name} ({key})")
 
@@ -169,7 +169,7 @@ def test_a_line_of_the_file_opens_the_editor_and_the_reloads_are_listed(desk: De
     expect(link).to_have_count(0)
     desk.page.get_by_text(LAST_LOADS, exact=True).click()
     loads = desk.page.locator(".wb-load")
-    expect(loads.first).to_contain_text("patched")
+    expect(loads.first).to_contain_text("restarted")
     expect(loads.nth(1)).to_contain_text("refused")
     expect(loads.nth(1)).to_contain_text(f"push_cube.py:{place}")
     desk.file.write_text(TASK.read_text())
