@@ -28,6 +28,7 @@ from workbench.session.live.view import SessionView
 from workbench.ui.live.status_line import slowed_by
 
 STEPS = 4
+EYE = "eye=[0.45, 0, 0.6]"
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +202,9 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
     assert version is not None and version.file is not None and played.step is not None
     file = Path(version.file)
     text = file.read_text()
-    file.write_text(text.replace("= 3\n", "= 4\n"))
+    said = camera(session, BASE).now
+    assert said is not None and text.count(EYE) == 1
+    file.write_text(text.replace("= 3\n", "= 4\n").replace(EYE, "eye=[0.4, 0, 0.6]"))
     wait_until(
         session, lambda view: view.task is not None and view.task.source_hash != version.source_hash, "it"
     )
@@ -211,9 +214,37 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
     assert list(kept.info.source.values()) == list(version.source.values())
     np.testing.assert_array_equal(kept.reward[-1], played.step.reward[0])
     assert "an earlier version" in session.view().recording.saving.message
+    # What its source does not say of the pictures.
+    now = session.view().task
+    assert now is not None and kept.info.observed_by == now.source_hash
+    ((moved, used, in_file),) = [(m.name, m.used, m.in_file) for m in kept.info.moved_cameras]
+    assert (moved, in_file) == ("base_camera", said) and used.position == pytest.approx((0.4, 0, 0.6))
     file.write_text(text)
     wait_until(
         session, lambda view: view.task is not None and view.task.source_hash == version.source_hash, "it"
+    )
+
+
+def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_a_reset(
+    session: Session,
+) -> None:
+    session.start_recording((0,))
+    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
+    step(session, 3)
+    count = session.view().recording.episodes_written
+    before = wait_until(session, lambda view: elapsed(view) == 3, "the steps").task
+    assert before is not None and before.file is not None
+    file, text = Path(before.file), Path(before.file).read_text()
+    file.write_text(text.replace("CUBE_HALF_SIZE = 0.02\n", "CUBE_HALF_SIZE = 0.024\n"))
+    view = wait_until(session, lambda v: v.reload is not None and v.reload.level == "rebuilt", "the rebuild")
+    assert elapsed(view) == 3
+    assert len(written(session, count + 1)[-1].action) == 3
+    view = wait_until(session, lambda view: view.recording.active, "it to go on")
+    assert view.recording.waiting == 1 and elapsed(view) == 3
+    session.stop_recording()
+    file.write_text(text)
+    wait_until(
+        session, lambda view: view.task is not None and view.task.source_hash == before.source_hash, "it"
     )
 
 

@@ -64,10 +64,12 @@ class GatheredEpisode:
         acted_by: str = "",
         id: str = "",
         origin: Mapping[str, str] = NOWHERE,
+        observed_by: str = "",
     ) -> GatheredEpisode:
         """A new episode with a writer into `folder`; `id` if not a random one, `origin` as of `EpisodeGatherer`. Raises
         RecordingError."""
         info = relocated(episode_info(task, env, seed, reset_options, acted_by), origin)
+        info = replace(info, observed_by=observed_by)
         writer = EpisodeWriter(
             folder,
             replace(info, id=id) if id else info,
@@ -84,11 +86,17 @@ class GatheredEpisode:
             self.writer.acted_by(what)
             self.acted_by = what
 
-    def set_placed(self, placed: Mapping[CameraKey, CameraSettings]) -> None:
-        """Set the cameras that are placed by hand from the next state on. Raises RecordingError."""
-        for key in self.placed.keys() | placed.keys():
-            if self.placed.get(key) != placed.get(key):
-                self.writer.placed(key, placed.get(key))
+    def set_placed(
+        self, placed: Mapping[CameraKey, CameraSettings], in_file: Mapping[CameraKey, CameraSettings] = {}
+    ) -> None:
+        """Set the cameras that are placed by hand from the next state on. Raises RecordingError.
+
+        Args:
+            in_file: what the recorded source says of cameras for which the task's description says something else.
+        """
+        for key in self.placed.keys() | placed.keys() | in_file.keys():
+            if key in in_file or self.placed.get(key) != placed.get(key):
+                self.writer.placed(key, placed.get(key), in_file.get(key))
         self.placed = placed
 
     def take(

@@ -156,6 +156,7 @@ class Description(Struct, frozen=True, kw_only=True):
     acted_by: ActedBy = ()
     pictures: PictureDegree = "exact"
     moved_cameras: tuple[MovedCamera, ...] = ()
+    observed_by: Name = ""
     length: SmallInt
     total_reward: float = msgspec.field(name="return")
     success: bool | None
@@ -202,7 +203,7 @@ class Description(Struct, frozen=True, kw_only=True):
 SHARED = (
     "id", "task", "env_index", "control_dt", "control_mode", "backend", "versions", "env_kwargs", "reset_options",
     "max_episode_steps", "written_at", "recovered", "source_hash", "side_files", "acted_by",
-    "pictures", "moved_cameras",
+    "pictures", "moved_cameras", "observed_by",
 )  # fmt: skip
 """Fields that `EpisodeInfo` and `Description` share."""
 
@@ -337,6 +338,12 @@ def json_text(value: object, indent: int | None = None) -> str:
         return msgspec.json.format(text, indent=indent)
     except msgspec.DecodeError:  # it refuses NaN
         return json.dumps(value, indent=indent, default=_plain)
+
+
+def seen_otherwise(info: EpisodeInfo) -> dict[str, Any]:
+    """What an export says of an episode whose pictures or observations are not what its source gives; else empty."""
+    said = {"moved_cameras": as_json(info.moved_cameras), "observed_by": info.observed_by}
+    return {name: value for name, value in said.items() if value}
 
 
 def as_json(value: object) -> Any:

@@ -105,7 +105,9 @@ class EpisodeInfo:
     pictures: PictureDegree = "exact"
     """What degree the pictures of its cameras are of. Recordings of earlier versions are exact."""
     moved_cameras: tuple[MovedCamera, ...] = ()
-    """Cameras that were placed by hand, in order; empty if all were as in the file."""
+    """Cameras that did not stand where `source` says, in order; empty if all did."""
+    observed_by: Name = ""
+    """`source_hash` of the version that made the observations and pictures, where that is a later one than `source`."""
     seal: Seal | None = field(default=None, compare=False)
     """Set when read from a recording."""
 

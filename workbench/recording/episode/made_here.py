@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 KEY_FILE = "recordings.key"
 _KEY_BYTES = 32
-_COVERED = {*SHARED, "seed", "source"} - {"acted_by", "pictures", "moved_cameras"}
+_COVERED = {*SHARED, "seed", "source"} - {"acted_by", "pictures", "moved_cameras", "observed_by"}
 """Without what earlier versions did not seal: a seal of theirs stays valid."""
 _logged: set[str] = set()
 

@@ -133,10 +133,9 @@ def clean_facts(facts: Facts) -> Facts:
     """`facts` with valid types and bounded lengths: they come from a confined reader or from an older index."""
     texts = ("task", "uid", "copy_of", "control_mode", "acted_by", "source_hash")
     wholes = ("env_index", "length")
-    seed = integer(facts.seed)
     return replace(
         facts,
-        seed=None if seed is None or seed < 0 else seed,  # written for an unknown one
+        seed=known_seed(facts.seed),
         **{name: clean_text(getattr(facts, name)) for name in texts},
         **{name: integer(getattr(facts, name)) for name in wholes},
         trajectory=None if facts.trajectory is None else clean_text(facts.trajectory),
@@ -169,6 +168,12 @@ def integer(value: object) -> int | None:
     if isinstance(value, bool) or not isinstance(value, int) or not -(2**63) <= value < 2**63:
         return None
     return value
+
+
+def known_seed(value: object) -> int | None:
+    """A seed; one below 0 is written where none is known."""
+    seed = integer(value)
+    return None if seed is None or seed < 0 else seed
 
 
 def number(value: object) -> float | None:

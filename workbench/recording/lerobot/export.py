@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from workbench.recording.episode.document import as_json
+from workbench.recording.episode.document import seen_otherwise
 from workbench.recording.episode.episode import Episode, read_whole
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.films import Encoding, FilmWriter
@@ -235,7 +235,7 @@ class _Writer:
                 "task": info.task,
                 "seed": info.seed,
                 "source_hash": info.source_hash,
-                **({"moved_cameras": as_json(info.moved_cameras)} if info.moved_cameras else {}),
+                **seen_otherwise(info),
             }
         )
         self._made.episodes += 1

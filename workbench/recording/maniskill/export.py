@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from workbench.machine.text import short_line
-from workbench.recording.episode.document import as_json, json_text
+from workbench.recording.episode.document import json_text, seen_otherwise
 from workbench.recording.episode.episode import Episode, read_whole
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.maniskill.sensors import missing_pictures, observed_pictures, put_pictures
@@ -119,13 +119,12 @@ def export_maniskill(
                     made.incomplete.append(
                         f"{name}: its observations had more than its recording keeps: {missing}."
                     )
-                moved = episode.info.moved_cameras
                 document["episodes"].append(
                     {
                         **entry["episodes"][0],
                         "episode_id": made.episodes,
                         WORKBENCH_ID: episode.info.id,
-                        **({"moved_cameras": as_json(moved)} if moved else {}),
+                        **seen_otherwise(episode.info),
                     }
                 )
                 made.episodes, made.steps = made.episodes + 1, made.steps + episode.length

@@ -178,6 +178,8 @@ def properties(episode: Episode) -> dict[str, dict[str, Any]]:
     plain["acted_by"] = acted_by_text(episode.info.acted_by)
     if episode.info.moved_cameras:
         plain["moved_cameras"] = moved_cameras_text(episode.info.moved_cameras)
+    if episode.info.observed_by:
+        plain["observed_by"] = episode.info.observed_by
     for name in ("env_kwargs", "reset_options"):
         plain[name] = json_text(described[name])
     values: dict[str, dict[str, Any]] = {"episode": plain}

@@ -157,8 +157,14 @@ class EpisodeWriter:
         except OSError as error:
             raise self._failed(error) from error
 
-    def placed(self, key: CameraKey, used: CameraSettings | None) -> None:
-        """Note where a camera stands from the next state on; None: as in the file.
+    def placed(
+        self, key: CameraKey, used: CameraSettings | None, in_file: CameraSettings | None = None
+    ) -> None:
+        """Note where a camera stands from the next state on.
+
+        Args:
+            used: None for where the task's description has it.
+            in_file: what the recorded source says, where that is something else than the description.
 
         Raises:
             RecordingError: as `append`.
@@ -166,7 +172,7 @@ class EpisodeWriter:
         info = self._header.cameras[self._cameras[key]]
         if info.settings is None:
             return  # what the file says of it cannot be expressed, and such a camera cannot be placed
-        moved = MovedCamera(self._states, *key, used or info.settings, info.settings)
+        moved = MovedCamera(self._states, *key, used or info.settings, in_file or info.settings)
         try:
             self._journal.append(JournalEntry("placed", self._states, msgspec.json.encode(moved)))
         except OSError as error:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 from workbench.authoring.loading.reference import TaskName
 from workbench.core.capture.inspection import Section
@@ -508,17 +508,20 @@ class Session:
         self._send_settings()
         self.studio.send_placements(placed)
         if recording:
-            self._continue_recording(past, recording, one_each)
+            put_back = past != "gone" or (event.reload is not None and bool(event.reload.carried))
+            self._continue_recording(put_back, recording, one_each)
         with self._lock:
             to_enter, self._to_enter = self._to_enter, None
         if to_enter is not None:
             self._send_enter(*to_enter)
 
-    def _continue_recording(
-        self, past: Literal["same", "patched", "gone"], env_idx: tuple[int, ...], one_each: bool
-    ) -> None:
-        """Continue recording these envs after a version came in."""
-        if past == "gone":
+    def _continue_recording(self, put_back: bool, env_idx: tuple[int, ...], one_each: bool) -> None:
+        """Continue recording these envs after a version came in.
+
+        Args:
+            put_back: it goes on with episodes that are under way.
+        """
+        if not put_back:
             self.start_recording(env_idx, next_episode=one_each, goes_on=True)
         elif not self._recorder.recording:
             # No reset, which would lose the present moment: recording continues with each env's next episode.

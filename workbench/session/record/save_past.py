@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from workbench.core.camera_data import CameraKey, CameraSettings, differences
 from workbench.jobs.record.gather import EpisodeFinisher, GatheredEpisode
 from workbench.jobs.task import TaskDescription
 from workbench.recording.episode.columns import BatchPacker
@@ -204,9 +205,7 @@ class PastSaver:
                         if (writer := writers.get(episode.env)) is not None:
                             writer.set_source(moment.acted_by)
                         else:
-                            seed, task = seeds[episode.env], _as_played(what.task, episode)
-                            writer = GatheredEpisode.of(self._folder, task, episode.env, seed)
-                            writer.set_placed({p.key: p.settings for p in what.placed if p.settings})
+                            writer = self._begun(what, episode, seeds[episode.env])
                             writers[episode.env] = writer
                         writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
 
@@ -239,6 +238,16 @@ class PastSaver:
             + _earlier_text(earlier, len(made))
         )
 
+    def _begun(self, what: SaveRequest, episode: PastEpisode, seed: int) -> GatheredEpisode:
+        """The episode's recording, with what its source does not say of the pictures. Raises RecordingError."""
+        task = _as_played(what.task, episode)
+        observed_by = "" if task.source_hash == what.task.source_hash else what.task.source_hash
+        writer = GatheredEpisode.of(self._folder, task, episode.env, seed, observed_by=observed_by)
+        writer.set_placed(
+            {p.key: p.settings for p in what.placed if p.settings}, _cameras_in_source(what.task, episode)
+        )
+        return writer
+
     def _verified_seed(self, job: Job, episode: PastEpisode) -> int:
         """Its seed, if a reset of its env alone with it gives the first state; else -1.
 
@@ -270,6 +279,19 @@ def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:
     if played is None:
         return task
     return replace(task, file=played.file, source_hash=played.source_hash, source=played.source)
+
+
+def _cameras_in_source(task: TaskDescription, episode: PastEpisode) -> dict[CameraKey, CameraSettings]:
+    """Of the cameras that the running version has elsewhere than the one that played: what the latter said."""
+    now = {camera.key: camera.settings for camera in task.cameras}
+    played = () if episode.played_by is None else episode.played_by.cameras
+    return {
+        camera.key: camera.settings
+        for camera in played
+        if camera.settings is not None
+        and (here := now.get(camera.key)) is not None
+        and differences(camera.settings, here)
+    }
 
 
 def _unfinished_text(count: int, kept: int) -> str:

@@ -53,7 +53,7 @@ class Marks(PagePart[SessionView]):
 
     def urgent(self, view: SessionView) -> object:
         recording = view.recording
-        return recording.active, recording.env_idx, recording.episodes, moved_cameras(view)
+        return recording.active, recording.env_idx, recording.waiting, recording.episodes, moved_cameras(view)
 
     def draw(self, view: SessionView) -> None:
         rows = self._session.env_rows()
@@ -108,13 +108,14 @@ def recording_mark(view: SessionView, stop: str) -> dict[str, object] | None:
     # Nothing that changes with each step: the mark would be another element whenever somebody presses it.
     hint = f"Recording {envs_in_words(recording.env_idx)}."
     if recording.waiting:
-        hint += f" {counted(recording.waiting, 'env')} of them {'begins' if recording.waiting == 1 else 'begin'} with the next reset."
+        hint += f" {counted(recording.waiting, 'env')} of them {'begins' if recording.waiting == 1 else 'begin'} with the next reset: no step of {'it' if recording.waiting == 1 else 'them'} is recorded before."
     if view.selected_env not in recording.env_idx:
         hint += f" Env {view.selected_env}, which is selected, is not recorded."
+    every = len(recording.env_idx) == count > 1
     return {
-        "envs": f"all {count} envs"
-        if len(recording.env_idx) == count > 1
-        else envs_in_words(recording.env_idx, 2),
+        "envs": f"all {count} envs" if every else envs_in_words(recording.env_idx, 2),
+        "waiting": recording.waiting,
+        "all_wait": recording.waiting == len(recording.env_idx),
         "episodes": recording.episodes,
         "since": time.strftime("%H:%M", time.localtime(recording.since)),
         "stop": stop,

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Literal
 
 import viser
 
 from workbench.jobs.task import TaskDescription
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
+from workbench.session.record.live import RecordingStatus
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.live.timeline import ago_in_words, step_in_words
 from workbench.ui.live.version_panel import took
@@ -92,9 +94,16 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "plan": view.solve.plan if planning and not starting else None,
         "behind": moving and slow,
         "why_slow": slowed_by(view) if moving and slow else None,
-        "recording": view.recording.active,
+        "recording": _recording(view.recording),
         "robot": "" if task is None else robot_text(task),
     }
+
+
+def _recording(recording: RecordingStatus) -> Literal["", "waits", "on"]:
+    """Whether a step would be recorded, of any env."""
+    if not recording.active:
+        return ""
+    return "waits" if recording.waiting == len(recording.env_idx) else "on"
 
 
 def robot_text(task: TaskDescription) -> str:

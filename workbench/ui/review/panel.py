@@ -183,6 +183,7 @@ def facts_html(chosen: Opened, changed: str) -> str:
         changed=changed,
         most=MOST_OF_CODE,
         acted_by=acted_by_text(info.acted_by),
+        observed_by=info.observed_by,
         moved=moved_cameras_text(info.moved_cameras),
         assignments=assignments,
         local_time=local_time,
