@@ -176,10 +176,10 @@ def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_a
     page.get_by_role("tab", name="Run").click()
     expect(seed).to_have_value("0")
 
-    past.last.fill("7")
+    past.filter(visible=True).last.fill("7")
     page.keyboard.press("Enter")
     expect(said).to_have_text(re.compile(r"^Steps ago: it goes from -\d+ to 0\. It stays 0\.$"))
-    past.last.fill("-2")
+    past.filter(visible=True).last.fill("-2")
     page.keyboard.press("Enter")
     desk.timeline_says("2 steps ago")
     page.get_by_role("tab", name="Reward").click()

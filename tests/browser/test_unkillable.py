@@ -50,6 +50,9 @@ def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> No
 
 def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
     desk.tab("Run")
+    at = re.search(r"step \d+ / \d+", desk.page.locator(".wb-timeline").inner_text())
+    assert at is not None
+    where = at[0]
     provoke(desk.file, "evaluate", "native")
     desk.button("Step").click()
     desk.button("Interrupt").click()
@@ -57,7 +60,8 @@ def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
     expect(desk.button("Interrupt")).to_be_hidden()
     calm(desk.file)
     desk.button("Restart").click()
-    expect(desk.page.get_by_text(re.compile("is restored where it was"))).to_be_visible()
+    expect(desk.page.get_by_text("paused", exact=True)).to_be_visible()
+    desk.timeline_says(where)
     assert desk.opened.wait_for_line("worker failed.*stopped by hand in evaluate")
     # The new one is a fork, and so is the next spare: none has done the imports for itself.
     every = [Path(f"/proc/{pid}/cmdline").read_text() for pid in family(desk.opened.process.pid)]

@@ -120,6 +120,7 @@ class LiveState:
             step=event.first,
             load_milliseconds=sum(event.milliseconds.values()),
             reload=report,
+            timeline_cleared=past == "gone",
             activity="",
             stale=stale,
             failed_cameras=self.now.failed_cameras if restored else {},

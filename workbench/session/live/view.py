@@ -92,6 +92,8 @@ class SessionView:
     load_milliseconds: float = 0.0
     reload: ReloadReport | None = None
     """How the running version came in; None for the first."""
+    timeline_cleared: bool = False
+    """Whether the running version began another history."""
     loads: tuple[PastLoad, ...] = ()
     """The last loads, newest first."""
     choices: tuple[str, ...] = ()

@@ -92,7 +92,13 @@ class VersionPanel(PagePart[SessionView]):
         notices = () if task is None else task.notices
         refused = view.refused if view.state not in ("starting", "loading") else None
         self._html.content = version_html(
-            view.reload, view.load_milliseconds, task is not None, refused, notices, self._link
+            view.reload,
+            view.load_milliseconds,
+            task is not None,
+            refused,
+            notices,
+            self._link,
+            view.timeline_cleared,
         )
         self._loads_folder.visible = len(view.loads) > 1
         self._loads.content = loads_html(view.loads, self._link)
@@ -108,6 +114,7 @@ def version_html(
     refused: Problem | None = None,
     notices: tuple[str, ...] = (),
     link: LinkTo = no_links,
+    timeline_cleared: bool = False,
 ) -> str:
     """The panel's text about the running version, and about the file where that was refused.
 
@@ -118,6 +125,7 @@ def version_html(
         refused: why the file's present text does not run.
         notices: further notes for the author.
         link: links the line at which the file was refused.
+        timeline_cleared: with that load another history began.
     """
     return render(
         "version",
@@ -128,6 +136,7 @@ def version_html(
         notices=notices,
         most=MOST_SHOWN,
         link=link,
+        timeline_cleared=timeline_cleared,
     )
 
 
