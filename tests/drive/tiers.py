@@ -57,6 +57,17 @@ def pytest_itemcollected(item: pytest.Item) -> None:
         item.add_marker(MARKER_OF[fixture])
 
 
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """SAPIEN refuses the renderer while a material is alive that a test without one made: be first."""
+    if not session.config.getoption("fast") and any(
+        item.get_closest_marker("render") for item in session.items
+    ):
+        from workbench.core.backends import find_renderer, keep_render_device
+
+        if find_renderer() is not None:  # else each test that renders fails, with the reason
+            keep_render_device("cpu")
+
+
 class Guard:
     """Leaves out what is not fast, and fails what starts a process or makes a renderer without the fixture."""
 
