@@ -40,6 +40,7 @@ from workbench.jobs.actions import SOLVE, needed_by
 from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.episodes import RecordOptions, Written, with_given_actions
 from workbench.jobs.record.run import Recorded, RecordProgress, chunk_of, record
+from workbench.machine.text import rate_text
 from workbench.planning.report import underway_text
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
@@ -109,7 +110,7 @@ class RecordBar:
         seconds = max(time.monotonic() - self._began, 1e-3)
         self._bar.update(self._row, completed=now.done)
         if not self.stop_requested:
-            rate = f"{now.steps / seconds:.0f} steps a second"
+            rate = f"{rate_text(now.steps / seconds)} steps a second"
             at = "" if self._first_seed is None else underway_text(now.by_seed(self._first_seed), now.limit)
             failed = sum(len(failure.numbers) for failure in now.failures)
             doing = f"{self._doing}, {at or rate}" + (f", {failed} failed" if failed else "")

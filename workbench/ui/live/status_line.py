@@ -8,6 +8,7 @@ import time
 import viser
 
 from workbench.jobs.task import TaskDescription
+from workbench.machine.text import rate_text
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
 from workbench.ui.live.moment import MomentPart
@@ -117,7 +118,7 @@ def slowed_by(view: SessionView) -> tuple[str, str] | None:
     task, recorded, watched = view.task, view.recorded_share, view.watched_share
     if task is None or max(recorded, watched) < SLOWS:
         return None
-    rate = f"{counted(round(view.steps_per_second), 'step')} a second"
+    rate = f"{rate_text(view.steps_per_second)} steps a second"
     if recorded >= watched:
         cameras = counted(len(task.cameras) if task.can_render else 0, "camera")
         envs = counted(len(view.recording.env_idx), "env")
