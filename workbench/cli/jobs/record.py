@@ -130,8 +130,13 @@ _SAY_EVERY = 30.0
 def _ended_text(kept: Written | None) -> str:
     if kept is None:
         return "not kept"
-    ended = {None: "", True: ", success", False: ", no success"}[kept.success]
-    return f"{kept.steps} steps, return {kept.total_reward:.3f}{ended}"
+    return ", ".join((f"{kept.steps} steps", *_outcome_texts(kept)))
+
+
+def _outcome_texts(kept: Written) -> tuple[str, ...]:
+    """Its return and its success, as far as the task has them."""
+    earned = "no reward" if kept.total_reward is None else f"return {kept.total_reward:.3f}"
+    return (earned, *{None: (), True: ("success",), False: ("no success",)}[kept.success])
 
 
 def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> int:
@@ -177,6 +182,7 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
                     print_finding,
                     executor,
                     name,
+                    warn,
                 )
             record_bar.describe("recorded", len(recorded.written))
             status.end("stopped" if recorded.stopped else "done")
@@ -208,10 +214,7 @@ def _print_kept(requested: RecordOptions, before: set[Path]) -> None:
 def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
     """Print the episodes and what came of the request; returns the exit code."""
     for episode in recorded.written:
-        ended = {None: "", True: "success", False: "no success"}[episode.success]
-        print_text(
-            f"{episode.shown}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip()
-        )
+        print_text("  ".join((episode.shown, f"{episode.steps} steps", *_outcome_texts(episode))))
     kept = len(recorded.written)
     if requested.successes is not None:
         print_text(f"{kept} of {recorded.tried} episodes succeeded and were kept.")

@@ -85,6 +85,8 @@ class CurvesPanel(MomentPart):
             return
         self._task = "" if task is None else f"{task.file} {task.class_name}"
         entries = {entry_of(column): None for column in curves.columns}
+        if task is not None and task.reward_mode == "none":
+            entries.pop(entry_of(REWARD), None)
         chosen = [entry for entry in entries if self._is_on(entry)]
         self._draw_choice(list(entries), chosen)
         drawn = self._draw_charts(view, curves, chosen)
@@ -274,19 +276,13 @@ class NumberRow:
 def number_rows(
     step: StepResult, selected_env: int, max_episode_steps: int | None, reward_mode: str = ""
 ) -> list[NumberRow]:
-    """Elapsed steps, reward, success and fail first, then every other entry by its name."""
+    """Elapsed steps, reward if there is one, success and fail first, then every other entry by its name."""
     env = selected_env
     of = f" / {max_episode_steps}" if max_episode_steps else ""
-    rows = [
-        NumberRow("elapsed steps", f"{_item(step.elapsed_steps, env)}{of}", _batch(step.elapsed_steps)),
-        _earned_row(
-            "reward",
-            step.reward,
-            step,
-            env,
-            "" if reward_mode == "dense" else reward_mode.replace("_dense", ""),
-        ),
-    ]
+    rows = [NumberRow("elapsed steps", f"{_item(step.elapsed_steps, env)}{of}", _batch(step.elapsed_steps))]
+    if reward_mode != "none":
+        about = "" if reward_mode == "dense" else reward_mode.replace("_dense", "")
+        rows.append(_earned_row("reward", step.reward, step, env, about))
     first = [key for key in ("success", "fail") if key in step.evaluate]
     rest = sorted(key for key in [*step.evaluate, *step.others] if key not in first)
     shown = first + rest[: MOST_ROWS - len(first)]
