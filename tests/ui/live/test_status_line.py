@@ -23,6 +23,7 @@ def test_running_says_rates_envs_and_backend() -> None:
 
 def test_a_batch_that_steps_once_a_second_has_a_rate_too() -> None:
     text = html(running(1, steps_per_second=0.93, real_time_factor=0.0465, recorded_share=0.9))
+    assert "steps/s" not in html(running(1, steps_per_second=0.0)), "not known before the second step"
     assert "<b>0.93</b> steps/s" in text and "0.046 × real time" in text and "0.93 steps a second" in text
 
 

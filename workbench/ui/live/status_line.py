@@ -79,7 +79,10 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
     # A plan takes what it takes: rates of single steps would only say that it is slow.
     planning = moving and view.settings.action_source == "solve"
     starting = planning and view.solve.state == "starting"
-    slow = view.real_time_factor < 0.85 * view.settings.speed and view.settings.speed != float("inf")
+    known = view.steps_per_second > 0  # from the second step on
+    slow = (
+        known and view.real_time_factor < 0.85 * view.settings.speed and view.settings.speed != float("inf")
+    )
     return {
         "view": view,
         "state": view.state if busy is None else "loading",
@@ -89,7 +92,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "news": _news(view) if fresh else "",
         "at": step_in_words(view),
         "ago": ago_in_words(view.timeline),
-        "moving": moving and not planning,
+        "moving": moving and known and not planning,
         "plan": view.solve.plan if planning and not starting else None,
         "behind": moving and slow,
         "why_slow": slowed_by(view) if moving and slow else None,
