@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests.drive.session import TASKS
 from workbench.authoring.problem import TaskError
@@ -41,6 +42,22 @@ def test_a_task_that_is_written_for_one_env_is_told_the_option(line: str, code: 
         assert "--num-envs 1" in problem.message
         assert (problem.file, problem.code) == (str(file), code.strip())
     open_task(str(file), TaskOptions(1, env_kwargs=KWARGS)).env.close()
+
+
+def test_a_default_dtype_that_the_file_changed_is_told_where_no_line_of_it_fails(tmp_path: Path) -> None:
+    file = written(tmp_path, GOOD)
+    file.write_text(f"import torch\n\ntorch.set_default_dtype(torch.float64)\n{file.read_text()}")
+    before = torch.get_default_dtype()
+    try:
+        with pytest.raises(TaskError) as caught:
+            open_task(str(file), TaskOptions(1, env_kwargs=KWARGS))
+    finally:
+        torch.set_default_dtype(before)
+    problem = caught.value.problem
+    assert problem.line is None and "default dtype is torch.float64" in problem.message
+    with pytest.raises(TaskError) as caught:
+        open_task(str(written(tmp_path, WRONG)), TaskOptions(1, env_kwargs=KWARGS))
+    assert "dtype" not in caught.value.problem.message
 
 
 def test_what_fails_with_one_env_too_is_not_told_so(tmp_path: Path) -> None:

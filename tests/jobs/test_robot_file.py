@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from workbench.core.env import actions
+from workbench.jobs.open_task import open_task
+from workbench.jobs.record.episodes import RecordOptions
+from workbench.jobs.record.run import record
+from workbench.jobs.rescore.run import rescore
 from workbench.jobs.task import TaskOptions
+from workbench.recording.reader import reading
+from workbench.recording.reader.scan import scan_folder
 from workbench.session.protocol.messages import Load
 from workbench.session.worker.reload import Running, load_version
 
@@ -45,3 +53,31 @@ def test_a_robot_stands_in_the_scene_and_is_built_anew_by_a_save(tmp_path: Path)
             again.env.close()
     finally:
         opened.env.close()
+
+
+@pytest.mark.usefixtures("child_process")
+def test_a_record_of_it_has_no_return_and_says_in_which_scene_it_stands_and_how_long(tmp_path: Path) -> None:
+    file = tmp_path / "my_panda.py"
+    file.write_text(ROBOT.replace("my_panda", "its_panda"))
+    options = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})
+    what = RecordOptions(str(file), tmp_path / "out", episodes=2, pictures=False, options=options)
+    notices: list[str] = []
+    written = record(what, on_notice=notices.append).written
+    assert [(one.steps, one.total_reward, one.success) for one in written] == [(200, None, None)] * 2
+    shown, limit = notices
+    assert "MyPanda" in shown and "Empty-v1" in shown and "200" in limit
+    few = replace(what, out=tmp_path / "few", episodes=1, max_steps=3)
+    (one,) = record(few, on_notice=notices.append).written
+    assert one.steps == 3 and notices[2:] == [shown]
+    rows = [
+        row
+        for _, entries in reading.read_rows(few.out, scan_folder(few.out).found.values())
+        for row, _ in entries
+    ]
+    assert [(row.length, row.total_reward) for row in rows] == [(3, None)]
+    opened = open_task(str(file), replace(options, num_envs=1))
+    try:
+        (verdict,) = rescore(opened, reading.find_all_sources((few.out,)))
+    finally:
+        opened.env.close()
+    assert not verdict.why_not and not verdict.differs and verdict.has == ()

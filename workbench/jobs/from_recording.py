@@ -163,7 +163,7 @@ def run_of(episode: Episode, state: int | None = None) -> RecordedRun:
         action=np.asarray(episode.action, np.float32),
         env_states={name: np.asarray(rows) for name, rows in episode.env_states.items()},
         evaluate=dict(episode.evaluate),
-        reward=np.asarray(episode.reward, np.float32),
+        reward=np.asarray(episode.reward if info.has_reward else np.zeros(0), np.float32),
     )
     return run if state is None else run.until(state)
 

@@ -25,6 +25,11 @@ def number_text(value: float, form: str = ".4g") -> str:
     return format(value, form)
 
 
+def rate_text(value: float) -> str:
+    """A rate of zero or more, with two digits also where it is small: ``5 125``, ``240``, ``9.6``, ``0.93``, ``0.045``."""
+    return f"{value:,.0f}".replace(",", " ") if value >= 9.95 else f"{value:.2g}"
+
+
 def nonfinite_text(values: ArrayLike) -> str:
     """Counts of values that are not finite: ``NaN in 3 of 16``, ``NaN in 3, infinite in 1 of 16``; else empty."""
     flat = np.asarray(values).reshape(-1)

@@ -80,7 +80,10 @@ def test_a_file_that_does_not_parse_is_listed_if_it_is_a_task_that_somebody_is_w
 ) -> None:
     task(tmp_path / "broken.py", "class Push(BaseEnv):\n    def evaluate(self:\n")
     task(tmp_path / "noise.py", "BaseEnv ((((")
-    assert names(tmp_path) == ["broken.py"]
+    task(tmp_path / "open.py", "class Push(BaseEnv:\n")
+    task(tmp_path / "of_module.py", "class Push(sapien_env.BaseEnv, Mixin\n")
+    task(tmp_path / "registered.py", "@register_env('Push-v1')\nclass Push(Base:\n")
+    assert names(tmp_path) == ["broken.py", "of_module.py", "open.py", "registered.py"]
     assert names(tmp_path / "gone") == []
 
 

@@ -124,6 +124,7 @@ def test_a_misspelt_file_a_folder_and_another_kind_of_file_are_refused(write: Wr
     write("notes.txt", "hello")
     os.mkfifo(folder / "pipe.py")
     assert "push_cube.py" in refused(folder / "push_cub.py").message
+    assert "push_cube.py" not in refused(folder / "pull_cup.py").message, "a name that is not near"
     assert "is a folder" in refused(folder).message and "push_cube.py" in refused(folder).message
     assert "not a .py file" in refused(folder / "notes.txt").message
     assert "not an ordinary file" in refused(folder / "pipe.py").message

@@ -131,17 +131,23 @@ def test_the_oldest_pictures_go_first_and_are_gone_for_good() -> None:
     assert list(history.at(2).pictures) == [(1, "sensor", "eye")]
 
 
-def test_a_moment_that_is_gone_back_to_has_the_reward_of_its_record_in_each_env() -> None:
+def test_a_moment_that_is_gone_back_to_has_the_reward_and_its_terms_of_its_record_in_each_env() -> None:
+    reach = "reward_terms/reach"
     history = filled(1)
     for number in (1, 2, 3):
         step = stepped(number)
         step.step.reward[:] = [10 * number, 10 * number + 1, 10 * number + 2]
+        step.step.evaluate[reach] = step.step.reward / 2
         history.add(step)
     jump = stepped(4, jumped=(0, 2), restored=Restored((2, 0), (1, 2), 2, None, {}))
     moment = history.add(jump)
     assert moment.step.reward.tolist() == [22, 31, 21]
+    assert moment.step.evaluate[reach].tolist() == [11, 15.5, 10.5]
     gone = stepped(5, jumped=(1,), restored=Restored((1,), (0,), -7, None, {}))
-    assert np.array_equal(history.add(gone).step.reward, [22, np.nan, 21], equal_nan=True)
+    step = history.add(gone).step
+    assert np.array_equal(step.reward, [22, np.nan, 21], equal_nan=True)
+    assert np.array_equal(step.evaluate[reach], step.reward / 2, equal_nan=True)
+    assert reach not in history.add(stepped(0, jumped=(0, 1, 2))).step.evaluate, "no env has a term"
 
 
 def test_a_worker_that_came_back_with_the_moment_at_which_the_last_one_died_keeps_its_reward() -> None:

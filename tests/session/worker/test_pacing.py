@@ -69,4 +69,13 @@ def test_the_rate_is_that_of_the_last_second() -> None:
     for i in range(100):
         rate.tick(i * 0.02)
     assert rate.per_second(1.98) == pytest.approx(50)
-    assert rate.per_second(10.0) == 0.0
+    assert rate.per_second(11.98) == pytest.approx(0.1), "the next one takes ten seconds already"
+
+
+def test_events_that_are_further_apart_than_the_window_have_a_rate() -> None:
+    rate = Rate(window=1.0)
+    seen = []
+    for i in range(4):
+        rate.tick(i * 1.25)
+        seen += [rate.per_second(i * 1.25), rate.per_second(i * 1.25 + 1.1)]
+    assert seen[2:] == pytest.approx([0.8] * 6)

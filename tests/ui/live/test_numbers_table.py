@@ -149,3 +149,8 @@ def test_names_from_the_author_s_file_are_escaped() -> None:
     html = render("numbers", rows=rows, env=0, num_envs=4, has_success=False)
     assert "<script>" not in html
     assert "&lt;script&gt;" in html
+
+
+def test_a_task_without_a_reward_has_no_row_for_it() -> None:
+    names = [[row.name for row in number_rows(step_of(POSES), 0, 50, mode)] for mode in ("dense", "none")]
+    assert "reward" in names[0] and "reward" not in names[1]

@@ -25,7 +25,10 @@ def episode(env: int = 0, **changes: Any) -> Verdict[PastRun]:
     """An episode of fifty moments that differs at its fifth step."""
     run = PastRun(env, 0, 10 * env + np.arange(50))
     reward = {"first_difference": 5, "look_at": 5, "differing": ("reward",), "largest": 0.25}
-    return replace(Verdict(run, length=49, returns=(1.0, 2.0), metres=0.0), **{**reward, **changes})
+    return replace(
+        Verdict(run, length=49, returns=(1.0, 2.0), metres=0.0, has=("reward", "fail")),
+        **{**reward, **changes},
+    )
 
 
 def same(env: int = 0, **changes: Any) -> Verdict[PastRun]:
@@ -109,9 +112,19 @@ def test_outcomes_are_said_before_rewards() -> None:
     assert verdict_text.change_text(episode()) == "reward by up to 0.25, from step 5"
 
 
+def test_a_task_without_a_reward_has_no_return_to_tell() -> None:
+    none, flags = same(0, has=()), same(0, has=("success", "fail"))
+    assert "reward" not in verdict_text.headline([flags]) and "success and fail" in verdict_text.headline(
+        [flags]
+    )
+    assert "there is no reward" in verdict_text.headline([none])
+    assert verdict_text.totals([none]) == [] and "return" not in "".join(verdict_text.totals([flags]))
+    assert verdict_text.returns_text(none) == ""
+
+
 def test_nothing_that_differs_is_one_sentence() -> None:
     both = same(0), same(1)
-    says = "Nothing differs in 2 episodes: reward, success and fail are unchanged."
+    says = "Nothing differs in 2 episodes: reward and fail are unchanged."
     assert verdict_text.headline(both) == says and verdict_text.totals(both) == ["mean return: 1"]
     assert verdict_text.headline([same(0), same(1, differing=("height",))]).endswith(
         "Other entries differ: height."

@@ -11,9 +11,11 @@ import pytest
 import viser
 
 from tests.drive.panels import Panels
+from tests.ui.env_rows import rows_of
 from tests.ui.scenes import PLAN, problem, running
 from workbench.core.env.keywords import HowMade, Keyword
 from workbench.planning.options import PlanOptions
+from workbench.session.history.env_table import EnvRows
 from workbench.session.live.solver import SolveView
 from workbench.session.live.view import SessionView
 from workbench.session.process.job_lane import JobProgress
@@ -38,7 +40,6 @@ SOLVED = SolveView(
     plan_step=2,
     predicted=np.array([0.5, 0.6, 0.9], np.float32),
     achieved=np.array([0.4, 0.6, 0.8], np.float32),
-    total_reward=1.8,
     solved_at=3,
     solved=((0, 3),),
     steps_per_second=5125.0,
@@ -55,6 +56,9 @@ class RecordedSession:
 
     def view(self) -> SessionView:
         return self.shown
+
+    def env_rows(self) -> EnvRows:
+        return rows_of()
 
     def change(self, **settings: Any) -> None:
         self.asked.append(settings)
@@ -99,7 +103,7 @@ def test_it_tells_what_the_rollouts_earned_and_what_came_of_it(shown: Shown) -> 
     for told in (
         "Env 0 is solved at step 3",
         "3.5",
-        "has earned <b>1.8</b> in 3 steps",
+        "has earned <b>1</b> in 3 steps",
         "last plan, carried on",
         "5 rollouts in 0.25 s",
         "5 125 env-steps/s",
@@ -112,23 +116,25 @@ def test_it_tells_what_the_rollouts_earned_and_what_came_of_it(shown: Shown) -> 
     ]
 
 
-def test_an_episode_that_was_under_way_before_says_since_when_it_is_known() -> None:
-    assert "Since step 6 this episode has earned <b>1.8</b> in 3 steps" in solve_html(
-        replace(SOLVED, begins=6), 2
-    )
+def test_what_the_episode_earned_is_what_the_table_of_envs_says_also_where_planning_began_later() -> None:
+    later = replace(SOLVED, begins=6)
+    assert "has earned <b>3</b> in 30 steps" in solve_html(later, rows_of(), 5)
+    assert "has earned <b>20</b> in 33 steps" in solve_html(later, rows_of(), 1), "until the end"
+    assert "has earned" not in solve_html(later, rows_of(), 3), "it was not followed from its start"
 
 
 def test_without_a_plan_it_says_what_to_press_and_why_there_is_none() -> None:
-    assert "Press <i>Play</i>" in solve_html(SolveView(), 2)
-    assert "building envs" in solve_html(SolveView("starting", activity="building envs"), 2)
-    failed = solve_html(SolveView("failed", why="it is <b>random", problem=problem()), 2)
+    assert "Press <i>Play</i>" in solve_html(SolveView(), None, 0)
+    assert "building envs" in solve_html(SolveView("starting", activity="building envs"), None, 0)
+    failed = solve_html(SolveView("failed", why="it is <b>random", problem=problem()), None, 0)
     assert "There is no plan: it is &lt;b&gt;random: KeyError" in failed and "push.py:88" in failed
 
 
 def test_rollouts_that_earn_the_same_are_told() -> None:
     flat = replace(PLAN, returns=np.ones(5, np.float32), success_at=np.zeros(5, np.int32))
-    assert "nothing leads on" in solve_html(replace(SOLVED, plan=flat), 1)
-    assert "nothing leads on" not in solve_html(SOLVED, 1) and "Solved at step 3" in solve_html(SOLVED, 1)
+    assert "nothing leads on" in solve_html(replace(SOLVED, plan=flat), None, 0)
+    solved = solve_html(SOLVED, None, 0)
+    assert "nothing leads on" not in solved and "Solved at step 3" in solved
 
 
 def test_sliders_ask_for_other_plans(shown: Shown) -> None:

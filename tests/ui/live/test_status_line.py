@@ -21,6 +21,12 @@ def test_running_says_rates_envs_and_backend() -> None:
     )
 
 
+def test_a_batch_that_steps_once_a_second_has_a_rate_too() -> None:
+    text = html(running(1, steps_per_second=0.93, real_time_factor=0.0465, recorded_share=0.9))
+    assert "steps/s" not in html(running(1, steps_per_second=0.0)), "not known before the second step"
+    assert "<b>0.93</b> steps/s" in text and "0.046 × real time" in text and "0.93 steps a second" in text
+
+
 def test_while_actions_are_planned_it_says_so_and_how_long_a_plan_takes() -> None:
     def planning(**solve: Any) -> str:
         view = running(4, steps_per_second=0.3, real_time_factor=0.01, solve=SolveView(**solve))

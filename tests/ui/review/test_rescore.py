@@ -60,7 +60,7 @@ def test_success_is_said_before_rewards_and_what_is_the_same_is_said_to_be() -> 
 def test_all_of_them_are_one_sentence() -> None:
     many = [
         verdict("a"),
-        verdict("b", success=(None, 3), has_success=True, first_difference=3, returns=(1.0, 5.0)),
+        verdict("b", success=(None, 3), has=("reward", "success"), first_difference=3, returns=(1.0, 5.0)),
         verdict("c", why_not="x"),
     ]
     assert verdict_text.summary(many) == (

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
+import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.authoring.loading.load import LoadedTask
@@ -21,6 +23,8 @@ from workbench.authoring.problem import (
 from workbench.core.broken_rule import WrongReturn
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.error_notes import AuthorCall
+
+_DTYPE_AT_START = torch.get_default_dtype()
 
 
 class blamed:
@@ -56,9 +60,15 @@ class blamed:
         loaded = self._loaded
         if isinstance(error, WrongReturn):
             return problem_from_return(loaded.cls, error.hook, error.problem, loaded.source_files)
-        return self._wrong_return(error) or problem_from_exception(
+        problem = self._wrong_return(error) or problem_from_exception(
             error, self._stage, loaded.source_files, loaded.cls
         )
+        dtype = torch.get_default_dtype()
+        if problem.line is not None or dtype == _DTYPE_AT_START:
+            return problem
+        # It fails in ManiSkill's lines, far from the one that changed it.
+        was = f"torch's default dtype is {dtype}, and was {_DTYPE_AT_START} before the task was imported"
+        return replace(problem, message=f"{problem.message} ({was})")
 
     def _wrong_return(self, error: BaseException) -> Problem | None:
         """What ``evaluate`` returns and ManiSkill cannot use, if `error` comes from ManiSkill's use of it."""

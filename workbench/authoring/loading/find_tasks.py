@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -110,6 +111,10 @@ def find_task_files(
     return FoundTasks(tuple(found), left_out)
 
 
+_BEGUN = re.compile(rb"^[ \t]*(class[ \t][^(\n]*\([^)\n]*\bBaseEnv\b|@[\w.]*\bregister_env\b)", re.MULTILINE)
+"""In a text that does not parse: most likely a task that somebody is writing."""
+
+
 def read_task_file(path: Path) -> TaskFile | None:
     """What the text of a file says about its tasks; None if it has none, or cannot be read."""
     try:
@@ -125,9 +130,8 @@ def read_task_file(path: Path) -> TaskFile | None:
             warnings.simplefilter("ignore")
             tree = parse_python(raw)
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        # A broken file that names BaseEnv most likely is a task that somebody is writing.
         line = error.lineno if isinstance(error, SyntaxError) else None
-        return TaskFile(path, (), (), not_python=True, line=line) if b"(BaseEnv)" in raw else None
+        return TaskFile(path, (), (), not_python=True, line=line) if _BEGUN.search(raw) else None
     ids, classes = _tasks_of(tree)
     return TaskFile(path, ids, classes) if classes else None
 

@@ -132,8 +132,10 @@ def check_task_file(file: Path) -> None:
 def _missing(file: Path) -> TaskError:
     if not file.parent.is_dir():
         return task_error(f"{file} does not exist, nor does its folder {file.parent}")
-    names = difflib.get_close_matches(file.name, [path.name for path in file.parent.glob("*.py")], n=3)
-    hint = f"; did you mean {' or '.join(names)}?" if names else ""
+    # By stems: with the suffix, short names that share nothing else are alike.
+    stems = [path.stem for path in file.parent.glob("*.py")]
+    near = difflib.get_close_matches(file.stem, stems, n=3, cutoff=0.7)
+    hint = f"; did you mean {' or '.join(f'{stem}.py' for stem in near)}?" if near else ""
     return task_error(f"{file} does not exist{hint}")
 
 

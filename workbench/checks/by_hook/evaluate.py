@@ -129,14 +129,15 @@ def see_success_stays_possible(checkup: Checkup) -> Iterator[Seen]:
         for episodes in checkup.rollouts:
             reached = int(_flag(episodes, "success").any(axis=0).sum())
             yield Seen((episodes.kind,), tried=len(episodes.seeds), count=reached)
-    if not sparse:
-        yield Seen(("not sparse",))
 
 
 def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     for row in rows[:1]:
         if not row.names and not row.count:
-            yield Note("evaluate() has neither success nor fail, so no success rate can be counted")
+            raise NotApplicable(
+                "its reward is not the sparse one of ManiSkill, and evaluate() has neither success nor fail: no success rate "
+                "can be counted"
+            )
         elif not row.names:
             yield Found(
                 "evaluate() returns neither success nor fail, from which the sparse reward is made: it is always 0. Return "
@@ -146,8 +147,6 @@ def success_stays_possible(rows: Sequence[Seen]) -> Iterator[Found | Note]:
     for row in together(rows):
         if row.tried:
             yield Note(f"success in {of(row.count, row.tried, f'{row.names[0]} episode')}")
-    if any(row.names == ("not sparse",) for row in rows):
-        raise NotApplicable("its reward is not the sparse one of ManiSkill")
 
 
 def entry_name(checkup: Checkup) -> Iterator[Found | Note]:

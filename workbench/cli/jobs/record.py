@@ -40,6 +40,7 @@ from workbench.jobs.actions import SOLVE, needed_by
 from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.episodes import RecordOptions, Written, with_given_actions
 from workbench.jobs.record.run import Recorded, RecordProgress, chunk_of, record
+from workbench.machine.text import rate_text
 from workbench.planning.report import underway_text
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.publish import try_folder
@@ -109,7 +110,7 @@ class RecordBar:
         seconds = max(time.monotonic() - self._began, 1e-3)
         self._bar.update(self._row, completed=now.done)
         if not self.stop_requested:
-            rate = f"{now.steps / seconds:.0f} steps a second"
+            rate = f"{rate_text(now.steps / seconds)} steps a second"
             at = "" if self._first_seed is None else underway_text(now.by_seed(self._first_seed), now.limit)
             failed = sum(len(failure.numbers) for failure in now.failures)
             doing = f"{self._doing}, {at or rate}" + (f", {failed} failed" if failed else "")
@@ -129,8 +130,13 @@ _SAY_EVERY = 30.0
 def _ended_text(kept: Written | None) -> str:
     if kept is None:
         return "not kept"
-    ended = {None: "", True: ", success", False: ", no success"}[kept.success]
-    return f"{kept.steps} steps, return {kept.total_reward:.3f}{ended}"
+    return ", ".join((f"{kept.steps} steps", *_outcome_texts(kept)))
+
+
+def _outcome_texts(kept: Written) -> tuple[str, ...]:
+    """Its return and its success, as far as the task has them."""
+    earned = "no reward" if kept.total_reward is None else f"return {kept.total_reward:.3f}"
+    return (earned, *{None: (), True: ("success",), False: ("no success",)}[kept.success])
 
 
 def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> int:
@@ -176,6 +182,7 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
                     print_finding,
                     executor,
                     name,
+                    warn,
                 )
             record_bar.describe("recorded", len(recorded.written))
             status.end("stopped" if recorded.stopped else "done")
@@ -207,10 +214,7 @@ def _print_kept(requested: RecordOptions, before: set[Path]) -> None:
 def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
     """Print the episodes and what came of the request; returns the exit code."""
     for episode in recorded.written:
-        ended = {None: "", True: "success", False: "no success"}[episode.success]
-        print_text(
-            f"{episode.shown}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip()
-        )
+        print_text("  ".join((episode.shown, f"{episode.steps} steps", *_outcome_texts(episode))))
     kept = len(recorded.written)
     if requested.successes is not None:
         print_text(f"{kept} of {recorded.tried} episodes succeeded and were kept.")

@@ -40,6 +40,7 @@ from workbench.cli.terminal.output import (
     progress_bar,
     refuse,
     stdout_to_stderr,
+    warn,
 )
 from workbench.core.rules import FailOn, fails
 from workbench.jobs.pool.deal import Failure
@@ -122,6 +123,7 @@ def solve_in_terminal(what: SolveOptions, output: SolveOutput, run: JobArguments
                     executor,
                     run=name,
                     on_failures=failures.extend,
+                    on_notice=warn,
                 )
             shown.describe("solved", len(report.seeds))
             status.end("stopped" if report.stopped else "done")

@@ -37,6 +37,7 @@ from workbench.cli.terminal.output import (
     print_text,
     progress_bar,
     refuse,
+    warn,
 )
 from workbench.jobs.actions import needed_by
 from workbench.jobs.pool.job_file import JobKey, job_of
@@ -153,6 +154,7 @@ def sweep_in_terminal(what: SweepOptions, output: SweepOutput, run: JobArguments
                     print_finding,
                     executor,
                     name,
+                    warn,
                 )
             shown.describe("swept", len(report.results.episodes))
             status.end("stopped" if report.stopped else "done")

@@ -37,7 +37,7 @@ class RecordedRun:
     evaluate: dict[str, NDArray] = field(default_factory=dict)
     """(T + 1, ...) every entry that ``evaluate`` returned."""
     reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
-    """(T,)"""
+    """(T,); empty where the task had none."""
 
     @property
     def length(self) -> int:

@@ -112,6 +112,8 @@ class RecordUpdate:
     """What it does before its first episode."""
     underway: Underway | None = None
     finding: Finding | None = None
+    notice: str = ""
+    """About the task, as a sentence."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,8 @@ class Written:
     """Its .rrd; the .h5 and .json have the same name."""
     seed: int
     steps: int
-    total_reward: float
+    total_reward: float | None
+    """None for a task without a reward."""
     success: bool | None
     """At its last state; None for a task without ``success``."""
     start_corrected: bool = False
@@ -245,6 +248,8 @@ def _open(what: RecordOptions, options: TaskOptions, queue: ItemQueue) -> Opened
         on_activity=lambda activity: queue.send_update(RecordUpdate(activity)),
         on_finding=lambda finding: queue.send_update(RecordUpdate(finding=finding)),
     )
+    for notice in opened.loaded.notices if opened.loaded.followed else ():
+        queue.send_update(RecordUpdate(notice=notice))
     if what.pictures:
         for finding in findings_of_shaders(opened.description.cameras):
             queue.send_update(RecordUpdate(finding=finding))
@@ -276,6 +281,9 @@ class _Episodes:
         self._opened, self._what, self._given, self._queue = opened, what, given, queue
         self._run, self._first, self._folder = run, first, folder
         limit = what.max_steps or opened.description.max_episode_steps or STEPS_WITHOUT_LIMIT
+        if not (given or what.max_steps or opened.description.max_episode_steps):
+            text = f"{opened.loaded.env_id} has no time limit: each episode has {limit} steps. --max-steps sets another number."
+            queue.send_update(RecordUpdate(notice=text))
         if given:
             limit = min(max(run.length for run in given), what.max_steps or 10**9)
         self._limit = limit
@@ -393,7 +401,7 @@ class _Episodes:
                     files.rrd,
                     episode.seed,
                     episode.steps,
-                    episode.total_reward,
+                    episode.total_reward if self._opened.env.env.reward_mode != "none" else None,
                     episode.success,
                     start_corrected,
                     self._plans.pop(number, None),

@@ -88,6 +88,7 @@ def record(
     on_finding: Callable[[Finding], None] = warn_of,
     executor: Executor | None = None,
     run: str = "",
+    on_notice: Callable[[str], None] = lambda notice: None,
 ) -> Recorded:
     """Record into ``what.out``.
 
@@ -100,6 +101,7 @@ def record(
         stop: called between steps; after True the finished episodes are kept, and the others dropped.
         executor: None for this process, or for spawned processes with several workers.
         run: as of `RecordSetup`, where the job goes on.
+        on_notice: called with what the author should know of the task, each sentence once.
 
     Raises:
         TaskError: the task cannot be opened, or fails in every chunk of episodes, or in several alike one after another.
@@ -108,7 +110,7 @@ def record(
         FileNotFoundError, ValueError: the request is invalid.
     """
     what, given = with_given_actions(what)
-    recording = _Recording(what, on_activity, on_progress, stop, on_finding)
+    recording = _Recording(what, on_activity, on_progress, stop, on_finding, on_notice)
     run_items = record_items
     if executor is None:
         executor = ThisProcess() if what.workers == 1 else Processes(what.workers)
@@ -126,7 +128,12 @@ def collect(what: RecordOptions, known: Mapping[int, Written | None]) -> Recorde
         what: as `with_given_actions` completes it.
     """
     recording = _Recording(
-        what, lambda activity: None, lambda progress: None, lambda: False, lambda finding: None
+        what,
+        lambda activity: None,
+        lambda progress: None,
+        lambda: False,
+        lambda finding: None,
+        lambda _: None,
     )
     recording.deal.go_on(known, lambda number, written: None)
     return recording.so_far(stopped=False)
@@ -168,13 +175,18 @@ def do_record(
 class ToldByWorkers:
     """What the workers of a job tell of its episodes, for its progress."""
 
-    def __init__(self, on_activity: Callable[[str], None], on_finding: Callable[[Finding], None]) -> None:
-        self._on_activity, self._on_finding = on_activity, on_finding
+    def __init__(
+        self,
+        on_activity: Callable[[str], None],
+        on_finding: Callable[[Finding], None],
+        on_notice: Callable[[str], None],
+    ) -> None:
+        self._on_activity, self._on_finding, self._on_notice = on_activity, on_finding, on_notice
         self._running: dict[int, int] = {}
         """Control steps so far of each item under way."""
         self._steps = self._limit = 0
         self._found: set[object] = set()
-        """Findings of all workers, to report each once."""
+        """Findings and notices of all workers, to report each once."""
         self._failures: tuple[Failure, ...] = ()
 
     def take(self, update: RecordUpdate) -> bool:
@@ -184,6 +196,9 @@ class ToldByWorkers:
         if (finding := update.finding) is not None and finding.key not in self._found:
             self._found.add(finding.key)
             self._on_finding(finding)
+        if update.notice and update.notice not in self._found:
+            self._found.add(update.notice)
+            self._on_notice(update.notice)
         if (underway := update.underway) is None:
             return False
         self._steps, self._limit = self._steps + underway.made, underway.limit
@@ -234,10 +249,12 @@ class _Recording:
         on_progress: Callable[[RecordProgress], None],
         stop: Callable[[], bool],
         on_finding: Callable[[Finding], None],
+        on_notice: Callable[[str], None],
     ) -> None:
         self._out, self._folder, self._wanted = what.out, what.out.absolute(), what.successes
         self._upload = what.upload
-        self._on_progress, self._told = on_progress, ToldByWorkers(on_activity, on_finding)
+        self._on_progress = on_progress
+        self._told = ToldByWorkers(on_activity, on_finding, on_notice)
         self._kept: dict[int, Written] = {}
         self._ended = 0
         most = what.episodes if what.successes is None else what.tries

@@ -73,6 +73,7 @@ def solve(
     on_report: Callable[[SolveReport], None] = lambda report: None,
     run: str = "",
     on_failures: Callable[[Sequence[Failure]], None] = lambda failures: None,
+    on_notice: Callable[[str], None] = lambda notice: None,
 ) -> SolveReport:
     """Solve, recording every episode.
 
@@ -92,7 +93,7 @@ def solve(
             so_far = [done[number] for number in sorted(done)]
             on_report(_report(what, so_far, time.monotonic() - began, stopped=False))
 
-    recorded = record(what.recording(), on_activity, noted, stop, on_finding, executor, run)
+    recorded = record(what.recording(), on_activity, noted, stop, on_finding, executor, run, on_notice)
     if recorded.failures:
         on_failures(recorded.failures)
     return report_of(what, recorded, time.monotonic() - began)
@@ -108,18 +109,19 @@ def _report(what: SolveOptions, recorded: Sequence[Written], seconds: float, sto
     for written in recorded:
         assert written.planned is not None
         planned.append(written.planned)
+    totals = [total for written in recorded if (total := written.total_reward) is not None]
     rows = [
         SolvedSeed(
             written.seed,
             episode.solved_at,
             written.steps,
-            written.total_reward,
+            total,
             episode.plan_seconds,
             in_the_way(episode, planned),
             written.path,
             episode.cut_off,
         )
-        for written, episode in zip(recorded, planned, strict=True)
+        for written, episode, total in zip(recorded, planned, totals, strict=True)
     ]
     report = SolveReport(tuple(rows), (), seconds, stopped, what.seeds)
     return replace(report, verdicts=tuple(of_episodes(planned))) if report.tells else report

@@ -221,6 +221,7 @@ def sweep(
     on_finding: Callable[[Finding], None] = warn_of,
     executor: Executor | None = None,
     run: str = "",
+    on_notice: Callable[[str], None] = lambda notice: None,
 ) -> SweepReport:
     """Record every point of a sweep. A point that fails is told in its rows.
 
@@ -234,7 +235,7 @@ def sweep(
     recordings = recordings_of(what)
     if executor is None:
         executor = ThisProcess() if what.workers == 1 else Processes(what.workers)
-    collected = _Sweep(what, on_activity, on_progress, stop, on_finding)
+    collected = _Sweep(what, on_activity, on_progress, stop, on_finding, on_notice)
     do_record(recordings, what.stride, run, executor, collected.deal)
     collected.deal.require_results()
     return collected.report(stop())
@@ -242,7 +243,7 @@ def sweep(
 
 def collect_sweep(what: SweepOptions, known: Mapping[int, Written | None]) -> SweepReport:
     """The sweep of which these episodes are known. Runs nothing."""
-    collected = _Sweep(what, lambda _: None, lambda _: None, lambda: False, lambda _: None)
+    collected = _Sweep(what, lambda _: None, lambda _: None, lambda: False, lambda _: None, lambda _: None)
     collected.deal.go_on(known, lambda number, written: None)
     return collected.report(stopped=False)
 
@@ -257,9 +258,11 @@ class _Sweep:
         on_progress: Callable[[RecordProgress], None],
         stop: Callable[[], bool],
         on_finding: Callable[[Finding], None],
+        on_notice: Callable[[str], None],
     ) -> None:
         self._what, self._points, self._stride = what, what.points, what.stride
-        self._on_progress, self._told = on_progress, ToldByWorkers(on_activity, on_finding)
+        self._on_progress = on_progress
+        self._told = ToldByWorkers(on_activity, on_finding, on_notice)
         self._rows: dict[int, SweepEpisode] = {}
         self._kept = 0
         """Rows that are no failures."""

@@ -40,6 +40,8 @@ class _Rescoring:
     """What cannot be read or put into the env, with the reason."""
     damaged: bool = False
     start_differs: bool = False
+    has_reward: bool = True
+    """Of today's code."""
     reward: list[float] = field(default_factory=list)
     """(T,) new rewards."""
     evaluate: dict[str, list[float]] = field(default_factory=dict)
@@ -55,12 +57,13 @@ class _Rescoring:
     def verdict(self) -> Verdict[Source]:
         run = self.run
         # A recording of other software without rewards: nothing to compare with.
-        old = np.zeros(0) if np.isnan(run.reward).all() else run.reward
+        had_reward = not np.isnan(run.reward).all()
+        old = run.reward if had_reward else np.zeros(0)
         now = {name: np.array(rows) for name, rows in self.evaluate.items()}
         return compare(
             self.file,
-            Scores(old, scalar_entries(run.evaluate)),
-            Scores(np.array(self.reward), now),
+            Scores(old, scalar_entries(run.evaluate), had_reward),
+            Scores(np.array(self.reward), now, self.has_reward),
             np.array(self.drift) if run.env_states else None,
             task=self.task,
             seed=run.seed,
@@ -184,6 +187,7 @@ def _begin(opened: OpenedTask, rescorings: dict[int, _Rescoring]) -> None:
         first = task.rescore()
     now = read_states(task.env)
     for env, rescoring in rescorings.items():
+        rescoring.has_reward = task.env.reward_mode != "none"
         rescoring.start_differs = beginnings[env].differs
         rescoring.missed = beginnings[env].missed | rescoring.missed
         _add_scores(rescoring, first, env, now)

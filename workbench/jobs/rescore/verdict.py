@@ -18,7 +18,7 @@ SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
 DOUBTFUL_METRES, DOUBTFUL_RADIANS = 1e-3, 1e-2
 """A body further than this from the recorded state makes a comparison doubtful."""
 FLAGS = ("success", "fail")
-_MAIN = ("reward", *FLAGS)
+MAIN = ("reward", *FLAGS)
 Of = TypeVar("Of")
 
 
@@ -30,6 +30,8 @@ class Scores:
     """(T,); empty if none was recorded."""
     evaluate: Mapping[str, NDArray]
     """(T + 1,) each; NaN in a state without it."""
+    has_reward: bool = True
+    """False for a task without a reward (``reward_mode="none"``), whose `reward` is zeros."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,8 @@ class Verdict(Generic[Of]):
     success: tuple[int | None, int | None] = (None, None)
     """The first step of the episode after which it was true, then and now; None if never."""
     fail: tuple[int | None, int | None] = (None, None)
-    has_success: bool = False
+    has: tuple[str, ...] = ("reward",)
+    """Those of reward, success and fail that the record or today's code has."""
     returns: tuple[float, float] = (0.0, 0.0)
     largest: float = 0.0
     """The largest change of one reward."""
@@ -77,6 +80,10 @@ class Verdict(Generic[Of]):
     new_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
     @property
+    def has_success(self) -> bool:
+        return "success" in self.has
+
+    @property
     def differs(self) -> bool:
         """Whether reward, success or fail differs."""
         return self.first_difference is not None
@@ -84,7 +91,7 @@ class Verdict(Generic[Of]):
     @property
     def others(self) -> tuple[str, ...]:
         """`differing` without reward, success and fail."""
-        return tuple(name for name in self.differing if name not in _MAIN)
+        return tuple(name for name in self.differing if name not in MAIN)
 
     @property
     def drifted(self) -> bool:
@@ -115,6 +122,8 @@ def compare(
         begin: steps of the episode before the run.
     """
     steps = len(new.reward)
+    has = {"reward": old.has_reward or new.has_reward}
+    has |= {name: name in old.evaluate or name in new.evaluate for name in FLAGS}
     both = [n for n, values in new.evaluate.items() if len(old.evaluate.get(n, ())) >= len(values)]
     names = ("reward", *both)
     # In one array, since this runs for hundreds of runs several times a second.
@@ -134,8 +143,8 @@ def compare(
         flags = [_flag(scores.evaluate.get(name), steps + 1) for scores in (old, new)]
         others[name] = (flags[0] != flags[1]).nonzero()[0]
         turned[name] = _first(flags[0], begin), _first(flags[1], begin)
-    differing = tuple(name for name in dict.fromkeys((*_MAIN, *new.evaluate)) if len(others.get(name, ())))
-    first = min((begin + int(others[name][0]) for name in _MAIN if name in differing), default=None)
+    differing = tuple(name for name in dict.fromkeys((*MAIN, *new.evaluate)) if len(others.get(name, ())))
+    first = min((begin + int(others[name][0]) for name in MAIN if name in differing), default=None)
     look_at = first
     if "reward" in differing:
         look_at = begin + int(apart[0].argmax())
@@ -154,7 +163,7 @@ def compare(
         length=steps,
         success=turned["success"],
         fail=turned["fail"],
-        has_success="success" in old.evaluate or "success" in new.evaluate,
+        has=tuple(name for name, there in has.items() if there),
         returns=(float(was[0, 1:].sum()), float(np.asarray(new.reward, np.float64).sum())),
         largest=float(apart[0].max()),
         first_difference=first,

@@ -111,6 +111,11 @@ class EpisodeInfo:
     seal: Seal | None = field(default=None, compare=False)
     """Set when read from a recording."""
 
+    @property
+    def has_reward(self) -> bool:
+        """False for a task without a reward: ManiSkill's is 0 then."""
+        return self.env_kwargs.get("reward_mode") != "none"
+
 
 @dataclass
 class CameraTrack:

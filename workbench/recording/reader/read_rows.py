@@ -125,6 +125,8 @@ def _workbench_entry(found: RecordingFiles, document: Document) -> LibraryEntry:
 
 def _episode(kind: RecordingKind, data: dict[str, Any], if_undated: float) -> Facts:
     """Facts of a workbench episode; its ``.json`` and ``.rrd`` use the same names."""
+    made = data.get("env_kwargs")
+    has_reward = not (isinstance(made, dict) and made.get("reward_mode") == "none")
     return Facts(
         kind,
         task=clean_text(data.get("task")),
@@ -134,7 +136,7 @@ def _episode(kind: RecordingKind, data: dict[str, Any], if_undated: float) -> Fa
         env_index=integer(data.get("env_index")),
         length=integer(data.get("length")),
         max_episode_steps=integer(data.get("max_episode_steps")),
-        total_reward=total(data.get("return")),
+        total_reward=total(data.get("return")) if has_reward else None,
         success=boolean(data.get("success")),
         success_once=boolean(data.get("success_once")),
         fail=boolean(data.get("fail")),

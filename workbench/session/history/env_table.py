@@ -67,7 +67,7 @@ class EnvRows:
     total: NDArray[np.float64]
     """(N,) undiscounted return so far; NaN after a NaN reward."""
     followed: NDArray[np.bool_]
-    """(N,) whether the episode was followed from its start; otherwise `total` is NaN."""
+    """(N,) whether `total` is known: the task has a reward, and the episode was followed from its start."""
     first: Mapping[Hashable, NDArray[np.int32]]
     """(N,) the first step at which it was true (0: after the reset); -1: never. By bool entry of ``evaluate``, by
     `OutlierKind`, also of a rule that is off."""
@@ -118,6 +118,7 @@ class EnvTable:
         count = len(first.reward)
         never, nothing = np.full(count, -1, np.int32), np.zeros(count)
         zero, none = np.zeros(count, np.int8), np.zeros(count, np.int64)
+        self._has_reward = reward_mode != "none"
         self._watch = OutlierWatch(geometry, first, control_dt, reward_mode)
         self._rewards = np.full((count, KEPT_REWARDS), np.nan, np.float32)
         self._tick = 0
@@ -127,7 +128,7 @@ class EnvTable:
             outcome=zero,
             end=never,
             total=nothing,
-            followed=np.ones(count, bool),
+            followed=np.full(count, self._has_reward),
             first={},
             outliers={},
             last=LastEpisode(zero, never, nothing, {}),
@@ -160,7 +161,7 @@ class EnvTable:
         moved = step.elapsed_steps != self._now.steps + 1
         if moved.any():
             self._begin(moved, step)
-        self._rewards[:, self._tick % KEPT_REWARDS] = step.reward
+        self._rewards[:, self._tick % KEPT_REWARDS] = step.reward if self._has_reward else np.nan
         self._tick += 1
         self._step(step)
         return self._now
@@ -240,7 +241,7 @@ class EnvTable:
             outcome=np.where(envs, np.int8(Outcome.RUNNING), now.outcome),
             end=np.where(envs, np.int32(-1), now.end),
             total=np.where(envs, np.where(from_start, 0.0, np.nan), now.total),
-            followed=np.where(envs, from_start, now.followed),
+            followed=np.where(envs, from_start & self._has_reward, now.followed),
             first=first,
             outliers=_merged(envs, {}, now.outliers),
             last=now.last.with_envs(worth_keeping, before) if worth_keeping.any() else now.last,

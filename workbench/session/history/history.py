@@ -20,7 +20,7 @@ from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
 from workbench.core.snapshots.packing import WholeSnapshot
 from workbench.jobs.task import NO_MOMENT, Restored, Stepped
-from workbench.session.history.curves import Columns, StepCurves
+from workbench.session.history.curves import PREFIX, Columns, StepCurves
 from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, EnvTable
 from workbench.session.protocol.messages import PastPictures, Pictures, ReplayPath
 
@@ -200,8 +200,8 @@ class History:
     def add(self, stepped: Stepped) -> Moment:
         """Add a moment.
 
-        Without an action (a reset or a jump back) the worker sends reward zero. The stored one is NaN after a reset, that
-        of the origin after a jump back, and in all other envs that of the moment before.
+        Without an action (a reset or a jump back) the worker sends reward zero, and no terms of it. The stored ones are NaN
+        after a reset, those of the origin after a jump back, and in all other envs those of the moment before.
         """
         restored, jumps = stepped.restored, bool(stepped.reset_mask.any())
         origin = None if restored is None else self.at(restored.origin)
@@ -495,13 +495,22 @@ class History:
         if step.action is not None or not jumped.any():
             return step
         reward = np.full(self._num_envs, np.nan, np.float32)
-        if self._moments:
-            reward[:] = self._moments[-1].step.reward
-        if not stepped.resumed:
-            reward[jumped] = np.nan
+        terms: dict[str, NDArray[np.float32]] = {}
+
+        def take(then: StepResult, to: Sequence[int] | NDArray, of: Sequence[int] | NDArray) -> None:
+            """The rows of these envs, from those of others."""
+            reward[to] = then.reward[of]
+            for name, values in then.evaluate.items():
+                # evaluate() has no terms: only the hook of the reward adds them, and it is not called here.
+                if name.startswith(PREFIX) and name not in step.evaluate:
+                    terms.setdefault(name, np.full(values.shape, np.nan, np.float32))[to] = values[of]
+
+        kept = np.flatnonzero(~jumped | stepped.resumed)
+        if self._moments and len(kept):
+            take(self._moments[-1].step, kept, kept)
         if restored is not None and origin is not None:
-            reward[list(restored.env_idx)] = origin.step.reward[list(restored.source)]
-        return replace(step, reward=reward)
+            take(origin.step, list(restored.env_idx), list(restored.source))
+        return replace(step, reward=reward, evaluate={**step.evaluate, **terms})
 
     def _events(self, stepped: Stepped, rows: EnvRows) -> NDArray[np.uint8]:
         step, jumped = stepped.step, stepped.reset_mask

@@ -490,7 +490,9 @@ class Session:
             what_to_do = rescore_after_load(past, self.rescorer.rescoring.view)
             rescored = None
             if what_to_do == "rescore" and s.timeline is not None:
-                rescored = RescoredPast(s.timeline.history, s.timeline.at)
+                versions = [task for task in (before, event.task) if task is not None]
+                has_reward = any(task.reward_mode != "none" for task in versions)
+                rescored = RescoredPast(s.timeline.history, s.timeline.at, has_reward)
             s.loaded(event, restored=restored, stale=stale)
             level = None if event.reload is None else event.reload.level
             placed = self.studio.loaded(event.task, level)

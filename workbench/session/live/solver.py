@@ -51,8 +51,6 @@ class SolveView:
     """(T,) reward a step that came, over the horizon from there on as far as it is over."""
     begins: int = 0
     """The control step of the episode that `predicted` and `achieved` begin with."""
-    total_reward: float = 0.0
-    """Of the steps so far."""
     solved_at: int = 0
     """The step of the episode's first success, from 1 on; 0 without one."""
     solved: tuple[tuple[int, int], ...] = ()
@@ -116,7 +114,6 @@ class Solver:
                 predicted=predicted,
                 achieved=achieved,
                 begins=episode.begins,
-                total_reward=float(np.sum(episode.rewards)),
                 solved_at=episode.solved_at,
                 solved=solved,
                 steps_per_second=episode.rate,

@@ -72,13 +72,14 @@ class RescoredPast:
     (see `core.snapshots.snapshot`).
     """
 
-    def __init__(self, history: History, seen: int | None = None) -> None:
+    def __init__(self, history: History, seen: int | None = None, has_reward: bool = True) -> None:
         """Take the moments of `history`, up to the first jump without a snapshot.
 
         Args:
             seen: serial of the moment that the page shows; its run is replayed first.
+            has_reward: whether the version before or the new one has a reward.
         """
-        self._seen = seen
+        self._seen, self._has_reward = seen, has_reward
         self._moments: list[Moment] = []
         for moment in history.between(history.first, history.last):
             if moment.snapshot is None and (not self._moments or moment.jumped.any()):
@@ -207,6 +208,7 @@ class RescoredPast:
             Scores(
                 table["reward"][rows, env][1:],
                 {name: column[rows, env] for name, column in table.items() if name != "reward"},
+                self._has_reward,
             )
             for table in (self._old, self._new)
         )

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.jobs.rescore.verdict import FLAGS, Verdict
+from workbench.jobs.rescore.verdict import FLAGS, MAIN, Verdict
 from workbench.machine.text import length, mean_text, number_text
 from workbench.recording.episode.row import Source
 
@@ -59,6 +59,8 @@ def _reward_change(verdict: Verdict[Any]) -> str:
 
 
 def returns_text(verdict: Verdict[Any]) -> str:
+    if "reward" not in verdict.has:
+        return ""
     if math.isnan(verdict.returns[0]) and np.isnan(verdict.old_reward).all():
         return f"no reward → {number_text(verdict.returns[1])}"
     return _was_now(*map(number_text, verdict.returns))
@@ -83,7 +85,12 @@ def headline(verdicts: Sequence[Verdict[Any]], so_far: bool = False, others: Col
     differing, yet = sum(verdict.differs for verdict in rescored), " so far" * so_far
     if differing:
         return f"{differing} of {counted(len(rescored), 'episode')} {'differs' if differing == 1 else 'differ'}{yet}."
-    sentence = f"Nothing differs in {counted(len(rescored), 'episode')}{yet}: reward, success and fail are unchanged."
+    has = [name for name in MAIN if any(name in verdict.has for verdict in rescored)]
+    unchanged = "there is no reward, success or fail to compare"
+    if has:
+        listed = f"{', '.join(has[:-1])} and {has[-1]} are" if len(has) > 1 else f"{has[0]} is"
+        unchanged = f"{listed} unchanged"
+    sentence = f"Nothing differs in {counted(len(rescored), 'episode')}{yet}: {unchanged}."
     named = sorted({*others, *(name for verdict in rescored for name in verdict.differing)})[:_MOST_NAMED]
     return sentence + (f" Other entries differ: {', '.join(named)}." if named else "")
 
@@ -95,8 +102,8 @@ def totals(verdicts: Sequence[Verdict[Any]]) -> list[str]:
     if any(verdict.has_success for verdict in rescored):
         successes = (sum(verdict.success[k] is not None for verdict in rescored) for k in (0, 1))
         texts.append(f"episodes with success: {_was_now(*map(str, successes))}")
-    if rescored:
-        means = (mean_text([verdict.returns[k] for verdict in rescored]) for k in (0, 1))
+    if rewarded := [verdict for verdict in rescored if "reward" in verdict.has]:
+        means = (mean_text([verdict.returns[k] for verdict in rewarded]) for k in (0, 1))
         texts.append(f"mean return: {_was_now(*means)}")
     skipped = len(verdicts) - len(rescored)
     return texts + ([f"{counted(skipped, 'episode')} not rescored"] if rescored and skipped else [])
@@ -153,8 +160,8 @@ def as_rows(verdicts: Sequence[Verdict[Source]]) -> list[dict[str, Any]]:
             "success_now": verdict.success[1],
             "fail_before": verdict.fail[0],
             "fail_now": verdict.fail[1],
-            "return_before": verdict.returns[0],
-            "return_now": verdict.returns[1],
+            "return_before": verdict.returns[0] if "reward" in verdict.has else None,
+            "return_now": verdict.returns[1] if "reward" in verdict.has else None,
             "differs": verdict.differs,
             "first_difference": verdict.first_difference,
             "largest_reward_change": verdict.largest,

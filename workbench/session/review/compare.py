@@ -87,9 +87,10 @@ def difference(
     )
     bodies, body, apart = _bodies_difference(a, b, rows, begin, tolerance)
     numbers = [_first_difference("action", *_steps(a.action, b.action, rows), begin)]
-    numbers.append(
-        _first_difference("reward", *_steps(a.reward, b.reward, rows), begin, sum_of=(a.reward, b.reward))
-    )
+    if a.info.has_reward or b.info.has_reward:
+        numbers.append(
+            _first_difference("reward", *_steps(a.reward, b.reward, rows), begin, sum_of=(a.reward, b.reward))
+        )
     for name in dict.fromkeys([*a.evaluate, *b.evaluate]):
         if name in a.evaluate and name in b.evaluate:
             numbers.append(

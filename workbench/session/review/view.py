@@ -161,9 +161,9 @@ def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDA
     """
     states = np.arange(len(episode.reward) + 1)
     after = states[1:]
-    found: dict[str, dict[str, tuple[NDArray, NDArray]]] = {
-        REWARD: {REWARD: (after, _numbers(episode.reward))}
-    }
+    found: dict[str, dict[str, tuple[NDArray, NDArray]]] = {}
+    if episode.info.has_reward:
+        found[REWARD] = {REWARD: (after, _numbers(episode.reward))}
     terms: dict[str, tuple[NDArray, NDArray]] = {}
     for name, values in episode.evaluate.items():
         if values.dtype.kind not in "fiub":

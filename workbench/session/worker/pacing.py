@@ -59,7 +59,7 @@ class Pacer:
 
 @dataclass
 class Rate:
-    """Events per second over the last second or so."""
+    """Events per second over the last second or so, of slower ones over the last two."""
 
     window: float = 1.0
     _times: deque[float] = field(default_factory=deque)
@@ -69,11 +69,14 @@ class Rate:
         self.per_second(now)  # forgets what is older
 
     def per_second(self, now: float) -> float:
-        while self._times and now - self._times[0] > self.window:
+        # Two are kept: steps that take longer than the window have a rate too.
+        while len(self._times) > 2 and now - self._times[0] > self.window:
             self._times.popleft()
         if len(self._times) < 2:
             return 0.0
-        return (len(self._times) - 1) / max(self._times[-1] - self._times[0], 1e-9)
+        first, last = self._times[0], self._times[-1]
+        # The one that is due may take longer than the ones before.
+        return (len(self._times) - 1) / max(last - first, now - last, 1e-9)
 
     def clear(self) -> None:
         self._times.clear()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.machine.text import mean_text, nonfinite_text, number_text
-from workbench.session.history.curves import REWARD, SUCCESS, Column, Curves, Group, columns_of
+from workbench.session.history.curves import PREFIX, REWARD, SUCCESS, Column, Curves, Group, columns_of
 from workbench.session.live.view import SessionView
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.widgets.click_targets import Presses
@@ -85,6 +85,8 @@ class CurvesPanel(MomentPart):
             return
         self._task = "" if task is None else f"{task.file} {task.class_name}"
         entries = {entry_of(column): None for column in curves.columns}
+        if task is not None and task.reward_mode == "none":
+            entries.pop(entry_of(REWARD), None)
         chosen = [entry for entry in entries if self._is_on(entry)]
         self._draw_choice(list(entries), chosen)
         drawn = self._draw_charts(view, curves, chosen)
@@ -274,13 +276,13 @@ class NumberRow:
 def number_rows(
     step: StepResult, selected_env: int, max_episode_steps: int | None, reward_mode: str = ""
 ) -> list[NumberRow]:
-    """Elapsed steps, reward, success and fail first, then every other entry by its name."""
+    """Elapsed steps, reward if there is one, success and fail first, then every other entry by its name."""
     env = selected_env
     of = f" / {max_episode_steps}" if max_episode_steps else ""
-    rows = [
-        NumberRow("elapsed steps", f"{_item(step.elapsed_steps, env)}{of}", _batch(step.elapsed_steps)),
-        _reward_row(step, env, reward_mode),
-    ]
+    rows = [NumberRow("elapsed steps", f"{_item(step.elapsed_steps, env)}{of}", _batch(step.elapsed_steps))]
+    if reward_mode != "none":
+        about = "" if reward_mode == "dense" else reward_mode.replace("_dense", "")
+        rows.append(_earned_row("reward", step.reward, step, env, about))
     first = [key for key in ("success", "fail") if key in step.evaluate]
     rest = sorted(key for key in [*step.evaluate, *step.others] if key not in first)
     shown = first + rest[: MOST_ROWS - len(first)]
@@ -289,6 +291,9 @@ def number_rows(
             rows.append(_other_row(key, step.others[key], env))
             continue
         values = np.asarray(step.evaluate[key])
+        if key.startswith(PREFIX) and values.ndim == 1:
+            rows.append(_earned_row(key, values, step, env))
+            continue
         mood = ""
         if key in first and values.ndim and env < len(values) and bool(np.any(values[env])):
             mood = "good" if key == "success" else "bad"
@@ -308,15 +313,15 @@ def _other_row(name: str, entry: OtherEntry, env: int) -> NumberRow:
     return NumberRow(name, "", "", whole=value, hint=f"not per env: {hint}")
 
 
-def _reward_row(step: StepResult, env: int, mode: str) -> NumberRow:
-    """The reward's row: a dash right after a reset, when there is none (neither zero nor a NaN of the task)."""
-    there = np.isfinite(step.reward) | ((step.elapsed_steps > 0) & (step.action is not None))
-    there &= step.elapsed_steps > 0
+def _earned_row(name: str, values: NDArray, step: StepResult, env: int, about: str = "") -> NumberRow:
+    """The row of the reward or of a term of it: a dash right after a reset, when there is none (neither zero nor a NaN of
+    the task)."""
+    there = (step.elapsed_steps > 0) & (np.isfinite(values) | (step.action is not None))
     return NumberRow(
-        "reward",
-        _item(step.reward, env) if env < len(there) and there[env] else "—",
-        _batch(step.reward[there]) if there.any() else "—",
-        about="" if mode == "dense" else mode.replace("_dense", ""),
+        name,
+        _item(values, env) if env < len(there) and there[env] else "—",
+        _batch(values[there]) if there.any() else "—",
+        about=about,
     )
 
 

@@ -10,7 +10,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.machine.text import number_text, rate_text
 from workbench.planning.options import Method, PlanOptions
+from workbench.session.history.env_table import EnvRows
 from workbench.session.live.session import Session
 from workbench.session.live.solver import SolveView
 from workbench.session.live.view import SessionView
@@ -175,7 +177,7 @@ class SolvePanel(PagePart[SessionView]):
             return
         plan = view.settings.plan
         saving = view.recording.saving
-        self._status.content = solve_html(solve, task.num_envs, self._link)
+        self._status.content = solve_html(solve, self._session.env_rows(), view.selected_env, self._link)
         self._save.visible = bool(solve.solved) and not view.playing
         self._save.disabled = saving.progress is not None
         self._saving.visible = self._save.visible and (self._save.disabled or bool(saving.message))
@@ -277,13 +279,26 @@ def in_words(plan: PlannedEnv, place: int) -> str:
     return told + (f", success at step {plan.success_at[number]}" if plan.success_at[number] else "")
 
 
+def earned(rows: EnvRows, env: int) -> tuple[str, int] | None:
+    """Return and steps of the env's episode, until its end if it has ended; None if it was not followed from its start."""
+    if not rows.followed[env]:
+        return None
+    steps = rows.steps if rows.end[env] < 0 else rows.end
+    return number_text(float(rows.total[env])), int(steps[env])
+
+
 def is_flat(plan: PlannedEnv) -> bool:
     """Whether all rollouts earned the same, none of them by a success."""
     return bool(np.ptp(plan.returns) == 0 and not plan.success_at.any())
 
 
-def solve_html(solve: SolveView, num_envs: int, link: LinkTo = no_links) -> str:
-    """What the plan came to, or what to do for one."""
+def solve_html(solve: SolveView, rows: EnvRows | None, env: int, link: LinkTo = no_links) -> str:
+    """What the plan came to, or what to do for one.
+
+    Args:
+        rows: the table of envs.
+        env: the selected one.
+    """
     plan = solve.plan
     returns: list[tuple[str, str, float]] = []
     if plan is not None:
@@ -302,10 +317,10 @@ def solve_html(solve: SolveView, num_envs: int, link: LinkTo = no_links) -> str:
         solve=solve,
         solved=solve.solved[:MOST_TOLD],
         more=max(0, len(solve.solved) - MOST_TOLD),
-        several=num_envs > 1,
+        several=rows is not None and rows.num_envs > 1,
         flat=plan is not None and is_flat(plan),
         returns=returns,
-        steps=int(np.isfinite(solve.achieved).sum()),
-        per_second=f"{solve.steps_per_second:,.0f}".replace(",", " "),
+        earned=None if rows is None else earned(rows, env),
+        per_second=rate_text(solve.steps_per_second),
         link=link,
     )

@@ -9,6 +9,7 @@ from typing import Literal
 import viser
 
 from workbench.jobs.task import TaskDescription
+from workbench.machine.text import rate_text
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
 from workbench.session.record.live import RecordingStatus
@@ -80,7 +81,10 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
     # A plan takes what it takes: rates of single steps would only say that it is slow.
     planning = moving and view.settings.action_source == "solve"
     starting = planning and view.solve.state == "starting"
-    slow = view.real_time_factor < 0.85 * view.settings.speed and view.settings.speed != float("inf")
+    known = view.steps_per_second > 0  # from the second step on
+    slow = (
+        known and view.real_time_factor < 0.85 * view.settings.speed and view.settings.speed != float("inf")
+    )
     return {
         "view": view,
         "state": view.state if busy is None else "loading",
@@ -90,7 +94,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "news": _news(view) if fresh else "",
         "at": step_in_words(view),
         "ago": ago_in_words(view.timeline),
-        "moving": moving and not planning,
+        "moving": moving and known and not planning,
         "plan": view.solve.plan if planning and not starting else None,
         "behind": moving and slow,
         "why_slow": slowed_by(view) if moving and slow else None,
@@ -126,7 +130,7 @@ def slowed_by(view: SessionView) -> tuple[str, str] | None:
     task, recorded, watched = view.task, view.recorded_share, view.watched_share
     if task is None or max(recorded, watched) < SLOWS:
         return None
-    rate = f"{counted(round(view.steps_per_second), 'step')} a second"
+    rate = f"{rate_text(view.steps_per_second)} steps a second"
     if recorded >= watched:
         cameras = counted(len(task.cameras) if task.can_render else 0, "camera")
         envs = counted(len(view.recording.env_idx), "env")

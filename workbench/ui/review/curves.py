@@ -43,12 +43,17 @@ class ReviewNumbers(PagePart[ReviewView]):
         if chosen is None:
             self._html.content = render("note", text="Numbers and curves appear when a recording is open.")
             return
-        own = number_rows(step_of(chosen.episode, view.states[view.selected]), 0, chosen.length)
+        own = number_rows(
+            step_of(chosen.episode, view.states[view.selected]), 0, chosen.length, _mode_of(chosen.episode)
+        )
         beside = [(own, view.states[view.selected])]
         together = shown_together(view)
         if len(together) > 1:
-            steps = [(step_of(view.opened[i].episode, view.states[i]), view.states[i]) for i in together]
-            beside = [(number_rows(step, 0, None), state) for step, state in steps]
+            episodes = [(view.opened[i].episode, view.states[i]) for i in together]
+            beside = [
+                (number_rows(step_of(episode, state), 0, None, _mode_of(episode)), state)
+                for episode, state in episodes
+            ]
         self._html.content = render("review_numbers", rows=compared(own, beside), of=together)
 
 
@@ -185,6 +190,11 @@ class ReviewCurves(PagePart[ReviewView]):
             dot = np.full(len(x), np.nan)
             dot[np.abs(x - view.position).argmin()] = dotted.values[view.position - view.first]
         self._charts[chart].draw(title, x, lines, dot, span_of([line.values for line in lines]))
+
+
+def _mode_of(episode: Episode) -> str:
+    """The mode of the reward for `number_rows`: only whether there is one is shown."""
+    return "" if episode.info.has_reward else "none"
 
 
 def step_of(episode: Episode, state: int) -> StepResult:

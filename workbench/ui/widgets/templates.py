@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import jinja2
 
 from workbench.machine.folders import web_assets_folder
-from workbench.machine.text import plain_text
+from workbench.machine.text import plain_text, rate_text
 
 
 def render(template: str, **values: Any) -> str:
@@ -95,7 +95,7 @@ def _environment() -> jinja2.Environment:
         lstrip_blocks=True,
         auto_reload=False,  # else every panel looks at its file on every drawing
     )
-    filters = (place, size, percent, counted, short_text, letter, colour)
+    filters = (place, size, percent, counted, rate_text, short_text, letter, colour)
     environment.filters.update({filter.__name__: filter for filter in filters})
     macros = environment.get_template("can_be_pressed.html").module
     environment.globals.update(
