@@ -87,7 +87,14 @@ def test_stops_when_it_is_told(recorded: Any) -> None:
 @pytest.mark.slow
 def test_what_the_process_sends_and_cannot_be_read_is_told(recorded: Any, tmp_path: Path) -> None:
     file = tmp_path / "sends.py"
-    file.write_text("import os, sys, time\nos.write(int(sys.argv[1]), b'print(1)\\n')\ntime.sleep(3600)\n")
+    file.write_text(
+        "import os, time\n"
+        "for number in os.listdir('/proc/self/fd'):\n"
+        "    path = f'/proc/self/fd/{number}'\n"
+        "    if os.path.islink(path) and os.readlink(path).startswith('socket:'):\n"
+        "        os.write(int(number), b'print(1)\\n')\n"
+        "time.sleep(3600)\n"
+    )
     ended = make({0: read_maniskill(recorded[0], "traj_0")}, (file,))
     assert isinstance(ended[0], SceneError)
     assert "sent unreadable data (it says that it is 1886546286 bytes long)" in str(ended[0])
