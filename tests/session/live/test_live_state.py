@@ -161,16 +161,24 @@ def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it(
 
 def test_what_failed_while_running_stands_until_a_step_follows() -> None:
     state = running()
-    state.take(LoadFailed(problem(), kept=True))
-    assert (view(state).state, view(state).stale) == ("error", False)
+    state.take(LoadFailed(problem(), kept=True, at_run=True))
+    assert (view(state).state, view(state).playing, view(state).stale) == ("paused", False, False)
+    assert view(state).problem_at_run
     state.stepped(stepped(4))
-    assert view(state).state == "running" and view(state).problem is None
+    assert view(state).problem is None and not view(state).problem_at_run
+
+
+def test_what_fails_while_envs_are_put_back_failed_while_it_ran() -> None:
+    state = running()
+    state.take(Status(False, 0.0, 0.0, "going back: step 3 of 40"))
+    state.take(LoadFailed(problem(), kept=True, at_run=True))
+    assert view(state).problem_at_run and not view(state).stale and len(view(state).loads) == 1
 
 
 def test_the_reset_that_a_new_scene_begins_with_mends_no_failure_at_run() -> None:
     state = LiveState("push.py", TaskOptions(), 10**8)
     state.loaded(loaded(), restored=False, stale=False)
-    state.take(LoadFailed(problem(), kept=True))
+    state.take(LoadFailed(problem(), kept=True, at_run=True))
     state.stepped(stepped(0, jumped=True))
     assert view(state).problem is not None
     state.stepped(stepped(1))
@@ -182,7 +190,9 @@ def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before
     state.take(Loading("importing"))
     state.take(LoadFailed(problem(), kept=True))
     state.stepped(stepped(4))
-    assert view(state).stale and view(state).problem is not None and view(state).state == "error"
+    assert view(state).stale and view(state).problem is not None and view(state).state == "running"
+    state.take(Status(False, 0.0, 0.0))
+    assert view(state).state == "paused"
 
 
 def test_a_worker_that_could_load_nothing_waits_with_the_problem() -> None:
@@ -302,7 +312,7 @@ def test_every_load_is_remembered_also_one_that_was_refused() -> None:
         state.take(LoadFailed(problem(f"NameError: {number}"), kept=True))
     loads = view(state).loads
     assert len(loads) == 20 and loads[0].reason == "NameError: 29" and loads[0].problem is not None
-    state.take(LoadFailed(problem("ValueError: in a step"), kept=True))
+    state.take(LoadFailed(problem("ValueError: in a step"), kept=True, at_run=True))
     assert view(state).loads == loads, "it is no load"
     state.loaded(loaded(report("patched")), restored=False, stale=False)
     assert [load.level for load in view(state).loads[:2]] == ["patched", None]
@@ -352,7 +362,7 @@ def test_options_with_which_the_task_fails_are_dropped_and_said_and_the_file_is_
     state.apply_options(bad := TaskOptions(N, env_kwargs={"robot_uids": "no such"}))
     state.take(LoadFailed(problem(), kept=True, options=bad))
     seen = view(state)
-    assert seen.state == "error" and seen.problem is not None and not seen.stale
+    assert seen.state == "running" and seen.problem is not None and not seen.stale
     assert seen.options == TaskOptions() and seen.options_refused == bad
     assert state.load_request(None).options == TaskOptions(), "the next save does not fail for them"
     state.apply_options(TaskOptions())

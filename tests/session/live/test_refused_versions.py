@@ -156,6 +156,54 @@ def test_a_version_that_failed_while_it_ran_does_not_spoil_the_mended_one(
     assert view.step.elapsed_steps.tolist() == [2, 2] or view.step.elapsed_steps.tolist() == [1, 1]
 
 
+LATE = {
+    "a raise": ("pass", False),
+    "a default type": ("torch.set_default_dtype(torch.float64)", True),
+}
+
+
+@pytest.mark.parametrize("what", LATE)
+def test_after_a_failure_while_it_runs_a_reset_and_steps_are_those_of_a_clean_process(
+    mended: Session, task_file: Path, good: str, expected: SessionView, what: str
+) -> None:
+    did, replaced = LATE[what]
+    bad = in_evaluate(
+        good, "if self.elapsed_steps.max() > 3:", f"    {did}", "    raise RuntimeError('late')"
+    )
+    line = bad[: bad.index("raise RuntimeError('late')")].count("\n") + 1
+    task_file.write_text(bad)
+    runs(mended, bad)
+    for go_on in (mended.play, mended.step):
+        before, worker = played(mended), mended.worker_pid
+        assert before.problem is None
+        np.testing.assert_array_equal(before.step.poses, expected.step.poses)
+        np.testing.assert_array_equal(before.step.reward, expected.step.reward)
+        go_on()
+        view = wait_until(
+            mended,
+            lambda v, n=before.task_serial: (
+                v.problem_at_run and v.state == "paused" and v.task_serial == n + replaced
+            ),
+            "the failure, and a pause",
+        )
+        assert (mended.worker_pid != worker) is replaced is (view.spoiled != ""), view.spoiled
+        assert (view.problem.file, view.problem.line) == (str(task_file), line)
+        assert not view.stale and not view.playing
+        assert view.step.elapsed_steps.tolist() == [3, 3]
+
+
+@pytest.mark.parametrize("text", ["", "# to be written\n", '"""To be written."""\n'])
+def test_a_file_without_a_statement_costs_no_process(
+    mended: Session, task_file: Path, good: str, text: str
+) -> None:
+    worker = mended.worker_pid
+    task_file.write_text(text)
+    wait_until(mended, lambda v: v.problem is not None, "the refusal")
+    task_file.write_text(good)
+    runs(mended, good)
+    assert mended.worker_pid == worker, mended.view().reload
+
+
 def test_a_file_that_is_no_python_costs_no_process(mended: Session, task_file: Path, good: str) -> None:
     worker = mended.worker_pid
     task_file.write_text(good + "\ndef broken(:\n")

@@ -128,10 +128,10 @@ def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Ope
 def test_the_end_of_a_worker_says_whether_there_is_a_version_to_come_back(one: Open) -> None:
     told, comes_back = one.versions.died(DEATH, "the last words")
     assert told is not None and not comes_back
-    assert not one.shared.state.problem_at_run, "it is lost at the load that it began with"
+    assert not one.shared.state.now.problem_at_run, "it is lost at the load that it began with"
     one.runs()
     told, comes_back = one.versions.died(DEATH, "")
-    assert told is not None and comes_back and one.shared.state.problem_at_run
+    assert told is not None and comes_back and one.shared.state.now.problem_at_run
     one.versions.restart_worker()
     assert one.replaced == 1 and one.loads()[0].source is None, "the file as it is now"
 
@@ -143,7 +143,7 @@ def test_a_worker_that_ran_a_refused_version_is_followed_by_one_with_the_last_go
     (asked,) = one.sent
     assert isinstance(asked, Load)
     one.versions.began(Loading("", asked.number))
-    one.versions.failed(LoadFailed(problem(), kept=True, spoiled=True))
+    one.versions.failed(LoadFailed(problem(), kept=True, spoiled="it ran"))
     told, comes_back = one.versions.died(HANDED_OVER, "")
     assert told is None and comes_back
     _, load, play = one.versions.first_requests()

@@ -18,7 +18,26 @@ def test_first_says_what_failed_and_where() -> None:
     title, rest = html.split("</div>", 1)
     assert "PushEnv" in title and "failed in evaluate" in title and "push.py:88" in title
     assert "KeyError" in rest and "return goal[&lt;0&gt;]" in rest
-    assert "The last good version is still running." in rest
+
+
+def test_says_what_runs_now_while_an_open_traceback_stays(panels: Panels) -> None:
+    banner = Banner(panels.server, lambda: None, lambda: None, lambda: None)
+    refused = running(2, problem=problem(), problem_serial=1, stale=True)
+    failed = replace(refused, state="paused", playing=False, stale=False, problem_at_run=True)
+    said = []
+    for view in (
+        refused,
+        replace(refused, state="starting", playing=False),
+        replace(refused, state="paused", playing=False),
+        failed,
+        replace(failed, spoiled="torch.get_default_dtype() changed"),
+        replace(failed, problem=replace(problem(), stage="policy")),
+    ):
+        banner.draw(view)
+        said.append(panels.htmls()[1].content)
+    assert len({*said}) == len(said)
+    assert "running" in said[0] and not any("running" in words for words in said[1:])
+    assert "paused at env 0: step" in said[3] and "torch.get_default_dtype()" in said[4]
 
 
 def test_everything_of_the_author_s_is_escaped() -> None:
@@ -71,7 +90,7 @@ def test_traceback_that_someone_opened_is_not_written_again(panels: Panels) -> N
     banner.draw(view)
     panels.htmls()[0].content = "opened"
     banner.draw(replace(view, step_serial=99))
-    assert panels.html() == "opened"
+    assert panels.htmls()[0].content == "opened"
     banner.draw(replace(view, problem=problem("ValueError: other"), problem_serial=2))
     assert "ValueError: other" in panels.html()
 

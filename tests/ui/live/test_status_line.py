@@ -3,6 +3,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import pytest
+
 from tests.ui.scenes import EMPTY, PLAN, problem, running
 from workbench.session.live.solver import SolveView
 from workbench.ui.live.status_line import status_values
@@ -52,9 +54,11 @@ def test_paused_claims_no_rate() -> None:
     assert "steps/s" not in html(running(4, state="paused", playing=False))
 
 
-def test_error_and_stale_are_seen_together() -> None:
-    text = html(running(4, state="error", stale=True, problem=problem()))
-    assert "error" in text and "stale" in text
+@pytest.mark.parametrize("word", ["running", "paused", "loading"])
+def test_error_and_stale_are_marks_beside_the_state(word: Any) -> None:
+    text = html(running(4, state=word, playing=word == "running", stale=True, problem=problem()))
+    assert f"<b>{word}</b>" in text and text.count(">error</span>") == 1
+    assert (">stale</span>" in text) is (word != "loading")
 
 
 def test_machine_that_cannot_keep_up_is_said() -> None:

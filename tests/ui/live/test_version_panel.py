@@ -62,7 +62,7 @@ def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(panels: P
     told = panels.html()
     assert (
         told.index("not loaded")
-        < told.index("The previous version is still running")
+        < told.index("The previous version is still loaded")
         < told.index("only evaluate")
     )
     assert "push.py:88" in told and "KeyError" in told

@@ -186,6 +186,13 @@ class AuthorFinder(MetaPathFinder):
         )
 
 
+def _work(code: CodeType) -> tuple[bytes, tuple[str, ...]]:
+    return code.co_code, code.co_names
+
+
+_NO_WORK = [_work(compile(text, "", "exec", dont_inherit=True)) for text in ("", "'a docstring'")]
+
+
 class _AuthorLoader(importlib.machinery.SourceFileLoader):
     """Executes one text. Reads and writes no bytecode files."""
 
@@ -222,12 +229,12 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
             sys.modules[stem] = module
             self.finder.names.append(stem)
         code = self.get_code(name)
-        _AuthorLoader.executed += 1
+        _AuthorLoader.executed += _work(code) not in _NO_WORK
         exec(code, module.__dict__)
 
 
 def executed_modules() -> int:
-    """How many modules of authors this process has begun to execute, over all loads."""
+    """How many modules of authors that hold a statement this process has begun to execute, over all loads."""
     return _AuthorLoader.executed
 
 

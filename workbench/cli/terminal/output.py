@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from workbench.core.rules import Finding
     from workbench.jobs.pool.deal import Failure
     from workbench.session.process.captured_output import PrintedLine
-    from workbench.session.protocol.messages import Event
+    from workbench.session.protocol.messages import Event, LoadFailed
 
 
 class Exit(IntEnum):
@@ -214,11 +214,21 @@ def print_event(event: Event) -> None:
     elif isinstance(event, LoadFailed):
         print_problem(event.problem)
         if event.kept:
-            back = "comes back where it was" if event.problem.stage == "worker" else "keeps running"
-            err.print(f"[dim]the last good version {back}[/]")
+            err.print(f"[dim]{escape(_what_runs(event))}[/]", soft_wrap=True)
     elif isinstance(event, RulesBroken):
         for finding in event.new:
             print_finding(finding)
+
+
+def _what_runs(failed: LoadFailed) -> str:
+    """What runs after a failure that leaves a version, and how to go on."""
+    if failed.at_run:
+        of = "the policy" if failed.problem.stage == "policy" else "the version"
+        process = f"; another process loads the version again: {failed.spoiled}" if failed.spoiled else ""
+        return f"{of} failed while the task ran, which is paused{process}; save a mended file, or go on with a reset"
+    if failed.spoiled or failed.problem.stage == "worker":
+        return "the last good version comes back where it was"
+    return "the last good version stays as it was, running or paused"
 
 
 def print_line(line: PrintedLine) -> None:

@@ -58,6 +58,12 @@ def wait_for_debugger(hold: Callable[[bool], None]) -> None:
         hold(False)
 
 
+def is_debugged() -> bool:
+    """Whether a debugger has attached to this process."""
+    debugpy = sys.modules.get("debugpy")
+    return debugpy is not None and debugpy.is_client_connected()
+
+
 def debug_here(on_message: Callable[[str], None]) -> None:
     """Wait for a debugger in a process without a supervisor.
 

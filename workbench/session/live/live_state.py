@@ -71,8 +71,6 @@ class LiveState:
     """The live view, without the fields that `view` adds."""
     timeline: Timeline | None = None
     """None before a task is loaded."""
-    problem_at_run: bool = False
-    """`now.problem` came while the task ran, not while a version was loaded."""
     first_step_due: bool = False
     """The next step is the first of a new scene: it does not prove that the task runs."""
     clients: int = 0
@@ -176,7 +174,7 @@ class LiveState:
             moment = self.timeline.add(event)
             self.set(step=moment.step, step_serial=moment.serial)
         first, self.first_step_due = self.first_step_due, False
-        if self.now.problem is not None and self.problem_at_run and not first:
+        if self.now.problem is not None and self.now.problem_at_run and not first:
             # It runs again after a problem at run time: the task was reset, or the policy changed.
             self.set_problem(None)
             self._set_running()
@@ -187,17 +185,20 @@ class LiveState:
         if isinstance(event, Loading):
             self.set(state="loading", activity=event.activity)
         elif isinstance(event, LoadFailed):
-            self.set_problem(event.problem)
-            self.problem_at_run = now.state != "loading"
+            self.set_problem(event.problem, event.at_run, event.spoiled)
             of_options = self._refuse_options(event.options)
-            if not self.problem_at_run:
+            if not event.at_run:
                 self._remember(PastLoad(time.time(), None, event.problem.message, problem=event.problem))
             self.set(
-                state="error",
                 activity="",
+                playing=now.playing and not event.at_run,
                 choices=event.classes or now.choices,
-                stale=now.stale or not (self.problem_at_run or of_options),
+                stale=now.stale or not (event.at_run or of_options),
             )
+            if event.kept:
+                self._set_running()
+            else:
+                self.set(state="error")
         elif isinstance(event, RulesBroken):
             self.set(rules=event if event.rows else None, rules_serial=now.rules_serial + 1)
         elif isinstance(event, PastPictures):
@@ -269,8 +270,7 @@ class LiveState:
             if texts is None:
                 texts = {} if self.now.task is None else self.now.task.source
             problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, texts)
-            self.set_problem(problem)
-            self.problem_at_run = not while_loading
+            self.set_problem(problem, at_run=not while_loading)
         if death.doing == "drawing" and death.end is not End.ASKED:
             # The next worker would die of the same picture.
             why = (
@@ -296,8 +296,9 @@ class LiveState:
     def _remember(self, load: PastLoad) -> None:
         self.set(loads=(load, *self.now.loads[: _MOST_LOADS - 1]))
 
-    def set_problem(self, problem: Problem | None) -> None:
-        self.set(problem=problem, problem_serial=self.now.problem_serial + 1)
+    def set_problem(self, problem: Problem | None, at_run: bool = False, spoiled: str = "") -> None:
+        serial = self.now.problem_serial + 1
+        self.set(problem=problem, problem_serial=serial, problem_at_run=at_run, spoiled=spoiled)
 
     def _set_running(self) -> None:
         self.set(state="running" if self.now.playing else "paused")
@@ -480,7 +481,7 @@ class LiveState:
             known: further fields of the view.
         """
         now, timeline = self.now, self.timeline
-        refused = now.problem if now.stale and not self.problem_at_run else None
+        refused = now.problem if now.stale and not now.problem_at_run else None
         if timeline is None:
             return replace(now, refused=refused, **known)
         env, moment = now.settings.selected_env, timeline.shown

@@ -470,7 +470,7 @@ class Session:
                 self.studio.placed(event, self._state.now.task)
             if isinstance(event, LoadFailed):
                 self.versions.failed(event)
-                if not self._state.problem_at_run:
+                if not event.at_run:
                     self.studio.failed_to_load()
         self._notify()
         self._on_event(event)

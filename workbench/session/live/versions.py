@@ -305,7 +305,8 @@ class Versions:
                 )
             else:
                 state.wait_for_file()
-            if state.wants_play:
+            # A version that failed while it ran would fail again: it comes back paused.
+            if state.wants_play and not (self._recovery.restoring and state.now.problem_at_run):
                 requests.append(Play(True))
             return requests
 
@@ -358,7 +359,7 @@ class Versions:
         """A load failed; a worker without a version gets the next attempt of `Recovery`, unless it is spoiled and ends."""
         with self._shared.lock:
             if failed.spoiled:
-                self._needed = NewProcessNeeded("a refused version had run in the process", False)
+                self._needed = NewProcessNeeded(failed.spoiled, failed.at_run)
                 next_load = None
             else:
                 next_load = self._recovery.next_load() if self._recovery.failed(failed.kept) else None

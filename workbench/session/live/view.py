@@ -30,8 +30,8 @@ from workbench.session.record.live import RecordingStatus
 from workbench.session.rescore.background import RescoreView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
-"""``starting`` the worker process; ``loading``: a task is being imported or built; ``error``: see `SessionView.problem`;
-``stopped``: there is no worker."""
+"""``starting`` the worker process; ``loading``: a task is being imported or built; ``error``: no version is loaded,
+see `SessionView.problem`; ``stopped``: there is no worker."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,10 @@ class SessionView:
     """Why cameras cannot be drawn, as sentences; they are left out."""
     problem: Problem | None = None
     problem_serial: int = 0
+    problem_at_run: bool = False
+    """`problem` came while the task ran, not while a version was loaded."""
+    spoiled: str = ""
+    """Why another process brought the version back that ran when `problem` came, as `LoadFailed` has it."""
     refused: Problem | None = None
     """Why the file's present version does not run."""
     curves: Curves | None = None

@@ -301,7 +301,7 @@ def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
 
 def hands_over(event: object) -> bool:
     """Whether the worker ends with this event, and another one is to go on."""
-    return isinstance(event, NewProcessNeeded) or (isinstance(event, LoadFailed) and event.spoiled)
+    return isinstance(event, NewProcessNeeded) or (isinstance(event, LoadFailed) and event.spoiled != "")
 
 
 @dataclass(frozen=True)
@@ -364,9 +364,11 @@ class LoadFailed:
     """The tasks of the file, the one that was tried first; empty where the file has only one or none was tried."""
     options: TaskOptions | None = None
     """Those of the `Load` that failed; None if the problem came later."""
-    spoiled: bool = False
-    """The refused version's code ran in this process and may have left anything there: the worker ends, and the next one
-    brings the last good version back."""
+    at_run: bool = False
+    """The version that runs failed, or its policy; no load did."""
+    spoiled: str = ""
+    """What the failed code left in this process, or may have: the worker ends, and the next one brings the version that ran
+    back. Empty if the worker goes on."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,15 @@ from workbench.machine.processes.wire import MessageSocket, Unreadable
 from workbench.session.process.heartbeat import Doing, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import Event, Load, LoadFailed, Request, without_steps
 from workbench.session.protocol.questions import QUESTIONS
+from workbench.session.worker.process_state import (
+    ProcessState,
+    changed_settings,
+    read_process_state,
+    some_of,
+)
 from workbench.session.worker.step_events import StepEvents
+
+REFUSED = "a refused version had run in the process"
 
 _STAGE: dict[Doing, str] = {"loading": "build", "stepping": "step", "resetting": "reset"}
 
@@ -99,8 +107,10 @@ class GuardedTask:
         """The file that was requested last, loaded or not."""
         self.failed = False
         """`opened` has failed while it ran: what it was doing may be half done."""
+        self.when_loaded: ProcessState | None = None
+        """Settings of the process when the load of `opened` had ended."""
         self.spoiled = False
-        """A refused version's code ran in this process, which has to end."""
+        """What the author's code left in this process cannot be taken back: it has to end."""
 
     def run(self, doing: Doing | None, work: Callable[[], object], loads: bool = False) -> Problem | None:
         """Run `work`; if `doing` is not None it may run the author's code, and can be interrupted. Returns the failure,
@@ -131,10 +141,9 @@ class GuardedTask:
                 self.line.drop_steps()
             problem = problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error))
             if loads:
-                self.refuse(LoadFailed(problem, kept=self.opened is not None, spoiled=True))
+                self.refuse(LoadFailed(problem, kept=self.opened is not None, spoiled=REFUSED))
             else:
                 self.fail(problem)
-                self.restore_last_step()
             return problem
         finally:
             self.heartbeat.begin("idle")
@@ -155,10 +164,8 @@ class GuardedTask:
         try:
             do(self.opened)
         except TaskError as error:
-            interrupted = self.drop_steps_if_interrupted(error)
+            self.drop_steps_if_interrupted(error)
             self.fail(error.problem)
-            if interrupted:
-                self.restore_last_step()
 
     def drop_steps_if_interrupted(self, error: TaskError) -> bool:
         """Whether a person interrupted the author's code; then the waiting steps are dropped."""
@@ -168,22 +175,34 @@ class GuardedTask:
         return interrupted
 
     def fail(self, problem: Problem) -> None:
-        """Send a failure while the task runs, and stop playing."""
+        """Send a failure while the task runs, and stop playing. The batch is put back to the end of the last step, in another
+        process if this one cannot be trusted with it."""
         self.failed = self.failed or problem.stage != "policy"
-        self.line.send(LoadFailed(problem, kept=self.opened is not None))
+        spoiled = self._settings_changed()
+        if not spoiled and problem.stage != "policy" and self.restore_last_step() is not None:
+            spoiled = "the last step could not be put back"
+        self._send_failure(LoadFailed(problem, self.opened is not None, at_run=True, spoiled=spoiled))
         self._on_failure()
+
+    def _settings_changed(self) -> str:
+        changed = changed_settings(self.when_loaded, read_process_state()) if self.when_loaded else []
+        return f"{some_of(changed)} changed since the version was loaded" if changed else ""
 
     def refuse(self, failed: LoadFailed) -> None:
         """Send that a version was refused."""
-        self.spoiled = failed.spoiled
+        self._send_failure(failed)
+
+    def _send_failure(self, failed: LoadFailed) -> None:
+        self.spoiled = self.spoiled or failed.spoiled != ""
         self.line.send(failed)
 
-    def restore_last_step(self) -> None:
-        """Put the batch back to the end of the last step, after one that was cut short."""
+    def restore_last_step(self) -> Problem | None:
+        """Put the batch back to the end of the last step, after one that was cut short. Returns why that failed."""
         if self.opened is None or self.steps.moment is None:
-            return
+            return None
         try:
             # Not `TaskEnv.restore`: that calls `evaluate`, which may be what did not end.
             restore_snapshot(self.opened.env.env, self.steps.moment)
-        except (RuntimeError, ValueError, TypeError) as error:
-            self.fail(problem_from_exception(error, "reset", self.opened.loaded.source_files))
+        except Exception as error:  # the failed code may have put anything in place of what is restored
+            return problem_from_exception(error, "reset", self.opened.loaded.source_files)
+        return None

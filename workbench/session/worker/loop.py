@@ -89,7 +89,7 @@ from workbench.session.worker.go_back import (
     going_back_text,
     rescore_moments,
 )
-from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
+from workbench.session.worker.guarded_task import REFUSED, GuardedTask, ServerConnection
 from workbench.session.worker.make_scene import SceneEnv, draw_task, registered_ids
 from workbench.session.worker.pacing import Pacer, Rate, Shares, throttled
 from workbench.session.worker.plans import FollowedPlan, WorkerPlans, envs_to_plan, succeeded
@@ -139,8 +139,6 @@ class Worker:
         self._quit = False
         self._state_at_start: ProcessState = {}
         """Before any version was loaded."""
-        self._state_when_loaded: ProcessState | None = None
-        """When the load of the running version had ended."""
         self._handlers: dict[type, Callable[[Any], None]] = {
             Load: self._load,
             Play: self._play,
@@ -213,7 +211,9 @@ class Worker:
             return Answer(call.number, why=str(error))
         except TaskError as error:
             if self._task.drop_steps_if_interrupted(error):
-                self._task.restore_last_step()
+                failed = self._task.restore_last_step()
+                if failed is not None:
+                    self._task.fail(failed)
             return Answer(call.number, why=str(error), problem=error.problem)
 
     def _value(self, question: Question[Any], report: Callable[..., None]) -> object:
@@ -266,7 +266,7 @@ class Worker:
         return min(waits)
 
     def _load(self, request: Load) -> None:
-        running, when_loaded = self._running, self._state_when_loaded
+        running, when_loaded = self._running, self._task.when_loaded
         if running is not None and when_loaded is not None:
             needed = why_new_process(request, running, self._task.failed, self._state_at_start, when_loaded)
             if needed is not None:
@@ -280,8 +280,9 @@ class Worker:
         except TaskError as error:
             self._task.drop_steps_if_interrupted(error)
             kept = self._task.opened is not None
-            spoiled = executed_modules() > executed
-            self._task.refuse(LoadFailed(error.problem, kept, error.classes, request.options, spoiled))
+            spoiled = REFUSED if executed_modules() > executed else ""
+            refused = LoadFailed(error.problem, kept, error.classes, request.options, spoiled=spoiled)
+            self._task.refuse(refused)
 
     @property
     def _running(self) -> Running | None:
@@ -306,7 +307,7 @@ class Worker:
                     begins_anew=True,
                 ),
             )
-        self._state_when_loaded = read_process_state()
+        self._task.when_loaded = read_process_state()
         # No interrupt here: it would leave the page with another task than the worker's.
         with self._interrupts.shielded():
             self._replace_task(opened, report, request, send)
@@ -554,9 +555,6 @@ class Worker:
             else:
                 on_step = self._throttled_status(partial(entering_text, request))
                 step, restored = enter_recording(opened, request, on_step)
-        except TaskError:
-            self._task.restore_last_step()
-            raise
         finally:
             self._cameras.put_back()
         self._chooser.begin(restored.env_idx, _led_there(request))

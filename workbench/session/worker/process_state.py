@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from workbench.machine.processes.debugger import is_debugged
+
 _MODULES = (
     *("torch", "torch.nn.functional", "numpy", "numpy.random", "random", "time", "math", "os", "builtins"),
     *("mani_skill.envs.sapien_env", "mani_skill.utils.common", "mani_skill.utils.sapien_utils", "sapien"),
@@ -35,7 +37,7 @@ def read_process_state() -> ProcessState:
         "numpy.geterr()": np.geterr(),
         "sys.excepthook": sys.excepthook,
         "os.umask()": _umask(),
-        "sys.settrace()": sys.gettrace() is not None,
+        "sys.settrace()": sys.gettrace() is not None and not is_debugged(),
     }
     state |= {f"os.environ[{name!r}]": value for name, value in os.environ.items()}
     state |= {f"signal handler of {number.name}": signal.getsignal(number) for number in signal.Signals}
@@ -57,6 +59,12 @@ def changed_settings(before: ProcessState, now: ProcessState) -> list[str]:
     of the environment is."""
     found = [name for name, value in before.items() if name not in now or now[name] != value]
     return found + [name for name in now if name not in before and name.startswith("os.environ")]
+
+
+def some_of(names: list[str]) -> str:
+    """The first of the names, in a sentence."""
+    more = f" and {len(names) - 2} more" if len(names) > 2 else ""
+    return ", ".join(names[:2]) + more
 
 
 def threads_of(files: Mapping[str, Any]) -> list[str]:

@@ -51,6 +51,7 @@ from workbench.session.worker.process_state import (
     ProcessState,
     changed_settings,
     read_process_state,
+    some_of,
     threads_of,
 )
 
@@ -181,11 +182,11 @@ def why_new_process(
     if failed:
         reason = "the version before failed while it ran"
     elif while_running:
-        reason = f"the version before has changed {_some(while_running)}"
+        reason = f"the version before has changed {some_of(while_running)}"
     elif same_scene or not before.followed:
         return None  # what was imported and built stays as it is
     elif at_load:
-        reason = f"the version before has changed {_some(at_load)}"
+        reason = f"the version before has changed {some_of(at_load)}"
     else:
         reason = f"what {gone} did when it was imported cannot be taken back"
     return NewProcessNeeded(reason, same_scene)
@@ -200,11 +201,6 @@ def _is_python(text: str | None) -> bool:
     except (SyntaxError, ValueError, RecursionError):
         return False
     return True
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - 2} more" if len(names) > 2 else ""
-    return ", ".join(names[:2]) + more
 
 
 # --- which level -----------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from workbench.authoring.problem import Problem
 from workbench.authoring.templates.new_task import CannotBegin, fill_blank_file, is_blank
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
-from workbench.ui.live.timeline import GAP
+from workbench.ui.live.timeline import GAP, step_in_words
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
@@ -86,6 +86,8 @@ class Banner(PagePart[SessionView]):
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
+            # An element of its own: what it says changes, and the other must not be written again.
+            self._kept = server.gui.add_html("")
             self._fill = server.gui.add_button(FILL, icon=viser.Icon.FILE_PLUS, visible=False)
             self._reload = server.gui.add_button(RELOAD, icon=viser.Icon.REFRESH, color="gray")
             self._rebuild = server.gui.add_button(
@@ -105,7 +107,8 @@ class Banner(PagePart[SessionView]):
         self._reload.on_click(lambda _: reload())
         self._rebuild.on_click(lambda _: rebuild())
         self._restart.on_click(lambda _: restart())
-        self._drawn: tuple[int, str] | None = None
+        self._drawn: int | None = None
+        """Serial of the problem."""
 
     def draw(self, view: SessionView) -> None:
         problem = view.problem
@@ -118,15 +121,15 @@ class Banner(PagePart[SessionView]):
         self._restart.visible = stopped
         self._rebuild.visible = view.task is not None and not stopped and problem.stage in _MAY_BE_OLD
         # Written once for each problem: a new text would close an open traceback.
-        drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
-        if drawn != self._drawn:
-            self._drawn = drawn
+        if view.problem_serial != self._drawn:
+            self._drawn = view.problem_serial
             file = Path(problem.file) if problem.file and self._is_own(problem.file) else None
             self._blank = file if view.task is None and file is not None and is_blank(file) else None
             self._fill.visible = self._blank is not None
             self._html.content = banner_html(problem, view, self._link)
             self._panel.visible = True
             self._panel.expand()
+        self._kept.content = kept_html(view)
 
     def _on_fill(self, event: viser.GuiEvent) -> None:
         if self._blank is None:
@@ -151,7 +154,12 @@ def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) ->
         doing = "was not loaded"
     if problem.interrupted:
         doing = INTERRUPTED.get(problem.stage, f"was interrupted in {problem.stage}")
-    return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view), link=link)
+    return render("banner", subject=subject, doing=doing, problem=problem, link=link)
+
+
+def kept_html(view: SessionView) -> str:
+    """What runs now, and what to do, under the problem."""
+    return render("banner_kept", kept=_kept(view))
 
 
 def _stopped(view: SessionView) -> bool:
@@ -161,7 +169,7 @@ def _stopped(view: SessionView) -> bool:
 
 
 def _kept(view: SessionView) -> str:
-    """Which version still runs, in a sentence."""
+    """Which version still runs and how to go on, in sentences."""
     if _stopped(view):
         return "No process runs the task. Restart the worker to load the file as it is now."
     if view.task is None and not (view.problem is not None and view.problem.file):
@@ -169,12 +177,20 @@ def _kept(view: SessionView) -> str:
     if view.task is None:
         return "No version has loaded yet. Fix the file and save it, and the page will show it."
     if view.state in ("starting", "loading"):
-        return "A new process is taking over; the last good version will be back where it was."
+        return "A new process is taking over; the version that ran will be back where it was."
     if view.problem is not None and view.problem.stage == "worker":
         return "The last good version is back where it was, and paused."
+    if view.problem_at_run:
+        if view.problem is not None and view.problem.stage == "policy":
+            return "The task is paused. Mend the policy and save it, or choose another source of actions (Run tab)."
+        process = f" Another process has loaded it: {view.spoiled}." if view.spoiled else ""
+        return (
+            f"It failed while it ran, and is paused at {step_in_words(view)}.{process} Save a mended file, or go on with this version: with a "
+            "reset (Shift+R), or with another step (S)."
+        )
     if view.playing:
         return "The last good version is still running."
-    return "The last good version is still shown."
+    return "The last good version is still loaded, and paused."
 
 
 class BusyBanner(PagePart[SessionView]):

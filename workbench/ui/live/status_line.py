@@ -27,7 +27,7 @@ STATE_WORDS = {
     "loading": "loading",
     "running": "running",
     "paused": "paused",
-    "error": "error",
+    "error": "not loaded",
     "stopped": "worker stopped",
     "busy": "busy",
     "held": "held",
@@ -77,7 +77,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
     task = view.task
     # While the renderer works, the session's activity says more than "busy".
     busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
-    moving = view.playing and view.state in ("running", "error") and task is not None and busy is None
+    moving = view.playing and view.state == "running" and task is not None and busy is None
     # A plan takes what it takes: rates of single steps would only say that it is slow.
     planning = moving and view.settings.action_source == "solve"
     starting = planning and view.solve.state == "starting"
