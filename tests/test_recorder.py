@@ -74,7 +74,7 @@ def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_pa
     path = tmp_path / "theirs" / "run.h5"
     with h5py.File(path) as file:
         names = [*file]
-    theirs = [read_maniskill(path, name) for name in names]
+    theirs = [read_maniskill(path, str(name)) for name in names]
     read = episodes_in(tmp_path / "ours")
     assert sorted(e.length for e in read) == sorted(e.length for e in theirs) == [2, 3, 5]
     for one in read:

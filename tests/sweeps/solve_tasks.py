@@ -176,7 +176,7 @@ def run(row: Row, options: Options, known: Known) -> None:
                 task, out, most, actions=actions, pictures=False, max_steps=steps, options=envs
             )
             done = record(plain_run)
-            row.returns[actions] = mean(one.total_reward / one.steps for one in done.written)
+            row.returns[actions] = mean((one.total_reward or 0.0) / one.steps for one in done.written)
     known.save()
 
 

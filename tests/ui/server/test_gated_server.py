@@ -267,7 +267,7 @@ def test_a_name_that_viser_took_away_is_named(name, monkeypatch):
         "infra": viser.infra._infra,
         "messages": viser._messages,
         "gui": viser._gui_handles,
-        "callbacks": viser._threadpool_exceptions,
+        "callbacks": getattr(viser, "_threadpool_exceptions"),  # noqa: B009
     }
     here = roots[path[0]]
     for part in path[1:]:

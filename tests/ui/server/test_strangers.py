@@ -270,9 +270,9 @@ def test_whatever_is_sent_prints_a_few_short_lines(
     assert both(gated_server) == (200, 101)
     time.sleep(0.5)  # what fails in threads
     gated_server.close()
-    said = [
-        logging.lastResort.format(record) for record in caplog.records if record.levelno >= logging.WARNING
-    ]
+    last_resort = logging.lastResort
+    assert last_resort is not None
+    said = [last_resort.format(record) for record in caplog.records if record.levelno >= logging.WARNING]
     printed = capfd.readouterr()
     lines = "\n".join((*said, printed.out, printed.err)).strip().splitlines()
     assert len(lines) <= MOST_LINES * (4 if attack in (fails, presses) else 1), lines[:100]
