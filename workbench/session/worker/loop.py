@@ -350,6 +350,7 @@ class Worker:
     def _listen_for_debugger(self, request: ListenForDebugger) -> None:
         try:
             listen_for_debugger(request.port, self._heartbeat.hold)
+            self._state_at_start = read_process_state()  # with the variables that the debugger sets
         except CannotDebug as error:
             print(f"workbench: no debugger can attach: {error}", file=sys.stderr)
             return

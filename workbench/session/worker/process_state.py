@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from workbench.machine.processes.debugger import is_debugged
+from workbench.machine.processes.debugger import may_be_debugged
 
 _MODULES = (
     *("torch", "torch.nn.functional", "numpy", "numpy.random", "random", "time", "math", "os", "builtins"),
@@ -22,6 +22,8 @@ _MODULES = (
 )
 """Their functions are compared: a task may have put its own in place of one."""
 _FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType)
+
+_TRACED = "sys.settrace()"
 
 ProcessState = Mapping[str, object]
 
@@ -35,9 +37,7 @@ def read_process_state() -> ProcessState:
         "torch.are_deterministic_algorithms_enabled()": torch.are_deterministic_algorithms_enabled(),
         "torch.get_num_threads()": torch.get_num_threads(),
         "numpy.geterr()": np.geterr(),
-        "sys.excepthook": sys.excepthook,
         "os.umask()": _umask(),
-        "sys.settrace()": sys.gettrace() is not None and not is_debugged(),
     }
     state |= {f"os.environ[{name!r}]": value for name, value in os.environ.items()}
     state |= {f"signal handler of {number.name}": signal.getsignal(number) for number in signal.Signals}
@@ -46,6 +46,7 @@ def read_process_state() -> ProcessState:
         for name in dir(resource)
         if name.startswith("RLIMIT_")
     }
+    state |= {"sys.excepthook": sys.excepthook, _TRACED: sys.gettrace() is not None}
     for module in _MODULES:
         members = vars(sys.modules[module]) if module in sys.modules else {}
         for name, value in members.items():
@@ -57,6 +58,13 @@ def read_process_state() -> ProcessState:
 def changed_settings(before: ProcessState, now: ProcessState) -> list[str]:
     """Names of what differs: what had another value, or is gone. A function that came in addition is no change, a variable
     of the environment is."""
+    if may_be_debugged():
+        # A debugger puts its own functions in place of Python's, some when it attaches.
+        before = {
+            name: value
+            for name, value in before.items()
+            if name != _TRACED and not isinstance(value, _FUNCTIONS)
+        }
     found = [name for name, value in before.items() if name not in now or now[name] != value]
     return found + [name for name in now if name not in before and name.startswith("os.environ")]
 
