@@ -193,7 +193,7 @@ class StrictMixin:
 
     @contextmanager
     def _noting_rows(self, info: Any, obs: Any = None) -> Iterator[None]:
-        """ErrorNote what has no row for each env in what ``evaluate`` and ``_get_obs_extra`` returned to a hook that fails with it."""
+        """Note what has no row for each env in what ``evaluate`` and ``_get_obs_extra`` returned to a hook that fails with it."""
         try:
             yield
         except CoreRefusal:
