@@ -24,18 +24,13 @@ def choose(page: Page, words: str) -> None:
     expect(page.locator(".mantine-Spotlight-content")).to_be_hidden()
 
 
-# Fails at times: Tab stays on the page's body, after viser's notice of software WebGL was up. The cause is not found.
-@pytest.mark.slow
 def test_every_fold_is_reached_by_tab_and_opened_by_enter_and_space(
     example_without_pictures: At, browser: Browser
 ) -> None:
     with example_without_pictures(browser) as desk:
         page = desk.page
-        # viser's notice of software WebGL goes by itself, and takes the focus along that has walked into it.
-        expect(page.locator(".mantine-Notification-closeButton")).to_have_count(0)
         for tab in ("Run", "Studio", "Checks"):
             desk.tab(tab)
-            page.get_by_role("tab", name=tab, exact=True).focus()
             folded = page.locator("div[role=button][aria-expanded=false]:has(> svg)").filter(
                 has_text=re.compile("."), visible=True
             )
