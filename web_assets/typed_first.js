@@ -25,7 +25,7 @@
     "keydown",
     (event) => {
       const target = event.target;
-      if (!event.isTrusted || !(target instanceof Element) || target.matches(HEARS_KEYS) ) return;
+      if (!event.isTrusted || !(target instanceof Element) || target.matches(HEARS_KEYS)) return;
       // The browser moves the focus for no event of ours, so Tab, pressed again and again after a click, would move nothing.
       if (event.key === "Tab") return;
       if (!waiting && !pressed) return;
