@@ -236,7 +236,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("env_index", "length"), (int,)),
     **dict.fromkeys(("success", "fail"), (bool, type(None))),
     "seed": (int, type(None)),
-    "return": (int, float),
+    "return": (int, float, type(None)),
     "recovered": (bool,),
     "tags": (list,),
     "thumbnail": (str, type(None)),

@@ -32,6 +32,7 @@ from workbench.core.scene.shapes import Mesh
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.rerun import write
+from workbench.recording.rerun.read import read_properties
 from workbench.recording.writing.episode_writer import EpisodeFiles, EpisodeWriter
 from workbench.recording.writing.finish import episode_stem, recover
 from workbench.recording.writing.journal import FOLDER
@@ -90,6 +91,13 @@ def test_three_files_of_one_name_and_nothing_else(make_episode: Maker, tmp_path:
     said = json.loads(files.json.read_bytes())["workbench"]
     assert said["id"] == episode.info.id and said["success"] is True and said["fail"] is None
     assert (said["length"], said["return"], said["seed"], said["thumbnail"]) == (3, 0.0, 7, None)
+
+
+def test_an_episode_without_a_reward_has_no_return(make_episode: Maker, tmp_path: Path) -> None:
+    without = dataclasses.replace(make_episode().info, env_kwargs={"reward_mode": "none"})
+    files = make_episode(info=without).write(tmp_path)
+    assert json.loads(files.json.read_bytes())["workbench"]["return"] is None
+    assert read_properties(files.rrd)["episode"].get("return") is None
 
 
 def test_files_that_exist_are_never_written_over(make_episode: Maker, tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def describe(episode: Episode) -> Description:
         source_file=os.path.basename(info.source_file) if info.source_file else None,
         source={_relative(path, folder): text for path, text in info.source.items()},
         length=episode.length,
-        total_reward=float(np.sum(episode.reward, dtype=np.float64)),
+        total_reward=float(np.sum(episode.reward, dtype=np.float64)) if info.has_reward else None,
         success=last.get("success"),
         success_once=once.get("success"),
         fail=last.get("fail"),

@@ -158,7 +158,8 @@ class Description(Struct, frozen=True, kw_only=True):
     moved_cameras: tuple[MovedCamera, ...] = ()
     observed_by: Name = ""
     length: SmallInt
-    total_reward: float = msgspec.field(name="return")
+    total_reward: float | None = msgspec.field(name="return")
+    """None for a task without a reward."""
     success: bool | None
     """In the last state (`success_once`: in any). None if the task has no such entry."""
     success_once: bool | None
