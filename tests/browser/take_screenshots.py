@@ -282,7 +282,8 @@ def shoot_rescored(browser: Browser) -> None:
         rows.nth(1).click()
         expect(rows.nth(1)).to_have_class("wb-selected")
         time.sleep(2.0)
-        desk.page.locator(".wb-again-more").scroll_into_view_if_needed()
+        # By script: it is drawn anew while it is scrolled to.
+        desk.page.locator(".wb-again-more").evaluate("more => more.scrollIntoView({ block: 'nearest' })")
         desk.shoot("rescored")
 
 
