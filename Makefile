@@ -10,7 +10,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help open test test-all test-gpu gpu-wheels mutants lint wheel doctor clean set-up set-up-test FORCE
+.PHONY: help open test test-all test-order test-gpu gpu-wheels mutants lint wheel doctor clean set-up set-up-test FORCE
 
 TASK ?= tasks/push_cube.py
 ARGS ?=
@@ -19,7 +19,7 @@ MODULES ?= all
 # A third process would not help two cores: tried, and the tests in a browser took as much longer as others gained.
 # The files keep their order: by number of tests, as xdist has it, those of one long test come last and leave a core idle.
 WORKERS ?= 2
-SEEDS ?= $(shell echo $$RANDOM $$RANDOM)
+SEED := $(or $(SEED),$(shell echo $$RANDOM))
 # MANISKILL=nightly: ManiSkill's nightly build in place of its release, in an environment of its own.
 MANISKILL ?= release
 ifeq ($(MANISKILL),release)
@@ -57,8 +57,8 @@ help:
 	@echo "make open      show tasks/push_cube.py in the browser (TASK=file or env id, ARGS=options of workbench open)"
 	@echo "make test      lint, types and the tests that need no GPU and little time (ARGS=options of pytest)"
 	@echo "make test-fast ruff and the tests that need no process, renderer or browser: about two minutes"
-	@echo "make test-all  the slow tests too, all of them twice in random order (SEEDS=\"1 2\" makes two orders again),"
-	@echo "               then make test MANISKILL=nightly"
+	@echo "make test-all  the slow tests too, within an hour"
+	@echo "make test-order all of them in random order (SEED=1 makes one order again)"
 	@echo "make test MANISKILL=nightly  the same tests with ManiSkill's nightly build, in .venv-nightly; likewise make open"
 	@echo "make mutants   would a test notice? Slips are planted in copies of MODULES (ui/server/access ..., or all)"
 	@echo "make test-gpu  on a machine with CUDA: what of GPU simulation and GPU pictures works, within 8 minutes"
@@ -83,17 +83,15 @@ test-fast: set-up-test
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m pytest --fast -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
-# Whatever a test leaves behind for another is found by an order in which it comes first.
 test-all: lint
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
-	failed=; \
-	for seed in $(SEEDS); do \
-		echo "order of the tests: make test-all SEEDS=$$seed"; \
-		$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --random-order-seed=$$seed $(ARGS) \
-			|| failed="$$failed $$seed"; \
-	done; \
-	[ -z "$$failed" ] || { echo "failed in the order of seed$$failed" >&2; exit 1; }
-	$(MAKE) --no-print-directory test MANISKILL=nightly
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
+
+# Whatever a test leaves behind for another is found by an order in which it comes first.
+test-order: set-up-test
+	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
+	echo "this order again: make test-order SEED=$(SEED)"; \
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --random-order-seed=$(SEED) $(ARGS)
 
 test-gpu:
 	@if [ -z "$(GPU_PYTHON)" ]; then echo "test-gpu needs Python 3.11 or 3.12; name one: make test-gpu GPU_PYTHON=/path/to/python3.12" >&2; exit 1; fi
