@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 from tests.drive.panels import Panels
@@ -10,6 +10,8 @@ from tests.ui.env_rows import rows_of
 from tests.ui.scenes import running
 from workbench.core.capture.outliers import Outlier, OutlierKind
 from workbench.session.history.env_table import EnvRows
+from workbench.session.process.job_lane import JobProgress
+from workbench.session.record.save_past import SaveStatus
 from workbench.ui.app.marks import Marks, flagged_text
 from workbench.ui.widgets.open_tabs import OpenTabs
 
@@ -52,3 +54,14 @@ def test_no_env_flagged_is_no_mark(panels: Panels) -> None:
     marks(panels, rows_of(outliers={}), []).draw(running(6))
     assert "wb-sight" not in panels.html()
     assert flagged_text(rows_of(outliers={})) is None
+
+
+def test_what_is_saved_of_the_past_is_in_sight_until_it_is_saved(panels: Panels) -> None:
+    row, view = marks(panels, rows_of(outliers={}), []), running(6)
+    saves = SaveStatus(progress=JobProgress("replaying", 3, 20))
+    saving = replace(view, recording=replace(view.recording, saving=saves))
+    assert row.urgent(saving) != row.urgent(view)
+    row.draw(saving)
+    assert "wb-sight-saving" in panels.html()
+    row.draw(view)
+    assert "wb-sight" not in panels.html()

@@ -133,6 +133,10 @@ def test_where_there_is_no_reward_is_a_gap_and_without_a_change_a_straight_line(
     assert len(reward_lines(many)) == 1, "narrower than a pixel"
     html = strip_html(strip(reward=many[:101]), running(4, timeline=past()))
     assert "nan" not in html and html.count("<polyline") > 1
+    view = running(4, timeline=past())
+    assert view.task is not None
+    without = replace(view, task=replace(view.task, reward_mode="none"))
+    assert "<polyline" not in strip_html(strip(reward=np.zeros(101, np.float32)), without)
 
 
 def test_what_could_not_be_put_back_is_said_and_escaped() -> None:

@@ -16,7 +16,7 @@ from workbench.authoring.loading.reference import named_file
 from workbench.jobs.task import ShownPictures
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.app.marks import STUDIO, Marks
+from workbench.ui.app.marks import EPISODES, STUDIO, Marks
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.cameras.studio import StudioPanel
@@ -193,7 +193,7 @@ class Page:
             self._rescored = PastRescorePanel(server, session)
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, clock)
-        with tabs.add_tab("Episodes", viser.Icon.MOVIE):
+        with tabs.add_tab(EPISODES, viser.Icon.MOVIE):
             self._record = RecordPanel(server, session)
             review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS, color="gray")
             review.on_click(lambda _: on_review())
@@ -213,7 +213,7 @@ class Page:
             *reward,
             self._rescored,
         ]
-        self._open_tabs.are("Run", "Cameras", STUDIO, "Reward", "Inspect", "Episodes", CHECKS, "Log")
+        self._open_tabs.are("Run", "Cameras", STUDIO, "Reward", "Inspect", EPISODES, CHECKS, "Log")
         return run_tab, [*parts, self._inspect, self._record, checks, seeds, profile, log]
 
     def _add_table_of_envs(self) -> None:

@@ -1,4 +1,5 @@
-"""The marks that stay in sight on every tab: recording, a camera moved by hand, findings, flagged envs."""
+"""The marks that stay in sight on every tab: recording, saving of the past, a camera moved by hand, findings,
+flagged envs."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from workbench.ui.widgets.open_tabs import OpenTabs
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import counted, render
 
-STUDIO = "Studio"
+EPISODES, STUDIO = "Episodes", "Studio"
 
 
 class Marks(PagePart[SessionView]):
@@ -50,10 +51,19 @@ class Marks(PagePart[SessionView]):
         self._save = presses.id_of("save the camera's move", self._show_change)
         self._findings = presses.id_of("open", lambda client: tabs.open(CHECKS, client))
         self._flagged = presses.id_of("flagged", lambda _: on_flagged())
+        self._saving = presses.id_of("saving", lambda client: tabs.open(EPISODES, client))
 
     def urgent(self, view: SessionView) -> object:
         recording = view.recording
-        return recording.active, recording.env_idx, recording.waiting, recording.episodes, moved_cameras(view)
+        saves = recording.saving.progress is not None
+        return (
+            recording.active,
+            recording.env_idx,
+            recording.waiting,
+            recording.episodes,
+            saves,
+            moved_cameras(view),
+        )
 
     def draw(self, view: SessionView) -> None:
         rows = self._session.env_rows()
@@ -62,6 +72,7 @@ class Marks(PagePart[SessionView]):
             "marks",
             rec=recording_mark(view, self._stop),
             moved=moved_mark(view, self._undo, self._save),
+            saving=self._saving if view.recording.saving.progress is not None else "",
             findings=findings_mark(view),
             findings_press=self._findings,
             flagged=flagged and {"text": flagged[0], "hint": flagged[1], "press": self._flagged},

@@ -476,7 +476,10 @@ def fixed_values(view: ReviewView) -> dict[str, object]:
         (index, [h for h in view.opened[index].events if h.style != "reset"][:MOST_MARKS])
         for index in shown_together(view)
     ]
-    reward = np.asarray(view.opened[view.selected].episode.reward, np.float64)
+    episode = view.opened[view.selected].episode
+    reward = np.asarray(episode.reward, np.float64)
+    if not episode.info.has_reward:
+        reward = np.full_like(reward, np.nan)  # ManiSkill's is 0 then
     after, anchor = np.arange(1, len(reward) + 1), view.anchors[view.selected]
     over = column_at(after, reward, anchor, np.arange(view.first, view.last + 1)).astype(np.float32)
     styles = {h.style for _, marks in rows for h in marks}

@@ -354,7 +354,10 @@ def strip_html(strip: Strip, view: SessionView, pick: str = "") -> str:
     Args:
         pick: id of the input that gets the tick of a press.
     """
-    marks, finite = marks_of(strip), strip.reward[np.isfinite(strip.reward)]
+    has_reward = view.task is None or view.task.reward_mode != "none"
+    # ManiSkill's reward is 0 where a task has none.
+    reward = strip.reward if has_reward else np.full_like(strip.reward, np.nan)
+    marks, finite = marks_of(strip), reward[np.isfinite(reward)]
     return render(
         "timeline",
         strip=strip,
@@ -365,7 +368,7 @@ def strip_html(strip: Strip, view: SessionView, pick: str = "") -> str:
         where=where(view),
         span=[_number(float(value)) for value in (finite.min(), finite.max())] if len(finite) else None,
         megabytes=megabytes,
-        **strip_values(strip.low, strip.high, strip.reward, {style for _, style, _ in marks}),
+        **strip_values(strip.low, strip.high, reward, {style for _, style, _ in marks}),
     )
 
 
