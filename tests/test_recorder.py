@@ -48,17 +48,6 @@ def test_auto_resets_end_an_episode_and_begin_the_next(tmp_path: Path) -> None:
     assert read[0].info.max_episode_steps == 3 and bool(read[0].truncated[-1])
 
 
-def test_the_seed_that_a_reset_draws_itself_is_kept(tmp_path: Path) -> None:
-    env = workbench.make("PushCube-v1", 2, enhanced_determinism=True, **CPU)
-    env = workbench.Recorder(env, tmp_path, env_idx=[1])
-    env.reset(seed=[7, 8])
-    env.reset(options={"env_idx": torch.tensor([1])})
-    drawn = int(env.unwrapped._episode_seed[1])  # type: ignore[attr-defined]
-    env.step(env.action_space.sample())
-    env.close()
-    assert [e.info.seed for e in episodes_in(tmp_path)] == [drawn] and drawn != 8
-
-
 def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_path: Path) -> None:
     """The same run through both, RecordEpisode around ours: states, actions, rewards and flags are equal."""
     env = workbench.make(str(TASKS / "push_cube.py"), 2, **CPU)
@@ -200,10 +189,3 @@ def test_a_killed_program_loses_a_second(child_process: None, tmp_path: Path) ->
         assert (
             np.isfinite(episode.reward).all() and len(episode.env_states["actors/cube"]) == episode.length + 1
         )
-
-
-def test_a_vector_env_is_refused(tmp_path: Path) -> None:
-    env = ManiSkillVectorEnv(workbench.make("PushCube-v1", 1, **CPU))
-    with pytest.raises(TypeError, match="inside a vector env"):
-        workbench.Recorder(env, tmp_path)  # type: ignore[arg-type]
-    env.close()

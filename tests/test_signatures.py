@@ -105,21 +105,6 @@ def test_a_member_of_the_batched_system_takes_what_sapiens_takes(ours: type) -> 
     assert wrong == {}
 
 
-def test_a_wrapper_that_takes_less_would_be_seen() -> None:
-    def stock(self: Any, a: int, b: int = 0, *, c: int = 0) -> None: ...
-
-    def less(self: Any, a: int) -> None: ...
-    def other_name(self: Any, x: int, b: int = 0, c: int = 0) -> None: ...
-    def demands(self: Any, a: int, b: int, c: int = 0) -> None: ...
-    def more(self: Any, a: int, b: int = 0, c: int = 0, d: int = 0) -> None: ...
-    def all_of_it(*args: Any, **kwargs: Any) -> None: ...
-
-    assert [bool(_refuses(ours, stock)) for ours in (less, other_name, demands, more, all_of_it)] == [
-        *(True, True, True),
-        *(False, False),
-    ]
-
-
 def _parameters(function: Callable[..., Any]) -> Parameters:
     return dict(inspect.signature(function, follow_wrapped=False).parameters)
 

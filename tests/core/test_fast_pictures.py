@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,10 +19,8 @@ import workbench
 from tests.core.drawn_envs import batched
 from workbench.core.camera_data import PictureDegree
 from workbench.core.cameras.render import take_pictures
-from workbench.core.env.hot_swap import exchange_cameras
-from workbench.core.env.task_env import BackendUnavailable, EnvOptions
 from workbench.core.maniskill_private import camera_components
-from workbench.core.scene.fast_shader import ALL, COLOR, FastCameras, shader_folder
+from workbench.core.scene.fast_shader import ALL, COLOR, FastCameras
 from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -105,18 +102,6 @@ def test_a_body_that_is_hidden_is_hidden_in_both(env: Any) -> None:
         body.visibility = 1.0
 
 
-def test_what_maniskill_finds_of_a_link_stays_the_exact_shapes(env: Any) -> None:
-    take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
-    link = env.agent.robot.links_map["panda_link5"]
-    assert sum(len(part.triangles) for shape in link.render_shapes[0] for part in shape.parts) > 10_000
-
-
-def test_the_installed_sapien_has_the_shader_that_is_cut_down() -> None:
-    for textures in (COLOR, ALL):
-        folder = shader_folder(textures)
-        assert folder is not None and (folder / "gbuffer.frag").exists()
-
-
 @pytest.mark.parametrize("textures", [COLOR, ALL])
 def test_the_shader_that_is_cut_down_draws_the_same_picture_of_the_same_shapes(
     env: Any, textures: frozenset[str]
@@ -138,25 +123,6 @@ def test_the_shader_that_is_cut_down_draws_the_same_picture_of_the_same_shapes(
     assert colours[0].any() and off.max() <= step * 1.01 and (off > 0).mean() < 0.01
 
 
-def test_a_fast_picture_follows_its_camera(env: Any) -> None:
-    (still,) = take_pictures(env, 0, [("base_camera", "sensor", ALL_THREE)], degree="fast")
-    component = camera_components(env._sensors["base_camera"])[0]
-    was = component.local_pose
-    component.local_pose = was * sapien.Pose([0.1, 0.05, 0])
-    try:
-        exact, fast = (
-            take_pictures(env, 0, [("base_camera", "sensor", ALL_THREE)], degree=degree)[0]
-            for degree in ("exact", "fast")
-        )
-    finally:
-        component.local_pose = was
-    assert fast.rgb is not None and exact.rgb is not None
-    assert np.mean(fast.segmentation != exact.segmentation) < 0.01
-    assert np.mean(fast.segmentation != still.segmentation) > 0.01
-    assert np.abs(fast.rgb.astype(int) - exact.rgb).mean() < 2
-    np.testing.assert_array_equal(fast.pose, exact.pose)
-
-
 def test_an_environment_map_is_in_both(tmp_path: Path) -> None:
     # An env of its own: SAPIEN crashes where a map is taken away again.
     env: Any = batched("PickCube-v1", obs_mode="rgb", num_envs=1)
@@ -175,15 +141,6 @@ def test_an_environment_map_is_in_both(tmp_path: Path) -> None:
     env.close()
 
 
-def test_exchanged_cameras_draw_fast_pictures_too() -> None:
-    env: Any = batched("PickCube-v1", obs_mode="rgb", num_envs=1)
-    (before,) = take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
-    exchange_cameras(env)
-    (after,) = take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
-    np.testing.assert_array_equal(after.rgb, before.rgb)
-    env.close()
-
-
 def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
     with pytest.warns(UserWarning, match="other"):
         env: Any = workbench.make("PickCube-v1", 1, obs_mode="rgb", pictures="fast")
@@ -193,19 +150,6 @@ def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
     off = np.abs(obs["sensor_data"]["base_camera"]["rgb"][0].numpy().astype(int) - exact.rgb)
     assert 0 < off.mean() < 2
     env.close()
-
-
-def test_exact_pictures_are_made_without_a_word() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        workbench.make("PickCube-v1", 1, obs_mode="rgb").close()
-
-
-def test_other_degrees_and_gpu_simulation_are_refused() -> None:
-    with pytest.raises(ValueError, match="exact, fast"):
-        EnvOptions(1, pictures="quick")  # type: ignore[arg-type]
-    with pytest.raises(BackendUnavailable), pytest.warns(UserWarning, match="other"):
-        workbench.make("PickCube-v1", 1, backend="gpu", pictures="fast")
 
 
 def test_after_a_restored_snapshot_both_are_what_they_were(env: Any) -> None:
@@ -249,26 +193,6 @@ def test_a_wrist_camera_draws_nothing_of_what_is_beside_and_behind_it(wrist: Any
     drawn = drawn_by(wrist, "hand_camera")
     # The first is the camera's own body, of 425,000 triangles.
     assert drawn["camera_link"] == drawn["panda_link7"] == drawn["panda_link0"] == 0
-
-
-def test_a_camera_that_is_moved_on_its_mount_sees_what_it_is_fixed_to(wrist: Any) -> None:
-    component = camera_components(wrist._sensors["hand_camera"])[0]
-    take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb"])], degree="fast")
-    was = component.local_pose
-    # Back by the length of a hand, and looking the same way.
-    component.local_pose = was * sapien.Pose([-0.25, 0, 0])
-    try:
-        exact, fast = (
-            take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb", "segmentation"])], degree=degree)[0]
-            for degree in ("exact", "fast")
-        )
-    finally:
-        component.local_pose = was
-    mount = component.entity.per_scene_id
-    assert (exact.segmentation == mount).sum() > 50 and (fast.segmentation == mount).sum() > 50
-    assert (fast.segmentation != exact.segmentation).mean() < 0.02
-    (again,) = take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb"])], degree="fast")
-    assert drawn_by(wrist, "hand_camera")["camera_link"] == 0 and again.rgb is not None
 
 
 def test_a_body_that_comes_into_view_is_drawn(env: Any) -> None:

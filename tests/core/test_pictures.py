@@ -14,7 +14,6 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs import Pose
 
 from tests.core.drawn_envs import batched, stock
-from workbench.core.backends import keep_render_device
 from workbench.core.camera_data import Picture
 from workbench.core.cameras.render import list_cameras, segmentation_names, take_pictures
 from workbench.core.scene.scene_index import scene_index
@@ -125,15 +124,6 @@ def test_the_goal_is_hidden_from_sensors_and_shown_to_people(make: Any) -> None:
     env.close()
 
 
-def test_only_what_is_asked_for_is_given() -> None:
-    env = batched("PickCube-v1")
-    (picture,) = take_pictures(env, 1, [("base_camera", "sensor", ["depth"])])
-    assert picture.rgb is None and picture.segmentation is None
-    assert picture.depth is not None and picture.depth.shape == (128, 128)
-    assert take_pictures(env, 0, []) == ()
-    env.close()
-
-
 def test_cameras_are_described_and_stand_where_maniskill_says() -> None:
     env = batched("PegInsertionSide-v1")
     act(env)
@@ -197,14 +187,6 @@ def test_envs_that_are_built_alike_share_their_segmentation() -> None:
     env.close()
 
 
-def test_without_a_renderer_there_are_no_cameras() -> None:
-    env = batched("PickCube-v1", render=False)
-    assert list_cameras(env) == ()
-    with pytest.raises(ValueError, match="there are: none"):
-        take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])])
-    env.close()
-
-
 @pytest.mark.parametrize(
     ("env_index", "request_", "error", "says"),
     [
@@ -221,8 +203,3 @@ def test_what_cannot_be_is_refused_by_name(env_index: int, request_: Any, error:
     with pytest.raises(error, match=says):
         take_pictures(env, env_index, [request_])
     env.close()
-
-
-def test_an_unknown_render_device_is_named() -> None:
-    with pytest.raises(RuntimeError, match="cuda:99"):
-        keep_render_device("gpu:99")

@@ -16,8 +16,7 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import CPU, PICK_CUBE, batched
 from workbench.core.broken_rule import MOST_ROWS, BrokenRule, BrokenRules, RuleWarning
-from workbench.core.env.task_env import EnvOptions
-from workbench.core.rules import RULES, Finding, degrees_of
+from workbench.core.rules import Finding, degrees_of
 
 N = 3
 Hook = Callable[..., None]
@@ -31,21 +30,6 @@ def test_what_overwrites_other_envs_and_a_success_without_rows_stop_by_themselve
         "evaluate-rows",
     }
     assert {degree for rule, degree in degrees_of(None).items() if rule not in stops} == {"warn"}
-
-
-@pytest.mark.parametrize("choice", ["stop", "warn", "off"])
-def test_a_degree_that_is_chosen_is_that_of_all_rules(choice: Any) -> None:
-    assert degrees_of(choice) == dict.fromkeys(RULES, choice)
-
-
-def test_a_degree_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match="'stop', 'warn' or 'off', not 'strict'"):
-        EnvOptions(rules="strict")  # type: ignore[arg-type]
-
-
-def test_each_rule_says_what_it_asks_and_what_happens_otherwise() -> None:
-    for id, rule in RULES.items():
-        assert rule.id == id and rule.asks.endswith(".") and rule.otherwise.endswith(".")
 
 
 # --- a rule that warns changes nothing ------------------------------------------------------------------

@@ -17,7 +17,7 @@ from mani_skill.sensors.camera import CameraConfig
 from tests.core.stock_env import batch_of
 from tests.core.watched import RENDERED, Watched, pictures
 from workbench.core.camera_data import CameraKey, CameraSettings
-from workbench.core.cameras.place import PlacedCameras, settings_of
+from workbench.core.cameras.place import PlacedCameras
 from workbench.core.cameras.render import list_cameras, segmentation_names, take_pictures
 from workbench.core.env.hot_swap import exchange_cameras
 from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
@@ -136,17 +136,6 @@ def test_resets_and_snapshots_leave_a_placed_camera_where_it_is(env: Any) -> Non
         assert np.allclose(picture.pose, [0.5, 0, 1.3, 1, 0, 0, 0]) and picture.rgb.shape == (24, 30, 3)
 
 
-def test_a_reset_that_builds_the_scene_anew_is_followed_by_putting_cameras_back(env: Any) -> None:
-    placed = PlacedCameras()
-    settings = replace(said(env, PEOPLE), position=(-1.0, 0.0, 1.0))
-    placed.place(env, PEOPLE, settings)
-    env.reset(seed=SEEDS, options={"reconfigure": True})
-    assert said(env, PEOPLE).position == (0.0, 0.0, 1.0)
-    placed.put_back(env)
-    (picture,) = take_pictures(env, 0, [("people", "human", ("rgb",))])
-    assert picture.pose[0] == -1.0
-
-
 class Wandering(Watched):
     """Each time that its scene is built a camera stands elsewhere, and looks another way."""
 
@@ -210,14 +199,3 @@ def test_a_pose_that_differs_between_envs_is_said_and_comes_back(env: Any) -> No
     placed.place(env, BESIDE, None)
     (picture,) = take_pictures(env, 1, [("beside", "sensor", ("rgb",))])
     assert np.allclose(picture.pose[:3], [0.1, 0, 1])
-
-
-def test_settings_are_those_that_a_config_was_made_of() -> None:
-    pose = sapien.Pose([1, 2, 3], [0.5, 0.5, 0.5, 0.5])
-    made = settings_of(CameraConfig("c", pose, 8, 6, intrinsic=np.array(INTRINSIC)))
-    assert made == CameraSettings(
-        (1.0, 2.0, 3.0), (0.5, 0.5, 0.5, 0.5), None, INTRINSIC, 8, 6, 0.01, 100.0, "minimal"
-    )
-    straight_down = settings_of(CameraConfig("c", sapien.Pose(q=[0.5, 0, 0.5, 0]), 8, 6, fov=1.0))
-    assert straight_down is not None and np.allclose(np.linalg.norm(straight_down.quaternion), 1.0)
-    assert settings_of(CameraConfig("c", pose, 8, 6, fov=[1.0, 1.2])) is None

@@ -16,7 +16,7 @@ import torch
 
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core import maniskill_private
-from workbench.core.capture.inspect_env import MOST_VALUES, inspect_env
+from workbench.core.capture.inspect_env import inspect_env
 from workbench.core.capture.inspection import SECTIONS, Inspection
 from workbench.core.env import actions
 from workbench.core.env.task_env import TaskEnv
@@ -102,13 +102,6 @@ def test_a_flat_observation_is_taken_apart_under_the_names_it_was_made_of(pick: 
         assert read["extra/is_grasped"].shape == (1,)
 
 
-def test_a_dict_of_observations_is_shown_as_it_is() -> None:
-    nested = opened("PickCube-v1", num_envs=2, obs_mode="state_dict")
-    leaves = inspect_env(nested, 1, ["observation"]).observation
-    assert by_name(leaves)["extra/goal_pos"].tolist() == nested.obs["extra"]["goal_pos"][1].tolist()
-    assert {leaf.name: leaf.dtype for leaf in leaves}["extra/is_grasped"] == "bool"
-
-
 def test_the_state_dict_is_taken_apart_by_what_its_numbers_are(pick: TaskEnv) -> None:
     state = pick.env.get_state_dict()
     read = by_name(inspect_env(pick, 1, ["state"]).state)
@@ -169,21 +162,3 @@ def test_a_section_that_the_author_broke_does_not_take_the_others_along() -> Non
     read = inspect_env(task, 0, SECTIONS)
     assert read.state is None and dict(read.refused) == {"state": "reading it raised KeyError: 'goal'"}
     assert read.joints and read.observation
-
-
-def test_large_arrays_are_told_by_their_range() -> None:
-    class Wide(PICK_CUBE):
-        def _get_obs_extra(self, info: dict) -> dict:
-            grid = self.cube.pose.p.new_zeros(self.num_envs, 10 * MOST_VALUES)
-            grid[:, -1] = 7
-            return {"grid": grid}
-
-    leaves = inspect_env(opened(Wide, num_envs=2), 1, ["observation"]).observation
-    grid = next(leaf for leaf in leaves if leaf.name == "extra/grid")
-    assert grid.shape == (10 * MOST_VALUES,) and len(grid.values) == MOST_VALUES
-    assert (grid.low, grid.high) == (0, 7)
-
-
-def test_there_is_no_such_env(pick: TaskEnv) -> None:
-    with pytest.raises(IndexError, match="out of range for 3 envs"):
-        inspect_env(pick, 3, SECTIONS)

@@ -10,7 +10,6 @@ import pytest
 import torch
 from mani_skill.utils import common
 
-from tests.core.drawn_envs import batched as drawn
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.capture.recorded_run import states_of
 from workbench.core.capture.state_columns import StateReading, read_state_columns
@@ -52,14 +51,6 @@ def test_what_the_task_itself_moves_has_no_velocity_whatever_was_written() -> No
         column = columns[f"state/actors/{actor.name}"]
         assert (column[:, 7:10] == speed).all()
         np.testing.assert_array_equal(column, actor.get_state().numpy())
-    task.close()
-
-
-def test_pictures_are_left_out_of_an_observation(renderer: None) -> None:
-    task = TaskEnv(drawn("PickCube-v1", obs_mode="rgb"))
-    task.reset(seed=0)
-    seen = {name for name in read_state_columns(task) if name.startswith("obs/")}
-    assert {name.split("/")[1] for name in seen} == {"agent", "extra"}
     task.close()
 
 
@@ -117,16 +108,6 @@ def test_what_lies_on_a_device_comes_as_it_is_in_its_order() -> None:
         column = columns[name]
         assert column.shape == tuple(value.shape) and column.dtype == np.asarray(value).dtype
         np.testing.assert_array_equal(column, np.asarray(value))
-
-
-def test_columns_are_copies() -> None:
-    task = made("PushCube-v1")
-    before = read_state_columns(task)
-    kept = {name: column.copy() for name, column in before.items()}
-    task.step(np.ones((3, 8), np.float32))
-    for name, column in before.items():
-        np.testing.assert_array_equal(column, kept[name])
-    task.close()
 
 
 def test_what_an_env_does_not_have_is_left_out_of_its_states() -> None:

@@ -113,14 +113,6 @@ def test_texts_that_each_env_has_are_each_envs() -> None:
     assert others["complex"].of_env(1).texts == ("(1+1j)",)
 
 
-def test_with_one_env_a_row_is_a_row_and_a_number_is_not() -> None:
-    columns, others = split_entries(
-        {"row": torch.zeros(1), "number": torch.tensor(0.0), "success": torch.tensor(True)}, 1
-    )
-    assert columns["row"].shape == (1,) and columns["success"].tolist() == [True]
-    assert list(others) == ["number"]
-
-
 def test_nested_dicts_are_their_leaves_and_names_stay_apart() -> None:
     twice: dict[Any, Any] = {"a": {"b": EACH, 1: None}, "a/b": "also", "": 1, 2: 2, "2": 3}
     twice["self"] = OrderedDict(again=twice)
@@ -224,15 +216,6 @@ def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, rules: 
     step = env.step(None)
     assert step.terminated.tolist() == [True] and step.reward.tolist() == [-1.0]
     assert step.evaluate["success"].tolist() == [False] and step.evaluate["fail"].tolist() == [True]
-    env.close()
-
-
-def test_a_mean_that_a_built_in_task_returns_is_one_number() -> None:
-    # tabletop/pull_cube_tool.py line 213: the mean over all envs.
-    env = workbench.make("PullCubeTool-v1", 2, **CPU, rules="stop")
-    task = TaskEnv(open_env(env))
-    progress = task.reset(seed=0).others["cube_progress"]
-    assert progress.numbers is not None and progress.numbers.shape == ()
     env.close()
 
 

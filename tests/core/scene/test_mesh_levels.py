@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from workbench.core.scene import mesh_levels
 from workbench.core.scene.mesh_levels import deviation, from_afar, reduced_mesh
 from workbench.core.scene.shapes import Mesh
 
@@ -39,20 +37,6 @@ def test_a_reduced_mesh_is_read_from_disk_the_next_time_and_made_again_from_a_br
     assert reduced_mesh(mesh, 100) is not None and len(list(tmp_path.rglob("*.npz"))) == 2
 
 
-def test_room_is_made_among_the_files_of_other_versions_too_and_the_oldest_go_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(mesh_levels, "_MOST_ON_DISK", 50_000)
-    left = tmp_path / "workbench" / "meshes-1" / "left.npz"
-    left.parent.mkdir(parents=True)
-    left.write_bytes(bytes(49_000))
-    os.utime(left, (1, 1))
-    sphere = trimesh.creation.icosphere(subdivisions=4)
-    reduced_mesh(Mesh(sphere.vertices.astype(np.float32), sphere.faces.astype(np.uint32)), 100)
-    assert not left.exists() and len(list(tmp_path.rglob("*.npz"))) == 1
-
-
 def test_a_mesh_from_afar_has_few_triangles_near_its_surface_and_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -68,13 +52,3 @@ def test_a_mesh_from_afar_has_few_triangles_near_its_surface_and_is_kept(
     assert deviation(mesh, from_afar(mesh, 0.01)) <= 0.01
     assert len(list(tmp_path.rglob("*.npz"))) == 3
     assert from_afar(mesh, 0.0) is mesh
-
-
-def test_simple_and_textured_meshes_stay_from_afar_as_they_are() -> None:
-    disc = trimesh.creation.cylinder(0.1, 0.0005, sections=32)
-    thin = Mesh(disc.vertices.astype(np.float32), disc.faces.astype(np.uint32))
-    assert from_afar(thin, 0.1) is thin
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    uvs = np.zeros((len(ball.vertices), 2), np.float32)
-    textured = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32), uvs=uvs)
-    assert from_afar(textured, 0.1) is textured

@@ -90,22 +90,3 @@ def test_few_triangles_of_a_ball_are_shaded_round() -> None:
     )
     assert shaded.normals is not None and len(shaded.vertices) == len(coarse.vertices)
     assert (shaded.normals * shaded.vertices).sum(axis=1).min() > 0.998
-
-
-def test_a_surface_that_faces_the_other_way_leaves_the_own_normals() -> None:
-    simple = simple_tile()
-    exact = tile()
-    assert exact.normals is not None
-    shaded = ShadedSurface(Mesh(exact.vertices, exact.faces, -exact.normals)).shade(simple)
-    assert simple.normals is not None and shaded.normals is not None
-    np.testing.assert_allclose(np.sort(shaded.normals, axis=0), np.sort(simple.normals, axis=0), atol=1e-3)
-
-
-def test_a_normal_that_is_no_number_is_not_spread() -> None:
-    exact = tile()
-    assert exact.normals is not None
-    broken = exact.normals.copy()
-    broken[5] = np.nan
-    shaded = ShadedSurface(Mesh(exact.vertices, exact.faces, broken)).shade(simple_tile())
-    assert shaded.normals is not None
-    np.testing.assert_allclose(np.linalg.norm(shaded.normals, axis=1), 1, rtol=1e-5)

@@ -130,17 +130,6 @@ def redrawn(
     return np.array(copy.get_picture(texture)[..., :3])
 
 
-def test_a_plain_scene_drawn_from_its_geometry_is_the_same_picture() -> None:
-    env = stock("MS-CartpoleBalance-v1", human_render_camera_configs={"shader_pack": "minimal"})
-    geometry = read_geometry(env, **EVERYTHING)
-    (picture,) = take_pictures(env, 0, [("render_camera", "human", ["rgb"])])
-    assert picture.rgb is not None and picture.rgb.std() > 2
-    again = redrawn(geometry, read_poses(env), env, "minimal", "Color")
-    difference = np.abs(again.astype(int) - picture.rgb)
-    assert (difference > 2).mean() < 1e-4
-    env.close()
-
-
 def test_colours_and_textures_are_those_of_the_renderer() -> None:
     """Albedo: colour before light, so that only colours, textures, uvs and shapes can differ."""
     env = stock("PickCube-v1", human_render_camera_configs={"shader_pack": "default"})

@@ -80,15 +80,6 @@ def test_names_are_readable_and_kinds_are_right() -> None:
     env.close()
 
 
-def test_objects_that_differ_between_envs_are_one_body() -> None:
-    env = begun(batched("PegInsertionSide-v1", 4))
-    table = scene_index(env)
-    assert "peg" in table.names and "box_with_hole" in table.names
-    assert not [name for name in table.names if name.startswith("peg_")]
-    assert not np.isnan(read_poses(env)).any()
-    env.close()
-
-
 def test_a_hidden_body_is_where_it_would_be_seen() -> None:
     env: Any = begun(batched("PickCube-v1", 4))
     table = scene_index(env)
@@ -151,21 +142,6 @@ def test_a_body_that_an_env_lacks_is_nan_there_only() -> None:
     env.close()
 
 
-def test_a_view_over_two_bodies_of_one_env_leaves_them_their_names() -> None:
-    env = begun(batched(SparseBodiesEnv, 2))
-    table = scene_index(env)
-    assert {"left", "right"} < set(table.names) and "pair" not in table.names
-    env.close()
-
-
-def test_a_stock_env_may_gain_an_entity() -> None:
-    env = begun(stock("PushCube-v1"))
-    before = read_poses(env)
-    env.scene.sub_scenes[0].add_entity(sapien.Entity())
-    np.testing.assert_array_equal(read_poses(env), before)
-    env.close()
-
-
 def test_a_scene_is_looked_over_once_and_a_new_one_anew() -> None:
     env = begun(batched("PickCube-v1", 2))
     before = scene_index(env)
@@ -188,21 +164,6 @@ def test_what_is_known_of_a_scene_goes_with_it() -> None:
     assert scene() is None and index() is None
 
 
-def test_what_is_hidden_stays_where_it_is_and_can_be_moved() -> None:
-    env: Any = begun(batched("PickCube-v1", 3))
-    goal = scene_index(env).names.index("goal_site")
-    shown = read_poses(env)[:, goal]
-    env.goal_site.hide_visual()
-    np.testing.assert_array_equal(read_poses(env)[:, goal], shown)
-    pose = env.goal_site.pose.raw_pose.clone()
-    np.testing.assert_array_equal(pose, shown)
-    pose[1, 2] += 0.5
-    env.goal_site.set_pose(Pose.create(pose))
-    env.goal_site.show_visual()
-    np.testing.assert_array_equal(read_poses(env)[:, goal], pose)
-    env.close()
-
-
 @pytest.mark.parametrize("make", [stock, batched])
 def test_names_of_states_are_those_of_the_state_dict(make: Any) -> None:
     env = begun(make("PegInsertionSide-v1"))
@@ -220,12 +181,4 @@ def test_a_body_knows_its_actor_or_articulation() -> None:
     (link,) = env.valve_link._objs
     assert index.name_of(link) == index.name_of(link.entity) == "valve_station/valve"
     assert index.name_of(sapien.Entity()) is None
-    env.close()
-
-
-def test_all_envs_in_one_sub_scene_are_refused() -> None:
-    env = begun(stock("PushCube-v1"))
-    env.scene.parallel_in_single_scene = True  # ManiSkill itself allows it only with a GPU
-    with pytest.raises(NotImplementedError, match="parallel_in_single_scene"):
-        scene_index(env)
     env.close()

@@ -5,14 +5,12 @@
 
 from __future__ import annotations
 
-import gc
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import sapien
 import sapien.physx as physx
-import torch
 
 from workbench.core.simulation.contact_queries import ContactReader
 
@@ -129,21 +127,6 @@ def test_a_query_is_answered_anew_and_not_added_to(piles: list[Pile]) -> None:
         assert np.array_equal(pairs.cuda_impulses.torch()[0].numpy(), expected)
 
 
-def test_only_contacts_that_a_query_counts_are_read(piles: list[Pile]) -> None:
-    reader, first = reader_of(piles), piles[0]
-    assert reader.counted() == []
-    query = reader.create_pair_query([(first.high, first.low)])
-    assert [set(pair) for pair, _ in reader.counted()] == [{id(first.high), id(first.low)}]
-    of_body = reader.create_body_query([first.ground])
-    assert len(reader.counted()) == 2
-    assert query.rows and of_body.rows
-    del of_body
-    gc.collect()
-    again = reader.create_body_query([first.high])
-    assert len(reader.counted()) == 1, "what a dropped query asked for costs nothing any more"
-    assert again.rows
-
-
 def test_a_new_query_counts_what_was_not_read_before_it(piles: list[Pile]) -> None:
     reader, first = reader_of(piles), piles[0]
     lower = reader.create_pair_query([(first.low, first.ground)])
@@ -187,17 +170,3 @@ def test_what_is_carried_stands_for_one_systems_list_until_its_next_step(piles: 
     assert asked()[0] == own[0].tolist() and asked()[2] == [0, 0, 0]
     reader.stepped()
     assert asked()[2] == held
-
-
-def test_a_contact_of_a_body_with_itself_counts_once(piles: list[Pile]) -> None:
-    reader, body = reader_of(piles), piles[0].high
-    reader.carry(0, [((id(body), id(body)), np.float32([1, 2, 3]))])
-    assert net(reader, body).tolist() == [[1, 2, 3]]
-
-
-def test_an_answer_stays_where_the_task_keeps_it(piles: list[Pile]) -> None:
-    reader = reader_of(piles)
-    query = reader.create_body_query([piles[0].high])
-    kept = query.cuda_impulses.torch()
-    reader.answer(query)
-    assert kept is query.cuda_impulses.torch() and bool(kept.any()) and kept.dtype == torch.float32

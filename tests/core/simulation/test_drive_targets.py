@@ -88,17 +88,3 @@ def test_wherever_it_is_set_it_drives(where: str, one_joint: bool) -> None:
         task.step(None)
     assert torch.allclose(env.gated_server.qpos, torch.full((N, 1), 0.5), atol=0.05)
     task.close()
-
-
-@pytest.mark.parametrize("velocity", [True, False])
-def test_a_target_that_is_no_number_is_refused_with_the_name_and_the_env(velocity: bool) -> None:
-    task: Any = made()
-    task.reset(0)
-    set_targets = (
-        task.env.gated_server.set_joint_drive_velocity_targets
-        if velocity
-        else task.env.gated_server.set_joint_drive_targets
-    )
-    set_targets(torch.tensor([[0.1], [0.1], [torch.nan], [0.1]]), joints=[task.env.hinge])
-    with pytest.raises(ValueError, match="^door of env 2: .* NaN"):
-        task.env.scene._gpu_apply_all()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workbench.core.simulation.stepping import EnvThreads, env_threads, usable_cores
+from workbench.core.simulation.stepping import EnvThreads, env_threads
 
 shared = EnvThreads()
 
@@ -74,7 +74,3 @@ def test_a_forked_child_gets_threads_of_its_own(child_process: None) -> None:
         os._exit(0 if sorted(done) == [0, 1, 2, 3] else 1)
     _, status = os.waitpid(child, 0)
     assert os.waitstatus_to_exitcode(status) == 0
-
-
-def test_cores_are_those_this_process_may_use() -> None:
-    assert 1 <= usable_cores() <= (os.cpu_count() or 1)
