@@ -21,9 +21,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 import workbench
 from tests.drive.envs import CPU
-from workbench import gym_env
 from workbench.authoring.problem import TaskError
-from workbench.core.backends import BackendUnavailable, why_no_gpu_simulation
 from workbench.core.broken_rule import WrongReturn
 from workbench.core.env.cpu_scene import SIM_BACKEND
 from workbench.core.env.wrong_options import WrongOption
@@ -87,17 +85,6 @@ def test_a_batch_has_the_spaces_and_the_results_of_a_batch() -> None:
         assert value.shape == (3,)
     assert terminated.dtype == truncated.dtype == torch.bool
     env.close()
-
-
-def test_stock_gym_make_stays_stock() -> None:
-    before = dict(REGISTERED_ENVS), dict(gymnasium_registry)
-    workbench.make("PickCube-v1", 2, **CPU).close()
-    assert (dict(REGISTERED_ENVS), dict(gymnasium_registry)) == before
-    with pytest.raises(RuntimeError, match="multiple environments"):
-        gym.make("PickCube-v1", num_envs=2, sim_backend="physx_cpu", render_backend="none")
-    stock = gym.make("PickCube-v1", render_backend="none")
-    assert stock.unwrapped.backend.sim_backend == "physx_cpu" and not stock.unwrapped.gpu_sim_enabled
-    stock.close()
 
 
 # --- the time limit --------------------------------------------------------------------------------
@@ -317,22 +304,3 @@ def test_a_type_error_in_a_constructor_has_its_authors_frame_and_line(
     assert "raised from the environment creator" not in str(caught.value)
     frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(caught.value.__traceback__)]
     assert (str(file), number) in frames
-
-
-def test_a_gpu_that_is_not_there_is_refused() -> None:
-    if why_no_gpu_simulation() is None:
-        pytest.skip("this machine has GPU simulation")
-    with pytest.raises(BackendUnavailable, match="GPU simulation is not available"):
-        workbench.make("PickCube-v1", 2, backend="gpu", render_backend="none")
-    env = workbench.make("PickCube-v1", 2, backend="auto", render_backend="none")
-    assert env.unwrapped.backend.sim_backend == SIM_BACKEND
-    env.close()
-
-
-@pytest.mark.parametrize("kwargs", [{"obs_mode": "rgb+state"}, {"render_mode": "rgb_array"}])
-def test_pictures_without_a_renderer_are_refused(
-    kwargs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(gym_env, "find_renderer", lambda: None)
-    with pytest.raises(BackendUnavailable, match="workbench doctor"):
-        workbench.make("PickCube-v1", 2, backend="cpu", **kwargs)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import mani_skill.envs  # noqa: F401 (registers the tasks)
@@ -12,16 +11,11 @@ import pytest
 import sapien
 import sapien.render
 import torch
-from numpy.typing import NDArray
-from PIL import Image
 
 import workbench
 from tests.core.drawn_envs import batched
-from workbench.core.camera_data import PictureDegree
 from workbench.core.cameras.render import take_pictures
 from workbench.core.maniskill_private import camera_components
-from workbench.core.scene.fast_shader import ALL, COLOR, FastCameras
-from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
 
 pytestmark = pytest.mark.usefixtures("renderer")
 
@@ -102,45 +96,6 @@ def test_a_body_that_is_hidden_is_hidden_in_both(env: Any) -> None:
         body.visibility = 1.0
 
 
-@pytest.mark.parametrize("textures", [COLOR, ALL])
-def test_the_shader_that_is_cut_down_draws_the_same_picture_of_the_same_shapes(
-    env: Any, textures: frozenset[str]
-) -> None:
-    # Table, floor, robot and cube: with and without textures, a normal map, metal, and what is smooth and rough.
-    sensor = env._sensors["base_camera"]
-    exact = camera_components(sensor)[0]
-    cameras = FastCameras(env.scene.sub_scenes)
-    cameras.follow(0, sensor.config, exact, textures)
-    beside = cameras.beside(exact, textures)
-    assert beside is not exact
-    env.scene.sub_scenes[0].update_render()
-    colours = []
-    for component in (exact, beside):
-        component.take_picture()
-        colours.append(np.asarray(component.get_picture("Color")))
-    off = np.abs(colours[0].astype(np.float64) - colours[1])[..., :3]
-    step = 1 if colours[0].dtype == np.uint8 else 1 / 255
-    assert colours[0].any() and off.max() <= step * 1.01 and (off > 0).mean() < 0.01
-
-
-def test_an_environment_map_is_in_both(tmp_path: Path) -> None:
-    # An env of its own: SAPIEN crashes where a map is taken away again.
-    env: Any = batched("PickCube-v1", obs_mode="rgb", num_envs=1)
-
-    def taken(degree: PictureDegree) -> NDArray[np.int64]:
-        (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree=degree)
-        assert picture.rgb is not None
-        return picture.rgb.astype(int)
-
-    without = taken("fast")
-    Image.fromarray(np.full((8, 8, 4), (250, 30, 30, 255), np.uint8)).save(tmp_path / "side.png")
-    side = str(tmp_path / "side.png")
-    env.scene.sub_scenes[0].render_system.cubemap = sapien.render.RenderCubemap(*6 * [side])
-    exact, fast = taken("exact"), taken("fast")
-    assert np.abs(fast - exact).mean() < 2 < np.abs(fast - without).mean()
-    env.close()
-
-
 def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
     with pytest.warns(UserWarning, match="other"):
         env: Any = workbench.make("PickCube-v1", 1, obs_mode="rgb", pictures="fast")
@@ -150,20 +105,6 @@ def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
     off = np.abs(obs["sensor_data"]["base_camera"]["rgb"][0].numpy().astype(int) - exact.rgb)
     assert 0 < off.mean() < 2
     env.close()
-
-
-def test_after_a_restored_snapshot_both_are_what_they_were(env: Any) -> None:
-    def taken(degree: Any) -> Any:
-        return take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree=degree)[0].rgb
-
-    snapshot = take_snapshot(env)
-    # PhysX makes the poses of links anew from the joints: another last bit than a step gives them, here and there.
-    restore_snapshot(env, snapshot)
-    exact, fast = taken("exact"), taken("fast")
-    env.step(torch.from_numpy(env.action_space.sample()))
-    restore_snapshot(env, snapshot)
-    np.testing.assert_array_equal(taken("exact"), exact)
-    np.testing.assert_array_equal(taken("fast"), fast)
 
 
 @pytest.fixture(scope="module")
@@ -210,20 +151,3 @@ def test_a_body_that_comes_into_view_is_drawn(env: Any) -> None:
     exact, fast = (take_pictures(env, 0, request, degree=degree)[0] for degree in ("exact", "fast"))
     assert (fast.segmentation != exact.segmentation).mean() < 0.01
     assert (away.segmentation != exact.segmentation).mean() > 0.1
-
-
-def test_a_link_beside_the_view_whose_box_reaches_into_it_is_not_drawn(env: Any) -> None:
-    component = camera_components(env._sensors["base_camera"])[0]
-    request: list[Any] = [("base_camera", "sensor", ["rgb", "segmentation"])]
-    was = component.local_pose
-    base = env.agent.robot.links[0]._objs[0].entity
-    try:
-        # As in ManiSkill's RollBall: within the arm, right in front of the link that turns it.
-        seat = sapien.Pose([0.1, 0, 0.3], [0.98572, -0.00882, 0.15903, 0.05466])
-        component.local_pose = component.entity.pose.inv() * base.pose * seat
-        exact, fast = (take_pictures(env, 0, request, degree=degree)[0] for degree in ("exact", "fast"))
-        drawn = drawn_by(env, "base_camera")
-    finally:
-        component.local_pose = was
-    assert drawn["panda_link1"] == drawn["panda_link2"] == 0 < drawn["panda_link6"]
-    assert (fast.segmentation != exact.segmentation).mean() < 0.01

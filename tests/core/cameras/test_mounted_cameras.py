@@ -16,8 +16,6 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.stock_env import batch_of, put_in_same_state, single
 from tests.core.watched import RENDERED, Watched, pictures
-from workbench.core.cameras.render import take_pictures
-from workbench.core.scene.scene_index import read_poses
 
 N = 3
 
@@ -69,32 +67,3 @@ def test_a_camera_on_an_actor_sees_what_is_before_the_actor_of_its_own_env(env: 
     model = env.scene.sensors["on_actor"].camera.get_model_matrix()
     assert model.shape == (N, 4, 4)
     torch.testing.assert_close(model[:, :3, 3], env.rider.pose.p, atol=1e-5, rtol=0)
-
-
-def test_a_moment_of_the_past_is_drawn_from_poses_and_nothing_moves(env: Any) -> None:
-    requests = [
-        (name, "sensor", ("rgb", "depth", "segmentation")) for name in ("on_link", "on_actor", "beside")
-    ]
-    env.reset(seed=[0, 1, 2])
-    then_poses = read_poses(env)[1]
-    then = take_pictures(env, 1, requests)
-    for _ in range(6):
-        env.step(None)
-    pose = env.rider.pose.raw_pose.clone()
-    pose[:, 1] += 0.4
-    env.rider.set_pose(Pose.create(pose))
-    env.apply()
-    now_poses = read_poses(env)
-    now = take_pictures(env, 1, requests)
-    drawn = take_pictures(env, 1, requests, then_poses)
-    assert np.array_equal(read_poses(env), now_poses, equal_nan=True)
-    for was, again, other in zip(then, drawn, now, strict=True):
-        np.testing.assert_allclose(again.pose, was.pose, atol=1e-5)
-        # A pose that was taken apart and put together again may move an edge by a pixel.
-        assert np.mean(again.segmentation != was.segmentation) < 0.02
-        assert np.mean(np.abs(again.rgb.astype(int) - was.rgb) > 4) < 0.03
-        if was.camera != "beside":
-            assert np.mean(np.abs(other.rgb.astype(int) - was.rgb) > 4) > 0.03, "the camera saw no change"
-    for before, after in zip(now, take_pictures(env, 1, requests), strict=True):
-        np.testing.assert_array_equal(before.rgb, after.rgb)
-        np.testing.assert_array_equal(before.pose, after.pose)

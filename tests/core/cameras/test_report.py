@@ -59,13 +59,6 @@ def test_a_mark_is_what_is_left_to_see() -> None:
     assert_allclose(thing(pixels=[200, 1], alone=[100, 0]).marks(), [1, 0])
 
 
-def test_who_covers_it_is_told_by_what_each_takes_away() -> None:
-    seen = thing(pixels=[25, 0, 0, 60], unhindered=[50, 0, 40, 50], alone=[100, 100, 40, 0])
-    assert seen.hidden_share.dtype == np.float32
-    assert_allclose(seen.hidden_share, [0.5, NAN, 1, 0])
-    assert_allclose(seen.covered_share, [0.5, 1, 0, NAN])
-
-
 def test_a_summary_is_of_the_envs_that_have_it() -> None:
     seen = thing(
         pixels=[25, 0, 0, 70, 999],

@@ -58,15 +58,6 @@ def test_joints_are_those_of_sapien(pick: TaskEnv) -> None:
     )
 
 
-def test_a_joint_without_a_drive_has_no_target() -> None:
-    cartpole = opened("MS-CartpoleBalance-v1")
-    [read] = inspect_env(cartpole, 1, ["joints"]).joints
-    own = maniskill_private.objects_of(cartpole.env.agent.robot)[1].active_joints
-    for i, joint in enumerate(own):
-        assert np.isnan(read.target[i]) == (joint.stiffness == 0)
-    assert "prismatic" in read.kinds and any("revolute" in kind for kind in read.kinds)
-
-
 def test_contacts_add_up_to_those_of_sapien(pick: TaskEnv) -> None:
     for env in range(3):
         own: dict[frozenset[str], np.ndarray] = {}

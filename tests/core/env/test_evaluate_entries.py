@@ -13,8 +13,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from mani_skill.utils.structs.pose import Pose
-from mani_skill.utils.wrappers.record import RecordEpisode
-from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.drive.entries import ENTRIES, Mute
@@ -85,32 +83,6 @@ def test_what_is_no_number_is_a_text_of_the_whole_batch(value: Any, what: str, t
     entry = others["entry"]
     assert columns == {} and (entry.what, entry.texts, entry.numbers) == (what, (text,), None)
     assert not entry.per_env
-
-
-@pytest.mark.parametrize(
-    ("value", "number"),
-    [
-        (0.5, 0.5),
-        (3, 3),
-        (True, True),
-        (np.float32(2.5), 2.5),
-        (EACH.mean(), 1.5),
-        (torch.tensor(float("nan")), np.nan),
-        (torch.arange(3), [0, 1, 2]),
-        ([1, 2], [1, 2]),
-    ],
-)
-def test_numbers_of_the_whole_batch_stay_numbers(value: Any, number: Any) -> None:
-    columns, others = split_entries({"entry": value}, N)
-    assert columns == {} and others["entry"].numbers is not None
-    np.testing.assert_array_equal(others["entry"].numbers, number)
-
-
-def test_texts_that_each_env_has_are_each_envs() -> None:
-    _, others = split_entries({"words": list("abcd"), "complex": EACH + 1j, "mute": [Mute()] * N}, N)
-    assert all(entry.per_env for entry in others.values())
-    assert others["words"].of_env(2).texts == ("c",)
-    assert others["complex"].of_env(1).texts == ("(1+1j)",)
 
 
 def test_nested_dicts_are_their_leaves_and_names_stay_apart() -> None:
@@ -185,20 +157,6 @@ def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
         assert torch.equal(given[1], expected[1]) and torch.equal(given[2], expected[2])
     ours.close()
     stock.close()
-
-
-def test_maniskills_wrappers_take_it_from_a_batch(
-    child_process: None, odd_task: Path, tmp_path: Path
-) -> None:
-    env: Any = workbench.make(odd_task, 2, **CPU)
-    env = RecordEpisode(env, str(tmp_path), save_video=False)
-    env = ManiSkillVectorEnv(env, auto_reset=True, record_metrics=True)
-    env.reset(seed=[0, 1])
-    for step in range(1, 8):
-        _, _, _, truncated, info = env.step(env.action_space.sample())
-        assert info["phase"] == ("reach" if step in (1, 6, 7) else "push")
-        assert ("final_info" in info) == (step == 6) and bool(truncated.all()) == (step == 6)
-    env.close()
 
 
 class OneTruth:

@@ -115,26 +115,6 @@ def test_modes_have_what_the_class_supports_and_the_present_one() -> None:
     assert modes["reward_mode"].value == '"dense"'
 
 
-def test_several_robots_and_none_and_a_class_for_a_robot_are_described_too() -> None:
-    env = Base()
-    env.agent = SimpleNamespace(agents=[SimpleNamespace(uid="panda"), SimpleNamespace(uid="fetch")])
-    made = describe_keywords(Task, env, {}, {}, Base)
-    assert made.robot == "panda, fetch" and "control_mode" not in {one.name for one in made.modes}
-    env.agent, env.robot_uids, env.SUPPORTED_ROBOTS = None, object, None
-    made = describe_keywords(Base, env, {}, {}, Base)
-    assert made.robot == "" and made.modes[0].fixed
-
-
-class Awkward:
-    def __repr__(self) -> str:
-        raise RuntimeError("no words")
-
-
-def test_a_value_of_the_authors_that_cannot_even_be_printed_is_told_by_its_type() -> None:
-    (one,) = own(Closed, Base(), {"only": Awkward()}, {}).values()
-    assert (one.value, bool(one.fixed)) == ("Awkward", True)
-
-
 def test_what_json_says_becomes_what_the_class_takes() -> None:
     given = {"robot_uids": ["panda", "panda"], "colour": "blue", "noise": 1}
     taken = constructor_arguments(Task, given, Base)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tests.core.drawn_envs import batched
 from workbench.core.maniskill_private import camera_components
-from workbench.core.scene.fast_shapes import FastShapes, shown
+from workbench.core.scene.fast_shapes import shown
 from workbench.core.scene.lean_materials import LeanBody, LeanMaterials
 
 SPOTS = np.zeros((4, 4, 4), np.uint8)
@@ -97,22 +97,3 @@ def test_it_is_not_for_a_body_whose_material_the_author_changes_later(
         for name, value in was.items():
             setattr(wood, name, value)
     assert lean.is_like_exact()
-
-
-def test_a_fast_picture_draws_it_until_the_author_changes_the_material(env: Any) -> None:
-    body, cameras = body_of(env, "table-workspace"), camera_components(env._sensors["base_camera"])
-    shapes = FastShapes(env.scene.sub_scenes)
-    wood = materials_of(body)[0]
-
-    def drawn_instead() -> Any:
-        shapes.prepare(0, "base_camera", cameras)
-        return dict(shapes.bodies("base_camera", 0)).get(body)
-
-    try:
-        assert materials_of(drawn_instead())[0].metallic_texture is None
-        wood.specular = 0.7
-        assert drawn_instead() is None
-    finally:
-        wood.specular = 0.0
-        shapes.remove()
-    assert len(body.entity.components) == 2, "nothing stays behind"

@@ -62,13 +62,12 @@ def painted(
     return np.asarray(image)[fine // 2 :: fine, fine // 2 :: fine].astype(np.int64)
 
 
-@pytest.mark.parametrize("detail", [EVERYTHING, {}], ids=["whole", "reduced"])
-def test_silhouettes_are_those_of_the_renderer(detail: dict[str, int]) -> None:
+def test_silhouettes_are_those_of_the_renderer() -> None:
     size = 512
     env = batched("PickCube-v1", 2, sensor_configs={"width": size, "height": size})
     env.step(None)
     table = scene_index(env)
-    geometry, poses = read_geometry(env, **detail), read_poses(env)
+    geometry, poses = read_geometry(env), read_poses(env)
     camera = next(c for c in list_cameras(env) if c.name == "base_camera")
     names = segmentation_names(env)
     drawn = [i for i, n in enumerate(table.names) if n == "cube" or n.startswith("panda/")]
@@ -185,7 +184,7 @@ def test_shapes_that_differ_between_envs_are_each_drawn_in_their_own_env() -> No
     env.close()
 
 
-@pytest.mark.parametrize("task", ["PushCube-v1", "PegInsertionSide-v1", "MS-CartpoleBalance-v1"])
+@pytest.mark.parametrize("task", ["PegInsertionSide-v1", "MS-CartpoleBalance-v1"])
 def test_every_mesh_is_sound(task: str) -> None:
     env = batched(task, 2)
     for visual in read_geometry(env).visuals:
@@ -272,17 +271,6 @@ def test_a_ghost_is_transparent_and_linear_textures_are_encoded(odd_shapes: Any)
     texture = visual["linear/0"].material.texture
     assert texture is not None and texture.shape == (4, 4, 4)
     assert (texture[0, :, :3] == 188).all() and (texture[1:, :, :3] == 0).all()  # 0.5 linear is 188 sRGB
-
-
-def test_a_mesh_with_uneven_scale_has_normals_across_its_faces(odd_shapes: Any) -> None:
-    (visual,) = [v for v in read_geometry(odd_shapes).visuals if "mirrored" in v.name]
-    mesh = visual.mesh
-    np.testing.assert_allclose(np.sort(np.ptp(mesh.vertices, axis=0)), [0.5, 1.0, 2.0], atol=1e-5)
-    corner = mesh.vertices[mesh.faces].astype(float)
-    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    assert mesh.normals is not None
-    np.testing.assert_allclose(np.abs((across * mesh.normals[mesh.faces[:, 0]]).sum(-1)), 1.0, atol=1e-4)
 
 
 def test_an_edited_mesh_file_is_read_again(odd_shapes: Any) -> None:

@@ -17,7 +17,7 @@ from mani_skill.utils.structs import Actor, Pose
 from tests.drive.envs import batched, stock
 from workbench.core.scene.scene_index import read_poses, scene_index
 
-TASKS = ["PickCube-v1", "PushCube-v1", "PegInsertionSide-v1", "MS-CartpoleBalance-v1"]
+TASKS = ["PickCube-v1", "PegInsertionSide-v1"]
 
 
 def begun(env: Any) -> Any:
@@ -70,16 +70,6 @@ def test_poses_are_those_of_the_physics(task: str) -> None:
     env.close()
 
 
-def test_names_are_readable_and_kinds_are_right() -> None:
-    env = begun(stock("PickCube-v1"))
-    table = scene_index(env)
-    kind = dict(zip(table.names, table.kinds, strict=True))
-    assert kind["cube"] == "dynamic" and kind["ground"] == "static" and kind["goal_site"] == "kinematic"
-    assert kind["panda/panda_hand"] == "link"
-    assert [n for n, h in zip(table.names, table.hidden, strict=True) if h] == ["goal_site"]
-    env.close()
-
-
 def test_a_hidden_body_is_where_it_would_be_seen() -> None:
     env: Any = begun(batched("PickCube-v1", 4))
     table = scene_index(env)
@@ -93,26 +83,6 @@ def test_a_hidden_body_is_where_it_would_be_seen() -> None:
     assert (moved[:, goal, :3] != shown[:, goal, :3]).any()
     env.goal_site.show_visual()
     np.testing.assert_array_equal(read_poses(env), moved)
-    env.close()
-
-
-class MarkerFirst(PushCubeEnv):
-    """Nothing stands before its marker among the bodies."""
-
-    def _load_scene(self, options: dict) -> None:
-        builder = self.scene.create_actor_builder()
-        builder.add_sphere_visual(radius=0.02)
-        builder.initial_pose = Pose.create(sapien.Pose([0.3, 0.3, 1.0]))
-        self.marker = builder.build_kinematic(name="marker")
-        super()._load_scene(options)
-
-
-def test_the_first_body_of_all_may_be_hidden_too() -> None:
-    env: Any = begun(batched(MarkerFirst, 3))
-    assert scene_index(env).names[0] == "marker"
-    shown = read_poses(env)
-    env.marker.hide_visual()
-    np.testing.assert_array_equal(read_poses(env), shown)
     env.close()
 
 
@@ -162,15 +132,6 @@ def test_what_is_known_of_a_scene_goes_with_it() -> None:
     del env
     gc.collect()
     assert scene() is None and index() is None
-
-
-@pytest.mark.parametrize("make", [stock, batched])
-def test_names_of_states_are_those_of_the_state_dict(make: Any) -> None:
-    env = begun(make("PegInsertionSide-v1"))
-    said = env.get_state_dict()
-    names = [f"{group}/{name}" for group in ("actors", "articulations") for name in said[group]]
-    assert list(scene_index(env).states) == names
-    env.close()
 
 
 def test_a_body_knows_its_actor_or_articulation() -> None:

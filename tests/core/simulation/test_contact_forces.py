@@ -192,22 +192,3 @@ def test_the_list_is_that_of_a_stock_env(piles: tuple[Any, list[Any]]) -> None:
             assert np.array_equal(our.separations, np.float32([point.separation for point in contact.points]))
             count = len(contact.points)
             assert our.points.shape == our.normals.shape == our.impulses.shape == (count, 3)
-
-
-def test_forces_in_the_list_hold_up_what_lies_there(piles: tuple[Any, list[Any]]) -> None:
-    batch, _ = piles
-    for env in range(N):
-        up = {"floor": 0.0, "low": 0.0, "high": 0.0}
-        for contact in list_contacts(batch, env):
-            first, second = contact.bodies
-            up[first] += float(contact.force[2])
-            up[second] -= float(contact.force[2])
-            # The normal points from the second body to the first: up, if the first is the upper one.
-            order = ("floor", "low", "high")
-            sign = 1.0 if order.index(first) > order.index(second) else -1.0
-            assert np.allclose(contact.normals * sign, [0, 0, 1], atol=1e-3)
-            assert np.allclose(np.abs(contact.points[:, :2]) <= 0.1, True)
-        weight = {name: 9.81 * float(getattr(batch, name).mass[env]) for name in ("low", "high")}
-        assert up["low"] == pytest.approx(weight["low"], rel=0.02)
-        assert up["high"] == pytest.approx(weight["high"], rel=0.02)
-        assert up["floor"] == pytest.approx(-weight["low"] - weight["high"], rel=0.02)

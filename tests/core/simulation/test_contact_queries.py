@@ -74,42 +74,6 @@ def net(reader: ContactReader, *bodies: physx.PhysxRigidBaseComponent) -> np.nda
     return query.cuda_impulses.torch().numpy().copy()
 
 
-def between(reader: ContactReader, *pairs: tuple) -> np.ndarray:
-    query = reader.create_pair_query(pairs)
-    assert query.cuda_impulses.shape == (len(pairs), 3)
-    reader.answer(query)
-    return query.cuda_impulses.torch().numpy().copy()
-
-
-def test_each_body_is_answered_with_the_sum_of_its_contacts_in_whichever_system_it_is(
-    piles: list[Pile],
-) -> None:
-    first, second = piles
-    bodies = [first.high, second.low, first.low, first.ground, second.high, first.high]
-    owners = [first, second, first, first, second, first]
-    found = net(reader_of(piles), *bodies)
-    expected = [impulse_on(owner, body) for owner, body in zip(owners, bodies)]
-    assert np.array_equal(found, np.float32(expected))
-    assert found[0, 2] > 0 > found[3, 2], "the upper box is held up, and the ground is pressed"
-
-
-def test_each_pair_is_answered_for_its_first_body(piles: list[Pile]) -> None:
-    first, second = piles
-    pairs = [
-        (first.low, first.high),
-        (first.high, first.low),
-        (second.low, second.ground),
-        (first.high, first.ground),
-        (first.low, first.high),
-        (first.low, second.high),
-    ]
-    found = between(reader_of(piles), *pairs)
-    assert np.array_equal(found[0], np.float32(impulse_on(first, first.low, first.high)))
-    assert np.array_equal(found[1], -found[0]) and np.array_equal(found[4], found[0]) and found[0, 2] < 0
-    assert np.array_equal(found[2], np.float32(impulse_on(second, second.low, second.ground)))
-    assert not found[3].any() and not found[5].any()
-
-
 def test_a_query_is_answered_anew_and_not_added_to(piles: list[Pile]) -> None:
     reader = reader_of(piles)
     query, pairs = (

