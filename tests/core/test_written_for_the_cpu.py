@@ -185,7 +185,9 @@ class GoesBehindTheTensors(Written):
             entity.set_pose(sapien.Pose([0.1 * self.env_numbers()[env], 0, 0.1]))
             self.chain._objs[env].set_qpos(np.array([0.1 * self.env_numbers()[env], 0.2], np.float32))
             self.lies._bodies[env].linear_velocity = [0.1, 0, 0]
+            self.wall._objs[env].set_pose(sapien.Pose([0.5 + 0.1 * self.env_numbers()[env], 0.5, 0.05]))
         self.see(pose=self.falls.pose.raw_pose, link=self.last.pose.p, velocity=self.lies.linear_velocity)
+        self.see(wall=self.wall.pose.raw_pose)
 
 
 class LooksBehindTheTensors(Written):

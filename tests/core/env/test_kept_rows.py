@@ -20,6 +20,7 @@ from mani_skill.utils.structs.pose import Pose
 from tests.core import draws_goals
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.broken_rule import BrokenRule
+from workbench.core.env.hot_swap import put_class
 from workbench.core.rules import Finding
 
 pytestmark = pytest.mark.thorough
@@ -285,6 +286,20 @@ def test_a_row_that_the_first_reset_did_not_change_gets_its_line_later() -> None
     # The constructor's reset and the first are of all envs; the first partial one changes nothing.
     (finding,) = found_in(task_with(reset), resets=3)
     assert finding.count == 2 and is_at_fault(finding), finding
+
+
+def test_the_lines_of_an_edited_task_are_sought_anew() -> None:
+    """As after a reload, which puts another class on the env."""
+    env = batched(
+        task_with(writes_its_rows), N, rules="warn", on_finding=lambda finding: None, obs_mode="none"
+    )
+    for _ in range(5):
+        env.reset(options={"env_idx": torch.tensor([1])})
+    put_class(env, task_with(whole_tensor))
+    env.reset(options={"env_idx": torch.tensor([1])})
+    (finding,) = env.broken_rules.rows
+    assert is_at_fault(finding) and finding.function == "whole_tensor", finding
+    env.close()
 
 
 def test_long_resets_are_not_looked_at_line_by_line_to_their_end() -> None:
