@@ -52,7 +52,10 @@ def test_a_task_with_a_fault_of_its_own_does_the_rest(renderer: None) -> None:
 
 _EACH = [
     pytest.param(
-        fault, env_id, id=f"{env_id} {fault.stage}", marks=[pytest.mark.slow] * (env_id == "DrawSVG-v1")
+        fault,
+        env_id,
+        id=f"{env_id} {fault.stage}",
+        marks=[pytest.mark.slow] * (env_id != fault.ids[0] or env_id == "DrawSVG-v1"),
     )
     for fault in FAULTS
     for env_id in fault.ids

@@ -322,6 +322,7 @@ class _Beside:
             assert self.batch.scene.px.systems[env].pack() == stock.scene.px.pack(), (
                 f"{when}: state of env {env}"
             )
+            assert self.batch.elapsed_steps[env] == stock.elapsed_steps[0], f"{when}: steps of env {env}"
             for name, theirs in stock.seen.items() if seen_of is None or env in seen_of else ():
                 ours = self.batch.seen[name][env]
                 assert np.array_equal(ours, theirs[0]), (
