@@ -70,14 +70,14 @@ def stack() -> Iterator[BaseEnv]:
     env.close()
 
 
-PROPERTY = settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+PROPERTY = settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @PROPERTY
 @given(
     seed=st.integers(0, 10_000),
     before=st.integers(0, 8),
-    steps=st.integers(1, 10),
+    steps=st.integers(1, 5),
     chosen=st.sets(st.integers(0, N - 1), min_size=1),
 )
 def test_a_restored_episode_goes_the_same_way_every_time(
