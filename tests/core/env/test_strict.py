@@ -452,14 +452,18 @@ def test_an_env_can_be_reset_after_any_of_this(rules: Any, hook: str) -> None:
             self.scene._gpu_fetch_all()
             self.scene._gpu_apply_all()
             raise ZeroDivisionError
+        if failing == "interrupted":
+            self.cube.set_pose(Pose.create(self.cube.pose.raw_pose + 1))
+            raise KeyboardInterrupt
 
     env = build(hook, fail, rules)
-    for failing in ("nan", "applied"):
-        with pytest.raises((BrokenRule, ValueError, ZeroDivisionError)):
+    for failing in ("nan", "applied", "interrupted"):
+        with pytest.raises((BrokenRule, ValueError, ZeroDivisionError, KeyboardInterrupt)):
             env.reset(seed=[0, 1, 2])
             env.step(ACTION)
         failing = ""
         env.reset(seed=[0, 1, 2])
+        assert env.cube.pose.p.abs().max() < 0.5, "what was written before it failed"
         env.step(ACTION)
         assert torch.isfinite(env.get_state()).all()
     env.close()
