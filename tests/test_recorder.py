@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -177,10 +176,13 @@ def test_a_killed_program_loses_a_second(child_process: None, tmp_path: Path) ->
     """A second is for all that waits anywhere."""
     child = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert child.stdout is not None and child.stdout.readline() == "begun\n"
-    time.sleep(random.uniform(1.2, 3.0))  # at any moment, when there are steps older than a second
+    lines, begun = [child.stdout.readline()], time.time()
+    while time.time() < begun + 1.5:  # until there are steps older than a second
+        lines.append(child.stdout.readline())
     child.send_signal(signal.SIGKILL)
     killed = time.time()
-    made = [line.split() for line in child.stdout.read().splitlines(keepends=True) if line.endswith("\n")]
+    lines += child.stdout.read().splitlines(keepends=True)
+    made = [line.split() for line in lines if line.endswith("\n")]
     child.wait()
     old = max(int(step) for step, at in made if float(at) < killed - 1.0)
     assert len(recover(tmp_path)) == 3

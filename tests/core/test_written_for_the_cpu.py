@@ -24,7 +24,7 @@ pytestmark = [
     pytest.mark.thorough,
     pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
 ]
-STEPS = 6
+STEPS = 4
 
 
 class Written(Bare):
@@ -277,7 +277,7 @@ TASKS = [
 ]
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("num_envs", [pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.__name__)
 def test_an_env_of_the_batch_does_what_the_stock_env_does(task: type[Written], num_envs: int) -> None:
     beside = _Beside(task, num_envs)

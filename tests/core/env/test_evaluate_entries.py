@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mani_skill.utils.structs.pose import Pose
 
@@ -105,6 +105,7 @@ def test_columns_are_copies_that_the_next_step_does_not_change() -> None:
     assert columns["each"].tolist() == [0, 1, 2, 3] and others["mean"].numbers == 1
 
 
+@settings(max_examples=30)
 @given(ENTRIES, st.integers(1, 5))
 def test_any_dict_is_split(entries: dict[Any, Any], num_envs: int) -> None:
     columns, others = split_entries(entries, num_envs)
