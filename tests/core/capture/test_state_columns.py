@@ -13,6 +13,7 @@ from mani_skill.utils import common
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.capture.recorded_run import states_of
 from workbench.core.capture.state_columns import StateReading, read_state_columns
+from workbench.core.env.hot_swap import put_class
 from workbench.core.env.task_env import TaskEnv
 
 
@@ -75,6 +76,23 @@ def test_the_names_of_a_flat_observation_are_asked_for_once_and_what_is_empty_ha
     assert evaluated > before
     assert "obs/extra/tcp_pose" in columns and "obs/extra/nothing" not in columns
     assert [*read_state_columns(task)] == [*columns] and len(Observes.evaluated) == evaluated
+    task.close()
+
+
+class ObservesOtherwise(PICK_CUBE):
+    def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, Any]:
+        return {f"{name}_now": value for name, value in super()._get_obs_extra(info).items()}
+
+
+def test_the_names_are_those_of_the_class_that_the_env_has_now() -> None:
+    """As after a reload: as wide an observation, under other names."""
+    task = TaskEnv(batched(Observes, 3, obs_mode="state"))
+    task.reset(seed=0)
+    assert "obs/extra/tcp_pose" in read_state_columns(task)
+    put_class(task.env, ObservesOtherwise)
+    task.step(None)
+    names = read_state_columns(task).keys()
+    assert "obs/extra/tcp_pose_now" in names and "obs/extra/tcp_pose" not in names
     task.close()
 
 

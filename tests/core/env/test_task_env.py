@@ -185,10 +185,17 @@ def test_a_seed_is_kept_to_where_resets_without_one_draw_their_own() -> None:
 def test_holding_still_holds_still(control_mode: str) -> None:
     env = opened("PickCube-v1", 2, control_mode=control_mode)
     env.reset(seed=0)
-    start = env.env.agent.robot.get_qpos().clone()
+    robot = env.env.agent.robot
+    start = robot.get_qpos().clone()
+    start[:, 7:] = torch.tensor([[0.02], [0.035]])  # a hand that is half open, in each env otherwise
+    robot.set_qpos(start)
+    env.env.scene._gpu_apply_all()
+    env.env.scene.px.gpu_update_articulation_kinematics()
+    env.env.scene._gpu_fetch_all()
     for _ in range(10):
         env.step(actions.hold_action(env.parts, 2))
-    assert (env.env.agent.robot.get_qpos() - start).abs().max() < 0.02
+    moved = (robot.get_qpos() - start).abs()
+    assert moved[:, :7].max() < 0.02 and ("delta" in control_mode or moved[:, 7:].max() < 0.005), moved
     env.close()
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from workbench.core.snapshots.rng import RngReader, read_shared_rng, write_shared_rng
@@ -42,6 +42,16 @@ DRAWS = {
 }
 
 
+# A normal number that is kept aside is put back, and taking it, which changes no byte of the key, is seen.
+@example(
+    [
+        ("draw", 1, 0, "normal"),
+        ("keep", 0, 0, "nothing"),
+        ("draw", 1, 0, "normal"),
+        ("write", 1, 1, "nothing"),
+        ("draw", 1, 0, "normal"),
+    ]
+)
 @settings(max_examples=60)
 @given(
     st.lists(
