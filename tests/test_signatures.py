@@ -12,7 +12,6 @@ from typing import Any
 
 import mani_skill.envs  # noqa: F401  imports all modules that are replaced in
 import pytest
-import sapien.physx as physx
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.scene import ManiSkillScene
 
@@ -22,8 +21,6 @@ from workbench.checks.evidence.builds import noting_builds, noting_poses
 from workbench.core.env.assets import refuse_downloads
 from workbench.core.env.cpu_scene import BatchedCpuScene
 from workbench.core.maniskill_private import mark_camera_configs, noting_cameras
-from workbench.core.simulation.cpu_system import BatchedCpuSystem
-from workbench.core.simulation.strict_system import StrictCpuSystem
 
 OURS = str(Path(workbench.__file__).parent)
 Parameters = dict[str, inspect.Parameter]
@@ -89,19 +86,6 @@ def test_what_overrides_a_method_of_maniskill_takes_what_that_takes(base: type) 
             if inspect.isfunction(member) and inspect.isfunction(theirs) and name != "__init__":
                 wrong |= {name: problem} if (problem := _refuses(member, theirs)) else {}
     env.close()
-    assert wrong == {}
-
-
-@pytest.mark.parametrize("ours", [BatchedCpuSystem, StrictCpuSystem])
-def test_a_member_of_the_batched_system_takes_what_sapiens_takes(ours: type) -> None:
-    """pybind11 gives signatures in docstrings only."""
-    wrong = {}
-    for system in (physx.PhysxCpuSystem, physx.PhysxGpuSystem):
-        for name in (name for name in dir(system) if not name.startswith("_")):
-            theirs = _documented(getattr(system, name))
-            if theirs is not None and inspect.isfunction(member := getattr(ours, name, None)):
-                problem = _differences(_parameters(member), theirs)
-                wrong |= {name: problem} if problem else {}
     assert wrong == {}
 
 

@@ -12,14 +12,12 @@ from typing import Any
 
 import gymnasium as gym
 import h5py
-import imageio.v2 as imageio
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
 import torch
 from mani_skill.trajectory import replay_trajectory
 from mani_skill.utils.registration import REGISTERED_ENVS
-from mani_skill.utils.visualization.misc import tile_images
 from mani_skill.utils.wrappers import (
     ActionRepeatWrapper,
     CachedResetWrapper,
@@ -100,26 +98,6 @@ def test_auto_reset_resets_the_envs_that_ended_and_keeps_their_last_observation(
     assert ended_once == set(range(N))
     env.close()
     plain.close()
-
-
-def test_ignored_terminations_do_not_end_an_episode_and_metrics_are_kept() -> None:
-    env = ManiSkillVectorEnv(
-        made(SucceedsInTurn, max_episode_steps=4, reward_mode="sparse"),
-        ignore_terminations=True,
-        record_metrics=True,
-    )
-    env.reset(seed=0)
-    total = torch.zeros(N)
-    for step in range(1, 5):
-        _, reward, terminated, truncated, info = env.step(env.action_space.sample())
-        total += torch.as_tensor(reward)
-        assert not terminated.any() and truncated.all() == (step == 4)
-    final = info["final_info"]["episode"]
-    assert final["success_once"].tolist() == [True, True, True, False]  # env 3 would have in its step 5
-    assert final["success_at_end"].tolist() == [False, False, True, False]
-    assert torch.equal(final["return"], total) and final["episode_len"].tolist() == [4] * N
-    assert not env.returns.any() and not env.success_once.any()
-    env.close()
 
 
 def test_a_goal_that_is_hidden_moves_with_a_partial_reset(renderer: None) -> None:
@@ -214,30 +192,6 @@ def test_stock_maniskill_replays_what_was_recorded(child_process: None, tmp_path
             # first state are not recorded.
             np.testing.assert_allclose(a["obs"][1:], b["obs"][1:], atol=2e-3)
             np.testing.assert_allclose(a["rewards"][:], b["rewards"][:], atol=1e-4)
-
-
-def test_videos_of_all_envs_side_by_side(renderer: None, tmp_path: Path) -> None:
-    env = made("PickCube-v1", render=True, render_mode="rgb_array", **SMALL_HUMAN)
-    with pytest.raises(AssertionError, match="max steps per video"):
-        RecordEpisode(env, str(tmp_path), save_trajectory=False)
-    env = RecordEpisode(
-        env,
-        str(tmp_path),
-        save_trajectory=False,
-        max_steps_per_video=3,
-        video_fps=10,
-    )
-    env.reset(seed=0)
-    for _ in range(6):
-        env.step(env.action_space.sample())
-    last = tile_images(env.unwrapped.render_rgb_array(), nrows=2).numpy().astype(float)
-    env.close()
-    videos = sorted(tmp_path.glob("*.mp4"))
-    assert [v.name for v in videos] == ["0.mp4", "1.mp4"]
-    frames = imageio.mimread(videos[1], memtest=False)
-    assert len(frames) == 4 and frames[0].shape == last.shape  # the first state and three steps
-    loss = np.abs(frames[-1].astype(float) - last).mean()  # of H.264
-    assert loss < 8
 
 
 def test_substeps_are_filmed(renderer: None, tmp_path: Path) -> None:

@@ -46,15 +46,6 @@ def test_no_episode_starts_decided(name: str, make: Make) -> None:
         assert not info["success"].any() and not info.get("fail", torch.zeros(1)).any()
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
-def test_it_builds_and_steps_with_rendering(name: str, make: Make, renderer: None) -> None:
-    env = make(name, render_backend="cpu")
-    env.reset(seed=0)
-    _, reward, terminated, _, info = env.step(env.action_space.sample())
-    assert torch.isfinite(reward).all() and reward.shape == terminated.shape
-    assert info["elapsed_steps"].unique().tolist() == [1]
-
-
 # --- one idea a file --------------------------------------------------------------------------------
 
 

@@ -168,22 +168,3 @@ def test_fov_and_intrinsic_are_one_lens(fov: float, width: int, height: int) -> 
     assert frames.vertical_fov(larger, 3 * height) == pytest.approx(fov)
     assert frames.horizontal_fov(larger, 2 * width) == pytest.approx(frames.horizontal_fov(k, width))
     assert frames.matrix3(k) == tuple(map(tuple, k.tolist()))
-
-
-@pytest.mark.parametrize(
-    ("matrix", "says"),
-    [
-        (np.diag([1, 1, -1, 1]), "mirror image"),
-        (np.diag([2, 2, 2, 1]), "scales by 2"),
-        (np.diag([0.001, 0.001, 0.001, 1]), "scales by 0.001"),
-        (np.diag([1, 1, 0, 1]), "flattens"),
-        ([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "right angles"),
-        ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]], "transposed"),
-        ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 2]], "last row"),
-        (np.eye(3), "4 x 4 or 3 x 4"),
-        (np.full((4, 4), np.nan), "not finite"),
-    ],
-)
-def test_a_matrix_that_is_no_pose_is_refused_in_words(matrix: Any, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
-        frames.pose_from_matrix(matrix, "opencv", "camera_to_world")

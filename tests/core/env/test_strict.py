@@ -24,6 +24,7 @@ from mani_skill.utils.structs.pose import Pose
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.broken_rule import BrokenRule, NeedsOneEnv, RuleWarning, WrongReturn
 from workbench.core.env.task_env import EnvOptions, make_env
+from workbench.core.snapshots.cpu_state import renew_physics
 
 pytestmark = pytest.mark.thorough
 
@@ -489,6 +490,38 @@ def test_an_env_with_rules_gives_the_same_bits(strict: Any) -> None:
     assert torch.equal(run_steps(checked), run_steps(plain))
     plain.close()
     checked.close()
+
+
+@pytest.fixture(scope="module")
+def warned_and_not() -> Iterator[list[Any]]:
+    envs = [batched(Hooked, N, rules=rules, on_finding=lambda finding: None) for rules in ("warn", "off")]
+    yield envs
+    for env in envs:
+        env.close()
+
+
+@pytest.mark.parametrize(("hook", "fault"), [(hook, fault) for hook, fault, *_ in FAULTS])
+def test_what_only_warns_goes_on_to_the_same_bits_as_without_rules(
+    warned_and_not: list[Any], hook: str, fault: Hook, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = []
+    for env in warned_and_not:
+        monkeypatch.undo()
+        renew_physics(env.scene, [*range(N)])
+        env.reset(seed=[0, 1, 2])
+        torch.manual_seed(0)
+        monkeypatch.setattr(Hooked, hook, also(hook, fault))
+        of_env = []
+        for step in range(3):
+            env.step(ACTION)
+            of_env.append(env.get_state())
+            if step == 1:
+                env.reset(seed=[3, 4, 5], options={"env_idx": torch.tensor([1])})
+                of_env.append(env.get_state())
+        states.append(torch.stack(of_env))
+        monkeypatch.undo()
+    torch.testing.assert_close(states[0], states[1], rtol=0, atol=0, equal_nan=True)
+    assert fault.__name__ in {row.function for row in warned_and_not[0].broken_rules.rows}
 
 
 def test_warn_tells_once_with_the_place_and_goes_on() -> None:

@@ -273,19 +273,6 @@ def test_a_ghost_is_transparent_and_linear_textures_are_encoded(odd_shapes: Any)
     assert (texture[0, :, :3] == 188).all() and (texture[1:, :, :3] == 0).all()  # 0.5 linear is 188 sRGB
 
 
-def test_an_edited_mesh_file_is_read_again(odd_shapes: Any) -> None:
-    def width(env: Any) -> float:
-        visuals = read_geometry(env).visuals
-        (visual,) = [v for v in visuals if v.name == "mirrored/0"]
-        return float(np.ptp(visual.mesh.vertices, axis=0).max())
-
-    assert width(odd_shapes) == pytest.approx(2.0)
-    trimesh.creation.box(extents=[3.0, 1.0, 1.0]).export(OddShapesEnv.mesh_file)
-    sapien.render.clear_cache()  # SAPIEN keeps files by name; whoever reloads a task must say so
-    odd_shapes.reset(options={"reconfigure": True})
-    assert width(odd_shapes) == pytest.approx(6.0)
-
-
 def test_without_a_renderer_the_collision_shapes_are_drawn() -> None:
     env = batched("PickCube-v1", 2, render=False)
     geometry = read_geometry(env)
@@ -302,16 +289,3 @@ def test_without_a_renderer_the_collision_shapes_are_drawn() -> None:
     assert trimesh.Trimesh(hull.vertices, hull.faces).volume > 0
     env.close()
     rendered.close()
-
-
-def test_geometry_is_that_of_the_scene_that_stands_now() -> None:
-    env: Any = stock("PegInsertionSide-v1")
-    lengths = []
-    for seed in (0, 1):
-        env.reset(seed=seed, options={"reconfigure": True})
-        peg = scene_index(env).names.index("peg")
-        meshes = [v.mesh.vertices for v in read_geometry(env).visuals if peg in v.bodies]
-        lengths.append(float(np.ptp(np.concatenate(meshes)[:, 0])))
-        np.testing.assert_allclose(lengths[-1], 2 * env.peg_half_sizes[0, 0], rtol=1e-5)
-    assert lengths[0] != lengths[1]
-    env.close()

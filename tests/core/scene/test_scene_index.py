@@ -132,14 +132,3 @@ def test_what_is_known_of_a_scene_goes_with_it() -> None:
     del env
     gc.collect()
     assert scene() is None and index() is None
-
-
-def test_a_body_knows_its_actor_or_articulation() -> None:
-    env = begun(stock("RotateValveLevel0-v1"))
-    index = scene_index(env)
-    of = dict(zip(index.names, index.owners, strict=True))
-    assert of["valve_station/valve"] == "valve_station" and of["ground"] == "ground"
-    (link,) = env.valve_link._objs
-    assert index.name_of(link) == index.name_of(link.entity) == "valve_station/valve"
-    assert index.name_of(sapien.Entity()) is None
-    env.close()
