@@ -200,6 +200,20 @@ class LooksBehindTheTensors(Written):
         )
 
 
+class ThrowsAFreeChain(Written):
+    def built(self) -> None:
+        self.free = by_hand(self, 1, "free", fixed=False)
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        self.free.set_pose(Pose.create_from_pq(self.per_env(env_idx, (-0.5, 0.1), (0.5, 0.1), (0.8, 0.1))))
+        self.free.set_root_linear_velocity(self.per_env(env_idx, (0.1, 0.1), (0.2, 0), (0.3, -0.1)))
+        self.free.set_root_angular_velocity(self.per_env(env_idx, (1, 0.2), (2, 0.1), (-3, 0.1)))
+
+    def evaluate(self) -> dict:
+        self.see(linear=self.free.root_linear_velocity, angular=self.free.root_angular_velocity)
+        return {}
+
+
 class GivesRowsOfAllEnvs(Written):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.falls.set_pose(self.place(None))
@@ -273,7 +287,7 @@ TASKS = [
     *(StepsTheEnvInReset, StepsAfterReset, LooksAtLinksInReset, WritesInEvaluate),
     *(WritesAndReadsBetweenSubsteps, MovesAStaticActor, GoesBehindTheTensors, LooksBehindTheTensors),
     *(GivesRowsOfAllEnvs, SetsJointsOneByOne, ChangesWhatIsFixedOnTheGpu, ComputesPassiveForces),
-    *(BuildsInItsFirstReset, RemovesABody),
+    *(BuildsInItsFirstReset, RemovesABody, ThrowsAFreeChain),
 ]
 
 

@@ -107,12 +107,17 @@ def test_a_placed_camera_sees_what_one_built_so_sees(
     assert segmentation_names(env) == segmentation_names(envs[1])
 
 
-def test_a_placement_goes_over_another_and_back(env: Any) -> None:
+def test_a_placement_goes_over_another_and_back(env: Any, envs: tuple[Any, Any]) -> None:
     before = pictures(env.get_obs(env.get_info()))
     placed, file = PlacedCameras(), said(env, BESIDE)
-    placed.place(env, BESIDE, replace(file, fov=None, intrinsic=INTRINSIC, width=50))
-    placed.place(env, BESIDE, replace(file, position=(1.0, 0.0, 1.0)))
-    assert not np.array_equal(pictures(env.get_obs(env.get_info()))["beside/rgb"], before["beside/rgb"])
+    for change in (
+        {"fov": None, "intrinsic": INTRINSIC},
+        {"position": (1.0, 0.0, 1.0)},
+        {"fov": None, "intrinsic": INTRINSIC, "width": 50},
+        {"quaternion": TURNED},
+    ):
+        placed.place(env, BESIDE, replace(file, **change))  # pyright: ignore[reportArgumentType]
+        assert_sees_alike(env, configured(envs[1], BESIDE, replace(file, **change)), BESIDE)  # pyright: ignore[reportArgumentType]
     placed.place(env, BESIDE, None)
     assert said(env, BESIDE) == file
     after = pictures(env.get_obs(env.get_info()))

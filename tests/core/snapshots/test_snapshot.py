@@ -237,6 +237,9 @@ def test_what_was_evaluated_is_evaluated_again(pick: BaseEnv) -> None:
     for name, value in held.evaluate.items():
         assert np.array_equal(restored.evaluate[name], value), name
     assert torch.equal(pressed(), impulses)
+    restore_snapshot(pick, snapshot, [1, 2], source=[4, 0])
+    assert torch.equal(pressed(), impulses[[0, 4, 0, 3, 4, 5]])
+    env.restore(snapshot)
     np.testing.assert_allclose(restored.poses, held.poses, atol=1e-6)
     assert restored.elapsed_steps.tolist() == held.elapsed_steps.tolist()
     assert not restored.reward.any() and restored.action is None
