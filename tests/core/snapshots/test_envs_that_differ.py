@@ -1,7 +1,7 @@
 """Envs of one batch with unlike things in them: whatever is done to some, each keeps to what it was given."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
-# pyright: reportAttributeAccessIssue=false, reportArgumentType=false
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalIterable=false
 
 from __future__ import annotations
 
