@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -98,10 +97,7 @@ def _refuses(ours: Callable[..., Any], theirs: Callable[..., Any]) -> str:
     try:
         theirs_of = _parameters(theirs)
     except ValueError:
-        documented = _documented(theirs)
-        if documented is None:
-            return ""
-        theirs_of = documented
+        return ""
     return _differences(_parameters(ours), theirs_of)
 
 
@@ -131,21 +127,3 @@ def _differences(ours: Parameters, theirs: Parameters) -> str:
     wanted = [e.name for e in ours.values() if e.kind not in _VAR and e.default is e.empty]
     wrong += [f"wants {name}" for name in wanted[len(theirs) :]]
     return ", ".join(wrong)
-
-
-def _documented(member: Any) -> Parameters | None:
-    """The parameters of a pybind11 method, by its docstring; None where there are several ways to call it."""
-    first = (getattr(member, "__doc__", None) or "").partition("\n")[0]
-    match = re.match(r"\w+\((self: .*?)\) -> ", first)
-    if match is None:
-        return None
-    names = re.findall(r"(?:^|, )(\w+): ", re.sub(r"\[[^\[\]]*\]", "", re.sub(r"\[[^\[\]]*\]", "", match[1])))
-    optional = set(re.findall(r"(\w+): [^,]*? = ", match[1]))
-    return {
-        name: inspect.Parameter(
-            name,
-            inspect.Parameter.POSITIONAL_OR_KEYWORD,
-            default=None if name in optional else inspect.Parameter.empty,
-        )
-        for name in names
-    }
