@@ -36,7 +36,7 @@ class Meddles(Plain):
     def evaluate(self) -> dict:
         self.looks += 1
         pose = self.obj.pose.raw_pose.clone()
-        pose[:, 2] += 0.1 * torch.rand(self.num_envs)
+        pose[1, 2] += 0.1 * torch.rand(())  # of one env: the others are where they were
         self.obj.set_pose(Pose.create(pose))
         if self.way == "applies":
             self.scene._gpu_apply_all()
@@ -76,13 +76,13 @@ def test_hooks_are_tried_without_a_trace(way: str, monkeypatch: pytest.MonkeyPat
     env = begun()
     monkeypatch.setattr(Meddles, "way", way)
     put_class(env, Meddles)
-    before = moment(env)
+    before, hooks = moment(env), HOOKS[1:] if way == "applies" else HOOKS
     for _ in range(2):
         if way in ("raises", "is interrupted"):
             with pytest.raises((ZeroDivisionError, KeyboardInterrupt)):
-                rehearse_hooks(env, HOOKS)
+                rehearse_hooks(env, hooks)
         else:
-            assert rehearse_hooks(env, HOOKS) == {}
+            assert rehearse_hooks(env, hooks) == {}
         after = moment(env)
         if way == "applies":  # what was stepped or applied comes out of a snapshot
             np.testing.assert_allclose(after[1], before[1], atol=1e-5)
