@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
@@ -116,27 +115,6 @@ def test_a_file_and_a_class_of_it(tables_as_before: None) -> None:
         assert find_max_episode_steps_value(env) == REGISTERED_ENVS[env.spec.id].max_episode_steps
         env.reset(seed=0)
         env.close()
-
-
-def test_a_class_of_a_module_is_the_one_that_import_gives(
-    tmp_path: Path, tables_as_before: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    package = tmp_path / "lab_to_make"
-    package.mkdir()
-    (package / "__init__.py").write_text("from lab_to_make.tasks import MinimalEnv\n")
-    text = (TASKS / "minimal.py").read_text().replace("WorkbenchMinimal-v1", "LabToMake-v1")
-    (package / "tasks.py").write_text(text)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(TaskError, match="import package"):
-        workbench.make("LabToMake-v1", **CPU)
-    env = workbench.make("lab_to_make:MinimalEnv", 2, **CPU)
-    try:
-        assert env.spec.id == "LabToMake-v1" and find_max_episode_steps_value(env) == 50
-        assert isinstance(env.unwrapped, sys.modules["lab_to_make.tasks"].MinimalEnv)
-    finally:
-        env.close()
-        for name in ("lab_to_make", "lab_to_make.tasks"):
-            del sys.modules[name]
 
 
 def test_a_class_with_and_without_a_registered_id() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 
 from workbench.core.cameras.report import (
     CameraReport,
@@ -44,19 +44,6 @@ def depth(nearest: Any = 1.0, farthest: Any = 2.0) -> DepthReport:
 def report(*objects: ObjectSeen, envs: tuple[int, ...] = (0,), **given: Any) -> CameraReport:
     plain = CameraReport(("sensor", "eye"), (8, 6), (4, 3), envs, objects, depth(), 3, 1.5)
     return replace(plain, **given)
-
-
-def test_a_mark_is_what_is_left_to_see() -> None:
-    marks = thing(
-        pixels=[100, 400, 25, 50, 50, 0, 100, 100],
-        alone=[100, 400, 25, 100, 50, 0, 100, 100],
-        cut=[False, False, False, False, True, False, True, False],
-        present=[True] * 7 + [False],
-    ).marks()
-    assert marks.dtype == np.float32
-    assert_allclose(marks, [1, 1, 0.5, 0.5, 0.5 * 0.5**0.5, 0, 0.5, NAN], rtol=1e-6)
-    # More is never left than the whole of it, and what is drawn only beside others is no division by zero.
-    assert_allclose(thing(pixels=[200, 1], alone=[100, 0]).marks(), [1, 0])
 
 
 def test_a_summary_is_of_the_envs_that_have_it() -> None:

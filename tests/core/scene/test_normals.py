@@ -10,15 +10,6 @@ from workbench.core.scene.normals import ShadedSurface, with_normals
 from workbench.core.scene.shapes import Mesh
 
 
-def test_normals_are_sharp_on_a_box_and_smooth_on_a_ball() -> None:
-    box = with_normals(Mesh(*shared(trimesh.creation.box())))
-    assert box.normals is not None and len(box.vertices) == 24
-    np.testing.assert_allclose(np.abs(box.normals).max(axis=1), 1.0, atol=1e-6)
-    ball = with_normals(Mesh(*shared(trimesh.creation.icosphere(subdivisions=3))))
-    assert ball.normals is not None and len(ball.vertices) == 642
-    assert (ball.normals * ball.vertices).sum(axis=1).min() > 0.99
-
-
 def shared(mesh: trimesh.Trimesh) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
 

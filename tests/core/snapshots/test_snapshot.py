@@ -22,7 +22,7 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.env.task_env import TaskEnv
-from workbench.core.snapshots.cpu_state import CpuState, plan_cpu_state
+from workbench.core.snapshots.cpu_state import CpuState
 from workbench.core.snapshots.snapshot import (
     begin_anew,
     in_this_state,
@@ -371,29 +371,6 @@ def test_what_slept_sleeps(pick: BaseEnv) -> None:
     cubes[2].wake_up()
     restore_snapshot(pick, snapshot)
     assert [cube.is_sleeping for cube in cubes] == [i == 2 for i in range(N)]
-
-
-@pytest.mark.parametrize("env_id", ["PickCube-v1", "StackCube-v1"])
-def test_whatever_physx_lets_sleep_is_said_to_sleep(env_id: str) -> None:
-    """Also with a velocity: neither a cube nor an arm that falls asleep need have lost all of it."""
-    env = batched(env_id, 3)
-    env.reset(seed=0)
-    plan = plan_cpu_state(env)
-    bodies = [component for sleepers in plan.sleepers for _, _, component in sleepers]
-    slept = 0
-    for step in range(60):
-        env.step(env.action_space.sample() if step < 20 else np.zeros(env.action_space.shape, np.float32))
-        if step % 7 == 3:
-            bodies[step % len(bodies)].put_to_sleep()
-            env.scene.px.note_change()
-        state = take_snapshot(env).simulation
-        assert isinstance(state, CpuState)
-        for said, sleepers in zip(state.asleep, plan.sleepers, strict=True):
-            truth = {part: asleep() for part, asleep, _ in sleepers}
-            assert {part: said[part] for part in truth} == truth
-            slept += sum(truth.values())
-    assert slept
-    env.close()
 
 
 def test_a_hidden_object_keeps_its_true_pose(pick: BaseEnv) -> None:

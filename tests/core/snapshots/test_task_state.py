@@ -238,24 +238,3 @@ def test_an_edited_task_keeps_its_constants_and_gets_the_buffers_that_fit(env: A
     assert report.not_carried["notes.visits"] == "the task has none of this name now"
     assert report.not_carried["velocity_bonus"].startswith("it is not in the snapshot")
     edited.close()
-
-
-class Lazy(PUSH_CUBE):
-    """What is not written yet is the class's."""
-
-    best: Any = None
-    count: Any = 0
-
-
-def test_what_is_not_set_yet_but_by_its_class_is_set_when_all_envs_go_back() -> None:
-    env: Any = batched(Lazy, N)
-    env.reset(seed=[0, 1, 2, 3])
-    env.best, env.count = torch.arange(float(N)), 3
-    snapshot = take_snapshot(env)
-    del env.best, env.count
-    report = restore_snapshot(env, snapshot, [1, 2])
-    assert env.best is None and env.count == 0
-    assert report.not_carried["best"] == report.not_carried["count"] == "the task has none of this name now"
-    report = restore_snapshot(env, snapshot)
-    assert env.best.tolist() == [0, 1, 2, 3] and env.count == 3 and {"best", "count"} <= set(report.carried)
-    env.close()
