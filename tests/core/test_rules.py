@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import Any, cast
 
 import mani_skill.envs  # noqa: F401  registers the ids
@@ -91,6 +92,18 @@ def test_what_is_not_broken_again_at_the_same_occasion_leaves() -> None:
     with rules.during("reset"):
         rules.report_breach("rows-rewritten", "drawn", None, ("task.py", 10, "draw"), subject="target")
     assert rules.rows[0].count == 2
+
+
+def test_a_comment_silences_its_line_until_the_file_is_edited(tmp_path: Path) -> None:
+    file = tmp_path / "task.py"
+    file.write_text("x = 1  # workbench: off[not-applied] the GPU is far\ny = 2\n")
+    rules = a_rule()
+    for line in (1, 1, 2):
+        rules.report_breach("not-applied", "lost", None, (str(file), line, "lift"))
+    assert [(row.line, row.count) for row in rules.rows] == [(2, 1)]
+    assert [(finding.line, silence.reason) for finding, silence in rules.silenced] == [(1, "the GPU is far")]
+    rules.edited(lambda row: (str(file), row.line or 0))
+    assert rules.silenced == () and [row.line for row in rules.rows] == [2]
 
 
 def test_of_several_things_lost_at_once_each_is_told() -> None:
