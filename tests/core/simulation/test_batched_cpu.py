@@ -16,6 +16,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
+from tests.core.stock_env import batch_of
+from tests.core.test_written_for_the_cpu import ThrowsAFreeChain
 from workbench.core.env.cpu_scene import batched_class
 from workbench.core.rules import Degree
 
@@ -101,4 +103,45 @@ def test_every_env_has_its_own_ground() -> None:
     heights = env.cube.pose.p[:, 2]
     assert torch.allclose(heights, heights[:1]), heights
     assert float(heights.min()) > -0.95, "fell through the floor"
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
+def test_what_is_written_into_the_tensors_and_applied_is_what_physx_has() -> None:
+    env = batch_of(ThrowsAFreeChain, 3)
+    env.reset(seed=[0, 1, 2])
+    px, rng = env.scene.px, np.random.default_rng(0)
+
+    def drawn(width: int) -> torch.Tensor:
+        return torch.from_numpy(rng.uniform(-0.5, 0.5, (3, width)).astype(np.float32))
+
+    turned = torch.nn.functional.normalize(drawn(4))
+    written = {name: torch.cat([drawn(3), turned, drawn(6)], dim=1) for name in ("falls", "free")}
+    data = px.cuda_rigid_body_data.torch()
+    data[env.falls._body_data_index] = written["falls"]
+    data[env.free.root._body_data_index] = written["free"]
+    joints = {name: drawn(2) for name in ("qpos", "qvel", "qf", "target_qpos", "target_qvel")}
+    for name, values in joints.items():
+        getattr(px, f"cuda_articulation_{name}").torch()[env.chain._data_index.long(), :2] = values
+    env.scene._gpu_apply_all()
+    px.gpu_apply_articulation_qf()
+    px.gpu_apply_articulation_target_velocity()
+    px.packs()  # targets are written before the next step, or before it is packed
+    for i in range(3):
+        body, root, chain = env.falls._bodies[i], env.free._objs[i], env.chain._objs[i]
+        for moved, row in ((body, written["falls"][i]), (root, written["free"][i])):
+            pose = moved.entity.pose if moved is body else moved.root_pose
+            linear, angular = (
+                (moved.linear_velocity, moved.angular_velocity)
+                if moved is body
+                else (moved.root_linear_velocity, moved.root_angular_velocity)
+            )
+            np.testing.assert_allclose([*pose.p, *linear, *angular], [*row[:3], *row[7:]], atol=1e-5)
+            assert abs(float(pose.q @ row[3:7].numpy())) == pytest.approx(1, abs=1e-5)
+        for name, got in {"qpos": chain.qpos, "qvel": chain.qvel, "qf": chain.qf}.items():
+            np.testing.assert_allclose(got, joints[name][i], atol=1e-6, err_msg=name)
+        for joint, target, velocity in zip(
+            chain.active_joints, joints["target_qpos"][i], joints["target_qvel"][i], strict=True
+        ):
+            assert (joint.drive_target[0], joint.drive_velocity_target[0]) == (target, velocity)
     env.close()
