@@ -64,6 +64,16 @@ def test_a_rule_broken_at_each_step_is_one_row_with_a_count() -> None:
     assert (row.file, row.line, row.function) == ("task.py", 7, "lift")
 
 
+def test_steps_are_counted_from_where_the_task_begins() -> None:
+    rules = a_rule()
+    rules.step = 7  # while it was tried
+    rules.report_breach("not-applied", "lost", None, ("task.py", 7, "lift"))
+    rules.begin()
+    rules.step += 2
+    rules.report_breach("not-applied", "lost", None, ("task.py", 9, "drop"))
+    assert [(row.line, row.first_step) for row in rules.rows] == [(7, 0), (9, 2)]
+
+
 def test_rows_are_bounded_and_the_rest_is_counted() -> None:
     rules, serial = a_rule(), 0
     for line in range(3 * MOST_ROWS):

@@ -161,3 +161,24 @@ def test_a_moment_comes_back_with_what_is_hidden_in_its_place(env: Any) -> None:
     again = pictures(env.get_obs(env.get_info()))
     assert all(np.array_equal(again[name], picture) for name, picture in seen.items())
     assert np.array_equal(np.asarray(env.render_rgb_array("people")), people)
+
+
+class Ghost(Hides):
+    """A part is half transparent where it is shown."""
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        for thing in self.own._objs:
+            thing.find_component_by_type(sapien.render.RenderBodyComponent).visibility = 0.3
+
+
+def test_a_ghost_stays_one(renderer: None) -> None:
+    env = batch_of(Ghost, 1, **RENDERED)
+    env.reset(seed=0)
+    (never_hidden,) = take_pictures(env, 0, [PEOPLE])
+    for _ in range(2):
+        env.get_obs(env.get_info())
+        (human,) = take_pictures(env, 0, [PEOPLE])
+        assert np.array_equal(human.rgb, never_hidden.rgb)
+        assert np.array_equal(np.asarray(env.render_rgb_array("people"))[0], never_hidden.rgb)
+    env.close()

@@ -430,6 +430,7 @@ def test_the_list_of_contacts_needs_one_env() -> None:
     [
         ("evaluate", lambda env: {"success": torch.tensor(True)}, "success"),
         ("evaluate", lambda env: {"success": True}, "success"),
+        ("evaluate", lambda env: {"success": torch.ones(N)}, "success"),  # a row each, but no truths
         ("compute_normalized_dense_reward", lambda env, **_: torch.zeros((N, 1)), r"\(3, 1\)"),
         ("_get_obs_extra", lambda env, info: {"goal": torch.zeros(4)}, "goal"),
     ],

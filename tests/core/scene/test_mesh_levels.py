@@ -52,3 +52,13 @@ def test_a_mesh_from_afar_has_few_triangles_near_its_surface_and_is_kept(
     assert deviation(mesh, from_afar(mesh, 0.01)) <= 0.01
     assert len(list(tmp_path.rglob("*.npz"))) == 2
     assert from_afar(mesh, 0.0) is mesh
+
+
+def test_simple_and_textured_meshes_stay_from_afar_as_they_are() -> None:
+    disc = trimesh.creation.cylinder(0.1, 0.0005, sections=32)
+    thin = Mesh(disc.vertices.astype(np.float32), disc.faces.astype(np.uint32))
+    assert from_afar(thin, 0.1) is thin
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    uvs = np.zeros((len(ball.vertices), 2), np.float32)
+    textured = Mesh(ball.vertices.astype(np.float32), ball.faces.astype(np.uint32), uvs=uvs)
+    assert from_afar(textured, 0.1) is textured
