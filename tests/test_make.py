@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,17 +15,13 @@ import pytest
 import torch
 from gymnasium.envs.registration import registry as gymnasium_registry
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.utils import assets
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 import workbench
 from tests.drive.envs import CPU
-from workbench import gym_env
 from workbench.authoring.problem import TaskError
-from workbench.core.backends import BackendUnavailable, why_no_gpu_simulation
 from workbench.core.broken_rule import WrongReturn
-from workbench.core.env.assets import MissingAssets
 from workbench.core.env.cpu_scene import SIM_BACKEND
 from workbench.core.env.wrong_options import WrongOption
 
@@ -92,25 +86,6 @@ def test_a_batch_has_the_spaces_and_the_results_of_a_batch() -> None:
     env.close()
 
 
-def test_stock_gym_make_stays_stock() -> None:
-    before = dict(REGISTERED_ENVS), dict(gymnasium_registry)
-    workbench.make("PickCube-v1", 2, **CPU).close()
-    assert (dict(REGISTERED_ENVS), dict(gymnasium_registry)) == before
-    with pytest.raises(RuntimeError, match="multiple environments"):
-        gym.make("PickCube-v1", num_envs=2, sim_backend="physx_cpu", render_backend="none")
-    stock = gym.make("PickCube-v1", render_backend="none")
-    assert stock.unwrapped.backend.sim_backend == "physx_cpu" and not stock.unwrapped.gpu_sim_enabled
-    stock.close()
-
-
-def test_the_same_seed_starts_the_episode_that_stock_starts() -> None:
-    ours, stock = workbench.make("PickCube-v1", **CPU), gym.make("PickCube-v1", render_backend="none")
-    assert torch.equal(ours.reset(seed=5)[0], stock.reset(seed=5)[0])
-    assert ours.unwrapped._episode_seed.tolist() == stock.unwrapped._episode_seed.tolist()
-    ours.close()
-    stock.close()
-
-
 # --- the time limit --------------------------------------------------------------------------------
 
 
@@ -129,11 +104,6 @@ def test_the_time_limit_is_the_registered_one_or_the_one_given(given: int | None
     env.close()
 
 
-def test_a_time_limit_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match="positive"):
-        workbench.make("MS-CartpoleBalance-v1", max_episode_steps=0, **CPU)
-
-
 # --- what is made ----------------------------------------------------------------------------------
 
 
@@ -145,27 +115,6 @@ def test_a_file_and_a_class_of_it(tables_as_before: None) -> None:
         assert find_max_episode_steps_value(env) == REGISTERED_ENVS[env.spec.id].max_episode_steps
         env.reset(seed=0)
         env.close()
-
-
-def test_a_class_of_a_module_is_the_one_that_import_gives(
-    tmp_path: Path, tables_as_before: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    package = tmp_path / "lab_to_make"
-    package.mkdir()
-    (package / "__init__.py").write_text("from lab_to_make.tasks import MinimalEnv\n")
-    text = (TASKS / "minimal.py").read_text().replace("WorkbenchMinimal-v1", "LabToMake-v1")
-    (package / "tasks.py").write_text(text)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(TaskError, match="import package"):
-        workbench.make("LabToMake-v1", **CPU)
-    env = workbench.make("lab_to_make:MinimalEnv", 2, **CPU)
-    try:
-        assert env.spec.id == "LabToMake-v1" and find_max_episode_steps_value(env) == 50
-        assert isinstance(env.unwrapped, sys.modules["lab_to_make.tasks"].MinimalEnv)
-    finally:
-        env.close()
-        for name in ("lab_to_make", "lab_to_make.tasks"):
-            del sys.modules[name]
 
 
 def test_a_class_with_and_without_a_registered_id() -> None:
@@ -200,19 +149,6 @@ def test_the_kwargs_of_a_registration_are_used_and_overridden(tmp_path: Path, ta
     assert env.unwrapped.spec.kwargs["control_mode"] == "pd_joint_vel"
     env.close()
     assert gym.spec("Registered-v3").max_episode_steps == 7  # gym.make knows the id of the file
-
-
-def test_a_file_that_takes_a_built_in_id_is_told_so(tmp_path: Path, tables_as_before: None) -> None:
-    file = tmp_path / "taken.py"
-    file.write_text(
-        "from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv\n"
-        "from mani_skill.utils.registration import register_env\n"
-        "@register_env('PushCube-v1', max_episode_steps=9)\nclass Taken(PushCubeEnv):\n    pass\n"
-    )
-    with pytest.warns(UserWarning, match="PushCube-v1"):
-        env = workbench.make(file, 2, **CPU)
-    assert type(env.unwrapped).__name__ == "Taken"
-    env.close()
 
 
 def test_the_spec_makes_such_an_env_again() -> None:
@@ -346,43 +282,3 @@ def test_a_type_error_in_a_constructor_has_its_authors_frame_and_line(
     assert "raised from the environment creator" not in str(caught.value)
     frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(caught.value.__traceback__)]
     assert (str(file), number) in frames
-
-
-def test_a_gpu_that_is_not_there_is_refused() -> None:
-    if why_no_gpu_simulation() is None:
-        pytest.skip("this machine has GPU simulation")
-    with pytest.raises(BackendUnavailable, match="GPU simulation is not available"):
-        workbench.make("PickCube-v1", 2, backend="gpu", render_backend="none")
-    env = workbench.make("PickCube-v1", 2, backend="auto", render_backend="none")
-    assert env.unwrapped.backend.sim_backend == SIM_BACKEND
-    env.close()
-
-
-@pytest.mark.parametrize("kwargs", [{"obs_mode": "rgb+state"}, {"render_mode": "rgb_array"}])
-def test_pictures_without_a_renderer_are_refused(
-    kwargs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(gym_env, "find_renderer", lambda: None)
-    with pytest.raises(BackendUnavailable, match="workbench doctor"):
-        workbench.make("PickCube-v1", 2, backend="cpu", **kwargs)
-
-
-def test_a_missing_download_is_named_with_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(assets, "is_data_source_downloaded", lambda name: name != "ycb")
-    with pytest.raises(MissingAssets, match="mani_skill.utils.download_asset ycb"):
-        workbench.make("PickSingleYCB-v1", 2, **CPU)
-
-
-# --- importing -------------------------------------------------------------------------------------
-
-
-def test_importing_the_package_imports_no_simulation(child_process: None) -> None:
-    # The process that serves the page imports it, and must start at once and without a graphics driver.
-    heavy = {"mani_skill", "sapien", "torch", "gymnasium"}
-    code = f"import sys, workbench; assert not {heavy!r} & set(sys.modules), sorted(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
-
-
-def test_a_name_that_the_package_lacks_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="no attribute 'patch'"):
-        workbench.patch  # noqa: B018

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -12,7 +11,6 @@ from typing import Any
 
 import mani_skill.envs  # noqa: F401  imports all modules that are replaced in
 import pytest
-import sapien.physx as physx
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.scene import ManiSkillScene
 
@@ -22,8 +20,6 @@ from workbench.checks.evidence.builds import noting_builds, noting_poses
 from workbench.core.env.assets import refuse_downloads
 from workbench.core.env.cpu_scene import BatchedCpuScene
 from workbench.core.maniskill_private import mark_camera_configs, noting_cameras
-from workbench.core.simulation.cpu_system import BatchedCpuSystem
-from workbench.core.simulation.strict_system import StrictCpuSystem
 
 OURS = str(Path(workbench.__file__).parent)
 Parameters = dict[str, inspect.Parameter]
@@ -92,34 +88,6 @@ def test_what_overrides_a_method_of_maniskill_takes_what_that_takes(base: type) 
     assert wrong == {}
 
 
-@pytest.mark.parametrize("ours", [BatchedCpuSystem, StrictCpuSystem])
-def test_a_member_of_the_batched_system_takes_what_sapiens_takes(ours: type) -> None:
-    """pybind11 gives signatures in docstrings only."""
-    wrong = {}
-    for system in (physx.PhysxCpuSystem, physx.PhysxGpuSystem):
-        for name in (name for name in dir(system) if not name.startswith("_")):
-            theirs = _documented(getattr(system, name))
-            if theirs is not None and inspect.isfunction(member := getattr(ours, name, None)):
-                problem = _differences(_parameters(member), theirs)
-                wrong |= {name: problem} if problem else {}
-    assert wrong == {}
-
-
-def test_a_wrapper_that_takes_less_would_be_seen() -> None:
-    def stock(self: Any, a: int, b: int = 0, *, c: int = 0) -> None: ...
-
-    def less(self: Any, a: int) -> None: ...
-    def other_name(self: Any, x: int, b: int = 0, c: int = 0) -> None: ...
-    def demands(self: Any, a: int, b: int, c: int = 0) -> None: ...
-    def more(self: Any, a: int, b: int = 0, c: int = 0, d: int = 0) -> None: ...
-    def all_of_it(*args: Any, **kwargs: Any) -> None: ...
-
-    assert [bool(_refuses(ours, stock)) for ours in (less, other_name, demands, more, all_of_it)] == [
-        *(True, True, True),
-        *(False, False),
-    ]
-
-
 def _parameters(function: Callable[..., Any]) -> Parameters:
     return dict(inspect.signature(function, follow_wrapped=False).parameters)
 
@@ -129,10 +97,7 @@ def _refuses(ours: Callable[..., Any], theirs: Callable[..., Any]) -> str:
     try:
         theirs_of = _parameters(theirs)
     except ValueError:
-        documented = _documented(theirs)
-        if documented is None:
-            return ""
-        theirs_of = documented
+        return ""
     return _differences(_parameters(ours), theirs_of)
 
 
@@ -162,21 +127,3 @@ def _differences(ours: Parameters, theirs: Parameters) -> str:
     wanted = [e.name for e in ours.values() if e.kind not in _VAR and e.default is e.empty]
     wrong += [f"wants {name}" for name in wanted[len(theirs) :]]
     return ", ".join(wrong)
-
-
-def _documented(member: Any) -> Parameters | None:
-    """The parameters of a pybind11 method, by its docstring; None where there are several ways to call it."""
-    first = (getattr(member, "__doc__", None) or "").partition("\n")[0]
-    match = re.match(r"\w+\((self: .*?)\) -> ", first)
-    if match is None:
-        return None
-    names = re.findall(r"(?:^|, )(\w+): ", re.sub(r"\[[^\[\]]*\]", "", re.sub(r"\[[^\[\]]*\]", "", match[1])))
-    optional = set(re.findall(r"(\w+): [^,]*? = ", match[1]))
-    return {
-        name: inspect.Parameter(
-            name,
-            inspect.Parameter.POSITIONAL_OR_KEYWORD,
-            default=None if name in optional else inspect.Parameter.empty,
-        )
-        for name in names
-    }

@@ -16,8 +16,10 @@ def box(env: Any, name: str, half_size: list[float] = BOX, pose: Any = None, kin
     return builder.build(name) if kind == "dynamic" else getattr(builder, f"build_{kind}")(name)
 
 
-def by_hand(env: Any, joints: int, name: str = "chain", scene_idxs: list[int] | None = None) -> Any:
-    """A chain of links that hang from a fixed base, joined by `joints` hinges."""
+def by_hand(
+    env: Any, joints: int, name: str = "chain", scene_idxs: list[int] | None = None, fixed: bool = True
+) -> Any:
+    """A chain of links that hang from a base, joined by `joints` hinges."""
     builder = env.scene.create_articulation_builder()
     if scene_idxs is not None:
         builder.set_scene_idxs(scene_idxs)
@@ -38,4 +40,4 @@ def by_hand(env: Any, joints: int, name: str = "chain", scene_idxs: list[int] | 
             damping=0.02,
         )
     builder.initial_pose = sapien.Pose([0, 0, 1])
-    return builder.build(name, fix_root_link=True)
+    return builder.build(name, fix_root_link=fixed)

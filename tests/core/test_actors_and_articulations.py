@@ -16,7 +16,7 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 
 from tests.core.by_hand import BOX, box, by_hand
-from tests.core.stock_env import Bare, batch_of, follow
+from tests.core.stock_env import Bare, follow
 
 
 class Table(Bare):
@@ -53,13 +53,6 @@ def test_dynamic_kinematic_and_static_actors_do_what_they_do_in_a_stock_env() ->
     ]
     assert bool((env.box.pose.p[:, 0] > 0.3).all()), "the pusher never pushed: the test proved nothing"
     assert env.slab.pose.raw_pose.shape[-1] == 7
-
-
-def test_initial_poses_may_differ_from_env_to_env() -> None:
-    env = batch_of(Table, 3)
-    expected = torch.tensor([[0.03 * i, 0.02 * i, 0.2 + 0.01 * i] for i in range(3)])
-    assert torch.equal(env.box.pose.p, expected)
-    assert torch.equal(env.box.initial_pose.p, expected)
 
 
 URDF = """<robot name="lever">

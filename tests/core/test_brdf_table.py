@@ -5,19 +5,15 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import sapien
 import sapien.render
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
-from PIL import Image
 
-import workbench
 from workbench.core import backends
 from workbench.core.backends import give_brdf_table
-from workbench.core.cameras.render import take_pictures
 
 SHADERS = Path(sapien.__file__).parent / "vulkan_shader"
 DRAWN = "outColor.rgb = mix(bg, color.rgb, color.a);"
@@ -54,59 +50,3 @@ def test_it_is_the_one_that_sapien_computes_to_the_bit(tmp_path: Path, renderer:
     give_brdf_table(ours)
     ours.take_picture()
     assert np.array_equal(ours.get_picture("Color")[..., :2], computed)
-
-
-@pytest.mark.parametrize("pack", ["minimal", "default"])
-def test_a_mirror_is_as_bright_as_the_table_says(tmp_path: Path, pack: str, renderer: None) -> None:
-    scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device("cpu"))])
-    side = tmp_path / "side.png"
-    Image.new("RGB", (64, 64), (200, 200, 200)).save(side)
-    scene.render_system.cubemap = sapien.render.RenderCubemap(*[str(side)] * 6)
-    builder = scene.create_actor_builder()
-    mirror = sapien.render.RenderMaterial(base_color=[1, 1, 1, 1], metallic=1, roughness=0.1)
-    builder.add_sphere_visual(radius=0.5, material=mirror)
-    builder.set_initial_pose(sapien.Pose([2, 0, 0]))
-    builder.build_static("mirror")
-    before = sapien.render.get_camera_shader_dir()
-    sapien.render.set_camera_shader_dir(str(SHADERS / pack))
-    try:
-        cameras = [scene.add_camera(name, 32, 32, 0.3, 0.01, 10.0) for name in ("lit", "dark")]
-    finally:
-        sapien.render.set_camera_shader_dir(before)
-    scene.update_render()
-    give_brdf_table(cameras[0])
-    nothing = np.zeros((8, 8, 2), np.float32)
-    cameras[1].set_texture("BRDFLUT", sapien.render.RenderTexture(nothing, 2, "R32G32Sfloat"))
-    brightness = []
-    for camera in cameras:
-        camera.take_picture()
-        brightness.append(float(camera.get_picture("Color")[16, 16, :3].mean()))
-    lit, dark = brightness
-    assert dark < 0.05 < 0.5 < lit
-
-
-def test_cameras_keep_it_when_their_env_begins_anew(
-    tmp_path: Path, renderer: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Else the process computes its own for the first exact picture after that, which takes seconds."""
-    side = tmp_path / "side.png"
-    Image.new("RGB", (64, 64), (200, 200, 200)).save(side)
-    nothing = sapien.render.RenderTexture(np.zeros((8, 8, 2), np.float32), 2, "R32G32Sfloat")
-    with monkeypatch.context() as instead:
-        instead.setattr(backends, "_brdf_table", lambda: nothing)
-        env = workbench.make("PushCube-v1", 2, backend="cpu", render_backend="cpu").unwrapped
-        env.reset(seed=0)
-        for scene in env.scene.sub_scenes:  # type: ignore[attr-defined]
-            scene.render_system.cubemap = sapien.render.RenderCubemap(*[str(side)] * 6)
-        dark = pictured(env)
-        workbench.begin_anew(env, [1])
-        assert np.array_equal(pictured(env), dark)
-    workbench.begin_anew(env, [1])
-    assert pictured(env).mean() > dark.mean() + 3
-    env.close()
-
-
-def pictured(env: Any) -> np.ndarray:
-    (picture,) = take_pictures(env, 1, [("base_camera", "sensor", ("rgb",))])
-    assert picture.rgb is not None
-    return picture.rgb

@@ -18,15 +18,17 @@ from tests.sweeps import follow_stock
 from tests.sweeps.follow_stock import MOVED_BY_THE_TASK, batch_of, compare, packed, take_over, touching
 from workbench.core.env import actions
 
-pytestmark = pytest.mark.thorough
+pytestmark = [
+    pytest.mark.thorough,
+    # ManiSkill's own tasks break some: `env/test_strict.py` lists them.
+    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
+]
 
 CASES = (
-    ("PickCube-v1", 1, 0),
-    ("PickCube-v1", 16, 7),
+    ("PickCube-v1", 8, 7),
     ("PushCube-v1", 4, 3),
-    ("StackCube-v1", 16, 15),
+    ("StackCube-v1", 6, 5),
     ("PegInsertionSide-v1", 4, 2),  # another peg for every seed
-    ("LiftPegUpright-v1", 4, 3),
     ("TwoRobotPickCube-v1", 4, 3),  # an action for each robot
     ("TriFingerRotateCubeLevel4-v1", 4, 3),  # three fingers push a cube all the time
     # a hand, and another object in each env
@@ -35,7 +37,7 @@ CASES = (
     ("SO100GraspCube-v1", 4, 3),  # controllers that remember their target
     ("MS-CartpoleBalance-v1", 4, 3),  # from MJCF, no contacts
     ("MS-HumanoidRun-v1", 4, 3),  # falls over itself
-    ("UnitreeG1Stand-v1", 4, 3),
+    pytest.param("UnitreeG1Stand-v1", 4, 3, marks=pytest.mark.slow),
 )
 
 

@@ -12,7 +12,6 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 
 from tests.drive.envs import batched
 from tests.sweeps.exercise_task import exercise
@@ -53,7 +52,10 @@ def test_a_task_with_a_fault_of_its_own_does_the_rest(renderer: None) -> None:
 
 _EACH = [
     pytest.param(
-        fault, env_id, id=f"{env_id} {fault.stage}", marks=[pytest.mark.slow] * (env_id == "DrawSVG-v1")
+        fault,
+        env_id,
+        id=f"{env_id} {fault.stage}",
+        marks=[pytest.mark.slow] * (env_id != fault.ids[0] or env_id == "DrawSVG-v1"),
     )
     for fault in FAULTS
     for env_id in fault.ids
@@ -76,14 +78,6 @@ def test_a_fault_of_the_task_is_at_the_line_that_is_named(fault: Fault, env_id: 
         assert "[1, 3] of 4" in " ".join(caught.value.__notes__)
     env.reset(seed=1)
     made.close()
-
-
-def test_the_buffers_that_a_partial_reset_replaced_are_named() -> None:
-    env = batched("RotateValveLevel0-v1", 4, rules="off")
-    with pytest.raises(RuntimeError) as caught:
-        env.reset(options={"env_idx": torch.tensor([0, 2, 3])})
-    assert any("self.rest_qpos: 4 rows" in note and "3 now" in note for note in caught.value.__notes__)
-    env.close()
 
 
 def test_a_fault_that_upstream_mended_is_found_out(renderer: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import mani_skill.envs  # noqa: F401 (registers the tasks)
@@ -13,18 +11,11 @@ import pytest
 import sapien
 import sapien.render
 import torch
-from numpy.typing import NDArray
-from PIL import Image
 
 import workbench
 from tests.core.drawn_envs import batched
-from workbench.core.camera_data import PictureDegree
 from workbench.core.cameras.render import take_pictures
-from workbench.core.env.hot_swap import exchange_cameras
-from workbench.core.env.task_env import BackendUnavailable, EnvOptions
 from workbench.core.maniskill_private import camera_components
-from workbench.core.scene.fast_shader import ALL, COLOR, FastCameras, shader_folder
-from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
 
 pytestmark = pytest.mark.usefixtures("renderer")
 
@@ -105,85 +96,6 @@ def test_a_body_that_is_hidden_is_hidden_in_both(env: Any) -> None:
         body.visibility = 1.0
 
 
-def test_what_maniskill_finds_of_a_link_stays_the_exact_shapes(env: Any) -> None:
-    take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
-    link = env.agent.robot.links_map["panda_link5"]
-    assert sum(len(part.triangles) for shape in link.render_shapes[0] for part in shape.parts) > 10_000
-
-
-def test_the_installed_sapien_has_the_shader_that_is_cut_down() -> None:
-    for textures in (COLOR, ALL):
-        folder = shader_folder(textures)
-        assert folder is not None and (folder / "gbuffer.frag").exists()
-
-
-@pytest.mark.parametrize("textures", [COLOR, ALL])
-def test_the_shader_that_is_cut_down_draws_the_same_picture_of_the_same_shapes(
-    env: Any, textures: frozenset[str]
-) -> None:
-    # Table, floor, robot and cube: with and without textures, a normal map, metal, and what is smooth and rough.
-    sensor = env._sensors["base_camera"]
-    exact = camera_components(sensor)[0]
-    cameras = FastCameras(env.scene.sub_scenes)
-    cameras.follow(0, sensor.config, exact, textures)
-    beside = cameras.beside(exact, textures)
-    assert beside is not exact
-    env.scene.sub_scenes[0].update_render()
-    colours = []
-    for component in (exact, beside):
-        component.take_picture()
-        colours.append(np.asarray(component.get_picture("Color")))
-    off = np.abs(colours[0].astype(np.float64) - colours[1])[..., :3]
-    step = 1 if colours[0].dtype == np.uint8 else 1 / 255
-    assert colours[0].any() and off.max() <= step * 1.01 and (off > 0).mean() < 0.01
-
-
-def test_a_fast_picture_follows_its_camera(env: Any) -> None:
-    (still,) = take_pictures(env, 0, [("base_camera", "sensor", ALL_THREE)], degree="fast")
-    component = camera_components(env._sensors["base_camera"])[0]
-    was = component.local_pose
-    component.local_pose = was * sapien.Pose([0.1, 0.05, 0])
-    try:
-        exact, fast = (
-            take_pictures(env, 0, [("base_camera", "sensor", ALL_THREE)], degree=degree)[0]
-            for degree in ("exact", "fast")
-        )
-    finally:
-        component.local_pose = was
-    assert fast.rgb is not None and exact.rgb is not None
-    assert np.mean(fast.segmentation != exact.segmentation) < 0.01
-    assert np.mean(fast.segmentation != still.segmentation) > 0.01
-    assert np.abs(fast.rgb.astype(int) - exact.rgb).mean() < 2
-    np.testing.assert_array_equal(fast.pose, exact.pose)
-
-
-def test_an_environment_map_is_in_both(tmp_path: Path) -> None:
-    # An env of its own: SAPIEN crashes where a map is taken away again.
-    env: Any = batched("PickCube-v1", obs_mode="rgb", num_envs=1)
-
-    def taken(degree: PictureDegree) -> NDArray[np.int64]:
-        (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree=degree)
-        assert picture.rgb is not None
-        return picture.rgb.astype(int)
-
-    without = taken("fast")
-    Image.fromarray(np.full((8, 8, 4), (250, 30, 30, 255), np.uint8)).save(tmp_path / "side.png")
-    side = str(tmp_path / "side.png")
-    env.scene.sub_scenes[0].render_system.cubemap = sapien.render.RenderCubemap(*6 * [side])
-    exact, fast = taken("exact"), taken("fast")
-    assert np.abs(fast - exact).mean() < 2 < np.abs(fast - without).mean()
-    env.close()
-
-
-def test_exchanged_cameras_draw_fast_pictures_too() -> None:
-    env: Any = batched("PickCube-v1", obs_mode="rgb", num_envs=1)
-    (before,) = take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
-    exchange_cameras(env)
-    (after,) = take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree="fast")
-    np.testing.assert_array_equal(after.rgb, before.rgb)
-    env.close()
-
-
 def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
     with pytest.warns(UserWarning, match="other"):
         env: Any = workbench.make("PickCube-v1", 1, obs_mode="rgb", pictures="fast")
@@ -193,33 +105,6 @@ def test_an_env_is_made_with_fast_pictures_and_it_is_said() -> None:
     off = np.abs(obs["sensor_data"]["base_camera"]["rgb"][0].numpy().astype(int) - exact.rgb)
     assert 0 < off.mean() < 2
     env.close()
-
-
-def test_exact_pictures_are_made_without_a_word() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)
-        workbench.make("PickCube-v1", 1, obs_mode="rgb").close()
-
-
-def test_other_degrees_and_gpu_simulation_are_refused() -> None:
-    with pytest.raises(ValueError, match="exact, fast"):
-        EnvOptions(1, pictures="quick")  # type: ignore[arg-type]
-    with pytest.raises(BackendUnavailable), pytest.warns(UserWarning, match="other"):
-        workbench.make("PickCube-v1", 1, backend="gpu", pictures="fast")
-
-
-def test_after_a_restored_snapshot_both_are_what_they_were(env: Any) -> None:
-    def taken(degree: Any) -> Any:
-        return take_pictures(env, 0, [("base_camera", "sensor", ["rgb"])], degree=degree)[0].rgb
-
-    snapshot = take_snapshot(env)
-    # PhysX makes the poses of links anew from the joints: another last bit than a step gives them, here and there.
-    restore_snapshot(env, snapshot)
-    exact, fast = taken("exact"), taken("fast")
-    env.step(torch.from_numpy(env.action_space.sample()))
-    restore_snapshot(env, snapshot)
-    np.testing.assert_array_equal(taken("exact"), exact)
-    np.testing.assert_array_equal(taken("fast"), fast)
 
 
 @pytest.fixture(scope="module")
@@ -251,12 +136,21 @@ def test_a_wrist_camera_draws_nothing_of_what_is_beside_and_behind_it(wrist: Any
     assert drawn["camera_link"] == drawn["panda_link7"] == drawn["panda_link0"] == 0
 
 
-def test_a_camera_that_is_moved_on_its_mount_sees_what_it_is_fixed_to(wrist: Any) -> None:
+@pytest.mark.parametrize(
+    ("at", "turned"),
+    [
+        ((-0.25, 0, 0), (1, 0, 0, 0)),
+        ((-0.2, 0, -0.2), (1, 0, 0, 0)),
+        ((0.1, 0, 0.3), (0.7071068, 0, 0.7071068, 0)),
+    ],
+)
+def test_a_camera_that_is_moved_on_its_mount_sees_what_it_is_fixed_to(
+    wrist: Any, at: Any, turned: Any
+) -> None:
     component = camera_components(wrist._sensors["hand_camera"])[0]
     take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb"])], degree="fast")
     was = component.local_pose
-    # Back by the length of a hand, and looking the same way.
-    component.local_pose = was * sapien.Pose([-0.25, 0, 0])
+    component.local_pose = was * sapien.Pose(at, turned)
     try:
         exact, fast = (
             take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb", "segmentation"])], degree=degree)[0]
@@ -264,11 +158,11 @@ def test_a_camera_that_is_moved_on_its_mount_sees_what_it_is_fixed_to(wrist: Any
         )
     finally:
         component.local_pose = was
-    mount = component.entity.per_scene_id
-    assert (exact.segmentation == mount).sum() > 50 and (fast.segmentation == mount).sum() > 50
-    assert (fast.segmentation != exact.segmentation).mean() < 0.02
-    (again,) = take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb"])], degree="fast")
-    assert drawn_by(wrist, "hand_camera")["camera_link"] == 0 and again.rgb is not None
+    links = [link._objs[0].entity.per_scene_id for link in wrist.agent.robot.links]
+    assert exact.segmentation is not None and np.isin(exact.segmentation, links).sum() > 50
+    assert (fast.segmentation != exact.segmentation).mean() < 0.01
+    take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb"])], degree="fast")
+    assert drawn_by(wrist, "hand_camera")["camera_link"] == 0
 
 
 def test_a_body_that_comes_into_view_is_drawn(env: Any) -> None:
@@ -286,20 +180,3 @@ def test_a_body_that_comes_into_view_is_drawn(env: Any) -> None:
     exact, fast = (take_pictures(env, 0, request, degree=degree)[0] for degree in ("exact", "fast"))
     assert (fast.segmentation != exact.segmentation).mean() < 0.01
     assert (away.segmentation != exact.segmentation).mean() > 0.1
-
-
-def test_a_link_beside_the_view_whose_box_reaches_into_it_is_not_drawn(env: Any) -> None:
-    component = camera_components(env._sensors["base_camera"])[0]
-    request: list[Any] = [("base_camera", "sensor", ["rgb", "segmentation"])]
-    was = component.local_pose
-    base = env.agent.robot.links[0]._objs[0].entity
-    try:
-        # As in ManiSkill's RollBall: within the arm, right in front of the link that turns it.
-        seat = sapien.Pose([0.1, 0, 0.3], [0.98572, -0.00882, 0.15903, 0.05466])
-        component.local_pose = component.entity.pose.inv() * base.pose * seat
-        exact, fast = (take_pictures(env, 0, request, degree=degree)[0] for degree in ("exact", "fast"))
-        drawn = drawn_by(env, "base_camera")
-    finally:
-        component.local_pose = was
-    assert drawn["panda_link1"] == drawn["panda_link2"] == 0 < drawn["panda_link6"]
-    assert (fast.segmentation != exact.segmentation).mean() < 0.01

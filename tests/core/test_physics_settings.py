@@ -170,14 +170,6 @@ def test_the_simulation_config_reaches_every_env(change: str, unchanged: torch.T
     env.close()
 
 
-def test_the_simulation_config_may_be_given_when_the_env_is_made() -> None:
-    env = batch_of(Collision, 3, sim_config={"sim_freq": 50, "control_freq": 10, "spacing": 20})
-    assert [env.sim_freq, env.control_freq] == [50, 10]
-    assert env.scene.timestep == pytest.approx(1 / 50)
-    assert [system.timestep for system in env.scene.px.systems] == pytest.approx([1 / 50] * 3)
-    env.close()
-
-
 def test_what_the_gpu_refuses_once_it_runs_is_told_at_its_line() -> None:
     env = batch_of(Collision, 3)
     for change in (

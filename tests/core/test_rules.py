@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import mani_skill.envs  # noqa: F401  registers the ids
@@ -16,11 +16,9 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import CPU, PICK_CUBE, batched
 from workbench.core.broken_rule import MOST_ROWS, BrokenRule, BrokenRules, RuleWarning
-from workbench.core.env.task_env import EnvOptions
-from workbench.core.rules import RULES, Finding, degrees_of
+from workbench.core.rules import Finding, degrees_of
 
 N = 3
-Hook = Callable[..., None]
 
 
 def test_what_overwrites_other_envs_and_a_success_without_rows_stop_by_themselves() -> None:
@@ -31,21 +29,6 @@ def test_what_overwrites_other_envs_and_a_success_without_rows_stop_by_themselve
         "evaluate-rows",
     }
     assert {degree for rule, degree in degrees_of(None).items() if rule not in stops} == {"warn"}
-
-
-@pytest.mark.parametrize("choice", ["stop", "warn", "off"])
-def test_a_degree_that_is_chosen_is_that_of_all_rules(choice: Any) -> None:
-    assert degrees_of(choice) == dict.fromkeys(RULES, choice)
-
-
-def test_a_degree_that_is_none_is_refused() -> None:
-    with pytest.raises(ValueError, match="'stop', 'warn' or 'off', not 'strict'"):
-        EnvOptions(rules="strict")  # type: ignore[arg-type]
-
-
-def test_each_rule_says_what_it_asks_and_what_happens_otherwise() -> None:
-    for id, rule in RULES.items():
-        assert rule.id == id and rule.asks.endswith(".") and rule.otherwise.endswith(".")
 
 
 # --- a rule that warns changes nothing ------------------------------------------------------------------
@@ -61,79 +44,8 @@ def lifts(env: Any, *args: Any) -> None:
     env.cube.set_pose(_raised(env))
 
 
-def pushes_joints(env: Any, *args: Any) -> None:
-    env.agent.robot.set_qf(torch.ones((N, 9)))
-    env.agent.robot.set_qvel(torch.ones(9) * 0.1)
-
-
-def applies_late(env: Any, *args: Any) -> None:
-    lifts(env)
-    env.scene._gpu_apply_all()
-    env.scene._gpu_fetch_all()
-
-
-def moves_a_link(env: Any, *args: Any) -> None:
-    link = env.agent.robot.links_map["panda_hand"]
-    link.set_pose(Pose.create(cast(Any, link.pose).raw_pose + 0.1))
-
-
-def goes_behind(env: Any, *args: Any) -> None:
-    env.cube._objs[0].set_pose(
-        cast(Any, _raised(env).sp)[0] if len(env.cube._objs) == 1 else env.cube._objs[1].pose
-    )
-
-
 def writes_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
     env.scene.px.cuda_rigid_body_data.torch()[env.cube._body_data_index, 2] += 0.1
-
-
-def steps_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
-    env.scene._gpu_apply_all()
-    env.scene.px.step()
-    env.scene._gpu_fetch_all()
-
-
-def draws_for_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
-    env.target = torch.rand((N, 2))
-
-
-@pytest.mark.parametrize(
-    ("hook", "fault", "rules"),
-    [
-        ("evaluate", lifts, {"not-applied", "applied-by-reset"}),
-        ("_before_control_step", lifts, {"not-applied"}),
-        ("_before_control_step", pushes_joints, {"not-applied", "applied-by-reset"}),
-        ("_after_control_step", applies_late, {"apply-before-fetch", "read-before-fetch"}),
-        ("_before_control_step", moves_a_link, {"link-pose-set"}),
-        ("_before_control_step", goes_behind, {"behind-the-tensors"}),
-        ("_initialize_episode", writes_all, {"other-env-written"}),
-        ("_initialize_episode", steps_all, {"stepped-in-reset"}),
-        ("_initialize_episode", draws_for_all, {"rows-rewritten"}),
-    ],
-)
-def test_what_only_warns_goes_on_to_the_same_bits_as_without_rules(
-    hook: str, fault: Hook, rules: set[str]
-) -> None:
-    def after(self: Any, *args: Any) -> Any:
-        made = getattr(PICK_CUBE, hook)(self, *args)
-        fault(self, *args)
-        return made
-
-    task = type("BreaksARule", (PICK_CUBE,), {hook: after})
-    states, found = {}, []
-    for choice in ("warn", "off"):
-        env = batched(task, N, rules=choice, on_finding=found.append, obs_mode="none")
-        env.reset(seed=[0, 1, 2])
-        states[choice] = []
-        for step in range(4):
-            env.step(np.full((N, 8), 0.3, np.float32))
-            states[choice].append(env.get_state())
-            if step == 1:
-                env.reset(seed=[3, 4, 5], options={"env_idx": torch.tensor([1])})
-                states[choice].append(env.get_state())
-        env.close()
-    assert {finding.rule for finding in found} == rules
-    assert torch.equal(torch.stack(states["warn"]), torch.stack(states["off"]))
 
 
 # --- what is kept -------------------------------------------------------------------------------------------
@@ -150,6 +62,16 @@ def test_a_rule_broken_at_each_step_is_one_row_with_a_count() -> None:
     (row,) = rules.rows
     assert (row.count, row.first_step, row.message) == (5, 0, "lost in step 0")
     assert (row.file, row.line, row.function) == ("task.py", 7, "lift")
+
+
+def test_steps_are_counted_from_where_the_task_begins() -> None:
+    rules = a_rule()
+    rules.step = 7  # while it was tried
+    rules.report_breach("not-applied", "lost", None, ("task.py", 7, "lift"))
+    rules.begin()
+    rules.step += 2
+    rules.report_breach("not-applied", "lost", None, ("task.py", 9, "drop"))
+    assert [(row.line, row.first_step) for row in rules.rows] == [(7, 0), (9, 2)]
 
 
 def test_rows_are_bounded_and_the_rest_is_counted() -> None:
@@ -180,6 +102,18 @@ def test_what_is_not_broken_again_at_the_same_occasion_leaves() -> None:
     with rules.during("reset"):
         rules.report_breach("rows-rewritten", "drawn", None, ("task.py", 10, "draw"), subject="target")
     assert rules.rows[0].count == 2
+
+
+def test_a_comment_silences_its_line_until_the_file_is_edited(tmp_path: Path) -> None:
+    file = tmp_path / "task.py"
+    file.write_text("x = 1  # workbench: off[not-applied] the GPU is far\ny = 2\n")
+    rules = a_rule()
+    for line in (1, 1, 2):
+        rules.report_breach("not-applied", "lost", None, (str(file), line, "lift"))
+    assert [(row.line, row.count) for row in rules.rows] == [(2, 1)]
+    assert [(finding.line, silence.reason) for finding, silence in rules.silenced] == [(1, "the GPU is far")]
+    rules.edited(lambda row: (str(file), row.line or 0))
+    assert rules.silenced == () and [row.line for row in rules.rows] == [2]
 
 
 def test_of_several_things_lost_at_once_each_is_told() -> None:

@@ -14,7 +14,7 @@ import pytest
 import torch
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from tests.core.stock_env import batch_of, put_in_same_state, single
+from tests.core.stock_env import batch_of
 
 PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 TOLERANCE = 2e-6
@@ -38,20 +38,6 @@ def move(env: Any, steps: int = 5) -> None:
     rng = np.random.default_rng(0)
     for _ in range(steps):
         env.step(rng.uniform(-1, 1, (4, 8)).astype(np.float32))
-
-
-def test_a_state_dict_has_the_entries_of_a_stock_env(env: Any) -> None:
-    stock = single(PICK_CUBE)
-    stock.reset(seed=0)
-    ours, theirs = env.get_state_dict(), stock.get_state_dict()
-    for kind in ("actors", "articulations"):
-        assert list(ours[kind]) == list(theirs[kind])
-        for name, value in theirs[kind].items():
-            assert ours[kind][name].shape == (4, *value.shape[1:])
-    assert env.get_state().shape == (4, stock.get_state().shape[1])
-    put_in_same_state(stock, env, 3)
-    assert torch.equal(env.get_state()[3], stock.get_state()[0])
-    stock.close()
 
 
 @pytest.mark.parametrize("flat", [False, True], ids=["dict", "vector"])
@@ -85,24 +71,3 @@ def test_a_state_of_some_envs_reaches_only_them(env: Any, flat: bool) -> None:
         env.set_state_dict(rows, chosen)
     assert torch.equal(env.get_state()[[0, 2]], untouched)
     torch.testing.assert_close(env.get_state()[[1, 3]], wanted, atol=TOLERANCE, rtol=0)
-
-
-def test_a_reset_to_given_states(env: Any) -> None:
-    wanted = env.get_state()[[0, 2]].clone()
-    move(env)
-    env.reset(options={"env_idx": torch.tensor([0, 2]), "reset_to_env_states": {"env_states": wanted}})
-    torch.testing.assert_close(env.get_state()[[0, 2]], wanted, atol=TOLERANCE, rtol=0)
-    assert env.elapsed_steps.tolist() == [0, 10, 0, 10]
-
-
-def test_an_actor_that_leaves_the_registry_leaves_the_state(env: Any) -> None:
-    full = env.get_state().shape[1]
-    env.remove_from_state_dict_registry(env.goal_site)
-    assert "goal_site" not in env.get_state_dict()["actors"]
-    assert env.get_state().shape[1] == full - 13
-    with pytest.raises(AssertionError, match="not in state dict registry"):
-        env.remove_from_state_dict_registry(env.goal_site)
-    env.add_to_state_dict_registry(env.goal_site)
-    assert env.get_state().shape[1] == full
-    with pytest.raises(AssertionError, match="already in state dict registry"):
-        env.add_to_state_dict_registry(env.goal_site)

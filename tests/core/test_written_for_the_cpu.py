@@ -24,7 +24,7 @@ pytestmark = [
     pytest.mark.thorough,
     pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
 ]
-STEPS = 6
+STEPS = 4
 
 
 class Written(Bare):
@@ -185,7 +185,9 @@ class GoesBehindTheTensors(Written):
             entity.set_pose(sapien.Pose([0.1 * self.env_numbers()[env], 0, 0.1]))
             self.chain._objs[env].set_qpos(np.array([0.1 * self.env_numbers()[env], 0.2], np.float32))
             self.lies._bodies[env].linear_velocity = [0.1, 0, 0]
+            self.wall._objs[env].set_pose(sapien.Pose([0.5 + 0.1 * self.env_numbers()[env], 0.5, 0.05]))
         self.see(pose=self.falls.pose.raw_pose, link=self.last.pose.p, velocity=self.lies.linear_velocity)
+        self.see(wall=self.wall.pose.raw_pose)
 
 
 class LooksBehindTheTensors(Written):
@@ -196,6 +198,20 @@ class LooksBehindTheTensors(Written):
         self.see(
             qpos=[chain.qpos for chain in self.chain._objs], link=[x.entity_pose.p for x in self.last._objs]
         )
+
+
+class ThrowsAFreeChain(Written):
+    def built(self) -> None:
+        self.free = by_hand(self, 1, "free", fixed=False)
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        self.free.set_pose(Pose.create_from_pq(self.per_env(env_idx, (-0.5, 0.1), (0.5, 0.1), (0.8, 0.1))))
+        self.free.set_root_linear_velocity(self.per_env(env_idx, (0.1, 0.1), (0.2, 0), (0.3, -0.1)))
+        self.free.set_root_angular_velocity(self.per_env(env_idx, (1, 0.2), (2, 0.1), (-3, 0.1)))
+
+    def evaluate(self) -> dict:
+        self.see(linear=self.free.root_linear_velocity, angular=self.free.root_angular_velocity)
+        return {}
 
 
 class GivesRowsOfAllEnvs(Written):
@@ -271,11 +287,11 @@ TASKS = [
     *(StepsTheEnvInReset, StepsAfterReset, LooksAtLinksInReset, WritesInEvaluate),
     *(WritesAndReadsBetweenSubsteps, MovesAStaticActor, GoesBehindTheTensors, LooksBehindTheTensors),
     *(GivesRowsOfAllEnvs, SetsJointsOneByOne, ChangesWhatIsFixedOnTheGpu, ComputesPassiveForces),
-    *(BuildsInItsFirstReset, RemovesABody),
+    *(BuildsInItsFirstReset, RemovesABody, ThrowsAFreeChain),
 ]
 
 
-@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("num_envs", [pytest.param(1, marks=pytest.mark.slow), 3])
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.__name__)
 def test_an_env_of_the_batch_does_what_the_stock_env_does(task: type[Written], num_envs: int) -> None:
     beside = _Beside(task, num_envs)
@@ -320,6 +336,7 @@ class _Beside:
             assert self.batch.scene.px.systems[env].pack() == stock.scene.px.pack(), (
                 f"{when}: state of env {env}"
             )
+            assert self.batch.elapsed_steps[env] == stock.elapsed_steps[0], f"{when}: steps of env {env}"
             for name, theirs in stock.seen.items() if seen_of is None or env in seen_of else ():
                 ours = self.batch.seen[name][env]
                 assert np.array_equal(ours, theirs[0]), (

@@ -47,7 +47,7 @@ def two_robots(actions: torch.Tensor) -> Any:
     return {"panda-0": left, "panda-1": right}
 
 
-@pytest.mark.filterwarnings("ignore:.*which belonged to another task")  # the class that the fixture imported
+@pytest.mark.filterwarnings("ignore:.*which exists already")  # the class that the fixture imported
 @pytest.mark.parametrize(
     ("name", "policy", "as_action"),
     [

@@ -16,8 +16,6 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.stock_env import batch_of, put_in_same_state, single
 from tests.core.watched import RENDERED, Watched, pictures
-from workbench.core.cameras.render import take_pictures
-from workbench.core.scene.scene_index import read_poses
 
 N = 3
 
@@ -69,69 +67,3 @@ def test_a_camera_on_an_actor_sees_what_is_before_the_actor_of_its_own_env(env: 
     model = env.scene.sensors["on_actor"].camera.get_model_matrix()
     assert model.shape == (N, 4, 4)
     torch.testing.assert_close(model[:, :3, 3], env.rider.pose.p, atol=1e-5, rtol=0)
-
-
-def test_parameters_of_a_mounted_camera_follow_its_link(env: Any) -> None:
-    env.reset(seed=[0, 1, 2])
-    env.step(None)
-    poses = env.scene.sensors["on_link"].camera.get_global_pose()
-    expected = env.chain.links[-1].pose * Pose.create_from_pq(torch.tensor([[0.3, 0, 0]]))
-    torch.testing.assert_close(poses.p, expected.p, atol=1e-5, rtol=0)
-
-
-def test_a_hidden_object_is_seen_by_people_only_and_stays_where_it_is(env: Any) -> None:
-    obs, _ = env.reset(seed=[0, 1, 2])
-    place = env.marker.pose.raw_pose.clone()
-    assert env.marker.hidden
-    assert torch.equal(place[:, 1], torch.tensor([0.0, 0.1, 0.2]))
-    marker_id = int(env.marker.per_scene_id[0])
-    assert not (pictures(obs)["beside/segmentation"] == marker_id).any()
-    shown = np.asarray(env.render_rgb_array())
-    assert torch.equal(env.marker.pose.raw_pose, place)
-    hidden = pictures({"sensor_data": env.get_obs(env.get_info())["sensor_data"]})["beside/rgb"]
-    assert torch.equal(env.marker.pose.raw_pose, place)
-    for number in range(N):
-        assert (np.abs(shown[number].astype(int) - hidden[number]).max(axis=-1) > 50).sum() > 10
-    env.marker.show_visual()
-    assert torch.equal(env.marker.pose.raw_pose, place)
-    rows = env.scene.px.cuda_rigid_body_data.torch()[env.marker._body_data_index, :7]
-    assert torch.equal(rows, place)
-    assert [list(e.pose.p) for e in env.marker._objs] == place[:, :3].tolist()
-
-
-def test_a_partial_reset_moves_a_hidden_object_of_its_envs_only(env: Any) -> None:
-    env.reset(seed=[0, 1, 2])
-    assert env.marker.hidden
-    env.marker.set_pose(Pose.create(torch.tensor([[1.0, 0.5, 1.0, 1, 0, 0, 0]]).repeat(N, 1)))
-    env.apply()
-    env.reset(options={"env_idx": torch.tensor([2])})
-    torch.testing.assert_close(env.marker.pose.p[:, 1], torch.tensor([0.5, 0.5, 0.2]))
-
-
-def test_a_moment_of_the_past_is_drawn_from_poses_and_nothing_moves(env: Any) -> None:
-    requests = [
-        (name, "sensor", ("rgb", "depth", "segmentation")) for name in ("on_link", "on_actor", "beside")
-    ]
-    env.reset(seed=[0, 1, 2])
-    then_poses = read_poses(env)[1]
-    then = take_pictures(env, 1, requests)
-    for _ in range(6):
-        env.step(None)
-    pose = env.rider.pose.raw_pose.clone()
-    pose[:, 1] += 0.4
-    env.rider.set_pose(Pose.create(pose))
-    env.apply()
-    now_poses = read_poses(env)
-    now = take_pictures(env, 1, requests)
-    drawn = take_pictures(env, 1, requests, then_poses)
-    assert np.array_equal(read_poses(env), now_poses, equal_nan=True)
-    for was, again, other in zip(then, drawn, now, strict=True):
-        np.testing.assert_allclose(again.pose, was.pose, atol=1e-5)
-        # A pose that was taken apart and put together again may move an edge by a pixel.
-        assert np.mean(again.segmentation != was.segmentation) < 0.02
-        assert np.mean(np.abs(again.rgb.astype(int) - was.rgb) > 4) < 0.03
-        if was.camera != "beside":
-            assert np.mean(np.abs(other.rgb.astype(int) - was.rgb) > 4) > 0.03, "the camera saw no change"
-    for before, after in zip(now, take_pictures(env, 1, requests), strict=True):
-        np.testing.assert_array_equal(before.rgb, after.rgb)
-        np.testing.assert_array_equal(before.pose, after.pose)

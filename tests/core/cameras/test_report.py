@@ -7,17 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 
-from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.report import (
-    DEPTH_EDGES,
     CameraReport,
     DepthReport,
     ObjectSeen,
-    SearchSpace,
     join_reports,
-    report_text,
 )
 
 NAN = float("nan")
@@ -48,31 +44,6 @@ def depth(nearest: Any = 1.0, farthest: Any = 2.0) -> DepthReport:
 def report(*objects: ObjectSeen, envs: tuple[int, ...] = (0,), **given: Any) -> CameraReport:
     plain = CameraReport(("sensor", "eye"), (8, 6), (4, 3), envs, objects, depth(), 3, 1.5)
     return replace(plain, **given)
-
-
-def test_depth_is_counted_in_ten_bins_a_decade_from_a_centimetre_to_a_hundred_metres() -> None:
-    assert len(DEPTH_EDGES) == 41
-    assert_allclose(DEPTH_EDGES[::10], [0.01, 0.1, 1.0, 10.0, 100.0])
-
-
-def test_a_mark_is_what_is_left_to_see() -> None:
-    marks = thing(
-        pixels=[100, 400, 25, 50, 50, 0, 100, 100],
-        alone=[100, 400, 25, 100, 50, 0, 100, 100],
-        cut=[False, False, False, False, True, False, True, False],
-        present=[True] * 7 + [False],
-    ).marks()
-    assert marks.dtype == np.float32
-    assert_allclose(marks, [1, 1, 0.5, 0.5, 0.5 * 0.5**0.5, 0, 0.5, NAN], rtol=1e-6)
-    # More is never left than the whole of it, and what is drawn only beside others is no division by zero.
-    assert_allclose(thing(pixels=[200, 1], alone=[100, 0]).marks(), [1, 0])
-
-
-def test_who_covers_it_is_told_by_what_each_takes_away() -> None:
-    seen = thing(pixels=[25, 0, 0, 60], unhindered=[50, 0, 40, 50], alone=[100, 100, 40, 0])
-    assert seen.hidden_share.dtype == np.float32
-    assert_allclose(seen.hidden_share, [0.5, NAN, 1, 0])
-    assert_allclose(seen.covered_share, [0.5, 1, 0, NAN])
 
 
 def test_a_summary_is_of_the_envs_that_have_it() -> None:
@@ -165,47 +136,3 @@ def test_what_is_not_of_one_camera_and_one_scene_is_not_joined(changes: Any, say
     first = report(thing())
     with pytest.raises(ValueError, match=says):
         join_reports([first, first, replace(first, **changes)])
-
-
-def test_without_a_report_there_is_nothing_to_join() -> None:
-    with pytest.raises(ValueError, match="no report"):
-        join_reports([])
-
-
-def test_what_was_measured_is_said_of_what_is_there() -> None:
-    whole = thing("cube", pixels=[200, 221])
-    half = thing("ball", pixels=[3, 0, 6], unhindered=[4, 0, 6], alone=[4, 0, 6], cut=[True, False, False])
-    hardly = thing("peg", pixels=[995, 995], unhindered=[1000, 998])
-    found = report(whole, half, hardly, thing("gone", present=False), size=(128, 128))
-    assert report_text(found, ("cube", "gone")) == "cube: in 2 of 2 envs, about 210 pixels (1.3 %)"
-    assert report_text(found, ("ball", "peg")) == (
-        "ball: in 2 of 3 envs, about 3 pixels (0.018 %), cut by the border in 33%, 12% behind the robot; "
-        "peg: in 2 of 2 envs, about 995 pixels (6.1 %)"
-    )
-
-
-LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 0.9, None, 96, 64, 0.01, 100, "minimal")
-SPACE = SearchSpace(("cube",), (0.0, 0.0, 0.5), (1.0, 1.0, 0.5), LENS, candidates=1, best=1)
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"low": (0.0, 1.5, 0.5)}, "each low must be below its high"),
-        ({"high": (1.0, NAN, 1.0)}, "each low must be below its high"),
-        ({"low": (0.0, -np.inf, 0.5)}, "each low must be below its high"),
-        ({"objects": ()}, "at least one object"),
-        ({"candidates": 0}, "draws at least one placement"),
-        ({"best": 0}, "offers at least one"),
-        ({"lens": replace(LENS, fov=None)}, "field of view or an intrinsic"),
-    ],
-)
-def test_what_cannot_be_looked_for_is_refused(changes: Any, says: str) -> None:
-    SPACE.check()
-    with pytest.raises(ValueError, match=says):
-        replace(SPACE, **changes).check()
-
-
-def test_a_search_that_says_no_more_draws_a_hundred_and_offers_five() -> None:
-    space = SearchSpace(("cube",), SPACE.low, SPACE.high, LENS)
-    assert (space.kind, space.candidates, space.best, space.mount) == ("sensor", 100, 5, None)

@@ -15,13 +15,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from tests.drive.envs import batched
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.core.cameras.conventions import LookAt, compose, pose_from_look_at, relative_to, with_pose
-from workbench.core.cameras.render import cameras_of, list_cameras, segmentation_names, take_pictures
+from workbench.core.cameras.render import cameras_of, segmentation_names, take_pictures
 from workbench.core.cameras.report import CameraReport, ObjectSeen, join_reports
 from workbench.core.cameras.visibility import (
     Placement,
-    list_objects,
     measure_placement,
-    objects_to_see,
     placement_of,
     present_settings,
     small_size,
@@ -73,20 +71,6 @@ def cube_at(env: Any, e: int) -> Any:
 
 def seen(report: CameraReport, name: str) -> ObjectSeen:
     return next(thing for thing in report.objects if thing.name == name)
-
-
-def test_objects_are_told_from_robot_and_room(env: Any) -> None:
-    objects = {thing.name: thing for thing in list_objects(env)}
-    assert set(objects) == {"cube", "goal_region", "table-workspace", "ground", "panda"}
-    assert [name for name, thing in objects.items() if thing.robot] == ["panda"]
-    assert {name for name, thing in objects.items() if thing.scenery} == {"table-workspace", "ground"}
-    assert len(objects["panda"].bodies) > 10 and len(objects["cube"].bodies) == 1
-
-
-def test_of_a_robot_its_hand_comes_first_and_what_is_near_its_tool_before_the_rest(env: Any) -> None:
-    (robot,) = (thing for thing in objects_to_see(env) if thing.robot)
-    hand, *fingers, wrist = (name.removeprefix("panda/panda_") for name in robot.links[:4])
-    assert hand == "hand" and {*fingers} == {"leftfinger", "rightfinger"} and wrist == "link7"
 
 
 def test_pixels_are_those_of_maniskills_segmentation(env: Any) -> None:
@@ -154,24 +138,6 @@ def test_what_the_robot_stands_before_is_said(env: Any) -> None:
     assert free.env_marks(["cube"])[0] > 0.7 and 0.3 < cube.margin[0] < 0.5
 
 
-def test_what_stands_behind_another_object_is_said(env: Any) -> None:
-    # From under the table: the table is in the way, and the robot is not.
-    x, y, z = cube_at(env, 0)
-    report = measure_placement(env, 0, Placement(looking(LookAt((x + 0.02, y, -0.3), (x, y, z)))))
-    cube = seen(report, "cube")
-    assert cube.unhindered[0] == cube.pixels[0] == 0 and cube.alone[0] > 20 and cube.covered_share[0] == 1
-    assert cube.summary().covered == 1 and cube.summary().wholly_hidden == 0
-
-
-def test_a_cut_object_and_one_out_of_view_are_told_apart(env: Any) -> None:
-    x, y, z = cube_at(env, 1)
-    beside = measure_placement(env, 1, Placement(looking(LookAt((x, y, 0.4), (x, y + 0.2, 0)), fov=0.9)))
-    away = measure_placement(env, 1, Placement(looking(LookAt((x, y, 0.4), (x, y + 2, 0)), fov=0.9)))
-    assert seen(beside, "cube").cut[0] and seen(beside, "cube").pixels[0] > 0
-    assert not seen(away, "cube").cut[0] and seen(away, "cube").pixels[0] == 0
-    assert np.isnan(seen(away, "cube").hidden_share[0]) and seen(away, "cube").summary().seen == 0
-
-
 def test_an_object_that_reaches_any_of_the_four_borders_is_cut_and_one_that_stops_short_of_it_is_not(
     env: Any,
 ) -> None:
@@ -237,29 +203,6 @@ def test_a_mounted_placement_rides_along_in_every_env(env: Any) -> None:
         assert_array_equal(seen(ridden, "cube").pixels, seen(still, "cube").pixels)
 
 
-def test_a_past_moment_is_measured_where_its_bodies_were(env: Any) -> None:
-    cube = scene_index(env).names.index("cube")
-    past = read_poses(env)
-    past[:, cube, :3] += [0.0, 5.0, 0.0]
-    assert (seen(measure_camera(env, SENSOR, 0, poses=past[0]), "cube").pixels == 0).all()
-    assert (seen(measure_camera(env, SENSOR, 0), "cube").pixels > 0).all()
-
-
-def test_reports_are_joined_and_the_worst_env_comes_first(env: Any) -> None:
-    past = read_poses(env)
-    past[:, scene_index(env).names.index("cube"), :3] += [0.0, 5.0, 0.0]
-    now, last = measure_camera(env, SENSOR, 0), measure_camera(env, SENSOR, 2)
-    then = measure_camera(env, SENSOR, 1, poses=past[1])
-    both = join_reports([now, last, then])
-    assert both.envs == (0, 2, 1) and both.worst_first()[0] == 2
-    assert both.pictures == now.pictures + last.pictures + then.pictures
-    assert seen(both, "cube").summary().seen == pytest.approx(2 / 3)
-    with pytest.raises(ValueError, match="different"):
-        join_reports([now, measure_camera(env, PEOPLE, 0, size=(32, 32))])
-    with pytest.raises(ValueError, match="no object dragon"):
-        both.env_marks(["dragon"])
-
-
 def test_a_goal_that_is_hidden_from_the_policy_is_not_seen_by_its_cameras() -> None:
     env = built("PickCube-v1")
     sensor, people = measure_camera(env, SENSOR, 0), measure_camera(env, PEOPLE, 0, size=(128, 128))
@@ -268,13 +211,3 @@ def test_a_goal_that_is_hidden_from_the_policy_is_not_seen_by_its_cameras() -> N
     assert [thing.name for thing in sensor.wanted_objects()] == ["cube"]
     assert {thing.name for thing in people.wanted_objects()} == {"cube", "goal_site"}
     env.close()
-
-
-def test_what_cannot_be_measured_is_refused_by_name(env: Any) -> None:
-    with pytest.raises(ValueError, match=r"base_camera \(sensor\)"):
-        measure_camera(env, ("sensor", "nothing"), 0)
-    with pytest.raises(IndexError, match="out of range for 3"):
-        measure_camera(env, SENSOR, N)
-    with pytest.raises(ValueError, match="near plane"):
-        measure_placement(env, 0, Placement(looking(FAR_FLOOR, near=2.0, far=1.0)))
-    assert {c.name for c in list_cameras(env)} == {"base_camera", "render_camera"}

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import mani_skill.envs  # noqa: F401 (registers the tasks)
@@ -16,8 +15,8 @@ import torch
 
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core import maniskill_private
-from workbench.core.capture.inspect_env import MOST_VALUES, inspect_env
-from workbench.core.capture.inspection import SECTIONS, Inspection
+from workbench.core.capture.inspect_env import inspect_env
+from workbench.core.capture.inspection import SECTIONS
 from workbench.core.env import actions
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.scene.scene_index import scene_index
@@ -58,15 +57,6 @@ def test_joints_are_those_of_sapien(pick: TaskEnv) -> None:
     )
 
 
-def test_a_joint_without_a_drive_has_no_target() -> None:
-    cartpole = opened("MS-CartpoleBalance-v1")
-    [read] = inspect_env(cartpole, 1, ["joints"]).joints
-    own = maniskill_private.objects_of(cartpole.env.agent.robot)[1].active_joints
-    for i, joint in enumerate(own):
-        assert np.isnan(read.target[i]) == (joint.stiffness == 0)
-    assert "prismatic" in read.kinds and any("revolute" in kind for kind in read.kinds)
-
-
 def test_contacts_add_up_to_those_of_sapien(pick: TaskEnv) -> None:
     for env in range(3):
         own: dict[frozenset[str], np.ndarray] = {}
@@ -100,13 +90,6 @@ def test_a_flat_observation_is_taken_apart_under_the_names_it_was_made_of(pick: 
         np.testing.assert_array_equal(read["agent/qpos"], pick.env.agent.robot.get_qpos()[env])
         np.testing.assert_array_equal(read["extra/obj_pose"], pick.env.cube.pose.raw_pose[env])
         assert read["extra/is_grasped"].shape == (1,)
-
-
-def test_a_dict_of_observations_is_shown_as_it_is() -> None:
-    nested = opened("PickCube-v1", num_envs=2, obs_mode="state_dict")
-    leaves = inspect_env(nested, 1, ["observation"]).observation
-    assert by_name(leaves)["extra/goal_pos"].tolist() == nested.obs["extra"]["goal_pos"][1].tolist()
-    assert {leaf.name: leaf.dtype for leaf in leaves}["extra/is_grasped"] == "bool"
 
 
 def test_the_state_dict_is_taken_apart_by_what_its_numbers_are(pick: TaskEnv) -> None:
@@ -147,16 +130,6 @@ def test_looking_does_not_change_how_the_episode_goes_on() -> None:
         np.testing.assert_array_equal(plain, looked)
 
 
-def test_only_what_is_asked_is_read_and_it_crosses_a_pipe_without_torch(pick: TaskEnv) -> None:
-    read = inspect_env(pick, 2, ["joints"])
-    assert read.joints and read.observation is read.state is read.contacts is None
-    assert (read.env, read.elapsed_steps) == (2, 4)
-    whole = pickle.dumps(inspect_env(pick, 0, SECTIONS))
-    assert b"torch" not in whole and b"sapien" not in whole and b"mani_skill" not in whole
-    assert isinstance(pickle.loads(whole), Inspection)
-    assert len(whole) < 20_000
-
-
 def test_a_section_that_the_author_broke_does_not_take_the_others_along() -> None:
     class Broken(PICK_CUBE):
         def get_state_dict(self) -> Any:
@@ -169,21 +142,3 @@ def test_a_section_that_the_author_broke_does_not_take_the_others_along() -> Non
     read = inspect_env(task, 0, SECTIONS)
     assert read.state is None and dict(read.refused) == {"state": "reading it raised KeyError: 'goal'"}
     assert read.joints and read.observation
-
-
-def test_large_arrays_are_told_by_their_range() -> None:
-    class Wide(PICK_CUBE):
-        def _get_obs_extra(self, info: dict) -> dict:
-            grid = self.cube.pose.p.new_zeros(self.num_envs, 10 * MOST_VALUES)
-            grid[:, -1] = 7
-            return {"grid": grid}
-
-    leaves = inspect_env(opened(Wide, num_envs=2), 1, ["observation"]).observation
-    grid = next(leaf for leaf in leaves if leaf.name == "extra/grid")
-    assert grid.shape == (10 * MOST_VALUES,) and len(grid.values) == MOST_VALUES
-    assert (grid.low, grid.high) == (0, 7)
-
-
-def test_there_is_no_such_env(pick: TaskEnv) -> None:
-    with pytest.raises(IndexError, match="out of range for 3 envs"):
-        inspect_env(pick, 3, SECTIONS)

@@ -13,10 +13,9 @@ from mani_skill import ASSET_DIR
 from mani_skill.agents.robots import Panda
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import assets, download_asset
-from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.drive.envs import batched
-from workbench.core.env.assets import MissingAssets, assets_at, refuse_downloads, require_assets, robots_of
+from workbench.core.env.assets import MissingAssets, assets_at, refuse_downloads, require_assets
 
 NOT_HERE = "anymal_c"
 
@@ -36,21 +35,6 @@ def test_declared_assets_are_named_with_the_command_for_each() -> None:
     assert caught.value.names == ("ycb", "pick_clutter_ycb_configs")
     for name in caught.value.names:
         assert f"\n  python -m mani_skill.utils.download_asset {name}" in str(caught.value)
-
-
-def test_a_group_of_many_is_one_name_that_the_command_takes() -> None:
-    with pytest.raises(MissingAssets) as caught:
-        require_assets("OpenCabinet", ["partnet_mobility_cabinet"])
-    assert caught.value.names == ("partnet_mobility_cabinet",)
-    assert caught.value.names[0] in assets.DATA_GROUPS, "download_asset takes groups and single assets"
-
-
-def test_what_is_there_is_not_asked_for(tmp_path: Path) -> None:
-    with pytest.raises(MissingAssets):
-        require_assets("PickSingleYCB", ["ycb"], "panda")
-    (tmp_path / "assets" / "mani_skill2_ycb").mkdir(parents=True)
-    require_assets("PickSingleYCB", ["ycb"], "panda")
-    require_assets("Nothing", [])
 
 
 def test_a_robot_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -96,13 +80,6 @@ def test_a_file_that_a_download_would_bring_is_looked_up(
         raise RuntimeError(f"failed to load mesh {missing}.")
 
 
-def test_other_errors_pass(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), refuse_downloads("Some"):
-        (tmp_path / "of_the_author.obj").read_text()
-    with pytest.raises(ZeroDivisionError), refuse_downloads("Some"):
-        raise ZeroDivisionError
-
-
 def test_a_robot_of_the_authors_own_with_a_wrong_path_is_told_so(tmp_path: Path) -> None:
     class Arm(Panda):
         uid = "arm_that_is_not_registered"
@@ -117,33 +94,3 @@ def test_a_robot_of_the_authors_own_with_a_wrong_path_is_told_so(tmp_path: Path)
 
     with pytest.raises(MissingAssets, match=r"arm\.urdf.*test_assets\.py:\d+"):
         batched(Task)
-
-
-def test_a_relative_path_of_a_robot_is_told_as_it_was_looked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-
-    class Arm(Panda):
-        uid = "arm_with_a_relative_path"
-        urdf_path = "robots/arm.urdf"
-
-    class Task(BaseEnv):
-        SUPPORTED_ROBOTS = None  # type: ignore[assignment]  # any
-
-        def __init__(self, *args: Any, **kwargs: Any) -> None:
-            robot: Any = Arm
-            super().__init__(*args, robot_uids=robot, **kwargs)
-
-    with pytest.raises(MissingAssets) as caught:
-        batched(Task)
-    assert str(tmp_path / "robots/arm.urdf") in str(caught.value)
-
-
-def test_robots_are_those_asked_for_or_the_constructors_default() -> None:
-    push, gated_server = REGISTERED_ENVS["PushCube-v1"].cls, REGISTERED_ENVS["PickCubeWidowXAI-v1"].cls
-    assert robots_of(push, {}) == "panda"
-    assert robots_of(push, {"robot_uids": "fetch"}) == "fetch"
-    assert robots_of(gated_server, {}) is None, (
-        "it hands on another one than the constructor that it overrides"
-    )

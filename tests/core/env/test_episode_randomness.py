@@ -65,31 +65,6 @@ def test_env_i_draws_what_a_single_env_with_its_seed_draws() -> None:
     batch.close()
 
 
-def test_a_partial_reset_draws_only_from_the_generators_of_its_envs() -> None:
-    def second_draws(partial: list[int]) -> np.ndarray:
-        env = batch_of(Drawing, 4)
-        env.reset(seed=[1, 2, 3, 4])
-        if partial:
-            env.reset(options={"env_idx": torch.tensor(partial)})
-        env.reset(options={"env_idx": torch.tensor([2])})
-        env.close()
-        return env.drawn[2]
-
-    assert np.array_equal(second_draws([]), second_draws([0, 3]))
-
-
-def test_enhanced_determinism_works_for_partial_resets() -> None:
-    def run() -> np.ndarray:
-        env = batch_of(Drawing, 3, enhanced_determinism=True)
-        env.reset(seed=[1, 2, 3])
-        env.reset(options={"env_idx": torch.tensor([1])})
-        env.close()
-        return env.drawn
-
-    first, again = run(), run()
-    assert np.array_equal(first, again)
-
-
 def test_reconfiguration_freq_rebuilds_when_a_stock_env_does() -> None:
     batch, stock = batch_of(Drawing, 3, reconfiguration_freq=2), single(Drawing, reconfiguration_freq=2)
     builds: list[int] = []
@@ -106,18 +81,6 @@ def test_reconfiguration_freq_rebuilds_when_a_stock_env_does() -> None:
     assert rebuilt == [count > before for before, count in zip(builds, builds[1:])]
     batch.close()
     stock.close()
-
-
-def test_a_rebuilt_scene_is_another_one_and_follows_its_seeds() -> None:
-    env = batch_of(Drawing, 3, reconfiguration_freq=1)
-    env.reset(seed=[1, 2, 3])
-    first, scene = masses(env), env.scene
-    env.reset(seed=[4, 5, 6])
-    assert env.scene is not scene
-    assert masses(env) != first
-    env.reset(seed=[1, 2, 3])
-    assert masses(env) == first
-    env.close()
 
 
 @pytest.mark.parametrize("options", [{"reconfigure": True}, {}], ids=["asked for", "due"])

@@ -10,11 +10,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mani_skill.utils.structs.pose import Pose
-from mani_skill.utils.wrappers.record import RecordEpisode
-from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.drive.entries import ENTRIES, Mute
@@ -38,16 +36,11 @@ class Chatty:
     ("value", "dtype", "shape"),
     [
         (EACH, "float32", (N,)),
-        (EACH.bool(), "bool", (N,)),
-        (EACH.long(), "int64", (N,)),
         (EACH.half(), "float16", (N,)),
         (EACH.bfloat16(), "float32", (N,)),
         (EACH.clone().requires_grad_(), "float32", (N,)),
-        (torch.zeros(N, 3, 2), "float32", (N, 3, 2)),
         (torch.zeros(N, 0), "float32", (N, 0)),
         (torch.eye(N).to_sparse(), "float32", (N, N)),
-        (np.zeros((N, 2)), "float64", (N, 2)),
-        ([1, 2, 3, 4], "int64", (N,)),
         ((True, False, True, True), "bool", (N,)),
         ([torch.tensor(1.0)] * N, "float32", (N,)),
         ([[1.0, 2.0]] * N, "float64", (N, 2)),
@@ -64,15 +57,11 @@ def test_what_has_a_row_for_each_env_is_a_column(value: Any, dtype: str, shape: 
     ("value", "what", "text"),
     [
         (None, "None", "None"),
-        ("reach", "str", "reach"),
         ({}, "dict", "{}"),
-        (b"raw", "bytes", "b'raw'"),
         (1 + 2j, "complex", "(1+2j)"),
         (2**70, "int", str(2**70)),
         (10**5000, "int", "<int, whose repr raises ValueError>"),
         (Mute(), "Mute", "<Mute, whose repr raises KeyError>"),
-        (object(), "object", "<object object>"),
-        ([1, "a", None], "list", "[1, 'a', None]"),
         ([[1], [1, 2]], "list", "[[1], [1, 2]]"),
         (torch.zeros(0), "float32 tensor of shape (0,)", "[]"),
         (torch.zeros(300, 300), "float32 tensor of shape (300, 300)", "90,000 numbers"),
@@ -85,40 +74,6 @@ def test_what_is_no_number_is_a_text_of_the_whole_batch(value: Any, what: str, t
     entry = others["entry"]
     assert columns == {} and (entry.what, entry.texts, entry.numbers) == (what, (text,), None)
     assert not entry.per_env
-
-
-@pytest.mark.parametrize(
-    ("value", "number"),
-    [
-        (0.5, 0.5),
-        (3, 3),
-        (True, True),
-        (np.float32(2.5), 2.5),
-        (EACH.mean(), 1.5),
-        (torch.tensor(float("nan")), np.nan),
-        (torch.arange(3), [0, 1, 2]),
-        ([1, 2], [1, 2]),
-    ],
-)
-def test_numbers_of_the_whole_batch_stay_numbers(value: Any, number: Any) -> None:
-    columns, others = split_entries({"entry": value}, N)
-    assert columns == {} and others["entry"].numbers is not None
-    np.testing.assert_array_equal(others["entry"].numbers, number)
-
-
-def test_texts_that_each_env_has_are_each_envs() -> None:
-    _, others = split_entries({"words": list("abcd"), "complex": EACH + 1j, "mute": [Mute()] * N}, N)
-    assert all(entry.per_env for entry in others.values())
-    assert others["words"].of_env(2).texts == ("c",)
-    assert others["complex"].of_env(1).texts == ("(1+1j)",)
-
-
-def test_with_one_env_a_row_is_a_row_and_a_number_is_not() -> None:
-    columns, others = split_entries(
-        {"row": torch.zeros(1), "number": torch.tensor(0.0), "success": torch.tensor(True)}, 1
-    )
-    assert columns["row"].shape == (1,) and columns["success"].tolist() == [True]
-    assert list(others) == ["number"]
 
 
 def test_nested_dicts_are_their_leaves_and_names_stay_apart() -> None:
@@ -150,6 +105,7 @@ def test_columns_are_copies_that_the_next_step_does_not_change() -> None:
     assert columns["each"].tolist() == [0, 1, 2, 3] and others["mean"].numbers == 1
 
 
+@settings(max_examples=30)
 @given(ENTRIES, st.integers(1, 5))
 def test_any_dict_is_split(entries: dict[Any, Any], num_envs: int) -> None:
     columns, others = split_entries(entries, num_envs)
@@ -195,20 +151,6 @@ def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
     stock.close()
 
 
-def test_maniskills_wrappers_take_it_from_a_batch(
-    child_process: None, odd_task: Path, tmp_path: Path
-) -> None:
-    env: Any = workbench.make(odd_task, 2, **CPU)
-    env = RecordEpisode(env, str(tmp_path), save_video=False)
-    env = ManiSkillVectorEnv(env, auto_reset=True, record_metrics=True)
-    env.reset(seed=[0, 1])
-    for step in range(1, 8):
-        _, _, _, truncated, info = env.step(env.action_space.sample())
-        assert info["phase"] == ("reach" if step in (1, 6, 7) else "push")
-        assert ("final_info" in info) == (step == 6) and bool(truncated.all()) == (step == 6)
-    env.close()
-
-
 class OneTruth:
     """In front of a task: the single truth that a task written for one env returns."""
 
@@ -224,15 +166,6 @@ def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, rules: 
     step = env.step(None)
     assert step.terminated.tolist() == [True] and step.reward.tolist() == [-1.0]
     assert step.evaluate["success"].tolist() == [False] and step.evaluate["fail"].tolist() == [True]
-    env.close()
-
-
-def test_a_mean_that_a_built_in_task_returns_is_one_number() -> None:
-    # tabletop/pull_cube_tool.py line 213: the mean over all envs.
-    env = workbench.make("PullCubeTool-v1", 2, **CPU, rules="stop")
-    task = TaskEnv(open_env(env))
-    progress = task.reset(seed=0).others["cube_progress"]
-    assert progress.numbers is not None and progress.numbers.shape == ()
     env.close()
 
 

@@ -115,26 +115,6 @@ def test_modes_have_what_the_class_supports_and_the_present_one() -> None:
     assert modes["reward_mode"].value == '"dense"'
 
 
-def test_several_robots_and_none_and_a_class_for_a_robot_are_described_too() -> None:
-    env = Base()
-    env.agent = SimpleNamespace(agents=[SimpleNamespace(uid="panda"), SimpleNamespace(uid="fetch")])
-    made = describe_keywords(Task, env, {}, {}, Base)
-    assert made.robot == "panda, fetch" and "control_mode" not in {one.name for one in made.modes}
-    env.agent, env.robot_uids, env.SUPPORTED_ROBOTS = None, object, None
-    made = describe_keywords(Base, env, {}, {}, Base)
-    assert made.robot == "" and made.modes[0].fixed
-
-
-class Awkward:
-    def __repr__(self) -> str:
-        raise RuntimeError("no words")
-
-
-def test_a_value_of_the_authors_that_cannot_even_be_printed_is_told_by_its_type() -> None:
-    (one,) = own(Closed, Base(), {"only": Awkward()}, {}).values()
-    assert (one.value, bool(one.fixed)) == ("Awkward", True)
-
-
 def test_what_json_says_becomes_what_the_class_takes() -> None:
     given = {"robot_uids": ["panda", "panda"], "colour": "blue", "noise": 1}
     taken = constructor_arguments(Task, given, Base)
@@ -147,7 +127,6 @@ def test_what_json_says_becomes_what_the_class_takes() -> None:
     [
         (Keyword("a", "int", "1"), " 7 ", 7),
         (Keyword("a", "float", "1"), "1e-5", 1e-5),
-        (Keyword("a", "float", "1"), "2", 2.0),
         (Keyword("a", "bool", "true"), "false", False),
         (Keyword("a", "str", '"x"'), "true", "true"),
         (Keyword("a", "str", '"x"', optional=True), "null", None),
@@ -168,10 +147,7 @@ def test_what_is_typed_is_read(keyword: Keyword, text: str, value: object) -> No
         (Keyword("size", "int", "1"), str(10**30)),
         (Keyword("size", "float", "1"), "NaN"),
         (Keyword("size", "float", "1"), "1e999"),
-        (Keyword("size", "float", "1"), "much"),
-        (Keyword("size", "float", "1"), ""),
         (Keyword("size", "bool", "true"), "1"),
-        (Keyword("size", "json", "1"), "{"),
         (Keyword("size", "json", "1"), "[" * 3000),
         (Keyword("size", "choice", '"l"', choices=('"l"',)), '"m"'),
         (Keyword("size", "str", '"x"'), "x" * 3000),

@@ -18,17 +18,13 @@ from mani_skill.utils.structs import Pose
 
 from tests.core.stock_env import Bare, batch_of, single
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core.env.partial_reset import active_controllers
-from workbench.core.env.task_env import TaskEnv
 
 
 def made(task: str | type[BaseEnv] = PICK_CUBE, num_envs: int = 4, **kwargs: Any) -> Any:
     return batched(task, num_envs, rules="off", **kwargs)
 
 
-@pytest.mark.parametrize(
-    "control_mode", ["pd_joint_target_delta_pos", "pd_ee_target_delta_pose", "pd_ee_target_delta_pos"]
-)
+@pytest.mark.parametrize("control_mode", ["pd_joint_target_delta_pos", "pd_ee_target_delta_pose"])
 def test_an_env_that_is_not_reset_goes_on_to_the_target_that_it_had(control_mode: str) -> None:
     env = made(control_mode=control_mode)
     rng = np.random.default_rng(0)
@@ -57,26 +53,6 @@ def test_the_first_observation_after_it_shows_that_target_too() -> None:
     assert torch.equal(after[[1, 2]], before[[1, 2]])
     assert torch.equal(after[[0, 3]], env.agent.robot.qpos[[0, 3], :7])
     env.close()
-
-
-def test_a_reset_of_all_resets_all_controllers() -> None:
-    env = made(control_mode="pd_joint_target_delta_pos")
-    env.reset(seed=[1, 2, 3, 4])
-    env.step(np.full(env.action_space.shape, 0.7, np.float32))
-    env.reset(seed=[1, 2, 3, 4])
-    assert torch.equal(env.agent.get_controller_state()["arm"]["target_qpos"], env.agent.robot.qpos[:, :7])
-    env.close()
-
-
-def test_several_robots_and_none_have_their_controllers_found() -> None:
-    two = made("TwoRobotPickCube-v1", 2)
-    assert len(active_controllers(two)) == 4, "an arm and a gripper each"
-    two.close()
-
-    bare = batch_of(Bare, 2)
-    assert active_controllers(bare) == []
-    bare.reset(options={"env_idx": torch.tensor([1])})
-    bare.close()
 
 
 class Starts(Bare):
@@ -154,12 +130,6 @@ def test_seeds_for_some_envs_are_theirs_and_the_others_keep_their_own(
     starts.reset()
     for env, seed in ((0, 5), (1, 41), (2, 7), (3, 40)):
         assert torch.equal(starts.box.pose.p[env], drawn_by_stock(stock, seed, resets=2)), env
-
-
-def test_a_seed_for_one_env_alone_is_its_own(starts: Any, stock: Any) -> None:
-    starts.reset(seed=[5, 6, 7, 8])
-    TaskEnv(starts).reset(seed=44, env_idx=[2])
-    assert torch.equal(starts.box.pose.p[2], drawn_by_stock(stock, 44))
 
 
 def test_the_process_draws_on_as_if_seeds_for_some_envs_had_not_been_given(starts: Any) -> None:

@@ -6,7 +6,6 @@ import mani_skill.envs  # noqa: F401  registers the ids
 import pytest
 import sapien.physx as physx
 
-from tests.drive.envs import batched
 from workbench.core.env.cpu_scene import free_thread_keys, require_scenes
 
 
@@ -19,11 +18,6 @@ def test_each_physx_scene_takes_a_key_and_gives_it_back() -> None:
     del more
     assert free_thread_keys() == before
     del first
-
-
-def test_a_batch_that_does_not_fit_is_refused_with_the_number_that_does() -> None:
-    with pytest.raises(ValueError, match=r"num_envs=1024 is more than .* and \d+ are left here"):
-        batched("PickCube-v1", 1024)
 
 
 def test_what_fits_is_not_refused_and_one_more_is() -> None:

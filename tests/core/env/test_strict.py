@@ -1,4 +1,4 @@
-"""The rules: one broken task for each, really run, and the same task without the fault."""
+"""The rules: each broken by a hook of a task that really runs, told at its line, and kept by the same hook without the fault."""
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportCallIssue=false
@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import inspect
 import linecache
 import traceback
 import warnings
@@ -20,83 +19,89 @@ import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
-from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.broken_rule import BrokenRule, NeedsOneEnv, RuleWarning, WrongReturn
 from workbench.core.env.task_env import EnvOptions, make_env
-from workbench.core.simulation.state_properties import STATE_PROPERTIES, TARGET_SETTERS
-from workbench.core.simulation.strict_system import StrictCpuSystem
+from workbench.core.snapshots.cpu_state import renew_physics
 
 pytestmark = pytest.mark.thorough
 
 N = 3
+ACTION = np.full((N, 8), 0.3, np.float32)
 Hook = Callable[..., Any]
 
 
-def build(task: type, rules: Any = "stop", num_envs: int = N, **kwargs: Any) -> BaseEnv:
-    return batched(task, num_envs, rules=rules, **kwargs)
+class Hooked(PICK_CUBE):
+    """A test gives it a hook."""
 
 
-def pick_cube(**hooks: Hook) -> type:
-    """PickCube with some hooks of its own; each is called with the env, after PickCube's."""
+def also(name: str, hook: Hook) -> Hook:
+    """PickCube's hook of this name, and then `hook`, which may return something else."""
 
-    def after(name: str, hook: Hook) -> Hook:
-        def run(self: Any, *args: Any, **kwargs: Any) -> Any:
-            stock = getattr(PICK_CUBE, name)(self, *args, **kwargs)
-            replaced = hook(self, *args, **kwargs)
-            return stock if replaced is None else replaced
+    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
+        stock = getattr(PICK_CUBE, name)(self, *args, **kwargs)
+        replaced = hook(self, *args, **kwargs)
+        return stock if replaced is None else replaced
 
-        return run
-
-    return type("PickCubeOfATest", (PICK_CUBE,), {name: after(name, hook) for name, hook in hooks.items()})
+    return run
 
 
-def run(task: type, rules: Any = "stop", **kwargs: Any) -> BaseEnv:
-    """What the workbench does with a task: a reset, steps, a partial reset, another step."""
-    env = build(task, rules, **kwargs)
-    env.reset(seed=[0, 1, 2])
-    for _ in range(3):
-        env.step(ACTION)
-    env.reset(seed=[3, 4, 5], options={"env_idx": torch.tensor([1])})
-    env.step(ACTION)
-    return env
+def build(name: str, hook: Hook, rules: Any = "stop", num_envs: int = N) -> Any:
+    """An env of its own, where the hook runs while it is built, or the rules are others."""
+    return batched(type("HookedOnce", (PICK_CUBE,), {name: also(name, hook)}), num_envs, rules=rules)
 
 
-ACTION = np.full((N, 8), 0.3, np.float32)
-
-
-def keeps(task: type) -> None:
-    """Nothing is told, and every step and reset was made."""
-    env = run(task)
-    assert env.elapsed_steps.tolist() == [4, 1, 4]
+@pytest.fixture(scope="module")
+def strict() -> Iterator[Any]:
+    env = batched(Hooked, N, rules="stop")
+    yield env
     env.close()
 
 
-def breaks(task: type, words: str, **kwargs: Any) -> pytest.ExceptionInfo[Exception]:
-    with pytest.raises(BrokenRule, match=words) as caught:
-        run(task, **kwargs).close()
-    return caught
+@pytest.fixture
+def run(strict: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, Hook], None]:
+    """What the workbench does with a task: a reset, steps, a partial reset, another step; with a hook of this name.
+
+    Of one env for all tests: what a hook that raised had written or half applied is not the next episode's.
+    """
+
+    def run(name: str, hook: Hook) -> None:
+        strict.reset(seed=[0, 1, 2])
+        monkeypatch.setattr(Hooked, name, also(name, hook))
+        try:
+            strict.reset(seed=[0, 1, 2])
+            for _ in range(3):
+                strict.step(ACTION)
+            strict.reset(seed=[3, 4, 5], options={"env_idx": torch.tensor([1])})
+            strict.step(ACTION)
+        finally:
+            monkeypatch.undo()
+        assert strict.elapsed_steps.tolist() == [4, 1, 4]
+
+    return run
 
 
-def told_at(caught: pytest.ExceptionInfo[Exception]) -> str:
+def told_at(caught: pytest.ExceptionInfo[BaseException]) -> str:
     """The line that the page would show: the innermost of this file."""
     frames = [f for f in traceback.extract_tb(caught.value.__traceback__) if f.filename == __file__]
     return linecache.getline(__file__, frames[-1].lineno or 0)
 
 
-def raised_cube(env: Any) -> torch.Tensor:
-    pose = env.cube.pose.raw_pose.clone()
-    pose[:, 2] += 0.1
-    return pose
+# --- the faults ------------------------------------------------------------------------------------
 
 
-# --- state set and not applied ---------------------------------------------------------------------
+def apply(env: Any) -> None:
+    env.scene._gpu_apply_all()
+    env.scene.px.gpu_update_articulation_kinematics()
+    env.scene._gpu_fetch_all()
 
 
 def set_pose(env: Any) -> None:
-    env.cube.set_pose(Pose.create(raised_cube(env)))  # the fault
+    pose = env.cube.pose.raw_pose.clone()
+    pose[:, 2] += 0.1
+    env.cube.set_pose(Pose.create(pose))  # the fault
 
 
 def set_velocity(env: Any) -> None:
@@ -124,421 +129,87 @@ def write_the_tensor(env: Any) -> None:
     env.scene.px.cuda_rigid_body_data.torch()[env.cube._body_data_index, 2] += 0.1  # the fault
 
 
-@pytest.mark.parametrize(
-    ("write", "words"),
-    [
-        (set_pose, "The pose of 'cube' in envs 0, 1, 2 was set and not applied"),
-        (set_velocity, "The velocity of 'cube' in envs 0, 1, 2 was set and not applied"),
-        (set_qpos, "The qpos of 'panda' in envs 0, 1, 2 was set and not applied"),
-        (set_root_pose, "The pose of 'panda_link0' in envs 0, 1, 2 was set and not applied"),
-        (set_targets, "The drive targets of 'panda' in envs 0, 1, 2 was set and not applied"),
-        (set_target_of_a_joint, "The drive targets of 'panda'"),
-        (write_the_tensor, "The pose of 'cube'"),
-    ],
-)
-def test_a_write_that_is_not_applied_is_told_at_its_line(write: Hook, words: str) -> None:
-    caught = breaks(pick_cube(_before_control_step=lambda self: write(self)), words)
-    assert "# the fault" in told_at(caught)
+def set_forces(env: Any) -> None:
+    env.agent.robot.set_qf(torch.ones((N, 9)))  # the fault
 
 
-def test_targets_that_a_controller_sets_between_substeps_are_told_at_their_line() -> None:
-    """On the GPU they are never applied: ManiSkill applies targets before the first substep only."""
-    env = build(PICK_CUBE)
-    controller = env.agent.controller.controllers["arm"]
-    stock = controller.before_simulation_step
-
-    def interpolate() -> None:
-        stock()
-        controller.set_drive_targets(controller.qpos + 0.01)  # the fault
-
-    def interpolate_and_apply() -> None:
-        env.scene._gpu_fetch_all()
-        interpolate()
-        env.scene.px.gpu_apply_articulation_target_position()
-
-    controller.before_simulation_step = interpolate_and_apply
-    env.step(ACTION)
-    zero = controller._target_qpos * 0
-    controller.before_simulation_step = lambda: controller.set_drive_targets(zero)  # the fault
-    with pytest.raises(BrokenRule, match="The drive targets of 'panda' in envs 0, 1, 2") as caught:
-        env.step(ACTION)
-    assert "# the fault" in told_at(caught)
-    env.close()
+def move_a_link(env: Any) -> None:
+    link = env.agent.robot.links_map["panda_hand"]
+    link.set_pose(Pose.create(link.pose.raw_pose + 0.1))  # the fault
 
 
-@pytest.mark.parametrize("write", [set_pose, set_velocity, write_the_tensor])
-def test_a_write_in_evaluate_is_told_at_its_line_by_the_next_step(write: Hook) -> None:
-    caught = breaks(
-        pick_cube(evaluate=lambda self: write(self)), "'cube' in envs 0, 1, 2 was set and not applied"
-    )
-    assert "# the fault" in told_at(caught)
+def move_the_goal_and_apply(env: Any) -> None:
+    env.goal_site.set_pose(Pose.create_from_pq(torch.rand((N, 3))))
+    env.scene._gpu_apply_all()  # the fault
 
 
-def test_drive_targets_set_in_evaluate_are_applied_with_the_next_action() -> None:
-    keeps(pick_cube(evaluate=lambda self: set_targets(self)))
+def read_a_link(env: Any) -> None:
+    env.agent.tcp.pose  # noqa: B018  # the fault
 
 
-def test_a_write_that_a_reset_of_other_envs_would_apply_is_told() -> None:
-    env = build(PICK_CUBE)
-    set_pose(env)
-    with pytest.raises(BrokenRule, match="'cube' in envs 0, 2 was set outside _initialize_episode") as caught:
-        env.reset(options={"env_idx": torch.tensor([1])})
-    assert "# the fault" in told_at(caught)
-    env.close()
-    env = build(PICK_CUBE, rules="off")
-    height = env.cube.pose.p[:, 2].clone()
-    set_pose(env)
-    env.reset(options={"env_idx": torch.tensor([1])})
-    torch.testing.assert_close(env.cube.pose.p[:, 2] - height, torch.tensor([0.1, 0.0, 0.1]))
-    env.close()
+def read_qpos(env: Any) -> None:
+    env.agent.robot.active_joints[0].qpos  # noqa: B018  # the fault
 
 
-def test_what_only_warns_of_such_a_write_lets_the_reset_apply_it() -> None:
-    env = build(PICK_CUBE, rules="warn")
-    height = env.cube.pose.p[:, 2].clone()
-    set_pose(env)
-    with pytest.warns(RuleWarning, match="'cube' in envs 0, 2 was set outside _initialize_episode"):
-        env.reset(options={"env_idx": torch.tensor([1])})
-    torch.testing.assert_close(env.cube.pose.p[:, 2] - height, torch.tensor([0.1, 0.0, 0.1]))
-    env.close()
-
-
-def test_the_same_writes_applied_are_no_fault() -> None:
-    def apply(self: Any) -> None:
-        for write in (set_pose, set_velocity, set_qpos, set_targets, set_target_of_a_joint, write_the_tensor):
-            write(self)
-            self.scene._gpu_apply_all()
-            self.scene.px.gpu_update_articulation_kinematics()
-            self.scene._gpu_fetch_all()
-
-    keeps(pick_cube(_before_control_step=apply))
-
-
-def test_a_write_that_a_gpu_loses_is_told_once() -> None:
-    env = build(PICK_CUBE)
-    env.reset(seed=[0, 1, 2])
-    set_pose(env)
-    with pytest.raises(BrokenRule, match="not applied"):
-        env.scene._gpu_fetch_all()
+def look_at_a_link_too_early(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.agent.robot.set_qpos(torch.full((len(env_idx), 9), 0.2))
+    env.scene._gpu_apply_all()
     env.scene._gpu_fetch_all()
-    env.close()
+    env.agent.tcp.pose  # noqa: B018  # the fault
 
 
-def test_joint_forces_that_are_not_applied_are_told_before_the_step() -> None:
-    def push(self: Any) -> None:
-        self.agent.robot.set_qf(torch.ones((N, 9)))  # the fault
+def look_at_a_link(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.agent.robot.set_qpos(torch.full((len(env_idx), 9), 0.2))
+    apply(env)
+    env.agent.tcp.pose  # noqa: B018
 
-    def push_and_apply(self: Any) -> None:
-        push(self)
-        self.scene.px.gpu_apply_articulation_qf()
 
-    caught = breaks(pick_cube(_before_control_step=push), r"joint forces \(qf\) of 'panda' in envs 0, 1, 2")
-    assert "# the fault" in told_at(caught)
-    run(pick_cube(_before_control_step=push_and_apply)).close()
+def lift_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.scene.px.cuda_rigid_body_data.torch()[env.cube._body_data_index, 2] += 0.1  # the fault
 
 
-def test_the_pose_of_a_link_cannot_be_set() -> None:
-    def move(self: Any) -> None:
-        link = self.agent.robot.links_map["panda_hand"]
-        link.set_pose(Pose.create(link.pose.raw_pose + 0.1))  # the fault
-
-    caught = breaks(pick_cube(_before_control_step=move), "pose of link 'panda_hand' was set in envs 0, 1, 2")
-    assert "# the fault" in told_at(caught)
+def lift(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.scene.px.cuda_rigid_body_data.torch()[env.cube._body_data_index[env_idx], 2] += 0.1
 
 
-# --- state applied or read between a step and a fetch ---------------------------------------------
-
-
-def test_an_apply_of_what_was_fetched_before_the_step_is_refused() -> None:
-    def move(self: Any) -> None:
-        self.goal_site.set_pose(Pose.create_from_pq(torch.rand((N, 3))))
-        self.scene._gpu_apply_all()  # the fault
-
-    def fetch_and_move(self: Any) -> None:
-        self.scene._gpu_fetch_all()
-        move(self)
-
-    caught = breaks(
-        pick_cube(_after_control_step=move), "puts '.*', and everything else that moved, back to before"
-    )
-    assert "# the fault" in told_at(caught)
-    run(pick_cube(_after_control_step=fetch_and_move)).close()
-
-
-@pytest.mark.parametrize(
-    "read",
-    [
-        lambda env: env.agent.tcp.pose,  # the fault
-        lambda env: env.agent.robot.qpos,  # the fault
-        lambda env: env.agent.robot.active_joints[0].qpos,  # the fault
-        lambda env: env.agent.robot.get_qvel(),  # the fault
-    ],
-)
-@pytest.mark.parametrize("hook", ["_after_control_step", "_after_simulation_step"])
-def test_state_read_before_it_is_fetched_is_told_at_its_line(hook: str, read: Hook) -> None:
-    def look(self: Any) -> None:
-        read(self)
-
-    def fetch_and_look(self: Any) -> None:
-        self.scene._gpu_fetch_all()
-        read(self)
-
-    caught = breaks(
-        pick_cube(**{hook: look}), "is read after the simulation moved on and before it was fetched"
-    )
-    assert "# the fault" in told_at(caught)
-    run(pick_cube(**{hook: fetch_and_look})).close()
-
-
-def test_state_read_between_merged_substeps_is_told_as_between_others() -> None:
-    env = build(pick_cube())
-    env.reset(seed=[0, 1, 2])
-    env.step(ACTION)
-    px = env.scene.px
-    with px.merging(5):
-        px.step()
-        with pytest.raises(BrokenRule, match="is read after the simulation moved on"):
-            _ = env.agent.robot.qpos
-    env.close()
-
-
-def test_the_velocity_of_a_robots_root_may_be_read_of_the_robot() -> None:
-    seen = []
-    keeps(pick_cube(evaluate=lambda self: seen.append(self.agent.robot.root_linear_velocity)))
-    assert seen and all(velocity.shape == (N, 3) for velocity in seen)
-
-
-def test_a_step_computes_where_links_are_after_a_qpos_that_was_applied() -> None:
-    def put(self: Any) -> None:
-        self.agent.robot.set_qpos(self.agent.robot.qpos + 0.01)
-        self.scene._gpu_apply_all()
-        self.scene._gpu_fetch_all()
-
-    keeps(pick_cube(_before_control_step=put, evaluate=lambda self: self.agent.tcp.pose and None))
-
-
-def test_a_link_read_after_qpos_was_set_is_told() -> None:
-    def look(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.agent.robot.set_qpos(torch.full((len(env_idx), 9), 0.2))
-        self.agent.tcp.pose  # noqa: B018  # the fault
-
-    def update_and_look(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.agent.robot.set_qpos(torch.full((len(env_idx), 9), 0.2))
-        self.scene._gpu_apply_all()
-        self.scene.px.gpu_update_articulation_kinematics()
-        self.scene._gpu_fetch_all()
-        self.agent.tcp.pose  # noqa: B018
-
-    def forget_kinematics(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.agent.robot.set_qpos(torch.full((len(env_idx), 9), 0.2))
-        self.scene._gpu_apply_all()
-        self.scene._gpu_fetch_all()
-        self.agent.tcp.pose  # noqa: B018  # the fault
-
-    for broken in (look, forget_kinematics):
-        caught = breaks(
-            pick_cube(_initialize_episode=broken), "is read after the qpos or pose of 'panda' was set"
-        )
-        assert "# the fault" in told_at(caught)
-    run(pick_cube(_initialize_episode=update_and_look)).close()
-
-
-def test_state_that_is_read_or_set_while_the_scene_is_loaded_is_told() -> None:
-    for touch in (
-        lambda env: env.cube.pose,
-        lambda env: env.cube.linear_velocity,
-        lambda env: env.agent.robot.qpos,
-        lambda env: env.cube.set_pose(sapien.Pose()),
-        lambda env: env.agent.robot.set_qpos(torch.zeros(9)),
-    ):
-        task = pick_cube(_load_scene=lambda self, options, touch=touch: touch(self) and None)
-        with pytest.raises(BrokenRule, match="while the scene is built.*_initialize_episode"):
-            build(task)
-
-
-def test_two_applies_without_a_fetch_between_are_told() -> None:
-    def apply(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.scene._gpu_apply_all()
-
-    with pytest.raises(BrokenRule, match="called twice without self.scene._gpu_fetch_all"):
-        build(pick_cube(_initialize_episode=apply))
-    build(pick_cube(_initialize_episode=apply), "off").close()
-
-
-# --- batch sizes and static actors -----------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("write", "words"),
-    [
-        (lambda env, n: env.cube.set_pose(Pose.create_from_pq(torch.rand((n, 3)))), "pose of 'cube'"),
-        (lambda env, n: env.cube.set_linear_velocity(torch.rand((n, 3))), "linear velocity of 'cube'"),
-        (lambda env, n: env.agent.robot.set_qpos(torch.rand((n, 9))), "qpos of 'panda'"),
-        (lambda env, n: env.agent.robot.set_pose(Pose.create_from_pq(torch.rand((n, 3)))), "pose of"),
-        (
-            lambda env, n: env.agent.robot.set_joint_drive_targets(
-                torch.rand((n, 9)), env.agent.robot.active_joints
-            ),
-            "drive targets of 'panda'",
-        ),
-    ],
-)
-def test_a_batch_of_another_size_than_is_reset_is_told_with_both(write: Hook, words: str) -> None:
-    """All envs' worth of values in a partial reset: the first reset does not notice. Of any other size no row is known."""
-    of_all = pick_cube(
-        _initialize_episode=lambda self, env_idx, options: write(self, self.num_envs)
-    )  # the fault
-    other = pick_cube(
-        _initialize_episode=lambda self, env_idx, options: write(self, 5 if len(env_idx) < N else N)
-    )
-    mended = pick_cube(_initialize_episode=lambda self, env_idx, options: write(self, len(env_idx)))
-    some = {"env_idx": torch.tensor([0, 2])}
-    env = build(of_all)
-    with pytest.raises(BrokenRule, match=f"{words}.* with 3 rows, and 2 are wanted: .*len.env_idx"):
-        env.reset(options=some)
-    env.close()
-    for rules in ("stop", "off"):
-        env = build(other, rules)
-        with pytest.raises(ValueError, match=f"{words}.*batch of 5 .* 2 rows are wanted: .*len.env_idx"):
-            env.reset(options=some)
-        env.close()
-    for task, rules in ((mended, "stop"), (of_all, "off")):
-        env = build(task, rules)
-        env.reset(options=some)
-        env.close()
-
-
-@pytest.mark.parametrize(
-    "write",
-    [
-        lambda env: env.agent.robot.set_qpos(torch.rand((2, 5))),
-        lambda env: env.agent.robot.set_qpos(torch.rand(5)),
-        lambda env: env.cube.set_linear_velocity(torch.rand((1, 4))),
-    ],
-)
-def test_what_is_wrong_with_a_value_but_its_batch_is_said_by_torch(write: Hook) -> None:
-    """And not blamed on the batch, which is right, or one for all."""
-
-    def initialize(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        if len(env_idx) < N:
-            write(self)
-
-    env = build(pick_cube(_initialize_episode=initialize), "off")
-    with pytest.raises(RuntimeError, match="shape|size|expand") as caught:
-        env.reset(options={"env_idx": torch.tensor([0, 2])})
-    assert not isinstance(caught.value, ValueError) and "batch of" not in str(caught.value)
-    env.close()
-
-
-def test_a_static_actor_that_is_moved_is_told() -> None:
-    def load(self: Any, options: dict) -> None:
-        builder = self.scene.create_actor_builder()
-        builder.add_box_collision(half_size=[0.05] * 3)
-        builder.initial_pose = sapien.Pose([0.3, 0.3, 0.05])
-        self.wall = builder.build_static("wall")
-
-    def move(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.wall.set_pose(Pose.create_from_pq(torch.rand((len(env_idx), 3))))  # the fault
-
-    env = build(pick_cube(_load_scene=load))
-    assert env.wall.pose.p[0].tolist() == pytest.approx([0.3, 0.3, 0.05])
-    assert not hasattr(env.wall, "linear_velocity")
-    env.close()
-    with pytest.raises(BrokenRule, match="'wall' is static and moved: .* build_kinematic") as caught:
-        build(pick_cube(_load_scene=load, _initialize_episode=move))
-    assert "# the fault" in told_at(caught)
-
-
-# --- envs that are not being reset -----------------------------------------------------------------
-
-
-def test_a_neighbour_written_through_the_tensor_is_told() -> None:
-    def lift_all(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.scene.px.cuda_rigid_body_data.torch()[self.cube._body_data_index, 2] += 0.1  # the fault
-
-    def lift(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.scene.px.cuda_rigid_body_data.torch()[self.cube._body_data_index[env_idx], 2] += 0.1
-
-    caught = breaks(
-        pick_cube(_initialize_episode=lift_all),
-        "_initialize_episode changed the state of 'cube' in envs 0, 2, which are not being reset",
-    )
-    assert "# the fault" in told_at(caught)
-    run(pick_cube(_initialize_episode=lift)).close()
-
-
-def test_a_neighbours_velocity_is_told_too_and_that_of_its_links_may_be_read() -> None:
-    def push_all(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        body = self.cube._body_data_index
-        self.scene.px.cuda_rigid_body_data.torch()[body, 7] += 0.1  # the fault
-
-    def read(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        if len(env_idx) < N:
-            self.scene._gpu_apply_all()
-            self.scene.px.gpu_update_articulation_kinematics()
-            self.scene._gpu_fetch_all()
-            assert self.agent.tcp.linear_velocity[[0, 2]].any()
-
-    caught = breaks(
-        pick_cube(_initialize_episode=push_all), "changed the state of 'cube' in envs 0, 2, which are not"
-    )
-    assert "# the fault" in told_at(caught)
-    keeps(pick_cube(_initialize_episode=read))
-
-
-def test_a_neighbour_written_with_another_mask_is_told() -> None:
-    def restore(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.set_state_dict(self.get_state_dict(), torch.arange(N))  # the fault
-
-    caught = breaks(
-        pick_cube(_initialize_episode=restore), "is written in envs 0, 2, which are not being reset"
-    )
-    assert "# the fault" in told_at(caught)
-
-
-def test_a_step_in_the_middle_of_a_partial_reset_is_told() -> None:
-    def settle(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.scene._gpu_apply_all()
-        self.scene.px.step()  # the fault
-        self.scene._gpu_fetch_all()
-
-    caught = breaks(pick_cube(_initialize_episode=settle), "is stepped in a reset while envs 0, 2")
-    assert "# the fault" in told_at(caught)
-
-
-def test_a_tensor_of_the_task_that_loses_its_rows_is_told() -> None:
-    def replace(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        self.target = torch.rand((len(env_idx), 3))  # the fault
-
-    def write(self: Any, env_idx: torch.Tensor, options: dict) -> None:
-        if not hasattr(self, "target"):
-            self.target = torch.zeros((self.num_envs, 3))
-        self.target[env_idx] = torch.rand((len(env_idx), 3))
-
-    caught = breaks(
-        pick_cube(_initialize_episode=replace), r"self.target is left with a row for each of the 1 envs"
-    )
-    assert "# the fault" in told_at(caught)
-    keeps(pick_cube(_initialize_episode=write))
-
-
-# --- behind the tensors ------------------------------------------------------------------------------
+def push_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.scene.px.cuda_rigid_body_data.torch()[env.cube._body_data_index, 7] += 0.1  # the fault
+
+
+def restore_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.set_state_dict(env.get_state_dict(), torch.arange(N))  # the fault
+
+
+def settle(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.scene._gpu_apply_all()
+    env.scene.px.step()  # the fault
+    env.scene._gpu_fetch_all()
+
+
+def read_the_velocity_of_links(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    apply(env)
+    assert len(env_idx) == N or env.agent.tcp.linear_velocity[[0, 2]].any()
+
+
+def pose_of_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.cube.set_pose(Pose.create_from_pq(torch.rand((N, 3))))  # the fault
+
+
+def qpos_of_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.agent.robot.set_qpos(torch.rand((N, 9)))  # the fault
+
+
+def targets_of_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    robot = env.agent.robot
+    robot.set_joint_drive_targets(torch.rand((N, 9)), robot.active_joints)  # the fault
 
 
 def set_entity_pose(env: Any) -> None:
-    env.cube._objs[0].set_pose(sapien.Pose([0, 0, 0.5]))  # the fault
-
-
-def assign_entity_pose(env: Any) -> None:
     env.cube._objs[2].pose = sapien.Pose([0, 0, 0.5])  # the fault
 
 
 def set_body_velocity(env: Any) -> None:
     env.cube._bodies[0].set_linear_velocity([0, 0, 1])  # the fault
-
-
-def assign_body_velocity(env: Any) -> None:
-    env.cube._bodies[0].angular_velocity = [0, 0, 1]  # the fault
 
 
 def add_force(env: Any) -> None:
@@ -549,44 +220,193 @@ def set_articulation_qpos(env: Any) -> None:
     env.agent.robot._objs[1].set_qpos(np.zeros(9, np.float32))  # the fault
 
 
-def assign_root_pose(env: Any) -> None:
-    env.agent.robot._objs[1].pose = sapien.Pose([-0.5, 0, 0])  # the fault
-
-
 def set_joint_target(env: Any) -> None:
     env.agent.robot._objs[1].active_joints[2].set_drive_target(0.1)  # the fault
 
 
-@pytest.mark.parametrize(
-    ("write", "words"),
-    [
-        (set_entity_pose, r"Entity.set_pose\(\) on 'scene-0_cube' \(env 0\) .* Use Actor.set_pose"),
-        (assign_entity_pose, r"Entity.pose = ... on 'scene-2_cube' \(env 2\)"),
-        (set_body_velocity, r"PhysxRigidDynamicComponent.set_linear_velocity\(\) on .*env 0"),
-        (assign_body_velocity, r"PhysxRigidDynamicComponent.angular_velocity = "),
-        (add_force, r"PhysxRigidBodyComponent.add_force_at_point\(\) .* Use Actor.apply_force"),
-        (set_articulation_qpos, r"PhysxArticulation.set_qpos\(\) on 'scene-1_panda' \(env 1\)"),
-        (assign_root_pose, r"PhysxArticulation.pose = ... on"),
-        (
-            set_joint_target,
-            r"PhysxArticulationJoint.set_drive_target\(\) .* Use Articulation.set_joint_drive",
-        ),
-    ],
-)
-def test_sapiens_own_setters_are_refused_at_their_line(write: Hook, words: str) -> None:
-    caught = breaks(pick_cube(_before_control_step=lambda self: write(self)), words)
+def in_turn(*hooks: Hook) -> Hook:
+    def run(*args: Any) -> None:
+        for hook in hooks:
+            hook(*args)
+
+    return run
+
+
+BEFORE, AFTER, SUBSTEP = "_before_control_step", "_after_control_step", "_after_simulation_step"
+RESET, EVALUATE = "_initialize_episode", "evaluate"
+ALL, OTHERS = "'cube' in envs 0, 1, 2", "'cube' in envs 0, 2"
+FAULTS = [
+    (BEFORE, set_pose, "not-applied", f"pose of {ALL}"),
+    (BEFORE, set_velocity, "not-applied", f"velocity of {ALL}"),
+    (BEFORE, set_qpos, "not-applied", "qpos of 'panda' in envs 0, 1, 2"),
+    (BEFORE, set_root_pose, "not-applied", "pose of 'panda_link0' in envs 0, 1, 2"),
+    (BEFORE, set_targets, "not-applied", "targets of 'panda' in envs 0, 1, 2"),
+    (BEFORE, set_target_of_a_joint, "not-applied", "targets of 'panda'"),
+    (BEFORE, write_the_tensor, "not-applied", f"pose of {ALL}"),
+    (BEFORE, set_forces, "not-applied", "'panda' in envs 0, 1, 2"),
+    (BEFORE, move_a_link, "link-pose-set", "'panda_hand' was set in envs 0, 1, 2"),
+    (EVALUATE, set_pose, "not-applied", ALL),
+    (EVALUATE, write_the_tensor, "not-applied", ALL),
+    (AFTER, move_the_goal_and_apply, "apply-before-fetch", "'.*'"),
+    (AFTER, read_a_link, "read-before-fetch", "panda"),
+    (AFTER, read_qpos, "read-before-fetch", "panda"),
+    (SUBSTEP, read_qpos, "read-before-fetch", "panda"),
+    (RESET, look_at_a_link_too_early, "link-before-update", "'panda'"),
+    (RESET, lift_all, "other-env-written", OTHERS),
+    (RESET, push_all, "other-env-written", OTHERS),
+    (RESET, restore_all, "other-env-written", "envs 0, 2"),
+    (RESET, pose_of_all, "refused-by-gpu", r"'cube' .*3 rows.* 1 is wanted"),
+    (RESET, settle, "stepped-in-reset", "envs 0, 2"),
+    (BEFORE, set_entity_pose, "behind-the-tensors", r"'scene-2_cube' \(env 2\)"),
+    (BEFORE, set_body_velocity, "behind-the-tensors", "env 0"),
+    (BEFORE, add_force, "behind-the-tensors", "env 0"),
+    (BEFORE, set_articulation_qpos, "behind-the-tensors", r"'scene-1_panda' \(env 1\)"),
+    (BEFORE, set_joint_target, "behind-the-tensors", "env 1"),
+]
+NO_FAULTS = [
+    (EVALUATE, set_targets),  # applied with the next action
+    (RESET, look_at_a_link),
+    (RESET, lift),
+    (RESET, read_the_velocity_of_links),
+    (BEFORE, in_turn(set_forces, lambda env: env.scene.px.gpu_apply_articulation_qf())),
+    (AFTER, in_turn(lambda env: env.scene._gpu_fetch_all(), move_the_goal_and_apply)),
+    (SUBSTEP, in_turn(lambda env: env.scene._gpu_fetch_all(), read_qpos, read_a_link)),
+    (EVALUATE, in_turn(lambda env: env.agent.robot.root_linear_velocity)),
+]
+
+
+@pytest.mark.parametrize(("hook", "fault", "rule", "told"), FAULTS)
+def test_a_broken_rule_is_told_at_its_line(run: Hook, hook: str, fault: Hook, rule: str, told: str) -> None:
+    with pytest.raises(BrokenRule, match=told) as caught:
+        run(hook, fault)
+    assert caught.value.rule == rule
     assert "# the fault" in told_at(caught)
 
 
-def test_sapiens_own_setters_work_where_no_rule_is_checked(pick_cubes: BaseEnv) -> None:
+@pytest.mark.parametrize(("hook", "does"), NO_FAULTS)
+def test_what_is_no_fault_is_not_told(run: Hook, hook: str, does: Hook) -> None:
+    run(hook, does)
+
+
+def test_writes_that_are_applied_are_no_fault(run: Hook) -> None:
+    def write(env: Any) -> None:
+        for each in (set_pose, set_velocity, set_qpos, set_targets, set_target_of_a_joint, write_the_tensor):
+            each(env)
+            apply(env)
+
+    run(BEFORE, write)
+
+
+def test_targets_that_a_controller_sets_between_substeps_are_told(strict: Any) -> None:
+    """On the GPU they are never applied: ManiSkill applies targets before the first substep only."""
+    strict.reset(seed=[0, 1, 2])
+    controller = strict.agent.controller.controllers["arm"]
+    stock = controller.before_simulation_step
+
+    def interpolate_and_apply() -> None:
+        strict.scene._gpu_fetch_all()
+        stock()
+        controller.set_drive_targets(controller.qpos + 0.01)
+        strict.scene.px.gpu_apply_articulation_target_position()
+
+    try:
+        controller.before_simulation_step = interpolate_and_apply
+        strict.step(ACTION)
+        zero = controller._target_qpos * 0
+        controller.before_simulation_step = lambda: controller.set_drive_targets(zero)  # the fault
+        with pytest.raises(BrokenRule, match="'panda' in envs 0, 1, 2") as caught:
+            strict.step(ACTION)
+        assert "# the fault" in told_at(caught)
+    finally:
+        del controller.before_simulation_step
+
+
+def test_a_write_that_a_reset_of_other_envs_applies_is_told_and_without_rules_applied() -> None:
+    for rules, told in (("stop", BrokenRule), ("warn", RuleWarning), ("off", None)):
+        env = batched(PICK_CUBE, N, rules=rules)
+        height = env.cube.pose.p[:, 2].clone()
+        set_pose(env)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuleWarning)
+            for again in range(2 if told else 1):
+                try:
+                    if again:
+                        warnings.simplefilter("ignore", RuleWarning)
+                    env.reset(options={"env_idx": torch.tensor([1])})
+                except (BrokenRule, RuleWarning) as error:
+                    assert type(error) is told and "'cube' in envs 0, 2" in str(error) and not again
+        torch.testing.assert_close(env.cube.pose.p[:, 2] - height, torch.tensor([0.1, 0.0, 0.1]))
+        env.close()
+
+
+def test_state_read_between_merged_substeps_is_told_as_between_others(strict: Any) -> None:
+    strict.reset(seed=[0, 1, 2])
+    strict.step(ACTION)
+    px = strict.scene.px
+    with px.merging(5):
+        px.step()
+        with pytest.raises(BrokenRule) as caught:
+            _ = strict.agent.robot.qpos
+    assert caught.value.rule == "read-before-fetch"
+    strict.scene._gpu_fetch_all()
+
+
+def move_a_wall(env: Any, options: dict) -> None:
+    builder = env.scene.create_actor_builder()
+    builder.add_box_collision(half_size=[0.05] * 3)
+    builder.initial_pose = sapien.Pose([0.3, 0.3, 0.05])
+    builder.build_static("wall").set_pose(sapien.Pose())
+
+
+@pytest.mark.parametrize(
+    ("name", "hook", "rule"),
+    [
+        ("_load_scene", lambda env, options: env.cube.pose and None, "state-while-built"),
+        ("_load_scene", lambda env, options: env.agent.robot.set_qpos(torch.zeros(9)), "state-while-built"),
+        ("_load_scene", move_a_wall, "state-while-built"),
+        ("_initialize_episode", lambda env, *_: env.scene._gpu_apply_all(), "refused-by-gpu"),
+    ],
+)
+def test_what_is_done_wrong_while_it_is_built_is_told(name: str, hook: Hook, rule: str) -> None:
+    with pytest.raises(BrokenRule) as caught:
+        build(name, hook)
+    assert caught.value.rule == rule
+    build(name, hook, "off").close()
+
+
+@pytest.mark.parametrize("write", [pose_of_all, qpos_of_all, targets_of_all])
+def test_rows_of_all_envs_in_a_partial_reset_go_to_those_that_are_reset(write: Hook) -> None:
+    env = build(RESET, write, "off")
+    env.reset(seed=[0, 1, 2])
+    before = env.get_state()
+    env.reset(options={"env_idx": torch.tensor([0, 2])})
+    assert torch.equal(env.get_state()[1], before[1])
+    env.close()
+
+
+def test_a_batch_of_another_size_is_refused_with_both_and_another_fault_is_torchs() -> None:
+    rows = {"qpos": (5, 9)}
+
+    def write(self: Any, env_idx: torch.Tensor, options: dict) -> None:
+        if len(env_idx) < N:
+            self.agent.robot.set_qpos(torch.rand(rows["qpos"]))
+
+    env = build(RESET, write, "off")
+    with pytest.raises(ValueError, match=r"qpos of 'panda'.*5 .* 2 rows"):
+        env.reset(options={"env_idx": torch.tensor([0, 2])})
+    rows["qpos"] = (2, 5)
+    with pytest.raises(RuntimeError, match="shape|size|expand") as caught:
+        env.reset(options={"env_idx": torch.tensor([0, 2])})
+    assert not isinstance(caught.value, ValueError)
+    env.close()
+
+
+def test_sapiens_own_setters_work_where_no_rule_is_checked(strict: Any) -> None:
     """Also in a process that has a scene with rules."""
-    assert type(pick_cubes.scene.px) is StrictCpuSystem
-    env = build(PICK_CUBE, rules="off")
-    set_entity_pose(env)
-    assert env.cube._objs[0].pose.p[2] == pytest.approx(0.5)
-    set_body_velocity(env)
-    set_articulation_qpos(env)
-    set_joint_target(env)
+    env = batched(PICK_CUBE, N, rules="off")
+    for write in (set_entity_pose, set_body_velocity, set_articulation_qpos, set_joint_target):
+        write(env)
+    assert env.cube._objs[2].pose.p[2] == pytest.approx(0.5)
     env.close()
     free = sapien.Entity()
     free.pose = sapien.Pose([1, 2, 3])
@@ -594,69 +414,58 @@ def test_sapiens_own_setters_work_where_no_rule_is_checked(pick_cubes: BaseEnv) 
 
 
 def test_the_list_of_contacts_needs_one_env() -> None:
-    listing = pick_cube(evaluate=lambda self: (self.scene.get_contacts(), None)[1])
-    with pytest.raises(NeedsOneEnv, match="get_pairwise_contact_impulses") as caught:
-        run(listing)
+    def listing(self: Any) -> None:
+        self.scene.get_contacts()
+
+    with pytest.raises(NeedsOneEnv) as caught:
+        build(EVALUATE, listing).reset(seed=0)
     assert caught.value.place is not None and caught.value.place[0] == __file__
-    with pytest.raises(BrokenRule, match="does not exist in GPU simulation"):
-        build(listing, num_envs=1)
-    build(listing, "off", num_envs=1).close()
-
-
-# --- returns -----------------------------------------------------------------------------------------
+    with pytest.raises(BrokenRule):
+        build(EVALUATE, listing, num_envs=1)
+    build(EVALUATE, listing, "off", num_envs=1).close()
 
 
 @pytest.mark.parametrize(
-    ("hooks", "words"),
+    ("hook", "returns", "told"),
     [
-        (
-            {"evaluate": lambda self: {"success": torch.tensor(True)}},
-            r"evaluate\(\) returned 'success' as a bool",
-        ),
-        ({"evaluate": lambda self: {"success": True}}, r"evaluate\(\) returned 'success' as bool"),
-        (
-            {"compute_normalized_dense_reward": lambda self, obs, action, info: torch.zeros((N, 1))},
-            r"compute_normalized_dense_reward\(\) returned a float32 tensor of shape \(3, 1\)",
-        ),
-        (
-            {"_get_obs_extra": lambda self, info: {"goal": self.goal_site.pose.p[0]}},
-            r"_get_obs_extra\(\) returned 'goal' as a float32 tensor of shape \(3,\)",
-        ),
+        ("evaluate", lambda env: {"success": torch.tensor(True)}, "success"),
+        ("evaluate", lambda env: {"success": True}, "success"),
+        ("evaluate", lambda env: {"success": torch.ones(N)}, "success"),  # a row each, but no truths
+        ("compute_normalized_dense_reward", lambda env, **_: torch.zeros((N, 1)), r"\(3, 1\)"),
+        ("_get_obs_extra", lambda env, info: {"goal": torch.zeros(4)}, "goal"),
     ],
 )
-def test_returns_without_a_row_for_each_env_are_told(hooks: dict[str, Hook], words: str) -> None:
-    if "goal" in words:  # three numbers look like a row for each of three envs
-        env = build(PICK_CUBE, num_envs=4)
-        env.close()
-        with pytest.raises(WrongReturn, match=words):
-            build(pick_cube(**hooks), num_envs=4)
-        return
-    assert isinstance(breaks(pick_cube(**hooks), words).value, WrongReturn)
+def test_returns_without_a_row_for_each_env_are_told(run: Hook, hook: str, returns: Hook, told: str) -> None:
+    with pytest.raises(WrongReturn, match=rf"{hook}\(\).*{told}"):
+        run(hook, returns)
 
 
 @pytest.mark.parametrize("rules", ["stop", "off"])
 @pytest.mark.parametrize("hook", ["_initialize_episode", "_after_control_step"])
 def test_an_env_can_be_reset_after_any_of_this(rules: Any, hook: str) -> None:
     """What the hook that raised had written or half applied is not the next episode's."""
+    failing = ""
 
     def fail(self: Any, *args: Any) -> None:
-        if self.failing == "nan":
+        if failing == "nan":
             self.cube.set_pose(Pose.create(torch.full((1, 7), torch.nan)))
             self.scene._gpu_fetch_all() if rules == "stop" else self.scene._gpu_apply_all()
-        if self.failing == "applied":
+        if failing == "applied":
             self.scene._gpu_fetch_all()
             self.scene._gpu_apply_all()
             raise ZeroDivisionError
+        if failing == "interrupted":
+            self.cube.set_pose(Pose.create(self.cube.pose.raw_pose + 1))
+            raise KeyboardInterrupt
 
-    task = pick_cube(**{hook: fail})
-    task.failing = ""
-    env = build(task, rules)
-    for task.failing in ("nan", "applied"):
-        with pytest.raises((BrokenRule, ValueError, ZeroDivisionError)):
+    env = build(hook, fail, rules)
+    for failing in ("nan", "applied", "interrupted"):
+        with pytest.raises((BrokenRule, ValueError, ZeroDivisionError, KeyboardInterrupt)):
             env.reset(seed=[0, 1, 2])
             env.step(ACTION)
-        task.failing = ""
+        failing = ""
         env.reset(seed=[0, 1, 2])
+        assert env.cube.pose.p.abs().max() < 0.5, "what was written before it failed"
         env.step(ACTION)
         assert torch.isfinite(env.get_state()).all()
     env.close()
@@ -665,14 +474,7 @@ def test_an_env_can_be_reset_after_any_of_this(rules: Any, hook: str) -> None:
 # --- degrees ----------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def pick_cubes() -> Iterator[BaseEnv]:
-    env = build(PICK_CUBE)
-    yield env
-    env.close()
-
-
-def test_an_env_with_rules_gives_the_same_bits(pick_cubes: BaseEnv) -> None:
+def test_an_env_with_rules_gives_the_same_bits(strict: Any) -> None:
     def run_steps(env: BaseEnv) -> torch.Tensor:
         rng = np.random.default_rng(0)
         env.reset(seed=[0, 1, 2])
@@ -684,22 +486,54 @@ def test_an_env_with_rules_gives_the_same_bits(pick_cubes: BaseEnv) -> None:
             states.append(env.get_state())
         return torch.stack(states)
 
-    plain = build(PICK_CUBE, rules="off")
-    assert torch.equal(run_steps(pick_cubes), run_steps(plain))
+    plain = batched(PICK_CUBE, N, rules="off")
+    checked = batched(PICK_CUBE, N, rules="stop")
+    assert torch.equal(run_steps(checked), run_steps(plain))
     plain.close()
+    checked.close()
+
+
+@pytest.fixture(scope="module")
+def warned_and_not() -> Iterator[list[Any]]:
+    envs = [batched(Hooked, N, rules=rules, on_finding=lambda finding: None) for rules in ("warn", "off")]
+    yield envs
+    for env in envs:
+        env.close()
+
+
+@pytest.mark.parametrize(("hook", "fault"), [(hook, fault) for hook, fault, *_ in FAULTS])
+def test_what_only_warns_goes_on_to_the_same_bits_as_without_rules(
+    warned_and_not: list[Any], hook: str, fault: Hook, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states = []
+    for env in warned_and_not:
+        monkeypatch.undo()
+        renew_physics(env.scene, [*range(N)])
+        env.reset(seed=[0, 1, 2])
+        torch.manual_seed(0)
+        monkeypatch.setattr(Hooked, hook, also(hook, fault))
+        of_env = []
+        for step in range(3):
+            env.step(ACTION)
+            of_env.append(env.get_state())
+            if step == 1:
+                env.reset(seed=[3, 4, 5], options={"env_idx": torch.tensor([1])})
+                of_env.append(env.get_state())
+        states.append(torch.stack(of_env))
+        monkeypatch.undo()
+    torch.testing.assert_close(states[0], states[1], rtol=0, atol=0, equal_nan=True)
+    assert fault.__name__ in {row.function for row in warned_and_not[0].broken_rules.rows}
 
 
 def test_warn_tells_once_with_the_place_and_goes_on() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        env = run(pick_cube(_before_control_step=lambda self: set_pose(self)), rules="warn")
+        env = build(BEFORE, set_pose, "warn")
+        for _ in range(3):
+            env.step(ACTION)
     (told,) = [w for w in caught if w.category is RuleWarning]
-    assert "The pose of 'cube'" in str(told.message)
     assert told.filename == __file__ and "# the fault" in linecache.getline(__file__, told.lineno)
-    plain = run(pick_cube(_before_control_step=lambda self: set_pose(self)), rules="off")
-    assert torch.equal(env.get_state(), plain.get_state())
     env.close()
-    plain.close()
 
 
 @pytest.mark.parametrize(
@@ -782,12 +616,3 @@ def test_no_built_in_task_is_told_off_for_nothing(env_id: str) -> None:
     expected = UPSTREAM_BREAKS.get(env_id, [])
     assert len(messages) == len(expected), messages
     assert all(words in message for words, message in zip(expected, messages, strict=True)), messages
-
-
-def test_the_setters_that_are_watched_are_those_of_this_maniskill() -> None:
-    for each in STATE_PROPERTIES:
-        assert isinstance(each.owner.__dict__[each.name], property), (each.owner, each.name)
-    assert all(name in Articulation.__dict__ for name in TARGET_SETTERS)
-    for hook in ("_clear_sim_state", "_initialize_episode", "_setup_scene", "get_reward", "_get_obs_agent"):
-        assert hook in BaseEnv.__dict__
-    assert "self.scene._reset_mask" in inspect.getsource(BaseEnv.reset)

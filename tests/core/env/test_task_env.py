@@ -20,9 +20,8 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from tests.core.stock_env import Bare
 from tests.drive.envs import PUSH_CUBE, batched, stock
 from workbench.core import backends
-from workbench.core.backends import BackendUnavailable, choose_backend, why_no_gpu_simulation
+from workbench.core.backends import choose_backend
 from workbench.core.env import actions
-from workbench.core.env.assets import MissingAssets
 from workbench.core.env.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
 from workbench.core.scene.scene_index import scene_index
 
@@ -38,18 +37,6 @@ def push() -> Iterator[TaskEnv]:
     env = opened("PushCube-v1")
     yield env
     env.close()
-
-
-def test_a_step_is_plain_arrays_with_the_envs_first(push: TaskEnv) -> None:
-    first = push.reset(seed=0)
-    assert first.action is None and not first.reward.any()
-    action = np.zeros((N, 8), np.float32)
-    step = push.step(action)
-    assert step.elapsed_steps.tolist() == [1] * N
-    assert step.reward.dtype == np.float32 and step.reward.shape == (N,)
-    assert step.terminated.dtype == np.bool_ and step.truncated.dtype == np.bool_
-    assert all(isinstance(v, np.ndarray) and len(v) == N for v in step.evaluate.values())
-    assert step.poses.shape == (N, len(scene_index(push.env).names), 7) and step.poses.dtype == np.float32
 
 
 def test_a_reward_that_could_be_learned_from_is_a_number_like_others(push: TaskEnv) -> None:
@@ -69,25 +56,10 @@ def test_what_a_step_returned_does_not_change_with_the_next(push: TaskEnv) -> No
     assert np.array_equal(step.reward, copies[1]) and np.array_equal(step.elapsed_steps, copies[2])
 
 
-def test_an_env_that_goes_on_has_been_observed_last_by_who_had_it_before(push: TaskEnv) -> None:
-    assert TaskEnv(push.env, 50, obs=(seen := torch.ones(N, 3))).obs is seen
-    assert TaskEnv(push.env, 50).obs is None
-
-
 def test_the_time_limit_truncates(push: TaskEnv) -> None:
     push.reset(seed=0)
     results = [push.step(np.zeros((N, 8), np.float32)) for _ in range(push.max_episode_steps)]
     assert not results[-2].truncated.any() and results[-1].truncated.all()
-
-
-def test_a_seed_for_one_env_starts_the_episode_of_a_stock_single_env(push: TaskEnv) -> None:
-    push.reset(seed=0)
-    push.reset(seed=123, env_idx=[2])
-    single = stock("PushCube-v1")
-    single.reset(seed=123)
-    assert torch.equal(push.env.obj.pose.p[2], single.obj.pose.p[0])
-    assert push.episode_seeds.tolist() == [0, 1, 123, 3]
-    single.close()
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -173,44 +145,6 @@ def test_what_a_task_says_of_each_env_is_told_of_that_env(obs_mode: str) -> None
     env.close()
 
 
-class TellsOfTheRoom(TellsOfEach):
-    """What is of no env in particular stands in its observation too."""
-
-    def _get_obs_extra(self, info: dict) -> dict:
-        room = {"size": torch.full((3,), torch.nan), "height": torch.tensor(torch.inf)}
-        return {**super()._get_obs_extra(info), **room, "numbers": torch.arange(self.num_envs)}
-
-
-def test_what_is_no_batch_of_floats_is_sound() -> None:
-    env = TaskEnv(batched(TellsOfTheRoom, 4, rules="off", obs_mode="state_dict"), 50)
-    step = env.reset(seed=0)
-    assert step.sound_obs is not None and step.sound_obs.tolist() == [False, True, True, True]
-    env.close()
-
-
-def test_two_restores_of_one_snapshot_go_on_alike_to_the_last_bit() -> None:
-    env = opened("PickCube-v1")
-    env.reset(seed=0)
-    state = env.env.get_state_dict()
-    state["actors"]["cube"][:, :3] = env.env.agent.tcp.pose.p
-    env.env.set_state_dict(state)
-    chosen = np.random.default_rng(0).uniform(-1, 1, (22, N, 8)).astype(np.float32)
-    chosen[..., -1] = -1
-    for action in chosen[:10]:
-        held = env.step(action)
-    assert held.evaluate["is_grasped"].any(), "what is touched is what a physics with a past remembers"
-    snapshot, ends = env.snapshot(), []
-    for times in (5, 6, 7):
-        env.restore(snapshot)
-        for action in chosen[10:]:
-            env.step(action)
-        ends.append([system.pack() for system in env.env.scene.px.systems])
-        for _ in range(times):
-            env.step(-chosen[times])  # lets go
-    assert ends[0] == ends[1] == ends[2]
-    env.close()
-
-
 def test_a_scene_that_a_reset_builds_anew_is_the_one_that_is_read_and_acted_on() -> None:
     env = opened("PushCube-v1", 2, control_mode="pd_joint_pos")
     env.reset(seed=0)
@@ -241,36 +175,7 @@ def test_a_seed_is_kept_to_where_resets_without_one_draw_their_own() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("wrong", [[], [N], [-1], [0, 99], [1, 1]])
-def test_env_indices_that_are_not_there_are_refused(push: TaskEnv, wrong: list[int]) -> None:
-    with pytest.raises((ValueError, IndexError)):
-        push.reset(env_idx=wrong)
-
-
-def test_a_number_of_seeds_that_does_not_fit_is_refused(push: TaskEnv) -> None:
-    with pytest.raises(ValueError, match="2 seeds for 4 envs"):
-        push.reset(seed=[1, 2])
-
-
-def test_the_check_sees_what_the_task_returned_and_can_refuse_it() -> None:
-    seen: list[tuple[object, object]] = []
-    env = opened("PushCube-v1", 2)
-    checked = TaskEnv(env.env, 50, check=lambda evaluate, reward: seen.append((evaluate, reward)))
-    checked.reset(seed=0)
-    checked.step(np.zeros((2, 8), np.float32))
-    assert seen[0][1] is None and isinstance(seen[1][1], torch.Tensor)
-    env.close()
-
-
 # --- actions ---------------------------------------------------------------------------------------
-
-
-def test_dimensions_have_the_names_of_joints_and_the_bounds_of_the_space(push: TaskEnv) -> None:
-    names = [name for part in push.parts for name in part.names]
-    assert names[0] == "arm/panda_joint1" and names[-1].startswith("gripper/")
-    low, high = actions.bounds(push.parts)
-    assert np.array_equal(low, push.env.single_action_space.low)
-    assert np.array_equal(high, push.env.single_action_space.high)
 
 
 @pytest.mark.parametrize(
@@ -280,10 +185,17 @@ def test_dimensions_have_the_names_of_joints_and_the_bounds_of_the_space(push: T
 def test_holding_still_holds_still(control_mode: str) -> None:
     env = opened("PickCube-v1", 2, control_mode=control_mode)
     env.reset(seed=0)
-    start = env.env.agent.robot.get_qpos().clone()
+    robot = env.env.agent.robot
+    start = robot.get_qpos().clone()
+    start[:, 7:] = torch.tensor([[0.02], [0.035]])  # a hand that is half open, in each env otherwise
+    robot.set_qpos(start)
+    env.env.scene._gpu_apply_all()
+    env.env.scene.px.gpu_update_articulation_kinematics()
+    env.env.scene._gpu_fetch_all()
     for _ in range(10):
         env.step(actions.hold_action(env.parts, 2))
-    assert (env.env.agent.robot.get_qpos() - start).abs().max() < 0.02
+    moved = (robot.get_qpos() - start).abs()
+    assert moved[:, :7].max() < 0.02 and ("delta" in control_mode or moved[:, 7:].max() < 0.005), moved
     env.close()
 
 
@@ -327,19 +239,6 @@ def test_the_reward_is_the_richest_that_the_class_implements() -> None:
     assert default_reward_mode(PUSH_CUBE) == "normalized_dense"
 
 
-def test_a_task_whose_robot_is_not_downloaded_says_so() -> None:
-    spec = REGISTERED_ENVS["PickSingleYCB-v1"]
-    with pytest.raises(MissingAssets):
-        make_env(spec.cls, EnvOptions(2, "cpu", render=False), asset_ids=spec.asset_download_ids)
-
-
-@pytest.mark.skipif(why_no_gpu_simulation() is None, reason="this machine has GPU simulation")
-def test_gpu_simulation_is_refused_with_the_reason_where_it_cannot_be() -> None:
-    assert choose_backend("auto", render=False).simulation == "cpu"
-    with pytest.raises(BackendUnavailable, match="--backend cpu"):
-        choose_backend("gpu", render=False)
-
-
 def test_a_gpu_is_simulated_on_only_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """No test of GPU simulation has passed anywhere: whoever takes it is to know."""
     monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: None)
@@ -350,21 +249,6 @@ def test_a_gpu_is_simulated_on_only_where_it_is_asked_for(monkeypatch: pytest.Mo
     assert backends.unused_gpu_text("cpu") is backends.unused_gpu_text("gpu") is None
     monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: "there is none")
     assert backends.unused_gpu_text("auto") is None
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"num_envs": 0}, "num_envs must be at least 1, not 0"),
-        ({"backend": "tpu"}, "backend must be one of auto, cpu, gpu, not 'tpu'"),
-        ({"threads": 0}, "threads must be at least 1, or None for all cores, not 0"),
-        ({"rules": "sometimes"}, "sometimes"),
-    ],
-)
-def test_options_that_cannot_be_are_refused(wrong: dict, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        EnvOptions(**wrong)
-    assert EnvOptions(threads=1).threads == 1 and EnvOptions(num_envs=1).num_envs == 1
 
 
 @pytest.mark.parametrize(

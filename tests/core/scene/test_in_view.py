@@ -10,7 +10,7 @@ import sapien
 import sapien.render
 
 from tests.ui.scenes import box_mesh
-from workbench.core.scene.in_view import corners_of, cut_to_view, is_outside, outside_and_inside, planes_of
+from workbench.core.scene.in_view import cut_to_view, is_outside, outside_and_inside, planes_of
 
 
 @pytest.fixture
@@ -34,46 +34,6 @@ def test_a_point_is_in_view_where_its_pixel_is_in_the_picture(camera: Any) -> No
     np.testing.assert_array_equal([is_outside(point[None], planes) for point in points], outside)
     nearly = (x > 0.09) & (column > -2) & (column < 42) & (row > -2) & (row < 32)
     assert outside[~nearly].all()
-
-
-def test_a_box_around_the_camera_is_partly_in_view_and_one_behind_it_is_not(camera: Any) -> None:
-    boxes = np.array(
-        [
-            [[-1, -1, -1], [1, 1, 1]],
-            [[-3, -1, -1], [-2, 1, 1]],
-            [[1, 5, -1], [2, 6, 1]],
-            [[2, -0.1, -0.1], [3, 0.1, 0.1]],
-        ],
-        np.float32,
-    )
-    outside, inside = outside_and_inside(boxes, np.tile(planes_of(camera), (len(boxes), 1, 1)))
-    np.testing.assert_array_equal(outside, [False, True, True, False])
-    np.testing.assert_array_equal(inside, [False, False, False, True])
-
-
-def test_what_is_slanted_in_its_box_may_be_outside_where_its_box_is_not(camera: Any) -> None:
-    # A rod that goes away to the left of the view, with a thickness.
-    along = np.linspace([0.5, 0.6, 0], [3.5, 6.6, 0], 50)
-    rod = np.concatenate([along, along + [0, 0, 0.02], along + [0.02, 0, 0]])
-    box = np.array([[rod.min(axis=0), rod.max(axis=0)]], np.float32)
-    planes = planes_of(camera)
-    assert [sides.item() for sides in outside_and_inside(box, planes[None])] == [False, False]
-    assert is_outside(corners_of(rod), planes) and not is_outside(corners_of(rod - [0, 0.6, 0]), planes)
-
-
-@pytest.mark.parametrize("flat", [True, False])
-def test_the_corners_of_points_are_around_all_of_them(flat: bool) -> None:
-    points = np.random.default_rng(1).normal(size=(500, 3)) * [1, 1, 0 if flat else 1]
-    corners = corners_of(points)
-    assert len(corners) < len(points)
-    for direction in np.random.default_rng(2).normal(size=(50, 3)):
-        assert (corners @ direction).max() >= (points @ direction).max() - 1e-9
-
-
-def test_a_mesh_that_is_no_numbers_counts_as_seen(camera: Any) -> None:
-    points = np.random.default_rng(3).normal(size=(20, 3))
-    points[7] = np.nan
-    assert not is_outside(corners_of(points), planes_of(camera))
 
 
 def test_triangles_behind_the_camera_are_cut_and_the_rest_keeps_its_normals(camera: Any) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tests.core.drawn_envs import batched
 from workbench.core.maniskill_private import camera_components
-from workbench.core.scene.fast_shapes import FastShapes, shown
+from workbench.core.scene.fast_shapes import shown
 from workbench.core.scene.lean_materials import LeanBody, LeanMaterials
 
 SPOTS = np.zeros((4, 4, 4), np.uint8)
@@ -97,58 +97,3 @@ def test_it_is_not_for_a_body_whose_material_the_author_changes_later(
         for name, value in was.items():
             setattr(wood, name, value)
     assert lean.is_like_exact()
-
-
-def test_bodies_that_have_no_such_texture_or_no_file_have_none_beside_them(env: Any) -> None:
-    for name in ("ground", "cube", "panda_link5"):
-        assert LeanMaterials().beside(body_of(env, name)) is None
-    triangle = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-    material = sapien.render.RenderMaterial()
-    material.metallic_texture = sapien.render.RenderTexture2D(
-        np.full((2, 2, 4), 255, np.uint8), "R8G8B8A8Unorm"
-    )
-    body = sapien.render.RenderBodyComponent()
-    body.attach(
-        sapien.render.RenderShapeTriangleMesh(
-            triangle,
-            np.array([[0, 1, 2]], np.uint32),
-            np.zeros((0, 3), np.float32),
-            np.zeros((3, 2), np.float32),
-            material,
-        )
-    )
-    assert LeanMaterials().beside(body) is None
-
-
-def test_of_many_large_textures_the_first_are_looked_at(env: Any) -> None:
-    materials = LeanMaterials()
-    wood = materials_of(body_of(env, "table-workspace"))[0]
-    was = wood.metallic_texture
-    large = np.full((2048, 2048, 4), 255, np.uint8)
-    try:
-        found = []
-        for _ in range(6):
-            wood.metallic_texture = sapien.render.RenderTexture2D(large, "R8G8B8A8Unorm")
-            found.append(materials.beside(body_of(env, "table-workspace")) is not None)
-    finally:
-        wood.metallic_texture = was
-    assert found == [True] * 4 + [False] * 2
-
-
-def test_a_fast_picture_draws_it_until_the_author_changes_the_material(env: Any) -> None:
-    body, cameras = body_of(env, "table-workspace"), camera_components(env._sensors["base_camera"])
-    shapes = FastShapes(env.scene.sub_scenes)
-    wood = materials_of(body)[0]
-
-    def drawn_instead() -> Any:
-        shapes.prepare(0, "base_camera", cameras)
-        return dict(shapes.bodies("base_camera", 0)).get(body)
-
-    try:
-        assert materials_of(drawn_instead())[0].metallic_texture is None
-        wood.specular = 0.7
-        assert drawn_instead() is None
-    finally:
-        wood.specular = 0.0
-        shapes.remove()
-    assert len(body.entity.components) == 2, "nothing stays behind"

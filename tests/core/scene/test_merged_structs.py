@@ -17,7 +17,6 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.by_hand import box, by_hand
 from tests.core.stock_env import Bare, batch_of, follow
-from workbench.core.capture.inspect_env import list_contacts
 
 
 class Mixed(Bare):
@@ -80,17 +79,6 @@ def test_every_env_does_what_a_stock_env_with_its_objects_does() -> None:
     follow(Mixed, 4, look=look).close()
 
 
-def test_padding_of_the_shorter_articulations_is_zero(mixed: Any) -> None:
-    assert mixed.chain.max_dof == 2
-    assert mixed.chain.dof.tolist() == [1, 2, 1, 2]
-    mixed.reset(seed=[0, 1, 2, 3])
-    mixed.step(None)
-    for numbers in (mixed.chain.get_qpos(), mixed.chain.get_qvel(), mixed.chain.qacc):
-        assert numbers.shape == (4, 2)
-        assert torch.equal(numbers[[0, 2], 1], torch.zeros(2))
-        assert bool((numbers[[1, 3], 1] != 0).all())
-
-
 def test_a_partial_reset_reaches_the_right_parts_of_a_merged_actor(mixed: Any) -> None:
     mixed.reset(seed=[0, 1, 2, 3])
     for _ in range(5):
@@ -116,15 +104,6 @@ def test_the_state_of_merged_structs_comes_back(mixed: Any) -> None:
     mixed.set_state_dict(state)
     again = mixed.get_state_dict()
     torch.testing.assert_close(again, state, atol=1e-6, rtol=0)
-
-
-def test_contacts_are_listed_under_the_merged_name(mixed: Any) -> None:
-    mixed.reset(seed=[0, 1, 2, 3])
-    for _ in range(8):
-        mixed.step(None)
-    for env in range(4):
-        touching = {contact.bodies for contact in list_contacts(mixed, env) if contact.impulse.any()}
-        assert {frozenset(pair) for pair in touching} == {frozenset(("thing", "floor"))}, touching
 
 
 def test_drive_targets_of_parts_of_a_merged_articulation() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from workbench.core.scene import mesh_levels
 from workbench.core.scene.mesh_levels import deviation, from_afar, reduced_mesh
 from workbench.core.scene.shapes import Mesh
 
@@ -39,34 +37,20 @@ def test_a_reduced_mesh_is_read_from_disk_the_next_time_and_made_again_from_a_br
     assert reduced_mesh(mesh, 100) is not None and len(list(tmp_path.rglob("*.npz"))) == 2
 
 
-def test_room_is_made_among_the_files_of_other_versions_too_and_the_oldest_go_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(mesh_levels, "_MOST_ON_DISK", 50_000)
-    left = tmp_path / "workbench" / "meshes-1" / "left.npz"
-    left.parent.mkdir(parents=True)
-    left.write_bytes(bytes(49_000))
-    os.utime(left, (1, 1))
-    sphere = trimesh.creation.icosphere(subdivisions=4)
-    reduced_mesh(Mesh(sphere.vertices.astype(np.float32), sphere.faces.astype(np.uint32)), 100)
-    assert not left.exists() and len(list(tmp_path.rglob("*.npz"))) == 1
-
-
 def test_a_mesh_from_afar_has_few_triangles_near_its_surface_and_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    # Forty loose pieces, as screws are, which a collapse of edges alone keeps.
-    balls = [trimesh.creation.icosphere(subdivisions=2, radius=0.004) for _ in range(40)]
+    # Loose pieces, as screws are, which a collapse of edges alone keeps.
+    balls = [trimesh.creation.icosphere(subdivisions=2, radius=0.004) for _ in range(15)]
     for number, ball in enumerate(balls):
         ball.apply_translation((0.1 * np.cos(number), 0.1 * np.sin(number), 0.0))
     solid: Any = trimesh.util.concatenate([trimesh.creation.icosphere(subdivisions=3, radius=0.1), *balls])
     mesh = Mesh(solid.vertices.astype(np.float32), solid.faces.astype(np.uint32))
-    counts = [len(from_afar(mesh, error).faces) for error in (0.001, 0.01, 0.03)]
-    assert len(mesh.faces) > counts[0] > counts[1] > counts[2] > 0 and len(mesh.faces) > 10 * counts[1]
+    counts = [len(from_afar(mesh, error).faces) for error in (0.01, 0.03)]
+    assert len(mesh.faces) > 5 * counts[0] > 5 * counts[1] > 0
     assert deviation(mesh, from_afar(mesh, 0.01)) <= 0.01
-    assert len(list(tmp_path.rglob("*.npz"))) == 3
+    assert len(list(tmp_path.rglob("*.npz"))) == 2
     assert from_afar(mesh, 0.0) is mesh
 
 

@@ -3,42 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from workbench.core.scene.normals import ShadedSurface, share_smooth, with_normals
+from workbench.core.scene.normals import ShadedSurface, with_normals
 from workbench.core.scene.shapes import Mesh
-
-
-def test_normals_are_sharp_on_a_box_and_smooth_on_a_ball() -> None:
-    box = with_normals(Mesh(*shared(trimesh.creation.box())))
-    assert box.normals is not None and len(box.vertices) == 24
-    np.testing.assert_allclose(np.abs(box.normals).max(axis=1), 1.0, atol=1e-6)
-    ball = with_normals(Mesh(*shared(trimesh.creation.icosphere(subdivisions=3))))
-    assert ball.normals is not None and len(ball.vertices) == 642
-    assert (ball.normals * ball.vertices).sum(axis=1).min() > 0.99
 
 
 def shared(mesh: trimesh.Trimesh) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32)
-
-
-@pytest.mark.parametrize("off, left", [(4.0, 4), (30.0, 6)])
-def test_vertices_at_one_place_are_one_where_they_are_lit_alike(off: float, left: int) -> None:
-    """Two triangles with an edge in common, the second's normals turned by `off` degrees."""
-    square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], np.float32)
-    turned = [0.0, np.sin(np.deg2rad(off)), np.cos(np.deg2rad(off))]
-    normals = np.array([[0, 0, 1]] * 3 + [turned] * 3, np.float32)
-    mesh = Mesh(square[[0, 1, 2, 1, 3, 2]], np.arange(6, dtype=np.uint32).reshape(2, 3), normals)
-    shared = share_smooth(mesh)
-    assert shared.normals is not None and len(shared.vertices) == left
-    np.testing.assert_array_equal(shared.vertices[shared.faces], mesh.vertices[mesh.faces])
-    np.testing.assert_allclose(np.linalg.norm(shared.normals, axis=1), 1, rtol=1e-6)
-    lit = np.einsum("fcd,fcd->fc", shared.normals[shared.faces], normals[mesh.faces])
-    assert (
-        np.rad2deg(np.arccos(np.minimum(lit, 1))).max() < off / 2 + 0.1 if left == 4 else (lit > 0.9999).all()
-    )
 
 
 def strip(x: NDArray, z: NDArray, tilt: NDArray) -> Mesh:
@@ -90,22 +63,3 @@ def test_few_triangles_of_a_ball_are_shaded_round() -> None:
     )
     assert shaded.normals is not None and len(shaded.vertices) == len(coarse.vertices)
     assert (shaded.normals * shaded.vertices).sum(axis=1).min() > 0.998
-
-
-def test_a_surface_that_faces_the_other_way_leaves_the_own_normals() -> None:
-    simple = simple_tile()
-    exact = tile()
-    assert exact.normals is not None
-    shaded = ShadedSurface(Mesh(exact.vertices, exact.faces, -exact.normals)).shade(simple)
-    assert simple.normals is not None and shaded.normals is not None
-    np.testing.assert_allclose(np.sort(shaded.normals, axis=0), np.sort(simple.normals, axis=0), atol=1e-3)
-
-
-def test_a_normal_that_is_no_number_is_not_spread() -> None:
-    exact = tile()
-    assert exact.normals is not None
-    broken = exact.normals.copy()
-    broken[5] = np.nan
-    shaded = ShadedSurface(Mesh(exact.vertices, exact.faces, broken)).shade(simple_tile())
-    assert shaded.normals is not None
-    np.testing.assert_allclose(np.linalg.norm(shaded.normals, axis=1), 1, rtol=1e-5)

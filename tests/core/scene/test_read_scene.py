@@ -62,13 +62,12 @@ def painted(
     return np.asarray(image)[fine // 2 :: fine, fine // 2 :: fine].astype(np.int64)
 
 
-@pytest.mark.parametrize("detail", [EVERYTHING, {}], ids=["whole", "reduced"])
-def test_silhouettes_are_those_of_the_renderer(detail: dict[str, int]) -> None:
+def test_silhouettes_are_those_of_the_renderer() -> None:
     size = 512
     env = batched("PickCube-v1", 2, sensor_configs={"width": size, "height": size})
     env.step(None)
     table = scene_index(env)
-    geometry, poses = read_geometry(env, **detail), read_poses(env)
+    geometry, poses = read_geometry(env), read_poses(env)
     camera = next(c for c in list_cameras(env) if c.name == "base_camera")
     names = segmentation_names(env)
     drawn = [i for i, n in enumerate(table.names) if n == "cube" or n.startswith("panda/")]
@@ -130,17 +129,6 @@ def redrawn(
     return np.array(copy.get_picture(texture)[..., :3])
 
 
-def test_a_plain_scene_drawn_from_its_geometry_is_the_same_picture() -> None:
-    env = stock("MS-CartpoleBalance-v1", human_render_camera_configs={"shader_pack": "minimal"})
-    geometry = read_geometry(env, **EVERYTHING)
-    (picture,) = take_pictures(env, 0, [("render_camera", "human", ["rgb"])])
-    assert picture.rgb is not None and picture.rgb.std() > 2
-    again = redrawn(geometry, read_poses(env), env, "minimal", "Color")
-    difference = np.abs(again.astype(int) - picture.rgb)
-    assert (difference > 2).mean() < 1e-4
-    env.close()
-
-
 def test_colours_and_textures_are_those_of_the_renderer() -> None:
     """Albedo: colour before light, so that only colours, textures, uvs and shapes can differ."""
     env = stock("PickCube-v1", human_render_camera_configs={"shader_pack": "default"})
@@ -196,7 +184,7 @@ def test_shapes_that_differ_between_envs_are_each_drawn_in_their_own_env() -> No
     env.close()
 
 
-@pytest.mark.parametrize("task", ["PushCube-v1", "PegInsertionSide-v1", "MS-CartpoleBalance-v1"])
+@pytest.mark.parametrize("task", ["PegInsertionSide-v1", "MS-CartpoleBalance-v1"])
 def test_every_mesh_is_sound(task: str) -> None:
     env = batched(task, 2)
     for visual in read_geometry(env).visuals:
@@ -285,30 +273,6 @@ def test_a_ghost_is_transparent_and_linear_textures_are_encoded(odd_shapes: Any)
     assert (texture[0, :, :3] == 188).all() and (texture[1:, :, :3] == 0).all()  # 0.5 linear is 188 sRGB
 
 
-def test_a_mesh_with_uneven_scale_has_normals_across_its_faces(odd_shapes: Any) -> None:
-    (visual,) = [v for v in read_geometry(odd_shapes).visuals if "mirrored" in v.name]
-    mesh = visual.mesh
-    np.testing.assert_allclose(np.sort(np.ptp(mesh.vertices, axis=0)), [0.5, 1.0, 2.0], atol=1e-5)
-    corner = mesh.vertices[mesh.faces].astype(float)
-    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    assert mesh.normals is not None
-    np.testing.assert_allclose(np.abs((across * mesh.normals[mesh.faces[:, 0]]).sum(-1)), 1.0, atol=1e-4)
-
-
-def test_an_edited_mesh_file_is_read_again(odd_shapes: Any) -> None:
-    def width(env: Any) -> float:
-        visuals = read_geometry(env).visuals
-        (visual,) = [v for v in visuals if v.name == "mirrored/0"]
-        return float(np.ptp(visual.mesh.vertices, axis=0).max())
-
-    assert width(odd_shapes) == pytest.approx(2.0)
-    trimesh.creation.box(extents=[3.0, 1.0, 1.0]).export(OddShapesEnv.mesh_file)
-    sapien.render.clear_cache()  # SAPIEN keeps files by name; whoever reloads a task must say so
-    odd_shapes.reset(options={"reconfigure": True})
-    assert width(odd_shapes) == pytest.approx(6.0)
-
-
 def test_without_a_renderer_the_collision_shapes_are_drawn() -> None:
     env = batched("PickCube-v1", 2, render=False)
     geometry = read_geometry(env)
@@ -325,16 +289,3 @@ def test_without_a_renderer_the_collision_shapes_are_drawn() -> None:
     assert trimesh.Trimesh(hull.vertices, hull.faces).volume > 0
     env.close()
     rendered.close()
-
-
-def test_geometry_is_that_of_the_scene_that_stands_now() -> None:
-    env: Any = stock("PegInsertionSide-v1")
-    lengths = []
-    for seed in (0, 1):
-        env.reset(seed=seed, options={"reconfigure": True})
-        peg = scene_index(env).names.index("peg")
-        meshes = [v.mesh.vertices for v in read_geometry(env).visuals if peg in v.bodies]
-        lengths.append(float(np.ptp(np.concatenate(meshes)[:, 0])))
-        np.testing.assert_allclose(lengths[-1], 2 * env.peg_half_sizes[0, 0], rtol=1e-5)
-    assert lengths[0] != lengths[1]
-    env.close()

@@ -17,7 +17,7 @@ from mani_skill.utils.structs import Actor, Pose
 from tests.drive.envs import batched, stock
 from workbench.core.scene.scene_index import read_poses, scene_index
 
-TASKS = ["PickCube-v1", "PushCube-v1", "PegInsertionSide-v1", "MS-CartpoleBalance-v1"]
+TASKS = ["PickCube-v1", "PegInsertionSide-v1"]
 
 
 def begun(env: Any) -> Any:
@@ -70,25 +70,6 @@ def test_poses_are_those_of_the_physics(task: str) -> None:
     env.close()
 
 
-def test_names_are_readable_and_kinds_are_right() -> None:
-    env = begun(stock("PickCube-v1"))
-    table = scene_index(env)
-    kind = dict(zip(table.names, table.kinds, strict=True))
-    assert kind["cube"] == "dynamic" and kind["ground"] == "static" and kind["goal_site"] == "kinematic"
-    assert kind["panda/panda_hand"] == "link"
-    assert [n for n, h in zip(table.names, table.hidden, strict=True) if h] == ["goal_site"]
-    env.close()
-
-
-def test_objects_that_differ_between_envs_are_one_body() -> None:
-    env = begun(batched("PegInsertionSide-v1", 4))
-    table = scene_index(env)
-    assert "peg" in table.names and "box_with_hole" in table.names
-    assert not [name for name in table.names if name.startswith("peg_")]
-    assert not np.isnan(read_poses(env)).any()
-    env.close()
-
-
 def test_a_hidden_body_is_where_it_would_be_seen() -> None:
     env: Any = begun(batched("PickCube-v1", 4))
     table = scene_index(env)
@@ -102,26 +83,6 @@ def test_a_hidden_body_is_where_it_would_be_seen() -> None:
     assert (moved[:, goal, :3] != shown[:, goal, :3]).any()
     env.goal_site.show_visual()
     np.testing.assert_array_equal(read_poses(env), moved)
-    env.close()
-
-
-class MarkerFirst(PushCubeEnv):
-    """Nothing stands before its marker among the bodies."""
-
-    def _load_scene(self, options: dict) -> None:
-        builder = self.scene.create_actor_builder()
-        builder.add_sphere_visual(radius=0.02)
-        builder.initial_pose = Pose.create(sapien.Pose([0.3, 0.3, 1.0]))
-        self.marker = builder.build_kinematic(name="marker")
-        super()._load_scene(options)
-
-
-def test_the_first_body_of_all_may_be_hidden_too() -> None:
-    env: Any = begun(batched(MarkerFirst, 3))
-    assert scene_index(env).names[0] == "marker"
-    shown = read_poses(env)
-    env.marker.hide_visual()
-    np.testing.assert_array_equal(read_poses(env), shown)
     env.close()
 
 
@@ -151,21 +112,6 @@ def test_a_body_that_an_env_lacks_is_nan_there_only() -> None:
     env.close()
 
 
-def test_a_view_over_two_bodies_of_one_env_leaves_them_their_names() -> None:
-    env = begun(batched(SparseBodiesEnv, 2))
-    table = scene_index(env)
-    assert {"left", "right"} < set(table.names) and "pair" not in table.names
-    env.close()
-
-
-def test_a_stock_env_may_gain_an_entity() -> None:
-    env = begun(stock("PushCube-v1"))
-    before = read_poses(env)
-    env.scene.sub_scenes[0].add_entity(sapien.Entity())
-    np.testing.assert_array_equal(read_poses(env), before)
-    env.close()
-
-
 def test_a_scene_is_looked_over_once_and_a_new_one_anew() -> None:
     env = begun(batched("PickCube-v1", 2))
     before = scene_index(env)
@@ -186,46 +132,3 @@ def test_what_is_known_of_a_scene_goes_with_it() -> None:
     del env
     gc.collect()
     assert scene() is None and index() is None
-
-
-def test_what_is_hidden_stays_where_it_is_and_can_be_moved() -> None:
-    env: Any = begun(batched("PickCube-v1", 3))
-    goal = scene_index(env).names.index("goal_site")
-    shown = read_poses(env)[:, goal]
-    env.goal_site.hide_visual()
-    np.testing.assert_array_equal(read_poses(env)[:, goal], shown)
-    pose = env.goal_site.pose.raw_pose.clone()
-    np.testing.assert_array_equal(pose, shown)
-    pose[1, 2] += 0.5
-    env.goal_site.set_pose(Pose.create(pose))
-    env.goal_site.show_visual()
-    np.testing.assert_array_equal(read_poses(env)[:, goal], pose)
-    env.close()
-
-
-@pytest.mark.parametrize("make", [stock, batched])
-def test_names_of_states_are_those_of_the_state_dict(make: Any) -> None:
-    env = begun(make("PegInsertionSide-v1"))
-    said = env.get_state_dict()
-    names = [f"{group}/{name}" for group in ("actors", "articulations") for name in said[group]]
-    assert list(scene_index(env).states) == names
-    env.close()
-
-
-def test_a_body_knows_its_actor_or_articulation() -> None:
-    env = begun(stock("RotateValveLevel0-v1"))
-    index = scene_index(env)
-    of = dict(zip(index.names, index.owners, strict=True))
-    assert of["valve_station/valve"] == "valve_station" and of["ground"] == "ground"
-    (link,) = env.valve_link._objs
-    assert index.name_of(link) == index.name_of(link.entity) == "valve_station/valve"
-    assert index.name_of(sapien.Entity()) is None
-    env.close()
-
-
-def test_all_envs_in_one_sub_scene_are_refused() -> None:
-    env = begun(stock("PushCube-v1"))
-    env.scene.parallel_in_single_scene = True  # ManiSkill itself allows it only with a GPU
-    with pytest.raises(NotImplementedError, match="parallel_in_single_scene"):
-        scene_index(env)
-    env.close()

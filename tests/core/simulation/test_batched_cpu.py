@@ -7,19 +7,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
-import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
-import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
-from tests.core.stock_env import put_in_same_state
+from tests.core.stock_env import batch_of
+from tests.core.test_written_for_the_cpu import ThrowsAFreeChain
 from workbench.core.env.cpu_scene import batched_class
 from workbench.core.rules import Degree
 
@@ -35,78 +33,6 @@ def pick_cubes() -> Iterator[BaseEnv]:
     env = batched("PickCube-v1", 4)
     yield env
     env.close()
-
-
-def test_a_partial_reset_moves_only_the_envs_that_are_reset(pick_cubes: BaseEnv) -> None:
-    pick_cubes.reset(seed=[1, 2, 3, 4])
-    for _ in range(10):
-        pick_cubes.step(pick_cubes.action_space.sample())
-    before = pick_cubes.get_state()
-    pick_cubes.reset(options={"env_idx": torch.tensor([1, 3])})
-    after = pick_cubes.get_state()
-    assert torch.equal(after[[0, 2]], before[[0, 2]])
-    assert not torch.allclose(after[[1, 3]], before[[1, 3]])
-    assert pick_cubes.elapsed_steps.tolist() == [10, 0, 10, 0]
-
-
-def test_a_reset_env_goes_on_as_if_its_neighbours_had_not_been_reset(pick_cubes: BaseEnv) -> None:
-    actions = np.random.default_rng(0).uniform(-1, 1, (20, 4, 8)).astype(np.float32)
-
-    def run(reset_others: bool) -> Any:
-        pick_cubes.reset(seed=[1, 2, 3, 4])
-        for step, action in enumerate(actions):
-            if reset_others and step == 10:
-                pick_cubes.reset(options={"env_idx": torch.tensor([0, 1, 3])})
-            pick_cubes.step(action)
-        return pick_cubes.get_state()[2]
-
-    assert torch.equal(run(reset_others=False), run(reset_others=True))
-
-
-def test_contact_impulses_of_a_grasp_equal_the_stock_values(pick_cubes: BaseEnv) -> None:
-    stock = gym.make("PickCube-v1", num_envs=1, **STATE_ONLY).unwrapped
-    stock.reset(seed=0)
-    pick_cubes.reset(seed=[0, 1, 2, 3])
-    for env in (stock, pick_cubes):
-        pose = env.cube.pose
-        raw = pose.raw_pose.clone()
-        raw[:, :3] = env.agent.tcp.pose.p
-        state = env.get_state_dict()
-        state["actors"]["cube"][:, :7] = raw
-        env.set_state_dict(state)
-    put_in_same_state(stock, pick_cubes, 2)
-    grasp = np.zeros((4, 8), np.float32)
-    grasp[:, -1] = -1.0
-    fingers = ["panda_leftfinger", "panda_rightfinger"]
-    felt = 0.0
-    for _ in range(12):
-        pick_cubes.step(grasp)
-        stock.step(grasp[:1])
-        for finger in fingers:
-            ours = pick_cubes.scene.get_pairwise_contact_impulses(
-                pick_cubes.agent.robot.links_map[finger], pick_cubes.cube
-            )
-            theirs = stock.scene.get_pairwise_contact_impulses(
-                stock.agent.robot.links_map[finger], stock.cube
-            )
-            assert ours.shape == (4, 3)
-            torch.testing.assert_close(ours[2], theirs[0].float(), atol=1e-5, rtol=1e-4)
-            felt = max(felt, float(theirs.abs().max()))
-        torch.testing.assert_close(
-            pick_cubes.cube.get_net_contact_impulses()[2],
-            stock.cube.get_net_contact_impulses()[0].float(),
-            atol=1e-5,
-            rtol=1e-4,
-        )
-        torch.testing.assert_close(
-            pick_cubes.agent.robot.get_net_contact_forces(fingers)[2],
-            stock.agent.robot.get_net_contact_forces(fingers)[0].float(),
-            atol=2e-3,
-            rtol=1e-4,
-        )
-        assert pick_cubes.agent.is_grasping(pick_cubes.cube)[2] == stock.agent.is_grasping(stock.cube)[0]
-    assert felt > 0.01, "the fingers never touched the cube: the test proved nothing"
-    stock.close()
 
 
 def test_link_velocities_are_those_of_the_links(pick_cubes: BaseEnv) -> None:
@@ -141,16 +67,6 @@ def test_a_root_that_was_set_stays_set_when_the_velocity_of_a_link_is_read_befor
     env.close()
 
 
-def test_a_stock_env_in_the_same_process_is_left_as_it_was(pick_cubes: BaseEnv) -> None:
-    stock = gym.make("PickCube-v1", num_envs=1, **STATE_ONLY).unwrapped
-    stock.reset(seed=0)
-    assert not stock.gpu_sim_enabled
-    assert stock.backend.sim_backend == "physx_cpu"
-    with pytest.raises(RuntimeError, match="multiple environments"):
-        gym.make("PickCube-v1", num_envs=2, sim_backend="physx_cpu", render_backend="none")
-    stock.close()
-
-
 def test_a_pose_with_nan_is_refused_with_the_name_of_the_body(pick_cubes: BaseEnv) -> None:
     pick_cubes.reset(seed=[0, 1, 2, 3])
     state = pick_cubes.get_state_dict()
@@ -170,23 +86,6 @@ def test_a_velocity_of_what_the_task_moves_itself_is_not_given_to_physx(pick_cub
     assert all((body.linear_velocity == 0.5).all() for body in pick_cubes.cube._bodies)
 
 
-def test_every_number_of_the_first_body_of_all_is_read() -> None:
-    class MarkerFirst(REGISTERED_ENVS["PickCube-v1"].cls):
-        def _load_scene(self, options: dict) -> None:
-            builder = self.scene.create_actor_builder()
-            builder.add_sphere_visual(radius=0.02)
-            builder.initial_pose = sapien.Pose([0.1, 0.2, 0.3], [0.1, 0.3, 0.5, 0.65**0.5])
-            self.marker = builder.build_kinematic(name="marker")
-            super()._load_scene(options)
-
-    env = batched_class(MarkerFirst)(num_envs=2, **STATE_ONLY)
-    env.reset(seed=[0, 1])
-    env.step(np.zeros((2, 8), np.float32))
-    expected = torch.tensor([[0.1, 0.2, 0.3, 0.1, 0.3, 0.5, 0.65**0.5]] * 2)
-    torch.testing.assert_close(env.marker.pose.raw_pose, expected)
-    env.close()
-
-
 def test_every_env_has_its_own_ground() -> None:
     class DropsACube(REGISTERED_ENVS["PickCube-v1"].cls):
         """The cube falls beside the table, onto the floor that the table scene builds 0.92 m below."""
@@ -204,4 +103,45 @@ def test_every_env_has_its_own_ground() -> None:
     heights = env.cube.pose.p[:, 2]
     assert torch.allclose(heights, heights[:1]), heights
     assert float(heights.min()) > -0.95, "fell through the floor"
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
+def test_what_is_written_into_the_tensors_and_applied_is_what_physx_has() -> None:
+    env = batch_of(ThrowsAFreeChain, 3)
+    env.reset(seed=[0, 1, 2])
+    px, rng = env.scene.px, np.random.default_rng(0)
+
+    def drawn(width: int) -> torch.Tensor:
+        return torch.from_numpy(rng.uniform(-0.5, 0.5, (3, width)).astype(np.float32))
+
+    turned = torch.nn.functional.normalize(drawn(4))
+    written = {name: torch.cat([drawn(3), turned, drawn(6)], dim=1) for name in ("falls", "free")}
+    data = px.cuda_rigid_body_data.torch()
+    data[env.falls._body_data_index] = written["falls"]
+    data[env.free.root._body_data_index] = written["free"]
+    joints = {name: drawn(2) for name in ("qpos", "qvel", "qf", "target_qpos", "target_qvel")}
+    for name, values in joints.items():
+        getattr(px, f"cuda_articulation_{name}").torch()[env.chain._data_index.long(), :2] = values
+    env.scene._gpu_apply_all()
+    px.gpu_apply_articulation_qf()
+    px.gpu_apply_articulation_target_velocity()
+    px.packs()  # targets are written before the next step, or before it is packed
+    for i in range(3):
+        body, root, chain = env.falls._bodies[i], env.free._objs[i], env.chain._objs[i]
+        for moved, row in ((body, written["falls"][i]), (root, written["free"][i])):
+            pose = moved.entity.pose if moved is body else moved.root_pose
+            linear, angular = (
+                (moved.linear_velocity, moved.angular_velocity)
+                if moved is body
+                else (moved.root_linear_velocity, moved.root_angular_velocity)
+            )
+            np.testing.assert_allclose([*pose.p, *linear, *angular], [*row[:3], *row[7:]], atol=1e-5)
+            assert abs(float(pose.q @ row[3:7].numpy())) == pytest.approx(1, abs=1e-5)
+        for name, got in {"qpos": chain.qpos, "qvel": chain.qvel, "qf": chain.qf}.items():
+            np.testing.assert_allclose(got, joints[name][i], atol=1e-6, err_msg=name)
+        for joint, target, velocity in zip(
+            chain.active_joints, joints["target_qpos"][i], joints["target_qvel"][i], strict=True
+        ):
+            assert (joint.drive_target[0], joint.drive_velocity_target[0]) == (target, velocity)
     env.close()

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -19,9 +18,12 @@ from mani_skill.utils.structs.pose import Pose
 from tests.core.by_hand import box
 from tests.core.stock_env import Bare, batch_of, put_in_same_state, single
 from workbench.core.capture.inspect_env import Contact, list_contacts
-from workbench.core.scene.scene_index import scene_index
 
-pytestmark = pytest.mark.thorough
+pytestmark = [
+    pytest.mark.thorough,
+    # ManiSkill's own tasks break some: `env/test_strict.py` lists them.
+    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
+]
 
 N = 3
 
@@ -194,91 +196,3 @@ def test_the_list_is_that_of_a_stock_env(piles: tuple[Any, list[Any]]) -> None:
             assert np.array_equal(our.separations, np.float32([point.separation for point in contact.points]))
             count = len(contact.points)
             assert our.points.shape == our.normals.shape == our.impulses.shape == (count, 3)
-
-
-def test_forces_in_the_list_hold_up_what_lies_there(piles: tuple[Any, list[Any]]) -> None:
-    batch, _ = piles
-    for env in range(N):
-        up = {"floor": 0.0, "low": 0.0, "high": 0.0}
-        for contact in list_contacts(batch, env):
-            first, second = contact.bodies
-            up[first] += float(contact.force[2])
-            up[second] -= float(contact.force[2])
-            # The normal points from the second body to the first: up, if the first is the upper one.
-            order = ("floor", "low", "high")
-            sign = 1.0 if order.index(first) > order.index(second) else -1.0
-            assert np.allclose(contact.normals * sign, [0, 0, 1], atol=1e-3)
-            assert np.allclose(np.abs(contact.points[:, :2]) <= 0.1, True)
-        weight = {name: 9.81 * float(getattr(batch, name).mass[env]) for name in ("low", "high")}
-        assert up["low"] == pytest.approx(weight["low"], rel=0.02)
-        assert up["high"] == pytest.approx(weight["high"], rel=0.02)
-        assert up["floor"] == pytest.approx(-weight["low"] - weight["high"], rel=0.02)
-
-
-def test_a_robots_links_are_named_as_in_the_scenes_index() -> None:
-    batch, stocks = prepared("StackCube-v1", in_the_hand(lambda env: env.cubeA))
-    for _ in range(4):
-        batch.step(np.tile(GRASP, (N, 1)))
-        stocks[1].step(GRASP[None])
-    ours, theirs = list_contacts(batch, 1), list_contacts(stocks[1], 0)
-    assert len(ours) == len(theirs)
-    for our, their in zip(ours, theirs):
-        assert equal(our, their), (our, their)
-    names = {name for contact in ours for name in contact.bodies}
-    assert names <= set(scene_index(batch).names)
-    assert {"cubeA", *(f"panda_wristcam/panda_{side}finger" for side in ("left", "right"))} <= names
-    for env in (batch, *stocks):
-        env.close()
-
-
-def test_nothing_touches_before_the_first_step_in_the_air(piles: tuple[Any, list[Any]]) -> None:
-    class Floating(Pile):
-        def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-            super()._initialize_episode(env_idx, options)
-            p = torch.tensor([[0.0, 0.0, 1.5]]).repeat(len(env_idx), 1)
-            self.low.set_pose(Pose.create_from_pq(p))
-            self.high.set_pose(Pose.create_from_pq(p + 0.5))
-
-    env = batch_of(Floating, N)
-    env.reset(seed=[0, 1, 2])
-    env.step(None)
-    assert list_contacts(env, 0) == ()
-    env.close()
-
-
-def test_a_wrong_env_is_refused(piles: tuple[Any, list[Any]]) -> None:
-    batch, _ = piles
-    for env in (-1, N):
-        with pytest.raises(IndexError, match="out of range for 3 envs"):
-            list_contacts(batch, env)
-
-
-# --- queries ---------------------------------------------------------------------------------------
-
-
-def test_a_body_or_pair_that_is_asked_for_twice_is_answered_twice(piles: tuple[Any, list[Any]]) -> None:
-    px = piles[0].scene.px
-    low, high, floor = (getattr(piles[0], name)._bodies[0] for name in ("low", "high", "floor"))
-    bodies = px.gpu_create_contact_body_impulse_query([low, high, low])
-    px.gpu_query_contact_body_impulses(bodies)
-    net = bodies.cuda_impulses.torch()
-    assert torch.equal(net[0], net[2]) and bool(net[0].any())
-    pairs = px.gpu_create_contact_pair_impulse_query([(low, high), (high, low), (low, high), (high, floor)])
-    px.gpu_query_contact_pair_impulses(pairs)
-    impulse = pairs.cuda_impulses.torch()
-    assert (
-        torch.equal(impulse[0], impulse[2])
-        and torch.equal(impulse[0], -impulse[1])
-        and bool(impulse[0].any())
-    )
-    assert not impulse[3].any()
-
-
-def test_a_dropped_query_costs_nothing_any_more(piles: tuple[Any, list[Any]]) -> None:
-    px = piles[0].scene.px
-    gc.collect()
-    before = len(px.contacts._queries)
-    for _ in range(5):
-        query = px.gpu_create_contact_body_impulse_query(piles[0].low._bodies)
-        px.gpu_query_contact_body_impulses(query)
-    assert len(px.contacts._queries) == before + 1

@@ -5,14 +5,12 @@
 
 from __future__ import annotations
 
-import gc
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import sapien
 import sapien.physx as physx
-import torch
 
 from workbench.core.simulation.contact_queries import ContactReader
 
@@ -76,42 +74,6 @@ def net(reader: ContactReader, *bodies: physx.PhysxRigidBaseComponent) -> np.nda
     return query.cuda_impulses.torch().numpy().copy()
 
 
-def between(reader: ContactReader, *pairs: tuple) -> np.ndarray:
-    query = reader.create_pair_query(pairs)
-    assert query.cuda_impulses.shape == (len(pairs), 3)
-    reader.answer(query)
-    return query.cuda_impulses.torch().numpy().copy()
-
-
-def test_each_body_is_answered_with_the_sum_of_its_contacts_in_whichever_system_it_is(
-    piles: list[Pile],
-) -> None:
-    first, second = piles
-    bodies = [first.high, second.low, first.low, first.ground, second.high, first.high]
-    owners = [first, second, first, first, second, first]
-    found = net(reader_of(piles), *bodies)
-    expected = [impulse_on(owner, body) for owner, body in zip(owners, bodies)]
-    assert np.array_equal(found, np.float32(expected))
-    assert found[0, 2] > 0 > found[3, 2], "the upper box is held up, and the ground is pressed"
-
-
-def test_each_pair_is_answered_for_its_first_body(piles: list[Pile]) -> None:
-    first, second = piles
-    pairs = [
-        (first.low, first.high),
-        (first.high, first.low),
-        (second.low, second.ground),
-        (first.high, first.ground),
-        (first.low, first.high),
-        (first.low, second.high),
-    ]
-    found = between(reader_of(piles), *pairs)
-    assert np.array_equal(found[0], np.float32(impulse_on(first, first.low, first.high)))
-    assert np.array_equal(found[1], -found[0]) and np.array_equal(found[4], found[0]) and found[0, 2] < 0
-    assert np.array_equal(found[2], np.float32(impulse_on(second, second.low, second.ground)))
-    assert not found[3].any() and not found[5].any()
-
-
 def test_a_query_is_answered_anew_and_not_added_to(piles: list[Pile]) -> None:
     reader = reader_of(piles)
     query, pairs = (
@@ -127,21 +89,6 @@ def test_a_query_is_answered_anew_and_not_added_to(piles: list[Pile]) -> None:
         expected = np.float32(impulse_on(piles[0], piles[0].high))
         assert np.array_equal(query.cuda_impulses.torch()[0].numpy(), expected)
         assert np.array_equal(pairs.cuda_impulses.torch()[0].numpy(), expected)
-
-
-def test_only_contacts_that_a_query_counts_are_read(piles: list[Pile]) -> None:
-    reader, first = reader_of(piles), piles[0]
-    assert reader.counted() == []
-    query = reader.create_pair_query([(first.high, first.low)])
-    assert [set(pair) for pair, _ in reader.counted()] == [{id(first.high), id(first.low)}]
-    of_body = reader.create_body_query([first.ground])
-    assert len(reader.counted()) == 2
-    assert query.rows and of_body.rows
-    del of_body
-    gc.collect()
-    again = reader.create_body_query([first.high])
-    assert len(reader.counted()) == 1, "what a dropped query asked for costs nothing any more"
-    assert again.rows
 
 
 def test_a_new_query_counts_what_was_not_read_before_it(piles: list[Pile]) -> None:
@@ -187,17 +134,3 @@ def test_what_is_carried_stands_for_one_systems_list_until_its_next_step(piles: 
     assert asked()[0] == own[0].tolist() and asked()[2] == [0, 0, 0]
     reader.stepped()
     assert asked()[2] == held
-
-
-def test_a_contact_of_a_body_with_itself_counts_once(piles: list[Pile]) -> None:
-    reader, body = reader_of(piles), piles[0].high
-    reader.carry(0, [((id(body), id(body)), np.float32([1, 2, 3]))])
-    assert net(reader, body).tolist() == [[1, 2, 3]]
-
-
-def test_an_answer_stays_where_the_task_keeps_it(piles: list[Pile]) -> None:
-    reader = reader_of(piles)
-    query = reader.create_body_query([piles[0].high])
-    kept = query.cuda_impulses.torch()
-    reader.answer(query)
-    assert kept is query.cuda_impulses.torch() and bool(kept.any()) and kept.dtype == torch.float32

@@ -17,7 +17,6 @@ from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.pose import Pose
 
-import workbench
 from tests.core.drawn_envs import batched
 from workbench.core.cameras.render import step_pictures, take_pictures
 from workbench.core.cameras.report import join_reports
@@ -145,14 +144,6 @@ def _task(env: Any, obs: Any) -> TaskEnv:
     task = TaskEnv(env)
     task.obs = obs
     return task
-
-
-def test_make_hides_it_too() -> None:
-    env: Any = workbench.make(Hiding, num_envs=N, obs_mode=MODE, render_backend="cpu")
-    env.reset(seed=3)
-    obs = env.step(env.action_space.sample())[0]
-    assert has_cube(env.unwrapped, obs["sensor_data"]["base_camera"]["segmentation"]) == [True, False]
-    env.close()
 
 
 # --- the moments: written, applied, stepped, fetched ---------------------------------------------------

@@ -136,21 +136,6 @@ def test_a_drive_between_two_bodies_still_holds() -> None:
     env.close()
 
 
-def test_pictures_and_segmentation_are_the_same_after_it(renderer: None) -> None:
-    env: Any = batched(PICK_CUBE, 2, render=True, obs_mode="rgb+segmentation")
-    env.reset(seed=[0, 1])
-    env.step(env.action_space.sample())
-    restore_snapshot(env, take_snapshot(env))
-    pictures = {k: v.clone() for k, v in env.get_obs()["sensor_data"]["base_camera"].items()}
-    renew_physics(env.scene, [0, 1])
-    env.scene._gpu_fetch_all()
-    again = env.get_obs()["sensor_data"]["base_camera"]
-    assert len(torch.unique(pictures["segmentation"])) > 3
-    for name, picture in pictures.items():
-        assert torch.equal(again[name], picture), name
-    env.close()
-
-
 class ManyShaders(PICK_CUBE):
     """A minimal and a default camera on one link, and a default one for people, which is made last."""
 

@@ -19,12 +19,10 @@ from hypothesis import strategies as st
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.building import actors
 from mani_skill.utils.structs.pose import Pose
-from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
-import workbench
-from tests.drive.envs import CPU, PICK_CUBE, batched, stock
+from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.env.task_env import TaskEnv
-from workbench.core.snapshots.cpu_state import CpuState, plan_cpu_state, renew_physics
+from workbench.core.snapshots.cpu_state import CpuState
 from workbench.core.snapshots.snapshot import (
     begin_anew,
     in_this_state,
@@ -58,10 +56,6 @@ def after(env: BaseEnv, actions: list[np.ndarray]) -> list[list[bytes]]:
     return states
 
 
-def difference(one: bytes, other: bytes) -> float:
-    return float(np.abs(np.frombuffer(one, np.float32) - np.frombuffer(other, np.float32)).max())
-
-
 @pytest.fixture(scope="module")
 def pick() -> Iterator[BaseEnv]:
     env = batched(PICK_CUBE, N)
@@ -76,14 +70,14 @@ def stack() -> Iterator[BaseEnv]:
     env.close()
 
 
-PROPERTY = settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+PROPERTY = settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @PROPERTY
 @given(
     seed=st.integers(0, 10_000),
     before=st.integers(0, 8),
-    steps=st.integers(1, 10),
+    steps=st.integers(1, 5),
     chosen=st.sets(st.integers(0, N - 1), min_size=1),
 )
 def test_a_restored_episode_goes_the_same_way_every_time(
@@ -105,39 +99,6 @@ def test_a_restored_episode_goes_the_same_way_every_time(
     first, second = again(), again()
     for env in subset:
         assert [s[env] for s in first] == [s[env] for s in second]
-
-
-def in_the_fifth_step(stack: BaseEnv, seed: int) -> None:
-    """In PhysX scenes that have met nothing but these steps: what other tests touched is in the last bits too."""
-    renew_physics(stack.scene, list(range(N)))
-    stack.reset(seed=list(range(seed, seed + N)))
-    after(stack, random_actions(stack, 5, seed))
-
-
-def uninterrupted_and_renewed(stack: BaseEnv, seed: int, renewed: bool) -> list[list[bytes]]:
-    in_the_fifth_step(stack, seed)
-    if renewed:
-        renew_physics(stack.scene, list(range(N)))
-        stack.scene._gpu_fetch_all()
-    return after(stack, random_actions(stack, 1, seed + 1))
-
-
-# 218: a finger that is pressed into the table has struck a cube, whose spin then differs by 0.95 rad/s.
-@pytest.mark.parametrize("seed", [0, 218])
-def test_a_restore_differs_from_the_uninterrupted_run_only_by_what_physx_forgets(
-    stack: BaseEnv, seed: int
-) -> None:
-    live = uninterrupted_and_renewed(stack, seed, renewed=False)
-    assert uninterrupted_and_renewed(stack, seed, renewed=False) == live, "the run itself is not repeatable"
-    forgotten = uninterrupted_and_renewed(stack, seed, renewed=True)
-    in_the_fifth_step(stack, seed)
-    restore_snapshot(stack, take_snapshot(stack))
-    restored = after(stack, random_actions(stack, 1, seed + 1))
-    # The same bodies in a PhysX scene without a past, nothing written: that alone makes the difference.
-    for env in range(N):
-        from_live, by_forgetting = (difference(live[0][env], run[0][env]) for run in (restored, forgotten))
-        assert difference(restored[0][env], forgotten[0][env]) < 1e-4, env
-        assert from_live <= by_forgetting + 1e-4, env
 
 
 # The seed of the test above: without a new beginning the uninterrupted run goes another way.
@@ -219,17 +180,6 @@ def test_a_state_goes_the_same_way_in_whichever_env_it_is_put(
         assert [s[target] for s in result] == [s[source] for s in reference]
 
 
-def test_one_env_into_all(pick: BaseEnv) -> None:
-    pick.reset(seed=list(range(N)))
-    after(pick, random_actions(pick, 5, 0))
-    snapshot = take_snapshot(pick, [3])
-    restore_snapshot(pick, snapshot, range(N))
-    assert len(set(packs(pick))) == 1
-    states = pick.get_state()
-    assert torch.equal(states, states[:1].expand(N, -1))
-    assert len(set(packs(pick))) == 1
-
-
 def test_other_envs_are_not_touched(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 5, 0))
@@ -287,35 +237,14 @@ def test_what_was_evaluated_is_evaluated_again(pick: BaseEnv) -> None:
     for name, value in held.evaluate.items():
         assert np.array_equal(restored.evaluate[name], value), name
     assert torch.equal(pressed(), impulses)
+    restore_snapshot(pick, snapshot, [1, 2], source=[4, 0])
+    assert torch.equal(pressed(), impulses[[0, 4, 0, 3, 4, 5]])
+    env.restore(snapshot)
     np.testing.assert_allclose(restored.poses, held.poses, atol=1e-6)
     assert restored.elapsed_steps.tolist() == held.elapsed_steps.tolist()
     assert not restored.reward.any() and restored.action is None
     later = env.step(close)
     assert later.elapsed_steps.tolist() == [5] * N
-
-
-def test_a_restored_step_observes_the_restored_moment(pick: BaseEnv) -> None:
-    env = TaskEnv(pick, 50)
-    env.reset(seed=0)
-    env.step(random_actions(pick, 1, 0)[0])
-    seen, snapshot = env.obs.clone(), env.snapshot()
-    env.step(random_actions(pick, 1, 1)[0])
-    env.restore(snapshot)
-    torch.testing.assert_close(env.obs, seen, atol=1e-6, rtol=0)
-
-
-def test_a_snapshot_can_be_pickled_and_does_not_change_with_its_env(pick: BaseEnv) -> None:
-    pick.reset(seed=list(range(N)))
-    after(pick, random_actions(pick, 3, 0))
-    snapshot = take_snapshot(pick)
-    restore_snapshot(pick, snapshot)
-    actions = random_actions(pick, 4, 1)
-    reference = after(pick, actions)
-    copy = pickle.loads(pickle.dumps(snapshot))
-    assert not restore_snapshot(pick, copy).not_carried
-    assert after(pick, actions) == reference
-    restore_snapshot(pick, snapshot)
-    assert after(pick, actions) == reference
 
 
 def test_a_target_that_a_controller_goes_after_is_restored() -> None:
@@ -351,20 +280,6 @@ def test_the_next_unseeded_reset_draws_the_same_again(pick: BaseEnv) -> None:
     assert np.array_equal(first[1], second[1]) and np.array_equal(first[2], second[2])
 
 
-def test_a_part_of_the_batch_leaves_the_processs_generators_alone(pick: BaseEnv) -> None:
-    pick.reset(seed=list(range(N)))
-    snapshot = take_snapshot(pick)
-    state = torch.get_rng_state(), np.random.get_state()[1].copy()
-    torch.rand(3)
-    np.random.rand(3)
-    moved = torch.get_rng_state()
-    restore_snapshot(pick, snapshot, [2])
-    assert torch.equal(torch.get_rng_state(), moved)
-    restore_snapshot(pick, snapshot)
-    assert torch.equal(torch.get_rng_state(), state[0])
-    assert np.array_equal(np.random.get_state()[1], state[1])
-
-
 @pytest.mark.parametrize(
     ("taken", "into", "source", "whole"),
     [
@@ -386,20 +301,6 @@ def test_the_processs_generators_go_back_when_every_env_does_in_whichever_order(
     moved = drawn_next(set_it_on=True)
     restore_snapshot(pick, snapshot, into, source)
     assert drawn_next() == (then if whole else moved)
-
-
-def test_the_processs_generators_stay_where_they_are_for_a_snapshot_of_another_number_of_envs(
-    pick: BaseEnv,
-) -> None:
-    larger = batched("PickCube-v1", N + 1)
-    larger.reset(seed=0)
-    snapshot = take_snapshot(larger, range(N))
-    moved = drawn_next(set_it_on=True)
-    restore_snapshot(pick, snapshot)
-    assert drawn_next() == moved
-    restore_snapshot(larger, take_snapshot(pick), range(N))
-    assert drawn_next() == moved
-    larger.close()
 
 
 def drawn_next(set_it_on: bool = False) -> tuple[float, ...]:
@@ -456,6 +357,9 @@ def test_joint_forces_are_restored() -> None:
     restore_snapshot(env, snapshot, [1])
     forces = [articulation.qf.tolist() for articulation in robot._objs]
     assert forces == [[0.0] * robot.max_dof, [2.0] * robot.max_dof]
+    for _ in range(2):  # also where they have not changed since, in a PhysX scene that has none
+        restore_snapshot(env, snapshot)
+        assert [articulation.qf.tolist() for articulation in robot._objs] == [[2.0] * robot.max_dof] * 2
     env.close()
 
 
@@ -467,29 +371,6 @@ def test_what_slept_sleeps(pick: BaseEnv) -> None:
     cubes[2].wake_up()
     restore_snapshot(pick, snapshot)
     assert [cube.is_sleeping for cube in cubes] == [i == 2 for i in range(N)]
-
-
-@pytest.mark.parametrize("env_id", ["PickCube-v1", "StackCube-v1"])
-def test_whatever_physx_lets_sleep_is_said_to_sleep(env_id: str) -> None:
-    """Also with a velocity: neither a cube nor an arm that falls asleep need have lost all of it."""
-    env = batched(env_id, 3)
-    env.reset(seed=0)
-    plan = plan_cpu_state(env)
-    bodies = [component for sleepers in plan.sleepers for _, _, component in sleepers]
-    slept = 0
-    for step in range(60):
-        env.step(env.action_space.sample() if step < 20 else np.zeros(env.action_space.shape, np.float32))
-        if step % 7 == 3:
-            bodies[step % len(bodies)].put_to_sleep()
-            env.scene.px.note_change()
-        state = take_snapshot(env).simulation
-        assert isinstance(state, CpuState)
-        for said, sleepers in zip(state.asleep, plan.sleepers, strict=True):
-            truth = {part: asleep() for part, asleep, _ in sleepers}
-            assert {part: said[part] for part in truth} == truth
-            slept += sum(truth.values())
-    assert slept
-    env.close()
 
 
 def test_a_hidden_object_keeps_its_true_pose(pick: BaseEnv) -> None:
@@ -554,43 +435,6 @@ def test_an_edited_task_gets_what_still_fits_by_name_and_says_what_does_not(pick
     edited.close()
 
 
-def test_an_articulation_with_other_joints_is_left_as_it_is(pick: BaseEnv) -> None:
-    pick.reset(seed=list(range(N)))
-    snapshot = take_snapshot(pick)
-    other = batched("PickCube-v1", 2, robot_uids="fetch")
-    other.reset(seed=[0, 1])
-    qpos = other.agent.robot.get_qpos().clone()
-    report = restore_snapshot(other, snapshot, [0, 1])
-    assert "articulation fetch" in report.not_carried and "articulation panda" in report.not_carried
-    assert torch.equal(other.agent.robot.get_qpos(), qpos)
-    assert "actor cube" in report.carried
-    other.close()
-
-
-@pytest.mark.parametrize(
-    ("env_idx", "source", "error"),
-    [
-        ([], None, ValueError),
-        ([N], 0, IndexError),
-        ([0, 0], None, ValueError),
-        ([0, 1], [1], ValueError),
-        ([0], 5, IndexError),
-        (None, 1, ValueError),
-    ],
-)
-def test_wrong_envs_are_refused(pick: BaseEnv, env_idx: Any, source: Any, error: type[Exception]) -> None:
-    snapshot = take_snapshot(pick, [0, 1, 2])
-    with pytest.raises(error):
-        restore_snapshot(pick, snapshot, env_idx, source)
-
-
-def test_a_stock_env_is_refused_in_words() -> None:
-    single = stock("PickCube-v1")
-    with pytest.raises(NotImplementedError, match="workbench.make"):
-        take_snapshot(single)
-    single.close()
-
-
 @pytest.mark.parametrize(
     ("env_idx", "source", "error", "words"),
     [
@@ -617,31 +461,6 @@ def test_what_is_no_list_of_envs_is_refused(
     assert packs(pick) == before
 
 
-def test_one_env_may_be_named_by_its_number(pick: BaseEnv) -> None:
-    pick.reset(seed=list(range(N)))
-    restore_snapshot(pick, take_snapshot(pick, 3), 5)
-    assert packs(pick)[5] == packs(pick)[3]
-
-
-def test_wrappers_are_looked_through_and_what_is_no_env_is_refused(pick: BaseEnv) -> None:
-    wrapped = workbench.make("PickCube-v1", 2, **CPU)
-    vector = ManiSkillVectorEnv(wrapped)
-    vector.reset(seed=0)
-    assert not restore_snapshot(vector, take_snapshot(wrapped)).not_carried
-    for taken in (None, [0, 2]):
-        with pytest.raises(
-            IndexError, match="the snapshot is of envs .* and this env has 2: name with env_idx"
-        ):
-            restore_snapshot(wrapped, take_snapshot(pick, taken))
-    vector.close()
-    with pytest.raises(RuntimeError, match="this env is closed"):
-        take_snapshot(wrapped)
-    with pytest.raises(TypeError, match="expected a ManiSkill env, not dict"):
-        take_snapshot({})
-    with pytest.raises(TypeError, match="expected a Snapshot"):
-        restore_snapshot(pick, {})
-
-
 def test_a_state_in_gpu_simulation_is_read_and_written_by_the_tensors(pick: BaseEnv) -> None:
     """Here those of the CPU core, which are the same; what PhysX keeps beside them is not in it."""
     pick.reset(seed=list(range(N)))
@@ -660,17 +479,3 @@ def test_a_state_in_gpu_simulation_is_read_and_written_by_the_tensors(pick: Base
         for env, source, was in [(3, 1, before), (0, 3, before), (1, 1, now), (2, 2, now)]:
             np.testing.assert_allclose(rows[env], was.states[name][source], rtol=0, atol=1e-6)
     assert torch.equal(pick.scene.px.cuda_articulation_target_qpos.torch()[[3, 0]], targets[[1, 3]])
-
-
-def test_what_a_gpu_state_has_not_is_left_and_told(pick: BaseEnv) -> None:
-    pick.reset(seed=list(range(N)))
-    kept = read_gpu_state(pick, [0])
-    panda, cube = kept.states.pop("articulations/panda"), kept.states.pop("actors/cube")
-    kept.states.update(
-        {"articulations/panda": panda[:, :-1], "actors/box": cube, "actors/goal_site": cube + np.nan}
-    )
-    carried, missed = write_gpu_state(pick, [2], kept, [0])
-    assert carried == {"actor table-workspace": None}
-    left = "the snapshot has none of this name and shape; left unchanged"
-    there = ("actor cube", "actor goal_site", "articulation panda")
-    assert missed == {"actor box": "this env has none of this name", **dict.fromkeys(there, left)}

@@ -4,10 +4,7 @@
 
 from __future__ import annotations
 
-import ast
 import collections
-import inspect
-import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -16,13 +13,11 @@ import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
 import torch
-from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PUSH_CUBE, batched
 from workbench.core.env.task_env import TaskEnv
 from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
-from workbench.core.snapshots.task_attributes import base_env_members
 
 N = 4
 
@@ -196,13 +191,6 @@ def test_a_tensor_that_somebody_else_holds_is_not_written_to(env: Any) -> None:
     assert env.best_distance.tolist() == [1.0, 9.0, 9.0, 9.0]
 
 
-def test_a_view_of_the_simulations_tensors_stays_one(env: Any) -> None:
-    env.raw = env.scene.px.cuda_rigid_body_data.torch()
-    restore_snapshot(env, take_snapshot(env))
-    assert env.raw.data_ptr() == env.scene.px.cuda_rigid_body_data.torch().data_ptr()
-    del env.raw
-
-
 def test_evaluating_the_restored_moment_does_not_count_in_any_env(env: Any) -> None:
     task = TaskEnv(env, 50)
     task.reset(seed=0)
@@ -250,53 +238,3 @@ def test_an_edited_task_keeps_its_constants_and_gets_the_buffers_that_fit(env: A
     assert report.not_carried["notes.visits"] == "the task has none of this name now"
     assert report.not_carried["velocity_bonus"].startswith("it is not in the snapshot")
     edited.close()
-
-
-def test_the_shape_that_a_buffer_had_is_told(env: Any) -> None:
-    env.write(1.0)
-    snapshot, phases, best = take_snapshot(env), env.phases["steps"], env.best_distance
-    phases["count"], env.best_distance = torch.zeros(N, 3), torch.zeros(N, 1)
-    report = restore_snapshot(env, snapshot, [0])
-    phases["count"], env.best_distance = torch.zeros(N, 2), best
-    assert (
-        report.not_carried["phases['steps']['count']"]
-        == "it had shape (N, 2) and has another shape or type now"
-    )
-    assert report.not_carried["best_distance"] == "it had shape (N) and has another shape or type now"
-
-
-class Lazy(PUSH_CUBE):
-    """What is not written yet is the class's."""
-
-    best: Any = None
-    count: Any = 0
-
-
-def test_what_is_not_set_yet_but_by_its_class_is_set_when_all_envs_go_back() -> None:
-    env: Any = batched(Lazy, N)
-    env.reset(seed=[0, 1, 2, 3])
-    env.best, env.count = torch.arange(float(N)), 3
-    snapshot = take_snapshot(env)
-    del env.best, env.count
-    report = restore_snapshot(env, snapshot, [1, 2])
-    assert env.best is None and env.count == 0
-    assert report.not_carried["best"] == report.not_carried["count"] == "the task has none of this name now"
-    report = restore_snapshot(env, snapshot)
-    assert env.best.tolist() == [0, 1, 2, 3] and env.count == 3 and {"best", "count"} <= set(report.carried)
-    env.close()
-
-
-def test_base_envs_own_members_are_known() -> None:
-    assert {"_elapsed_steps", "_last_obs", "scene", "_batched_episode_rng", "num_envs"} <= base_env_members()
-    assert "agent" not in base_env_members()
-    assert base_env_members() > assigned_in_the_source() - {"agent"}
-
-
-def assigned_in_the_source() -> set[str]:
-    tree = ast.parse(textwrap.dedent(inspect.getsource(BaseEnv)))
-    targets = (node for node in ast.walk(tree) if isinstance(node, ast.Attribute))
-    return {
-        node.attr
-        for node in targets
-        if isinstance(node.ctx, ast.Store) and isinstance(node.value, ast.Name) and node.value.id == "self"
-    }

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from tests.ui.scenes import box_mesh, table_scene, visual
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.ui.scene.env_grid import (
-    MARGIN,
     env_under_ray,
     grid_offsets,
     lay_out,
@@ -109,11 +108,24 @@ def test_click_takes_the_nearer_of_two_envs_in_a_row() -> None:
     assert env_under_ray(layout, front, np.array([-1.0, 0.0, 0.0])) == 0
 
 
-@pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0]])
-def test_click_past_everything_or_with_broken_numbers_finds_none(direction: list[float]) -> None:
+@pytest.mark.parametrize(
+    "direction",
+    [
+        [0.0, 0.0, 1.0],
+        [1.0, 0.0, 0.0],
+        [0.0, 1.0, -0.1],
+        [np.nan, 0.0, -1.0],
+        [0.0, np.nan, np.nan],
+        [np.inf, 0.0, -1.0],
+    ],
+)
+def test_a_click_that_looks_away_past_or_nowhere_finds_none(direction: list[float]) -> None:
+    """From above an env, which is met downwards: the others are behind, beside or no direction."""
     geometry, poses = table_scene(4)
     layout = lay_out(geometry, poses)
-    assert env_under_ray(layout, np.array([0.0, MARGIN, 5.0]), np.array(direction)) is None
+    above = layout.offsets[2] + [0.1, 0.1, 5.0]
+    assert env_under_ray(layout, above, np.array([0.0, 0.0, -1.0])) == 2
+    assert env_under_ray(layout, above, np.array(direction)) is None
 
 
 def test_the_box_of_a_body_is_turned_with_it_by_the_right_hand_rule() -> None:

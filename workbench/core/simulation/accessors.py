@@ -519,6 +519,8 @@ def _guarded(stock: Any, called: str, instead: str) -> Callable[..., Any]:
         if not _may_write(system, env, self, called, instead) or system.held_back:
             return None
         system.note_direct_write(env)
+        if _entity(self).find_component_by_type(physx.PhysxRigidStaticComponent) is not None:
+            system.static_moves += 1
         return stock(self, *args, **kwargs)
 
     call.__doc__, call.__wrapped__ = stock.__doc__, stock  # type: ignore[attr-defined]
