@@ -7,6 +7,7 @@ not its tests.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import viser
@@ -86,18 +87,28 @@ class Live(Panels):
         super().__init__(server)
         viser_private.read_icons_once()
         self.clock, self.session = clock or Clock(), HandedSession()
+        self._envs = self._scenes = 0
+        self.asked_by_drawing: list[tuple[Any, ...]] = []
+        """Of the session, by the last drawing."""
         self.page = Page(server, self.session, on_look=on_look, clock=self.clock)  # type: ignore[arg-type]
 
     @property
     def asked(self) -> list[tuple[Any, ...]]:
+        """Of the session, by what was pressed."""
         return self.session.asked
 
     def show(self, view: SessionView, rows: EnvRows | None = None, seconds: float = 60.0) -> None:
         """Draw this view, so many seconds after the one before."""
+        if view.task is not None and view.task.num_envs != self._envs:
+            self._envs, self._scenes = view.task.num_envs, self._scenes + 1
+        view = replace(view, scene_serial=view.scene_serial + self._scenes)
         self.session.shown, self.session.rows = view, rows
         self.clock.passes(seconds)
+        pressed, self.session.asked = self.session.asked, []
         self.page.redraw()
+        self.asked_by_drawing, self.session.asked = self.session.asked, pressed
 
     def again(self, seconds: float = 60.0) -> None:
         """Draw what was shown, with what was pressed since."""
-        self.show(self.session.shown, self.session.rows, seconds)
+        shown = self.session.shown
+        self.show(replace(shown, scene_serial=shown.scene_serial - self._scenes), self.session.rows, seconds)

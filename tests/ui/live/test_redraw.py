@@ -81,7 +81,9 @@ def base() -> SessionView:
     """Everything has something to show; it is paused, so that each view is drawn."""
     view = running(ENVS, playing=False, state="paused", steps_per_second=0.0)
     assert view.task is not None
-    task = replace(view.task, cameras=(CAMERA,), made=HowMade("panda", MODES), joints=("hinge",), notices=("note one",))
+    task = replace(
+        view.task, cameras=(CAMERA,), made=HowMade("panda", MODES), joints=("hinge",), notices=("note one",)
+    )
     load = PastLoad(1e9, None, "the first version", 900.0)
     return replace(
         view,
@@ -239,7 +241,11 @@ def test_a_page_that_has_shown_much_shows_what_a_new_one_shows(live: Live) -> No
     for change in CHANGES.values():
         live.show(replace(view, **change(view)), rows())
     new = made()
-    for last in (view, replace(view, **CHANGES["another env"](view)), replace(view, **CHANGES["the past"](view))):
+    for last in (
+        view,
+        replace(view, **CHANGES["another env"](view)),
+        replace(view, **CHANGES["the past"](view)),
+    ):
         for page in (live, new):
             page.show(last, rows())
             page.again()

@@ -76,14 +76,6 @@ def test_loopback_is_localhost_and_its_addresses(host: str, loopback: bool) -> N
     assert host_is_ours(GATE, host) is loopback
 
 
-def test_a_gate_takes_no_address_and_no_name_that_it_was_not_given() -> None:
-    for host in ("192.168.1.5", "box", "evil.example"):
-        assert not host_is_ours(GATE, host)
-        assert host_is_ours(AccessRules(TOKEN, names=frozenset({host})), host)
-    assert host_is_ours(AccessRules(TOKEN, any_address=True), "192.168.1.5")
-    assert not host_is_ours(AccessRules(TOKEN, any_address=True), "box")
-
-
 def test_the_host_is_quoted_as_it_was_sent() -> None:
     for websocket in (False, True):
         for rules in (GATE, AccessRules(None)):
@@ -240,18 +232,3 @@ def test_where_no_token_is_asked_for_one_in_the_address_is_a_word_like_others() 
 @pytest.mark.parametrize("cookie", ["workbench-token-8080", f"workbench-token-8080=\udc80{TOKEN}"])
 def test_a_cookie_without_a_value_or_with_bytes_that_are_no_text_is_another_token(cookie: str) -> None:
     assert why(decide(GATE, replace(KNOWN, cookie=[cookie]))) is Why.OTHER_TOKEN
-
-
-def test_each_refusal_is_a_sentence_without_the_requests_words() -> None:
-    evil = "evil.example"
-    asked = [
-        replace(KNOWN, host=[evil]),
-        replace(KNOWN, origin=[f"http://{evil}"]),
-        replace(KNOWN, fetch_site=[evil]),
-        replace(KNOWN, path=f"/?token={evil}"),
-        replace(KNOWN, cookie=[f"other={evil}"]),
-    ]
-    reasons = [decision.reason for one in asked if isinstance(decision := decide(GATE, one), RefusedRequest)]
-    assert len(set(reasons)) == len(asked)
-    for reason in reasons:
-        assert evil not in reason and reason[0].isupper() and reason.endswith(".")
