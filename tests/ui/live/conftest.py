@@ -14,3 +14,9 @@ def open_live() -> Iterator[Live]:
     live = Live(viser.ViserServer(host="127.0.0.1", port=0, verbose=False))
     yield live
     live.server.stop()
+
+
+@pytest.fixture
+def live_page(server: viser.ViserServer) -> Live:
+    """A live page of a test's own, for what keeps how it was arranged."""
+    return Live(server)
