@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,14 +12,9 @@ from workbench.ui.live.timeline import LINE_HEIGHT as HEIGHT
 from workbench.ui.live.timeline import (
     MOST_MARKS,
     POINTS,
-    megabytes,
-    polylines,
     reward_lines,
-    step_in_words,
     strip_html,
-    where,
 )
-from workbench.ui.widgets.templates import render
 
 
 def strip(**changes: object) -> Strip:
@@ -135,20 +129,6 @@ def test_where_there_is_no_reward_is_a_gap_and_without_a_change_a_straight_line(
     assert "nan" not in html and html.count("<polyline") > 1
 
 
-def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
-    view = running(2, timeline=TimelineView(100, 200, not_carried=("actor <b>peg</b>: gone",)))
-    not_carried = "; ".join(view.timeline.not_carried)
-    for arrived in ("", "<i>Push</i>, step 3: its actions were replayed."):
-        html = render("timeline_hint", live=True, not_carried=not_carried, arrived=arrived)
-        assert "not restored: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
-        assert ("&lt;i&gt;Push&lt;/i&gt;, step 3" in html) == bool(arrived) and "<i>" not in html
-
-
-def test_fail_is_drawn_before_success() -> None:
-    html = strip_html(strip(events=((150, FAIL | SUCCESS),)), running(4, timeline=past()))
-    assert [style for _, style, _ in marks(html)] == ["fail"]
-
-
 def test_of_very_many_events_each_part_of_the_strip_shows_the_worst() -> None:
     ends = ((tick, (FAIL if tick % 1000 == 0 else TRUNCATED) | RESET) for tick in range(0, 100_000, 50))
     html = strip_html(
@@ -159,24 +139,3 @@ def test_of_very_many_events_each_part_of_the_strip_shows_the_worst() -> None:
     assert sum(style == "fail" for _, style, _ in drawn) == 100
     both = strip_html(strip(events=((190, REWARD_NONFINITE | RESET),)), running(4, timeline=past()))
     assert marks(both) == [(90.0, "odd", "reward is NaN or infinite, 10 steps ago")]
-
-
-def test_where_one_is_is_said_as_far_as_it_is_known() -> None:
-    view = running(2, selected_env=1)
-    assert view.task is not None
-    assert where(view) == "env 1: step 7 / 50, 0.35 s" and step_in_words(view) == "env 1: step 7 / 50"
-    assert step_in_words(replace(view, task=replace(view.task, max_episode_steps=None))) == "env 1: step 7"
-    assert step_in_words(running(1)) == "step 7 / 50"
-    for unknown in (replace(view, task=None), replace(view, step=None), running(2, selected_env=2)):
-        assert step_in_words(unknown) == where(unknown) == ""
-
-
-def test_sizes_have_a_digit_more_below_ten() -> None:
-    sizes = (0, 0.05, 9.94, 10, 255.6)
-    assert [megabytes(round(size * 1024**2)) for size in sizes] == ["0.0", "0.1", "9.9", "10", "256"]
-
-
-def test_a_point_alone_is_a_dot() -> None:
-    points = ["1,1", None, "2,2", "3,3", None, None, "4,4"]
-    assert polylines(points) == ["1,1 1,1", "2,2 3,3", "4,4 4,4"]
-    assert polylines([None, None]) == [] == polylines([])
