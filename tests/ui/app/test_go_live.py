@@ -17,9 +17,8 @@ from workbench.jobs.task import TaskOptions
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import LoadFailed
-from workbench.ui.app.go_live import ONE, GoLive, GoLivePart
+from workbench.ui.app.go_live import GoLive, GoLivePart
 from workbench.ui.app.workplace import Workplace
-from workbench.ui.review.rescore import RECORDED, TODAYS
 from workbench.ui.server.gated_server import GatedServer
 
 
@@ -139,9 +138,3 @@ def test_a_review_that_is_shown_anew_waits_for_nothing_that_is_under_way(desk: D
     assert desk.go_live.going()
     GoLivePart(desk.place.server, desk.go_live)
     assert desk.go_live.going() == ""
-
-
-def test_the_code_and_the_envs_are_chosen(desk: Desk) -> None:
-    assert (desk.part._code.options, desk.part._envs.value) == ((TODAYS, RECORDED), ONE)
-    desk.part._code.value = RECORDED
-    assert desk.go_live.recorded_source and not desk.go_live.everywhere

@@ -89,13 +89,6 @@ def shown(
 SLIDER = "step of the timeline"
 
 
-def test_says_what_to_do_while_nothing_is_open(shown: Shown) -> None:
-    shown.draw()
-    assert "Choose one in the library" in shown.panels.part("Review").html()
-    assert not shown.panels.part("Timeline").seen and not shown.panels.shows("Play")
-    assert not shown.panels.is_folded("Library") and "nothing open" in shown.panels.html("wb-status")
-
-
 def test_the_results_of_a_sweep_have_a_tab_also_if_they_come_later(
     child_process: None, gated_server: GatedServer, panels: Panels, clock: Clock, tmp_path: Path
 ) -> None:
@@ -189,16 +182,6 @@ def test_what_could_not_be_read_is_tried_again_with_a_press(shown: Shown, folder
     shown.library.refresh()
 
 
-def test_who_was_led_to_a_recording_begins_in_the_tab_where_it_is_watched(
-    child_process: None, folder: Path, gated_server: GatedServer, panels: Panels
-) -> None:
-    place = Workplace(gated_server, folder, no_session, TaskOptions())
-    place.wanted = folder / "push.rrd"
-    ReviewPage(place)
-    assert "data-anew" in panels.html()
-    place.close()
-
-
 def strip_of(shown: Shown) -> dict[str, list[tuple[str, ...]]]:
     """What the strip draws: extents of recordings, marks, and upright lines, with their places in per cent."""
     html = shown.panels.html("wb-timeline")
@@ -273,57 +256,6 @@ def test_the_timeline_has_its_buttons_and_is_not_drawn_again_where_nothing_moved
     shown.review.toggle_play()
 
 
-def test_what_is_known_of_a_recording_is_told_and_what_is_not_is_left_out(shown: Shown, folder: Path) -> None:
-    long = "x" * 200
-    known = made(
-        2,
-        seed=31,
-        reset_options={"at": "left side"},
-        versions={"sapien": "3.0", "numpy": "2"},
-        env_kwargs={"control_mode": "pd_joint_delta_pos", "note": long},
-        side_files={"mesh.obj": "1" * 12},
-        acted_by=((0, "random"), (1, "sliders")),
-        recovered=True,
-    )
-    write(folder, known, pictures=False)
-    write(folder, made(2, seed=-1, control_mode=None), pictures=False)
-    shown.library.refresh()
-    shown.open(31)
-
-    def facts() -> dict[str, tuple[str, str]]:
-        html = shown.panels.part("Review").html("wb-facts")
-        found = re.findall(r'<tr><td>([^<]*)</td><td title="([^"]*)">([^<]*)</td></tr>', html)
-        return {name: (value, hint) for name, hint, value in found}
-
-    said = facts()
-    assert said["file"][0] == said["file"][1] and said["file"][0].startswith("Push")
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", said["recorded"][0])
-    assert said["recorded"][1] == known.info.written_at
-    assert said["seed"] == ("31", "of the episode")
-    assert said["reset options"] == ("at=&#39;left side&#39;",) * 2
-    assert said["source"][1] == "push.py" and said["source"][0]
-    assert said["not stored"] == (
-        "mesh.obj",
-        "Other files that the task reads, as its code names them: mesh.obj",
-    )
-    assert said["ran on"] == ("cpu (batched)", "sapien 3.0, numpy 2")
-    assert said["actions"] == ("random; from step 2 on: sliders",) * 2
-    assert said["control mode"] == ("pd_joint_delta_pos", "")
-    assert said["made with"] == (f"note={long[:114]}…", f"note={long}")
-    assert said["cut short"] == ("the program that recorded it ended early", "")
-    shown.open(-1)
-    assert list(facts()) == ["file", "recorded", "source", "ran on"]
-
-
-def test_a_scene_is_framed_as_it_was_drawn_while_another_recording_comes(shown: Shown) -> None:
-    shown.open(1)
-    shown.review.open(tuple(row.id for row in shown.library.view().rows if row.seed in (1, 2)))
-    until(lambda: len(shown.review.view().opened) == 2, "the other recording")
-    shown.panels.command("Frame the scene")
-    shown.draw()
-    shown.panels.command("Frame the scene")
-
-
 def test_pressing_a_row_of_the_comparison_goes_there(shown: Shown) -> None:
     shown.open(1, 2)
     assert re.search(r'data-press="[^"]+"', shown.panels.part("Compare").html())
@@ -368,17 +300,6 @@ def test_what_is_not_per_env_is_shown_marked_and_drawn(shown: Shown, folder: Pat
     shown.open(11, 12)
     words = "Not compared, because they are not per env: progress: all, goal, phase."
     assert words in shown.panels.part("Compare").html()
-
-
-def test_many_recordings_stand_side_by_side(shown: Shown, folder: Path) -> None:
-    for seed in range(20, 26):
-        write(folder, made(3, seed=seed), pictures=False)
-    shown.library.refresh()
-    shown.open(*range(20, 26))
-    assert not shown.panels.shows("Layout")
-    (cubes,) = shown.panels.bodies("cube")
-    assert len(cubes.batched_positions) == 6
-    assert sorted(shown.panels.labels()) == ["A, seed 20", "B", "C", "D", "E", "F"]
 
 
 def test_of_too_many_recordings_only_the_selected_one_is_named(shown: Shown, folder: Path) -> None:

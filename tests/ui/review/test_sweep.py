@@ -20,7 +20,7 @@ from tests.recording.sweep_files import sweep_folder
 from workbench.recording.library.library import Library
 from workbench.recording.sweeps import RESULTS, SweepEpisode, SweepResults, write_results
 from workbench.session.review.view import Opened, ReviewView
-from workbench.ui.review.sweep import SweepPanel, axes_of, best_first
+from workbench.ui.review.sweep import SweepPanel, best_first
 
 
 class Tab:
@@ -184,27 +184,6 @@ def test_a_link_to_results_elsewhere_is_not_followed(
     tab = Tab(server, folder, clock)
     assert tab.points() == [] and "denied" in tab.panels.html("wb-note").lower()
     tab.library.close()
-
-
-def test_axes_are_in_order_and_within_the_plot(folder: Path) -> None:
-    results = sweep_folder(folder)
-    axes = axes_of(results, results.summaries())
-    names = ["reach_weight", "robot_uids", "success", "return", "reach", "push"]
-    assert [axis.name for axis in axes] == names
-    weights = [label for label, _, _ in sorted(axes[0].ticks, key=lambda tick: -tick[1])]
-    assert weights == ["0.5", "1", "2"]
-    heights = [y for axis in axes for y in axis.heights if y is not None]
-    assert min(heights) >= 34 and max(heights) <= 196
-
-
-def test_a_term_that_is_called_success_is_a_number_and_no_rate(folder: Path) -> None:
-    results = sweep_folder(folder)
-    named = tuple(replace(row, means={"reward_terms/success": 2.0 * row.point}) for row in results.episodes)
-    results = replace(results, episodes=named)
-    *_, rate, _, term = axes_of(results, results.summaries())
-    assert rate.name == term.name == "success"
-    assert [label for label, _, _ in rate.ticks] == ["0 %", "100 %"]
-    assert [label for label, _, _ in term.ticks] == ["0", "14"]
 
 
 def test_the_earlier_success_is_better_then_the_higher_return() -> None:

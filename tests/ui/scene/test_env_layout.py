@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from tests.ui.scenes import box_mesh, table_scene, visual
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.ui.scene.env_grid import (
-    MARGIN,
     env_under_ray,
     grid_offsets,
     lay_out,
@@ -38,23 +37,6 @@ def test_no_two_envs_of_a_grid_touch(num_envs: int, depth: float, width: float) 
     apart = np.abs(offsets[:, None] - offsets[None])
     clear = (apart[..., 0] > depth * 0.999) | (apart[..., 1] > width * 0.999)
     assert clear[~np.eye(num_envs, dtype=bool)].all()
-
-
-def test_grid_lies_round_the_origin_and_begins_in_front() -> None:
-    offsets = grid_offsets(16, np.array([1.5, 2.7]))
-    np.testing.assert_allclose(offsets.mean(axis=0), 0, atol=1e-5)
-    assert offsets[0, 0] == offsets[:, 0].max()
-
-
-def test_one_env_stands_at_the_origin() -> None:
-    np.testing.assert_array_equal(grid_offsets(1, np.array([2.0, 2.0])), [[0, 0, 0]])
-
-
-def test_body_that_an_env_lacks_does_not_count_for_its_box() -> None:
-    geometry, poses = table_scene(3)
-    poses[1, 2] = np.nan
-    layout = lay_out(geometry, poses)
-    assert np.isfinite(layout.low).all() and np.isfinite(layout.high).all()
 
 
 def test_scene_without_bodies_has_a_layout_too() -> None:
@@ -107,13 +89,6 @@ def test_click_takes_the_nearer_of_two_envs_in_a_row() -> None:
     layout = lay_out(geometry, poses)
     front = layout.offsets[0] + [10.0, 0.0, 0.0]
     assert env_under_ray(layout, front, np.array([-1.0, 0.0, 0.0])) == 0
-
-
-@pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0]])
-def test_click_past_everything_or_with_broken_numbers_finds_none(direction: list[float]) -> None:
-    geometry, poses = table_scene(4)
-    layout = lay_out(geometry, poses)
-    assert env_under_ray(layout, np.array([0.0, MARGIN, 5.0]), np.array(direction)) is None
 
 
 def test_the_box_of_a_body_is_turned_with_it_by_the_right_hand_rule() -> None:

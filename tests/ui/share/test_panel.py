@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import viser
 
 from tests.drive.panels import Panels
 from workbench.recording.episode.row import Source
@@ -123,18 +122,6 @@ def test_names_are_shown_without_their_time_and_the_scope_stays_as_chosen(
     assert panel.takes_opened(True)
 
 
-def test_a_value_that_no_page_of_ours_sends_makes_nothing(
-    panel: SharePanel, panels: Panels, making: Noted
-) -> None:
-    panel.draw(Chosen((RECORDING,), ("base_camera",)))
-    panels.claim("Camera", "../../etc")
-    panels.press("Make")
-    panels.claim("Make", "../../etc")
-    assert ["not one of the choices" in told for told in panels.client.notices] == [True] * 2
-    panels.press("Make")
-    assert [(wanted.camera, wanted.what) for wanted in making.wanted] == [(EVERY_CAMERA, "film")] * 2
-
-
 def test_a_dataset_goes_into_the_recordings_folder(
     panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
 ) -> None:
@@ -201,13 +188,3 @@ def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(
     film.unlink()
     panel.draw(Chosen((RECORDING,), ("x",)))
     assert "/offered/" not in panels.html()
-
-
-def test_the_page_is_built_anew_without_a_trace(
-    gated_server: GatedServer, making: Noted, tmp_path: Path
-) -> None:
-    offers = Downloads(gated_server)
-    for _ in range(3):
-        SharePanel(gated_server.server, offers, making, tmp_path).draw(Chosen((RECORDING,)))
-        gated_server.server.gui.reset()
-    assert isinstance(gated_server.server, viser.ViserServer)
