@@ -12,7 +12,6 @@ import pytest
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
 from workbench.session.clearance import CodeFile, Consent, Since, TrustQuestion
-from workbench.ui.app import trust_dialog
 from workbench.ui.app.trust_dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
 
 PUSH = CodeFile("/home/me/push.py", "0123456789ab", "import helper\n")
@@ -130,12 +129,3 @@ def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
     assert "Changes since then are marked; gone since: old.py" in said
     said = question_html(replace(PLAIN, trusted_before=True))
     assert "It is not known which of them has changed" in said
-
-
-def test_what_of_a_text_is_not_shown_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trust_dialog, "MOST_OF_ONE", 10)
-    monkeypatch.setattr(trust_dialog, "MOST_OF_ALL", 12)
-    said = question_html(PLAIN)
-    assert "The last 4 characters are not shown here: read the file itself" in said
-    assert "import hel" in said and "import help" not in said and "read the recording" not in said
-    assert "read the recording's .json" in question_html(replace(PLAIN, recorded_text=True))

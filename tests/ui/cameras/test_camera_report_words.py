@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
-from workbench.ui.cameras.report import env_words, headline, histogram, object_rows
+from workbench.ui.cameras.report import env_words, headline, object_rows
 
 
 def seen(
@@ -103,22 +103,3 @@ def test_an_env_is_called_by_what_is_worst_in_it() -> None:
         "cube hidden",
         "cube 50 % behind objects",
     ]
-
-
-def test_the_histogram_begins_and_ends_at_what_is_seen_and_marks_what_lies_behind_the_objects() -> None:
-    bars = histogram(
-        depth_of({20: 10, 30: 5}, 2, farthest_object=DEPTH_EDGES[25]), near=0.01, far=DEPTH_EDGES[31]
-    )
-    assert bars is not None
-    assert (bars.low, bars.high) == (DEPTH_EDGES[19], DEPTH_EDGES[32])
-    heights = [height for height, _ in bars.bars]
-    assert len(heights) == 13 and heights[1] == 1 and heights[11] == 0.5 and sum(heights) == 1.5
-    assert not bars.bars[1][1] and bars.bars[11][1]
-    assert bars.near is None and bars.far == pytest.approx(12)
-
-
-def test_over_steps_it_is_said_when_each_object_is_seen() -> None:
-    report = report_of(seen("cube", [50, 0, 10, 40], [50, 20, 40, 40], cut=(3,), present=[True] * 4))
-    (row,) = object_rows(report, "steps")
-    assert row["moods"] == ["good", "bad", "warn", "warn"]
-    assert headline(report, "steps") == "cube is not visible in 1 of 4 steps."

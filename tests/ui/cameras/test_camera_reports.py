@@ -16,7 +16,7 @@ from workbench.core.cameras.report import ObjectToSee
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.view import SessionView
 from workbench.ui.cameras.compare import BEFORE, CameraCompare, what_differs
-from workbench.ui.cameras.export import file_name, matrices_html
+from workbench.ui.cameras.export import file_name
 from workbench.ui.cameras.suggest import choices_of
 
 SETTINGS = CameraSettings(
@@ -30,8 +30,6 @@ SETTINGS = CameraSettings(
     far=100.0,
     shader_pack="minimal",
 )
-TURNED = np.array([1.0, 2.0, 3.0, math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)], np.float32)
-"""A mount, turned by 90 degrees about z."""
 
 
 def camera(mount_pose: np.ndarray | None = None, mount: str = "panda/panda_hand") -> StudioCamera:
@@ -88,15 +86,6 @@ def test_hands_of_robots_are_offered_first_and_are_not_asked_for_by_themselves()
         "hand",
         "arm",
     ]
-
-
-def test_the_matrices_say_which_way_they_go_and_where_a_mounted_camera_is() -> None:
-    html = matrices_html(camera(), "opencv", "world_to_camera")
-    assert "x right, y down, z forward" in html and "into the camera" in html
-    html = matrices_html(camera(TURNED), "maniskill", "camera_to_world")
-    assert "x forward, y left, z up" in html and "panda/panda_hand" in html
-    # 0.3 m ahead of a mount that looks along y.
-    assert "1.0000" in html and "2.3000" in html and "3.6000" in html
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from workbench.checks.results import RuleResult
 from workbench.core.rules import Degree, Finding
 from workbench.session.checks.checks import ChecksView
 from workbench.ui.checks.findings import cards, count, summary
-from workbench.ui.checks.rule_pages import as_html, rule_page
 
 
 def finding(
@@ -70,12 +69,3 @@ def test_findings_of_the_version_before_come_last_and_count() -> None:
         ("success-at-reset", True),
     ]
     assert count(shown) == 2 and summary(view, shown) == "1 warn, 1 of the version before"
-
-
-def test_a_page_shows_no_tag_of_its_text_and_links_to_help() -> None:
-    html = as_html("<b>bold</b> and [more](../batched_env.md#resets)")
-    assert "&lt;b&gt;" in html and 'href="/help/batched_env#resets"' in html and 'target="_blank"' in html
-
-
-def test_a_name_that_is_no_rule_s_reads_no_file() -> None:
-    assert rule_page("../safety") is None and rule_page("no-such-rule") is None

@@ -135,6 +135,20 @@ def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
     assert table.shown() == [] and "nothing has this" in table.panels.html("wb-library")
 
 
+def test_another_search_filter_or_order_begins_on_the_first_page(table: Table) -> None:
+    for arrange in (
+        lambda: table.look_for("r"),  # all of them have it
+        lambda: table.look_for(""),
+        lambda: table.press("outcome all"),
+        lambda: table.press("sort seed"),
+        lambda: table.press("sort seed"),
+    ):
+        table.press("on")
+        assert len(table.shown()) == COUNT - MOST_ROWS
+        arrange()
+        assert len(table.shown()) == MOST_ROWS
+
+
 def test_all_selects_what_is_listed_and_leaves_the_filter(table: Table) -> None:
     table.press("outcome no success")
     failed = table.shown()

@@ -63,16 +63,6 @@ def test_every_word_must_be_found(words: str, found: str) -> None:
     assert ids(chosen(ROWS, words)) == found
 
 
-def test_outcome_and_task_are_filters_too() -> None:
-    assert [ids(chosen(ROWS, outcome=o)) for o in ("all", "success", "no success", "broken")] == [
-        "abcde",
-        "a",
-        "bcd",
-        "e",
-    ]
-    assert ids(chosen(ROWS, "name", "no success", "Pick-v1")) == "d"
-
-
 @pytest.mark.parametrize(
     ("column", "up", "down"),
     [
@@ -148,22 +138,3 @@ def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted(
     assert kept == clean_facts(replace(kept, total_reward=float("nan")))
     assert cells(lost, None, NOW)["total"] == "NaN"
     assert {ids(ordered((*ROWS[:2], lost), "return", down))[-1] for down in (True, False)} == {"n"}
-
-
-def test_a_row_is_read_from_the_file_that_holds_it() -> None:
-    ours = row("a", paths=(Path("x/a.json"), Path("x/a.h5"))).source
-    theirs = row("b", kind="maniskill", trajectory="traj_1", paths=(Path("x/b.json"), Path("x/b.h5"))).source
-    dataset = row("c", kind="lerobot", trajectory="3", paths=(Path("x/set/meta/info.json"),)).source
-    assert (ours.kind, ours.path, ours.part, ours.stem) == ("workbench", Path("x/a.json"), None, "a")
-    assert (theirs.kind, theirs.path, theirs.part, theirs.stem) == (
-        "maniskill",
-        Path("x/b.h5"),
-        "traj_1",
-        "b_traj_1",
-    )
-    assert (dataset.kind, dataset.path, dataset.part, dataset.stem) == (
-        "lerobot",
-        Path("x/set"),
-        "3",
-        "set_3",
-    )

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.ui.env_rows import FELL, rows_of
-from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
+from tests.ui.env_rows import rows_of
+from workbench.session.history.env_table import KEPT_REWARDS, EnvRows
 from workbench.ui.live.env_panel import (
     FILTERS,
     columns,
@@ -79,17 +79,6 @@ def test_cells_say_how_an_env_stands() -> None:
     assert (cut.state, cut.total) == ("truncated", "")
     assert (after.last, after.last_steps) == ("fail", "9") and after.first_true == ("", "")
     assert odd.flags == ("bodies-stay: cube dropped 0.90 m (step 12)",) and odd.first_true == ("", "0")
-
-
-def test_an_outlier_of_the_episode_before_is_said_to_be_that() -> None:
-    last = LastEpisode(np.zeros(6, np.int8), np.full(6, 13, np.int32), np.zeros(6), {2: (FELL,)})
-    rows = rows_of(outliers={}, last=last)
-    row = cells_of(rows, np.array([2]))[0]
-    assert row.flags == ("bodies-stay: cube dropped 0.90 m (previous episode, step 12)",) and (
-        row.last,
-        row.last_steps,
-    ) == ("cut short", "13")
-    assert np.flatnonzero(mask(rows, "flagged")).tolist() == [2]
 
 
 def test_the_moment_of_an_env_is_its_first_outlier_else_its_end() -> None:

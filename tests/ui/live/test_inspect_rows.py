@@ -16,7 +16,6 @@ from workbench.ui.live.inspect_panel import (
     arrows_of,
     inspect_html,
     joint_rows,
-    leaf_rows,
     pose_rows,
 )
 
@@ -24,19 +23,6 @@ from workbench.ui.live.inspect_panel import (
 def leaf(name: str, *values: float, shape: tuple[int, ...] | None = None) -> Leaf:
     numbers = np.array(values, np.float32)
     return Leaf(name, numbers.shape if shape is None else shape, "float32", numbers, 0.0, 255.0)
-
-
-def changed(leaves: list[Leaf], before: list[Leaf] | None) -> list[list[bool]]:
-    return [[n["changed"] for n in row["numbers"]] for row in leaf_rows(leaves, before)]
-
-
-def test_numbers_that_differ_from_the_reading_before_are_marked() -> None:
-    before = [leaf("a", 1, 2, np.nan), leaf("b", 1)]
-    now = [leaf("a", 1, 2.0000002, np.nan), leaf("b", 1, 1), leaf("c", 1)]
-    # Another length, and an entry that was not there, have nothing to differ from.
-    assert changed(now, before) == [[False, True, False], [False, False], [False]]
-    assert changed([leaf("a", np.nan)], [leaf("a", 0)]) == [[True]]
-    assert changed(now, None) == [[False] * 3, [False] * 2, [False]]
 
 
 JOINTS = JointReadings(
@@ -130,15 +116,6 @@ def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str)
     if choice in expected:
         assert expected[choice] in own
         assert choice == "poses" or expected[choice] not in other
-
-
-def test_contacts_are_said_to_be_unknown_before_a_step_and_none_to_be_none_after_one() -> None:
-    now = Inspection(0, 5, contacts=(PRESSED,))
-    html = inspect_html("contacts", running(1), now, None, no_step_yet=True)
-    assert "known after the next step" in html and "5 N" not in html
-    assert "nothing touches anything" in inspect_html(
-        "contacts", running(1), Inspection(0, 5, contacts=()), None
-    )
 
 
 def test_what_changed_since_the_reading_before_is_marked_of_the_same_env_alone(live_page: Live) -> None:

@@ -79,30 +79,6 @@ def test_what_came_from_a_recording_or_from_before_the_strip_is_said_so() -> Non
     assert re.findall(r'<path d="([^"]*)"', html) == ["M 0.0 0 Q 30.0 -26 60.0 0"]
 
 
-def test_a_shown_moment_is_told_in_steps_ago() -> None:
-    html = strip_html(strip(), running(4, selected_env=2, timeline=past(163)))
-    assert cursor(html) == 63.0 and ">live<" not in html
-    assert "37 steps ago" in html and "env 2: step 7 / 50, 0.35 s" in html
-    assert "history: 100 steps, 3.0 of 256 MB" in html
-
-
-def test_a_moment_outside_the_strip_stays_at_its_edge() -> None:
-    assert cursor(strip_html(strip(low=160), running(4, timeline=past(120)))) == 0.0
-
-
-def test_one_moment_alone_can_be_drawn() -> None:
-    one = strip(
-        low=100,
-        high=100,
-        events=((100, RESET),),
-        reward=np.zeros(1),
-        branches=(),
-        segments=((100, 100, False),),
-    )
-    html = strip_html(one, running(1, timeline=past()))
-    assert "nan" not in html and 'width="-' not in html
-
-
 @pytest.mark.parametrize("count", [2, POINTS, POINTS + 1, 15_000])
 def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
     reward = np.zeros(count, np.float32)

@@ -13,13 +13,7 @@ from tests.drive.episodes import made
 from tests.drive.panels import Panels
 from workbench.session.review.view import Opened, ReviewView, find_events
 from workbench.ui.live.reward import NumberRow
-from workbench.ui.review.curves import ReviewCurves, compared, known
-
-
-def test_a_nan_that_the_task_returned_is_shown_and_what_the_first_state_lacks_is_not() -> None:
-    assert known("NaN", 0) == "—"
-    assert known("NaN", 7) == "NaN"
-    assert known("0.50", 0) == known("0.50", 7) == "0.50"
+from workbench.ui.review.curves import ReviewCurves, compared
 
 
 def test_what_only_another_recording_has_is_in_the_table() -> None:

@@ -20,6 +20,7 @@ from tests.recording.sweep_files import sweep_folder
 from workbench.recording.library.library import Library
 from workbench.recording.sweeps import RESULTS, SweepEpisode, SweepResults, write_results
 from workbench.session.review.view import Opened, ReviewView
+from workbench.ui.review import sweep
 from workbench.ui.review.sweep import SweepPanel, best_first
 
 
@@ -103,6 +104,27 @@ def test_a_value_of_an_axis_leaves_the_other_points_out(tab: Tab) -> None:
     assert len(tab.points()) == 6
     tab.press("clear")
     assert len(tab.points()) == 9
+
+
+def test_another_order_and_other_values_begin_on_the_first_page(
+    child_process: None,
+    server: viser.ViserServer,
+    folder: Path,
+    clock: Clock,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sweep, "ROWS", 2)
+    tab = Tab(server, folder, clock)
+    for press in ("sort set reach_weight", 'only robot_uids "fetch"', "clear"):
+        tab.press("on")
+        second = tab.points()
+        tab.press(press)
+        first = tab.points()
+        assert len(first) == 2 and first != second
+        tab.press("on")
+        tab.press("back")
+        assert tab.points() == first, press
+    tab.library.close()
 
 
 def test_the_point_of_the_open_episode_is_shown_until_another_one_is_chosen(tab: Tab) -> None:

@@ -39,12 +39,6 @@ def test_no_two_envs_of_a_grid_touch(num_envs: int, depth: float, width: float) 
     assert clear[~np.eye(num_envs, dtype=bool)].all()
 
 
-def test_scene_without_bodies_has_a_layout_too() -> None:
-    layout = lay_out(SceneGeometry(2, (), (), (), ()), np.zeros((2, 0, 7), np.float32))
-    assert not layout.has_floor
-    assert np.isfinite(layout.offsets).all()
-
-
 def test_wide_table_is_no_floor_and_a_moving_plate_is_none_either() -> None:
     geometry, poses = table_scene(1)
     normal = plane_normal(geometry.visuals[0], geometry, poses)
@@ -89,6 +83,22 @@ def test_click_takes_the_nearer_of_two_envs_in_a_row() -> None:
     layout = lay_out(geometry, poses)
     front = layout.offsets[0] + [10.0, 0.0, 0.0]
     assert env_under_ray(layout, front, np.array([-1.0, 0.0, 0.0])) == 0
+
+
+def test_a_click_between_envs_behind_them_or_with_broken_numbers_finds_none() -> None:
+    geometry, poses = table_scene(4)
+    layout = lay_out(geometry, poses)
+    above, down = layout.offsets[0] + [0.1, 0.1, 5.0], np.array([0.0, 0.0, -1.0])
+    assert env_under_ray(layout, above, down) == 0
+    assert env_under_ray(layout, above, -down) is None, "it lies behind"
+    between = (layout.offsets[0] + layout.offsets[1]) / 2 + [0.1, 0.0, 5.0]
+    assert env_under_ray(layout, between, down) is None
+    edge = layout.offsets[0] + [layout.high[0], 0.0, 5.0]
+    assert env_under_ray(layout, edge - [0.01, 0, 0], down) == 0
+    assert env_under_ray(layout, edge + [0.01, 0, 0], down) is None
+    for broken in (np.nan, np.inf):
+        assert env_under_ray(layout, above, np.array([broken, 0.0, -1.0])) is None
+        assert env_under_ray(layout, np.array([0.0, broken, 5.0]), down) is None
 
 
 def test_the_box_of_a_body_is_turned_with_it_by_the_right_hand_rule() -> None:

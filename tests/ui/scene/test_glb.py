@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from tests.ui.scenes import box_mesh, table_scene
-from workbench.core.scene.shapes import Material, Mesh
-from workbench.ui.scene.glb import LAYER, as_glb, face_limit, lift_painted_layers
+from tests.ui.scenes import box_mesh
+from workbench.core.scene.shapes import Material
+from workbench.ui.scene.glb import LAYER, as_glb, lift_painted_layers
 
 
 def read_back(glb: bytes) -> list[Any]:
@@ -56,17 +56,3 @@ def test_painted_layers_are_pulled_apart_and_solids_are_not() -> None:
     tops = [float(mesh.vertices[:, 2].max()) for mesh in lifted]
     assert np.diff(tops).min() > 0.9 * LAYER
     assert same is solid
-
-
-def test_face_limit_spares_simple_shapes_and_keeps_to_the_budget() -> None:
-    geometry, _ = table_scene(10)
-    sphere = trimesh.creation.icosphere(6)
-    rich = replace(
-        geometry.visuals[2],
-        mesh=Mesh(sphere.vertices.astype(np.float32), sphere.faces.astype(np.uint32)),
-    )
-    visuals = (*geometry.visuals, rich)
-    limit = face_limit(visuals, shown_envs=10, num_envs=10, budget=100_000)
-    assert sum(min(len(v.mesh.faces), limit) * 10 for v in visuals) <= 100_000
-    assert face_limit(visuals, shown_envs=1, num_envs=10, budget=1_000_000) == len(sphere.faces)
-    assert face_limit((), 1, 1, 100) >= 1

@@ -57,6 +57,14 @@ with_fixtures = settings(suppress_health_check=[HealthCheck.function_scoped_fixt
 LOADED_BY = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"}
 
 
+@pytest.fixture(scope="module")
+def gated_server() -> Iterator[GatedServer]:
+    """One for all that is tried on it."""
+    gated_server = open_server(ServerOptions(port=0))
+    yield gated_server
+    gated_server.close()
+
+
 @pytest.fixture
 def bystander(gated_server: GatedServer) -> Iterator[Callable[[], None]]:
     """An honest client that was there before; call it to see that it still works."""

@@ -14,7 +14,6 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from workbench.ui.server.access import RequestParts
 from workbench.ui.server.responses import (
     EVERY_REPLY,
     LONGEST_NAME,
@@ -24,7 +23,6 @@ from workbench.ui.server.responses import (
     STYLES,
     Handler,
     admitted_reply,
-    content_type,
     folder_handler,
     page_policy,
     refusals,
@@ -57,13 +55,6 @@ def answer(
 
 def says(body: bytes, kind: str = "text/plain") -> Callable[[str], tuple[int, str, bytes]]:
     return lambda path: (200, kind, body)
-
-
-def test_the_gate_is_told_every_value_of_what_it_judges() -> None:
-    headers = Headers([("Host", "a"), ("Host", "b"), ("Origin", "c"), ("Cookie", "d"), ("Cookie", "e")])
-    headers.update([("Sec-Fetch-Site", "f"), ("Sec-Fetch-Mode", "g"), ("Sec-Fetch-Dest", "h")])
-    asked = RequestParts("/x?y", ["a", "b"], ["c"], ["d", "e"], ["f"], ["g"], ["h"], websocket=False)
-    assert request_parts(Request("/x?y", headers)) == asked
 
 
 @pytest.mark.parametrize(
@@ -190,24 +181,6 @@ def test_a_folder_serves_its_files_and_nothing_else(tmp_path: Path) -> None:
     assert handle("inside.txt")[2] == b"1"
     for path in ("", "below", "link.txt", "none.txt", "../secret.txt"):
         assert handle(path) == (404, "text/plain; charset=utf-8", NO_SUCH_FILE)
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("a.css", "text/css; charset=utf-8"),
-        ("a.html", "text/html; charset=utf-8"),
-        ("a.min.Js", "text/javascript; charset=utf-8"),
-        ("a.json", "application/json"),
-        ("a.svg", "image/svg+xml"),
-        ("a.wasm", "application/wasm"),
-        ("a.png", "image/png"),
-        ("a.no-such-ending", "application/octet-stream"),
-        ("js", "application/octet-stream"),
-    ],
-)
-def test_a_content_type_goes_by_the_end_of_the_name(name: str, kind: str) -> None:
-    assert content_type(name) == kind
 
 
 def test_what_a_browser_asked_for_writes_nothing_into_the_terminal(caplog: pytest.LogCaptureFixture) -> None:

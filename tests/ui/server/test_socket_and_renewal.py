@@ -158,14 +158,6 @@ def test_a_folder_that_others_write_into_is_refused(folder):
     open_server(ServerOptions(socket=folder / "page.sock")).close()
 
 
-@pytest.mark.parametrize(
-    ("path", "sentence"), [("none/page.sock", "There is no folder"), ("x" * 200, "at most 107 bytes")]
-)
-def test_a_path_that_cannot_be_is_an_error_that_says_so(folder, path, sentence):
-    with pytest.raises(ServerError, match=sentence):
-        open_server(ServerOptions(socket=folder / path))
-
-
 def test_many_that_start_at_once_are_one(folder):
     made: list[listening.Listening] = []
 
@@ -241,15 +233,6 @@ def test_a_page_that_does_not_listen_is_closed_as_well(on_port):
     with pytest.raises(ConnectionClosed):
         while True:
             tab.recv(timeout=30)
-
-
-def test_without_a_token_there_is_none_to_renew():
-    gated_server = open_server(ServerOptions(port=0, token=False))
-    try:
-        with pytest.raises(ValueError, match="no token"):
-            gated_server.renew_token()
-    finally:
-        gated_server.close()
 
 
 def until_line(process: subprocess.Popen[str], wanted: Callable[[str], bool]) -> str:

@@ -80,31 +80,6 @@ def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
     assert not [path for path in (tmp_path / "films").iterdir() if path.suffix != ".mp4"]
 
 
-@pytest.mark.slow
-def test_a_dataset_is_stopped_in_the_middle_of_an_episode(recordings: Path, tmp_path: Path) -> None:
-    told = Told()
-    told.making.start(
-        MakeRequest("lerobot", find_all_sources([recordings]) * 200, tmp_path / "datasets" / "one")
-    )
-    until(lambda: list(tmp_path.glob("datasets/.one.*/videos/*/*/*")), "a film that is written")
-    told.making.stop()
-    view = told.wait(lambda view: not view.running)
-    assert view.done < 0.9 and (view.problem, view.made) == ("", ())
-    assert list((tmp_path / "datasets").iterdir()) == []
-
-
-def test_recordings_are_found_in_folders_and_by_any_of_their_files(recordings: Path, tmp_path: Path) -> None:
-    (found,) = find_all_sources([recordings])
-    for file in recordings.iterdir():
-        if not file.name.startswith("."):
-            assert find_all_sources([file, recordings]) == (found,)
-    with pytest.raises(FileNotFoundError, match="nothing at"):
-        find_all_sources([tmp_path / "none"])
-    (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(ValueError, match="no recording in"):
-        find_all_sources([tmp_path])
-
-
 def test_an_archive_unpacked_is_the_recording_again(recordings: Path, tmp_path: Path) -> None:
     (source,) = find_all_sources([recordings])
     made = make(MakeRequest("zip", (source,), tmp_path))

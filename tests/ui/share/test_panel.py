@@ -16,10 +16,8 @@ from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, Making, Mak
 from workbench.ui.share.panel import (
     ALL_CAMERAS,
     MOST_NAMED,
-    OPENED,
     Chosen,
     SharePanel,
-    short_names,
     will_make,
 )
 
@@ -105,34 +103,6 @@ def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(
     assert making.wanted[0].folder != making.wanted[1].folder
     panel.draw(Chosen((RECORDING,), ("base_camera",)))
     assert not panels.shows("Camera"), "there is no choice"
-
-
-def test_names_are_shown_without_their_time_and_the_scope_stays_as_chosen(
-    panel: SharePanel, panels: Panels
-) -> None:
-    name = "Push_seed0001_env00_2026-11-22T04-40-41"
-    panel.draw(Chosen((Source(Path(f"/recordings/{name}.json")),), ("eye",), selected=True))
-    assert ">Push_seed0001_env00<" in panels.html() and f'title="{name}"' in panels.html()
-    assert ">Push_seed0001_env00.eye.mp4<" in panels.html()
-    same = [name, name.replace("41", "42")]
-    assert short_names(same) == same
-    assert not panel.takes_opened(True) and panels.shows("Share")
-    panels.set("Share", OPENED)
-    assert panel.takes_opened(True) and not panel.takes_opened(False) and not panels.shows("Share")
-    assert panel.takes_opened(True)
-
-
-def test_a_dataset_goes_into_the_recordings_folder(
-    panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
-) -> None:
-    panels.set("Make", "LeRobot dataset")
-    panel.draw(Chosen((RECORDING,)))
-    assert panels.shows("Only successes") and panels.shows("Task") and not panels.shows("Camera")
-    panels.set("Task", "  push it  ")
-    panels.press("Make")
-    (wanted,) = making.wanted
-    assert wanted.folder.parent == tmp_path / "datasets"
-    assert (wanted.export.instruction, wanted.export.only_successes) == ("push it", True)
 
 
 def test_demonstrations_go_there_too_and_are_not_offered_to_be_saved_without_their_json(

@@ -9,21 +9,9 @@ import time
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.drive.panels import Panels
-from workbench.ui.widgets.click_targets import PLACE_STEPS, Paged, Presses, in_turn, place_of
-
-parts = st.integers(0, PLACE_STEPS - 1)
-
-
-@given(parts, parts, st.integers(0, 88))
-def test_a_place_comes_back_from_its_number_whatever_the_running_part(
-    column: int, row: int, running: int
-) -> None:
-    place = place_of(running * PLACE_STEPS**2 + column * PLACE_STEPS + row)
-    assert place == (column / (PLACE_STEPS - 1), row / (PLACE_STEPS - 1))
+from workbench.ui.widgets.click_targets import Paged, Presses, in_turn
 
 
 @pytest.mark.parametrize("sent", [True, "12", None, -1, 0.5, math.nan, math.inf, 2**60, 1e300, (1, 2)])

@@ -8,7 +8,6 @@ from tests.drive.panels import Clock, Panels
 from workbench.ui.widgets.inputs import HANDS_OFF, Control
 
 
-
 @dataclass
 class Slider:
     """A slider for an env, with what the session was asked for."""
