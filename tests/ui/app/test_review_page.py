@@ -55,7 +55,10 @@ CHANGES: dict[str, tuple[Any, Any]] = {
     "another moment": (lambda review: review.seek(5), lambda review: review.seek(0)),
     "beyond the end of one": (lambda review: review.seek(9), lambda review: review.seek(0)),
     "the other one selected": (lambda review: review.select(1), lambda review: review.select(0)),
-    "aligned at the success": (lambda review: review.align("first success"), lambda review: review.align("start")),
+    "aligned at the success": (
+        lambda review: review.align("first success"),
+        lambda review: review.align("start"),
+    ),
     "in another order": (lambda review: review.swap(0, 1), lambda review: review.swap(0, 1)),
     "another speed": (lambda review: review.set_speed(2.0), lambda review: review.set_speed(1.0)),
     "round and round": (lambda review: review.set_loop(True), lambda review: review.set_loop(False)),

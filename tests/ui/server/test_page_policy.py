@@ -4,14 +4,52 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
+import trimesh
+import trimesh.visual
+import trimesh.visual.material
+from PIL import Image
+from playwright.sync_api import Page
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.ui.knocking import ask
 from workbench.machine.folders import web_assets_folder
-from workbench.ui.server.gated_server import ServerOptions, open_server
+from workbench.ui.server import responses
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.responses import DIRECTIVES, HANDLERS
+
+
+@pytest.fixture
+def filled(gated_server: GatedServer) -> GatedServer:
+    """With one of each thing that a policy could break: blobs, data, workers, wasm, frames, handlers."""
+    server = gated_server.server
+    server.gui.add_html(
+        "<div id='from-html' style='color: red'>html</div><img src='/workbench/logo.svg'>"
+        '<style onload="wb.intoSight(this)"></style>'
+        "<iframe src='/workbench/logo.svg'></iframe>"
+    )
+    server.gui.add_image(np.zeros((8, 8, 3), np.uint8))
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.TextureVisuals(
+        uv=np.zeros((len(box.vertices), 2)),
+        material=trimesh.visual.material.PBRMaterial(
+            baseColorTexture=Image.new("RGB", (4, 4), (200, 30, 30))
+        ),
+    )
+    server.scene.add_mesh_trimesh("/box", box)
+    server.scene.add_camera_frustum("/frustum", fov=1.0, aspect=1.0, image=np.zeros((8, 8, 3), np.uint8))
+    server.scene.configure_environment_map("city", background=True)
+    return gated_server
+
+
+def complaints_of(page: Page) -> list[str]:
+    complaints: list[str] = []
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    return complaints
+
 
 # Without a browser --------------------------------------------------------------------------------
 
@@ -90,3 +128,43 @@ def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
             page.wait_for_selector("canvas", timeout=60_000)
     finally:
         gated_server.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_each_exception_is_needed(filled, browser, monkeypatch):
+    # 'self' means ws: too in Chromium, but not in every browser; connect-src 'self' is what let_in.js asks when the
+    # connection is lost, see the test above.
+    elsewhere = {("connect-src", source) for source in ("'self'", "ws://{authority}", "wss://{authority}")}
+    # viser's scripts by their hashes; without one there is no page.
+    exceptions = [
+        (name, source)
+        for name, sources in DIRECTIVES.items()
+        for source in sources.split()
+        if source != "'none'" and name != "frame-ancestors" and (name, source) not in elsewhere
+    ]
+
+    def load() -> list[str]:
+        page = browser.new_page(viewport={"width": 640, "height": 480})
+        complaints = complaints_of(page)
+        page.goto(filled.url, wait_until="domcontentloaded")
+        # The first complaint is enough; to have none takes as long as everything needs to load.
+        for _ in range(80):
+            page.wait_for_timeout(100)
+            if complaints:
+                break
+        page.close()
+        return complaints
+
+    assert load() == []
+    needless = []
+    for name, source in exceptions:
+        others = " ".join(other for other in DIRECTIVES[name].split() if other != source) or "'none'"
+        handler = next((one for one in HANDLERS if source == f"'{responses.hash_of(one)}'"), None)
+        if handler is not None and handler != "wb.intoSight(this)":
+            continue  # each is in a template: the test above
+        with monkeypatch.context() as without:
+            without.setitem(DIRECTIVES, name, others)
+            if not load():
+                needless.append(f"{name} {source}")
+    assert needless == []
