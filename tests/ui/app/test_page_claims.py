@@ -121,6 +121,7 @@ def attacker(gated_server: GatedServer) -> Iterator[Connection]:
         yield connection
 
 
+@pytest.mark.filterwarnings("ignore:Do not use the `random` module")  # the connection's threads do, meanwhile
 @with_fixtures
 @given(st.sampled_from(sorted(CONTROLS)), ANYTHING | st.lists(NUMBERS, min_size=2, max_size=4))
 def test_whatever_is_claimed_a_control_holds_what_it_can_hold(gated_server, controls, attacker, name, value):
