@@ -95,6 +95,17 @@ def test_a_file_comes_whole_and_under_its_name(
     until(lambda: open_files(path) == 0, "the end of the reading")
 
 
+def test_of_a_file_that_grows_no_more_comes_than_was_announced(
+    gated_server: GatedServer, file: tuple[str, Path]
+) -> None:
+    address, path = file
+    path.touch()
+    os.truncate(path, LARGE + 100)
+    raw, got = begun(gated_server, address)
+    os.truncate(path, LARGE + 10 * BLOCK)
+    assert rest(raw, got) == (LARGE + 100, LARGE + 100)
+
+
 def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(
     gated_server: GatedServer, file: tuple[str, Path]
 ) -> None:
