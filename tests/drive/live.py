@@ -12,7 +12,7 @@ from typing import Any
 
 import viser
 
-from tests.drive.panels import Clock, Panels
+from tests.drive.panels import Clock, Panels, forget_what_was_drawn
 from tests.ui.scenes import EMPTY
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.view import SessionView
@@ -107,6 +107,12 @@ class Live(Panels):
         pressed, self.session.asked = self.session.asked, []
         self.page.redraw()
         self.asked_by_drawing, self.session.asked = self.session.asked, pressed
+
+    def all_drawn(self) -> dict[str, object]:
+        """All that can be seen once every part was drawn, whatever its key says."""
+        forget_what_was_drawn(self.page._parts)
+        self.again()
+        return self.everything()
 
     def again(self, seconds: float = 60.0) -> None:
         """Draw what was shown, with what was pressed since."""

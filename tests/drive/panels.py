@@ -23,6 +23,7 @@ from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage, 
 
 from workbench.ui.server.control_values import check_value, name_of
 from workbench.ui.server.viser_private import element_id
+from workbench.ui.widgets.parts import Parts
 
 Kind = Literal["button", "field"]
 """Of an input. A button and what it is for may have the same label."""
@@ -104,6 +105,12 @@ def held_by(server: viser.ViserServer) -> dict[str, int]:
         "messages": len(sockets._broadcast_buffer.message_from_id),
         "pages": len(sockets._client_state_from_id),
     }
+
+
+def forget_what_was_drawn(parts: Parts[Any]) -> None:
+    """So that each part of a page is drawn with the next view, whatever its key says."""
+    for _, due in parts._parts:
+        due._drawn = None
 
 
 def told_so_far(server: viser.ViserServer) -> int:
@@ -241,6 +248,9 @@ class Panels:
         for node in self.nodes(""):
             if node.name and getattr(node, "visible", True):
                 seen[f"in the view: {node.name}"] = plain(node.position), plain(node.wxyz), of(node)
+
+        for label, (_, command) in self._commands().items():
+            seen[f"command {label}"] = of(command)
         return seen
 
     # --- what a person does ------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import viser
 
-from tests.drive.panels import Clock, Panels
+from tests.drive.panels import Clock, Panels, forget_what_was_drawn
 from tests.drive.waiting import until
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
@@ -35,6 +35,12 @@ class Reviewed(Panels):
     def draw(self) -> None:
         self.clock.passes()
         self.page.redraw()
+
+    def all_drawn(self) -> dict[str, object]:
+        """All that can be seen once every part was drawn, whatever its key says."""
+        forget_what_was_drawn(self.page._parts)
+        self.draw()
+        return self.everything()
 
     def open(self, *seeds: int) -> None:
         rows = {-1 if row.seed is None else row.seed: row.id for row in self.library.view().rows}

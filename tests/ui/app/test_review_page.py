@@ -77,7 +77,9 @@ def test_what_is_changed_is_seen_and_gone_when_it_is_taken_back(shown: Reviewed)
         before = shown.everything()
         change(shown.review)
         shown.draw()
-        assert difference(before, shown.everything()), f"{what} is not seen"
+        changed = shown.everything()
+        assert difference(before, changed), f"{what} is not seen"
+        assert difference(changed, shown.all_drawn()) == "", f"a part was not drawn that shows {what}"
         back(shown.review)
         shown.review.seek(0)
         for _ in range(3):

@@ -186,8 +186,8 @@ CHANGES: dict[str, Any] = {
 }  # fmt: skip
 
 
-def strip(low: int, high: int) -> Strip:
-    reward = np.linspace(0, 1, high - low + 1, dtype=np.float32)
+def strip(low: int, high: int, env: int) -> Strip:
+    reward = np.linspace(0, 1 + env, high - low + 1, dtype=np.float32) ** 2
     return Strip(low, high, ((low, RESET), ((low + high) // 2, SUCCESS)), reward, (), ((low, high, False),))
 
 
@@ -195,7 +195,7 @@ def made() -> Live:
     live = Live(viser.ViserServer(host="127.0.0.1", port=0, verbose=False))
     tick, old = np.arange(20), np.ones(20, np.float32)
     live.session.answers |= {
-        "past.strip": strip,
+        "past.strip": lambda low, high: strip(low, high, live.session.shown.selected_env),
         "rescorer.curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
     }
     live.command("Open or close the table of envs")
@@ -222,7 +222,10 @@ def test_a_change_is_seen_and_gone_when_it_is_taken_back(live: Live, change: str
     before = live.everything()
     after = replace(view, **CHANGES[change](view))
     live.show(after, rows())
-    assert difference(before, live.everything()), "it is not seen"
+    live.again()  # a new version is announced for some seconds
+    shown = live.everything()
+    assert difference(before, shown), "it is not seen"
+    assert difference(shown, live.all_drawn()) == "", "a part was not drawn that shows it"
     live.show(view, rows())
     live.again()
     assert difference(before, live.everything()) == ""

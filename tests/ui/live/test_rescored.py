@@ -108,6 +108,7 @@ def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescore
     asked = rescored.live.asked
     assert asked == [("show", 2, 25), ("show", MOST_ROWS + 2, 10 * (MOST_ROWS + 2) + 5)]
     rescored.panels.press("back")
+    rescored.draw(many)
     rescored.draw(many, first=500)
     rescored.panels.press("row 0")
     assert asked[-1] == ("change", {"selected_env": 0})

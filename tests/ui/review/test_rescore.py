@@ -92,6 +92,9 @@ class Told:
     def __init__(self) -> None:
         self.view, self.rescoring = RescoreView(), self
 
+    def start(self, *args: object, **named: object) -> None:
+        """Nothing is judged here."""
+
     def stop(self) -> None:
         raise AssertionError("nobody asked for that")
 
@@ -171,6 +174,9 @@ def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     rescoring.panels.press("on")
     rescoring.draw(RescoreView("done", 2, many, 23, 23))
     assert "21 to 23 of 23" in rescoring.panels.html()
+    rescoring.panel.rescore(["no such"])
+    rescoring.draw(RescoreView("done", 3, many, 23, 23))
+    assert "1 to 10 of 23" in rescoring.panels.html(), "what is judged anew begins with its first page"
 
 
 def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -> None:

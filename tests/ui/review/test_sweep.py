@@ -117,13 +117,9 @@ def test_another_order_and_other_values_begin_on_the_first_page(
     tab = Tab(server, folder, clock)
     for press in ("sort set reach_weight", 'only robot_uids "fetch"', "clear"):
         tab.press("on")
-        second = tab.points()
+        assert "3 to" in tab.panels.html("wb-sweep-scroll")
         tab.press(press)
-        first = tab.points()
-        assert len(first) == 2 and first != second
-        tab.press("on")
-        tab.press("back")
-        assert tab.points() == first, press
+        assert "1 to 2 of" in tab.panels.html("wb-sweep-scroll"), press
     tab.library.close()
 
 
