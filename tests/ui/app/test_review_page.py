@@ -52,8 +52,8 @@ def test_the_results_of_a_sweep_have_a_tab_also_if_they_come_later(
 
 
 CHANGES: dict[str, tuple[Any, Any]] = {
-    "another moment": (lambda review: review.seek(5), lambda review: review.seek(0)),
-    "beyond the end of one": (lambda review: review.seek(9), lambda review: review.seek(0)),
+    "another moment": (lambda review: review.seek(5), lambda review: review.seek(8)),
+    "beyond the end of one": (lambda review: review.seek(9), lambda review: review.seek(8)),
     "the other one selected": (lambda review: review.select(1), lambda review: review.select(0)),
     "aligned at the success": (
         lambda review: review.align("first success"),
@@ -70,7 +70,7 @@ def test_what_is_changed_is_seen_and_gone_when_it_is_taken_back(shown: Reviewed)
     shown.review.align("start")
     for what, (change, back) in CHANGES.items():
         change(shown.review), back(shown.review)
-        shown.review.seek(0)
+        shown.review.seek(8)
         shown.review.select(0)
         for _ in range(3):
             shown.draw()
@@ -81,7 +81,7 @@ def test_what_is_changed_is_seen_and_gone_when_it_is_taken_back(shown: Reviewed)
         assert difference(before, changed), f"{what} is not seen"
         assert difference(changed, shown.all_drawn()) == "", f"a part was not drawn that shows {what}"
         back(shown.review)
-        shown.review.seek(0)
+        shown.review.seek(8)
         for _ in range(3):
             shown.draw()
         assert difference(before, shown.everything()) == "", what
