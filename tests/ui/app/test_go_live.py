@@ -109,6 +109,8 @@ def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason
 
 
 def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_yes(desk: Desk) -> None:
+    desk.live.play()
+    until(lambda: desk.live.view().playing, "the play")
     desk.go(1)
     until(lambda: desk.person.asked, "the question")
     assert desk.go_live.going() == "waiting for permission to run the code of Pull-v1"
@@ -116,6 +118,7 @@ def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_y
     desk.person.says_yes.set()
     until(lambda: desk.place.session is desk.other, "the other session")
     assert desk.opened == ["Pull-v1"] and desk.go_live.can_go_home()
+    until(lambda: not desk.live.view().playing, "the pause of the task that nobody sees")
     until(lambda: desk.other.view().timeline.entered, "the recorded state")
     desk.draw()
     assert desk.place.pages._wish == "live"

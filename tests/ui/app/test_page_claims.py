@@ -217,6 +217,24 @@ def test_the_page_that_sent_it_is_told_and_shown_the_true_value(
     assert bodies == [sentence]
 
 
+def test_what_is_typed_on_the_way_to_a_number_is_not_held_against_it(gated_server, monkeypatch):
+    """12 is typed as 1, then 12: a correction that comes in between would take the 1 away."""
+    monkeypatch.setattr(page_guard, "HANDS_OFF", 0.2)
+    number = gated_server.server.gui.add_number("Steps", 50, min=10, max=99)
+    with client(gated_server) as connection:
+        say(connection, claim(number, 1))
+        say(connection, claim(number, 12))
+        until(lambda: number.value == 12, "the number")
+        seen: list[str] = []
+        with pytest.raises(TimeoutError):
+            while True:
+                frame = connection.recv(timeout=0.6)
+                assert isinstance(frame, bytes)
+                seen += [message["type"] for message in messages_in(frame)]
+    assert "NotificationShowMessage" not in seen
+    number.remove()
+
+
 # Other kinds of messages --------------------------------------------------------------------------
 
 

@@ -66,6 +66,19 @@ def test_absent_body_is_left_out_and_hidden_when_no_env_has_it(server: viser.Vis
     assert cube.visible
 
 
+def test_what_another_env_alone_has_is_not_seen_in_this_one(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(3)
+    cube = replace(geometry.visuals[4], envs=np.array([0, 2], np.int32), bodies=np.full(2, 3, np.int32))
+    geometry = replace(geometry, visuals=(*geometry.visuals[:4], cube))
+    layout, view = lay_out(geometry, poses), SceneView(server)
+    view.build(geometry, layout, poses, only_env=2)
+    assert handle_named(view, "cube").visible
+    view.move(poses, layout, only_env=1)
+    assert not handle_named(view, "cube").visible
+    view.move(poses, layout, only_env=None)
+    assert handle_named(view, "cube").visible and len(handle_named(view, "cube").batched_positions) == 2
+
+
 def test_reload_keeps_the_nodes_that_look_as_before(server: viser.ViserServer) -> None:
     geometry, poses = table_scene(4)
     layout = lay_out(geometry, poses)
