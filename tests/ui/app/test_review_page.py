@@ -69,7 +69,8 @@ def test_what_is_changed_is_seen_and_gone_when_it_is_taken_back(shown: Reviewed)
     shown.open(1, 2)
     shown.review.align("start")
     for what, (change, back) in CHANGES.items():
-        change(shown.review), back(shown.review)
+        change(shown.review)
+        back(shown.review)
         shown.review.seek(8)
         shown.review.select(0)
         for _ in range(3):
