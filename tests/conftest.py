@@ -57,9 +57,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 ONE_AFTER_THE_OTHER = {
-    "tests/browser/test_page.py": "tests/browser/test_camera_reports.py",
-    "tests/browser/test_layout.py": "tests/browser/test_camera_reports.py",
-    "tests/browser/test_timeline.py": "tests/browser/test_rescored_past.py",
+    **{
+        f"tests/browser/test_{name}.py": "tests/browser/test_camera_reports.py"
+        for name in ("by_keyboard", "layout", "marks", "page", "timeline")
+    },
+    **{
+        f"tests/browser/test_{name}.py": "tests/browser/test_rescored_past.py"
+        for name in ("first_steps", "help")
+    },
 }
 """Files that share a page's server with another (tests/browser/conftest.py), so that one process has to run both."""
 

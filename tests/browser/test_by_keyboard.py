@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.browser.conftest import At
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
 def choose(page: Page, words: str) -> None:
@@ -24,12 +24,10 @@ def choose(page: Page, words: str) -> None:
     expect(page.locator(".mantine-Spotlight-content")).to_be_hidden()
 
 
-def test_every_fold_is_reached_by_tab_and_opened_by_enter_and_space(
-    example_without_pictures: At, browser: Browser
-) -> None:
-    with example_without_pictures(browser) as desk:
+def test_every_fold_is_reached_by_tab_and_opened_by_enter_and_space(example: At, browser: Browser) -> None:
+    with example(browser) as desk:
         page = desk.page
-        for tab in ("Run", "Studio", "Checks"):
+        for tab in ("Run", "Checks"):
             desk.tab(tab)
             folded = page.locator("div[role=button][aria-expanded=false]:has(> svg)").filter(
                 has_text=re.compile("."), visible=True

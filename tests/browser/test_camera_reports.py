@@ -76,23 +76,7 @@ def back_to_the_file(page: Page) -> None:
     until(back, "the camera as the file has it")
 
 
-COVERED = """() => [...document.querySelectorAll(".mantine-ScrollArea-scrollbar[data-state=visible]")]
-    .filter((bar) => bar.dataset.orientation === "vertical" && bar.offsetHeight)
-    .map((bar) => {
-        const boxes = [...bar.parentElement.querySelectorAll("*")].filter((box) => {
-            const style = getComputedStyle(box);
-            return parseFloat(style.borderRightWidth) > 0 && style.borderRightStyle !== "none" && box.offsetWidth > 20;
-        });
-        const right = Math.max(...boxes.map((box) => box.getBoundingClientRect().right));
-        return right - bar.getBoundingClientRect().left;
-    })"""
 """By how many pixels each scrollbar lies over the boxes that it scrolls."""
-
-
-def test_the_scrollbar_covers_no_box(page: Page) -> None:
-    page.mouse.move(1100, 500)
-    until(lambda: bool(page.evaluate(COVERED)), "the scrollbar")
-    assert max(page.evaluate(COVERED)) <= 0
 
 
 def press(page: Page, name: str) -> None:
@@ -143,19 +127,6 @@ def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of
     expect(page.get_by_text(re.compile(r"far 10 → \d"))).to_be_visible()
     press(page, "Return to A")
     expect(page.get_by_text("measure again")).to_have_count(0)
-
-
-def test_the_sheet_has_all_envs_and_a_press_selects_one(page: Page) -> None:
-    press(page, "Pictures of all envs")
-    cells = page.locator(".wb-sheet figure")
-    expect(cells).to_have_count(ENVS)
-    last = page.locator(f".wb-sheet [data-env='{ENVS - 1}']")
-    last.click()
-    expect(last).to_have_class("wb-selected")
-    expect(page.get_by_text(f"env {ENVS - 1}: step 0").first).to_be_visible()
-    first = page.locator(".wb-sheet [data-env='0']")
-    first.click()
-    expect(first).to_have_class("wb-selected")
 
 
 def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:

@@ -12,9 +12,8 @@ from playwright.sync_api import Browser, expect
 
 from tests.drive.desk import Desk
 from tests.drive.page import TASK, page_on
-from tests.drive.waiting import until
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 GOOD, BAD = "(distance < GOAL_RADIUS)", "(distance < 1)"
 RULE = "[data-rule=success-at-reset]"
 
@@ -25,13 +24,6 @@ def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator
     arguments = ("--num-envs", "2", "--env", "render_backend=none")
     with page_on(file, *arguments, browser=browser, checks=True) as (page, errors, opened):
         yield Desk(page, errors, file, opened)
-
-
-@pytest.mark.slow
-def test_a_task_that_keeps_the_rules_says_how_many_were_checked(desk: Desk) -> None:
-    desk.page.get_by_role("tab", name="Checks", exact=True).click()
-    expect(desk.page.get_by_text(re.compile(r"^\d+ rules checked in "))).to_be_visible(timeout=180_000)
-    expect(desk.page.locator(RULE)).to_have_count(0)
 
 
 def test_a_broken_save_is_found_with_its_line_and_mending_it_clears_the_list(desk: Desk) -> None:
@@ -59,38 +51,6 @@ def test_a_broken_save_is_found_with_its_line_and_mending_it_clears_the_list(des
     expect(card).to_have_count(0)
 
 
-@pytest.mark.slow
-def test_a_check_can_be_stopped_and_asked_for_and_nothing_went_wrong_in_the_console(desk: Desk) -> None:
-    desk.page.get_by_role("tab", name=re.compile("^Checks")).click()
-    # A check of the version before, stopped, would say so for as long as the new one takes to load.
-    expect(desk.page.get_by_text(re.compile(r"^\d+ rules checked in "))).to_be_visible(timeout=180_000)
-    desk.edit(GOOD, BAD)
-    desk.button("Stop checking").click()
-    expect(desk.page.get_by_text(re.compile("^stopped by hand: "))).to_be_visible()
-    desk.button("Check now").click()
-    expect(desk.page.locator(RULE)).to_be_visible()
-    desk.file.write_text(TASK.read_text())
-    assert desk.errors == []
-
-
-def test_a_tab_that_a_key_opens_while_the_page_comes_back_stays_open(desk: Desk) -> None:
-    """The page opens the tab again that was pressed last, and looks for it for a second."""
-    page = desk.page
-    page.get_by_role("tab", name="Run").click()
-    page.reload()
-    expect(page.get_by_role("tab", name="Run")).to_be_visible()
-    checks = page.get_by_role("tab", name=re.compile("^Checks"))
-
-    def opened() -> bool:
-        # The page does not say when it listens to keys.
-        desk.press("w")
-        return checks.get_attribute("aria-selected") == "true"
-
-    until(opened, "the tab")
-    page.wait_for_timeout(1500)
-    expect(checks).to_have_attribute("aria-selected", "true")
-
-
 BREAKS = """
 import os, signal
 from workbench.checks.by_hook.run import GROUPS
@@ -108,7 +68,6 @@ for group in GROUPS:
 """
 
 
-@pytest.mark.slow
 def test_rules_whose_checks_fail_are_shown_and_all_others_are_checked(
     tmp_path: Path, browser: Browser
 ) -> None:

@@ -10,10 +10,7 @@ from playwright.sync_api import Browser, Locator, expect
 
 from tests.browser.conftest import At
 from tests.drive.desk import Desk
-from tests.drive.page import TASK
 from tests.drive.waiting import until
-from workbench.ui.live.reward import CHOICE
-from workbench.ui.live.version_panel import LAST_LOADS
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 STEPS = 12
@@ -42,16 +39,6 @@ def desk(opened: Desk) -> Desk:
 def charts(desk: Desk) -> Locator:
     """Where curves are drawn, the reward's first."""
     return desk.page.locator(".u-over:visible")
-
-
-def test_the_first_page_has_hints_that_are_closed_for_good(desk: Desk) -> None:
-    hints = desk.page.locator(".wb-hints")
-    expect(hints.locator("li")).to_have_count(4)
-    hints.get_by_text("close for good").click()
-    expect(hints).to_have_count(0)
-    desk.page.reload()
-    expect(desk.button("Play")).to_be_visible()
-    expect(hints).to_have_count(0)
 
 
 def test_a_question_mark_lists_the_keys_which_rest_meanwhile(desk: Desk) -> None:
@@ -125,27 +112,6 @@ def test_a_click_on_a_curve_shows_its_step_and_hovering_its_numbers(desk: Desk) 
     desk.comes_to(STEPS)
 
 
-def test_entries_and_joints_are_chosen_for_a_curve(desk: Desk) -> None:
-    desk.press("s", "s")
-    desk.timeline_says("step 2 /")
-    desk.tab("Reward")
-    expect(charts(desk)).to_have_count(3)  # reward, success, reward terms
-    desk.page.get_by_text(CHOICE, exact=True).click()
-    for name in ("cube_height", "panda_joint1"):
-        desk.page.locator(".wb-curve-choice").get_by_text(name, exact=True).click()
-    expect(charts(desk)).to_have_count(5)
-    expect(desk.page.get_by_text("joints, env 0", exact=True)).to_be_visible()
-    wide = "() => [...document.querySelectorAll('.wb-curve-choice .wb-pill')].every(p => p.getBoundingClientRect().right < innerWidth)"
-    assert desk.page.evaluate(wide), "no pill is cut"
-    desk.page.get_by_text(CHOICE, exact=True).click()
-
-
-def test_inspect_opens_with_a_reading(desk: Desk) -> None:
-    """Of the joints, unless another test on this server has chosen something else."""
-    desk.tab("Inspect")
-    expect(desk.page.locator(".wb-inspect")).to_contain_text("env 0 at step 0")
-
-
 def test_a_policy_is_chosen_from_those_in_the_folder(desk: Desk) -> None:
     desk.page.get_by_label("Source").click()
     desk.page.get_by_role("option", name="policy").click()
@@ -157,20 +123,3 @@ def test_a_policy_is_chosen_from_those_in_the_folder(desk: Desk) -> None:
     desk.timeline_says("step 1 /")
     desk.page.get_by_label("Source").click()
     desk.page.get_by_role("option", name="random").click()
-
-
-def test_a_line_of_the_file_opens_the_editor_and_the_reloads_are_listed(desk: Desk) -> None:
-    place = next(i for i, line in enumerate(TASK.read_text().splitlines(), 1) if '"cube_to_goal"' in line)
-    desk.edit('"cube_to_goal"', '"cube_to_goal_" + 1')
-    link = desk.page.locator(".wb-banner a")
-    expect(link).to_have_attribute("href", f"vscode://file{desk.file}:{place}")
-    expect(desk.page.locator(".wb-banner [data-copy]")).to_have_attribute("data-copy", f"{desk.file}:{place}")
-    desk.edit("return reward\n", "return reward + 1\n")
-    expect(link).to_have_count(0)
-    desk.page.get_by_text(LAST_LOADS, exact=True).click()
-    loads = desk.page.locator(".wb-load")
-    expect(loads.first).to_contain_text("restarted")
-    expect(loads.nth(1)).to_contain_text("refused")
-    expect(loads.nth(1)).to_contain_text(f"push_cube.py:{place}")
-    desk.file.write_text(TASK.read_text())
-    expect(loads.first).to_contain_text("only compute_dense_reward changed")

@@ -55,13 +55,7 @@ def test_every_page_of_the_documents_opens_with_its_pictures(
         assert errors == []
 
 
-def test_without_the_token_no_document_is_served(served: GatedServer, browser: Browser) -> None:
-    page = browser.new_context().new_page()
-    answer = page.goto(served.addresses("/help/safety")[0].partition("?")[0])
-    assert answer is not None and answer.status == 403 and "HMAC" not in page.content()
-    page.context.close()
-
-
+@pytest.mark.slow
 def test_a_link_to_a_part_of_a_page_shows_that_part(served: GatedServer, browser: Browser) -> None:
     with page_at(browser, served.addresses("/help/tasks")[0]) as (page, errors):
         page.get_by_role("link", name="rules", exact=True).click()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, FloatRect, Page, expect
+from playwright.sync_api import Browser, Page, expect
 
 from tests.browser.conftest import At
 from tests.browser.layout import FAULTS
@@ -19,7 +19,7 @@ from tests.drive.page import close_notice, open_workbench, page_at, picture_of_v
 from tests.drive.studio import press
 from tests.drive.waiting import until
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 SIZES = [(1280, 720), (1440, 900), (1920, 1080)]
 DEFECTS = {
     "buttons touch": ".mantine-Flex-root { gap: 0 !important }",
@@ -90,7 +90,6 @@ def choose_camera(desk: Desk) -> None:
         desk.page.get_by_role("option", name=re.compile("^base_camera")).first.click()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", SIZES)
 def test_every_tab_of_the_live_page_in_both_themes(desk: Desk, size: tuple[int, int]) -> None:
     choose_camera(desk)
@@ -115,43 +114,6 @@ def test_what_is_wrong_is_found(desk: Desk) -> None:
         until(lambda kind=kind: any(fault.startswith(kind) for fault in desk.page.evaluate(FAULTS)), kind)
         sheet.evaluate("sheet => sheet.remove()")
     assert faults(desk.page) == []
-
-
-@pytest.mark.slow
-def test_the_view_keeps_half_of_the_page_beside_the_envs(desk: Desk) -> None:
-    table = desk.page.locator(".wb-env-table")
-
-    def heads() -> list[str]:
-        """Of the columns that are seen."""
-        return [head.inner_text().split()[0] for head in table.locator("th").all() if head.is_visible()]
-
-    desk.press("b")
-    expect(desk.page.locator(".wb-env-table")).to_be_visible()
-    until(
-        lambda: width_of(desk.page, VIEW) >= 640,
-        "a view of half the page",
-        seen=lambda: width_of(desk.page, VIEW),
-    )
-    # Beside it columns give way, and none is cut.
-    cut = "() => { const t = document.querySelector('.wb-env-table'); return t.getBoundingClientRect().right > t.closest('[data-dock-region]').getBoundingClientRect().right }"
-    until(lambda: not desk.page.evaluate(cut), "a table that is not cut")
-    assert heads() == ["env", "state", "steps", "return", "success"]
-    hidden = desk.page.locator(".wb-envs-hidden")
-    expect(hidden).to_have_text("4 hidden")
-    expect(hidden).to_have_attribute("title", re.compile("flags, last, fail, reward"))
-    desk.page.set_viewport_size({"width": 1920, "height": 1080})
-    fits = "() => { const t = document.querySelector('.wb-env-table'); return t.scrollWidth <= t.closest('.mantine-ScrollArea-viewport').clientWidth && t.closest('[data-dock-region]').offsetWidth - t.offsetWidth < 40 }"
-    until(lambda: desk.page.evaluate(fits), "a table as wide as its columns")
-    assert len(heads()) == 9
-    expect(hidden).to_be_empty()
-    pills = desk.page.locator(".wb-envs")
-    pills.get_by_text("columns ▾").click()
-    pills.get_by_text("✓ fail").click()
-    expect(desk.page.locator(".wb-env-table th", has_text="fail")).to_have_count(0)
-    pills.get_by_text("fail", exact=True).click()
-    expect(desk.page.locator(".wb-env-table th", has_text="fail")).to_have_count(1)
-    pills.get_by_text("columns ▴").click()
-    desk.press("b")
 
 
 def test_all_tabs_are_in_one_row_and_inputs_are_written_as_their_labels(desk: Desk) -> None:
@@ -180,7 +142,6 @@ def test_what_a_control_says_of_itself_stands_beside_its_panel(desk: Desk) -> No
     expect(tooltip).to_have_count(0)
 
 
-@pytest.mark.slow
 def test_nothing_lies_over_what_is_looked_at_through_a_camera(desk: Desk) -> None:
     choose_camera(desk)
     timeline = desk.page.locator("[data-floating-window]")
@@ -204,17 +165,6 @@ def test_nothing_lies_over_what_is_looked_at_through_a_camera(desk: Desk) -> Non
     until(lambda: timeline.bounding_box() == high, "the timeline as it was")
 
 
-@pytest.mark.slow
-def test_the_light_theme_has_a_light_view(desk: Desk) -> None:
-    clip: FloatRect = {"x": 420.0, "y": 10.0, "width": 200.0, "height": 60.0}
-    dark = picture_of_view(desk.page, clip).mean()
-    desk.press("d")
-    until(lambda: picture_of_view(desk.page, clip).mean() > 170, "a light floor")
-    assert dark < 130
-    desk.press("d")
-
-
-@pytest.mark.slow
 def test_every_tab_of_the_review_in_all_sizes_and_both_themes(tmp_path: Path, browser: Browser) -> None:
     shutil.copytree(GOLDEN / "v1", tmp_path / "v1")
     with (
@@ -242,7 +192,6 @@ def test_every_tab_of_the_review_in_all_sizes_and_both_themes(tmp_path: Path, br
         assert ({tab: said for tab, said in found.items() if said}, errors) == ({}, [])
 
 
-@pytest.mark.slow
 def test_a_browser_without_webgl_says_what_is_missing_and_what_to_do(
     example: At, browser: Browser, chromium_path: str
 ) -> None:

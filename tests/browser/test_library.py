@@ -112,6 +112,7 @@ def test_rows_are_selected_by_mouse_and_keys_and_opened(shown: Shown) -> None:
     until(lambda: shown.opened[1:] == [("id59",)], "opened by pressing twice", seen=lambda: shown.opened)
 
 
+@pytest.mark.slow
 def test_a_key_right_after_a_press_is_about_what_was_pressed(shown: Shown) -> None:
     """Both within one task of the page, which is as fast as a page that was busy hears of them."""
     for k in range(12):
@@ -209,6 +210,7 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     until(lambda: shown.seeds()[:2] == [0, 1], "the row again")
 
 
+@pytest.mark.slow
 def test_a_new_recording_appears_by_itself_with_all_of_its_seed(shown: Shown) -> None:
     largest = 2**31 - 1
     describe(shown.library.folder, "new", id="new", seed=largest, written_at="2026-11-21T12:00:00")

@@ -39,6 +39,7 @@ def in_sight_on_every_tab(desk: Desk, mark: Locator) -> None:
         expect(mark).to_be_visible()
 
 
+@pytest.mark.slow
 def test_letters_typed_beside_a_field_reset_and_record_nothing(desk: Desk) -> None:
     desk.tab("Reward")
     desk.press("Shift+R", "s", "s")
@@ -103,6 +104,7 @@ def test_a_moved_camera_is_in_sight_until_it_is_put_back(desk: Desk) -> None:
     until(lambda: numbers(desk.page, "Position") == [0.45, 0, 0.6], "where the file has it")
 
 
+@pytest.mark.slow
 def test_a_recording_of_a_moved_camera_says_so_in_the_review(desk: Desk) -> None:
     page = desk.page
     desk.tab("Studio")

@@ -81,18 +81,3 @@ def test_a_row_shows_its_env_at_its_moment_and_a_key_goes_to_the_next(desk: Desk
     desk.page.keyboard.press("End")
     expect(desk.page.locator(".wb-timeline").get_by_text("live", exact=True)).to_be_visible()
     desk.select_the_first_env()
-
-
-def test_an_edit_that_changes_no_number_is_one_line(desk: Desk) -> None:
-    desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
-    says(desk, r"Nothing differs in \d+ episodes: reward, success and fail are unchanged\.")
-    expect(rows(desk)).to_have_count(0)
-    expect(desk.page.get_by_text("before and now")).to_have_count(0)
-
-
-def test_code_that_raises_on_the_way_is_told_with_its_line(desk: Desk) -> None:
-    desk.edit(REWARD, f"if self.elapsed_steps.max() > 40: raise KeyError('far')\n        {REWARD} * 2")
-    says(desk, "the new code raised: KeyError")
-    says(desk, r"push_cube\.py:\d+")
-    expect(desk.page.get_by_text("before and now")).to_be_visible()
-    assert desk.errors == []

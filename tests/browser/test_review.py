@@ -144,31 +144,6 @@ def test_compares_two_and_says_where_they_part(desk: tuple[Page, list[str]]) -> 
     assert [e for e in errors if LATE not in e] == []
 
 
-@pytest.mark.slow
-def test_the_librarys_keys_rest_while_it_is_folded_and_a_folded_panel_leaves_the_others_as_they_look(
-    desk: tuple[Page, list[str]],
-) -> None:
-    page, errors = desk
-    question = page.get_by_role("dialog")
-    open_both(page)
-    page.keyboard.press("Delete")
-    page.keyboard.press("b")  # after it: had it been heard, its question would be here too
-    expect(page.locator(".wb-library")).to_be_visible()
-    expect(question).to_be_hidden()
-    page.keyboard.press("Delete")
-    expect(question).to_be_visible()
-    page.keyboard.press("Escape")
-    expect(question).to_be_hidden()
-    page.get_by_role("button", name="Collapse panel area").last.click()
-    expect(page.locator(".wb-status")).to_have_count(0)
-    expect(page.locator(".wb-library-pills .wb-on")).to_have_css("border-radius", re.compile("[1-9]"))
-    page.get_by_role("button", name="Expand column").last.click()
-    expect(page.locator(".wb-status")).to_be_visible()
-    page.keyboard.press("b")
-    expect(page.locator(".wb-library")).to_have_count(0)
-    assert [e for e in errors if LATE not in e] == []
-
-
 def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) -> None:
     page, errors = desk
     open_both(page)

@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, expect
 
 from tests.drive.page import new_page, open_workbench
 
-pytestmark = pytest.mark.browser
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
 def test_a_server_that_is_gone_is_said_with_its_address(browser: Browser, tmp_path: Path) -> None:

@@ -187,44 +187,6 @@ def test_from_the_start_page_to_a_task_to_another_and_back(
         assert errors == []
 
 
-@pytest.mark.slow
-def test_options_are_applied_on_the_page_and_bad_ones_leave_the_envs(
-    started: Opened, browser: Browser
-) -> None:
-    with page_at(browser, started.url, 1280, 900) as (page, errors):
-        open_list(page)
-        page.keyboard.type("push.py")
-        row(page, "push.py").click()
-        runs(page, "WorkbenchPushCube-v1")
-        page.get_by_text("How the envs are made").click()
-        form = page.locator(".wb-env-options")
-        expect(form).to_contain_text("--num-envs 2 --env render_backend=none")
-        envs = page.get_by_role("textbox", name="Envs", exact=True)
-        envs.click()
-        page.keyboard.press("Control+a")
-        page.keyboard.type("3")
-        page.keyboard.press("Tab")
-        expect(envs).to_have_value("3")
-        page.get_by_role("combobox", name="Control").click()
-        page.get_by_role("option", name="pd_joint_pos", exact=True).click()
-        page.get_by_role("button", name="Apply").click()
-        runs(page, "WorkbenchPushCube-v1", "3 envs")
-        expect(page.locator(".wb-status")).to_contain_text("pd_joint_pos")
-        expect(form).to_contain_text("--num-envs 3")
-        expect(form).to_contain_text("--env control_mode=pd_joint_pos")
-        page.get_by_role("combobox", name="Observation").click()
-        page.get_by_role("option", name="rgb", exact=True).click()
-        page.get_by_role("button", name="Apply").click()
-        # Nothing renders here, so no picture can be observed.
-        expect(form).to_contain_text("Not taken: obs_mode", timeout=PATIENT)
-        expect(page.locator(".wb-banner")).to_be_visible()
-        expect(page.locator(".wb-status")).to_contain_text("3 envs")
-        page.get_by_role("button", name="Discard").click()
-        expect(page.locator(".wb-banner")).to_be_hidden(timeout=PATIENT)
-        runs(page, "WorkbenchPushCube-v1", "3 envs")
-        assert errors == []
-
-
 def test_a_new_task_is_created_with_the_mouse_and_opens(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
@@ -258,6 +220,7 @@ def colours(page: Page) -> int:
     return len(np.unique(view_of(page).reshape(-1, 3), axis=0))
 
 
+@pytest.mark.slow
 def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_once_mended(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
@@ -282,21 +245,4 @@ def test_a_file_that_is_not_python_yet_shows_nothing_of_another_task_and_opens_o
         shutil.copy(TASK, file)
         runs(page, "WorkbenchPushCube-v1")
         expect(banner).to_be_hidden()
-        assert errors == []
-
-
-@pytest.mark.slow
-def test_the_list_is_in_the_review_too(started: Opened, browser: Browser) -> None:
-    with page_at(browser, started.url) as (page, errors):
-        open_list(page)
-        page.keyboard.type("recordings/")
-        page.keyboard.press("Enter")
-        expect(page.locator(".wb-library-tools, .wb-note").first).to_be_visible(timeout=PATIENT)
-        expect(page.get_by_role("tab", name="Library")).to_be_visible(timeout=PATIENT)
-        open_list(page)
-        page.keyboard.press("Escape")
-        expect(page.get_by_role("dialog")).to_be_hidden()
-        open_list(page)
-        row(page, "sub/small.py").click()
-        runs(page, "WorkbenchMinimal-v1")
         assert errors == []

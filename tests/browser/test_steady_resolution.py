@@ -40,14 +40,6 @@ window.requestAnimationFrame = (draw) => soon(() => setTimeout(() => {
     draw(now);
 }, 60));
 """
-SOURCES = """
-const give = WebGL2RenderingContext.prototype.shaderSource;
-window.shaders = [];
-WebGL2RenderingContext.prototype.shaderSource = function (shader, text) {
-    window.shaders.push(text);
-    return give.call(this, shader, text);
-};
-"""
 ENOUGH_FRAMES = 60
 """viser decides after ten quarters of a second in which frames follow each other."""
 CANVAS = "document.querySelector('canvas[data-engine]')"
@@ -93,20 +85,6 @@ def draw_until(gated_server: GatedServer, page: Page, reached: str) -> None:
     until(seen, reached)
 
 
-def shaders_of_a_box(gated_server: GatedServer, page: Page) -> list[str]:
-    """The texts of the shaders that draw boxes as the envs' bodies are drawn."""
-    box = as_glb([(box_mesh((0.5, 0.5, 0.5)), Material((0.5, 0.5, 0.5, 1.0)))])
-    one = {
-        "batched_wxyzs": np.eye(4, dtype=np.float32)[:1],
-        "batched_positions": np.zeros((1, 3), np.float32),
-    }
-    node = gated_server.server.scene.add_batched_glb("/boxes", box, **one)
-    found = "window.shaders.filter((text) => text.includes('USE_INSTANCING_INDIRECT') && text.includes('#define STANDARD'))"
-    until(lambda: page.evaluate(f"{found}.length") >= 2, "the shaders of a box")
-    node.remove()
-    return page.evaluate(found)
-
-
 def width(page: Page) -> int:
     return page.evaluate(f"{CANVAS}.width")
 
@@ -127,29 +105,6 @@ def test_a_page_with_a_graphics_card_is_sharp_and_still_adapts(gated_server: Gat
     assert width(page) == 2 * 640
     draw_until(gated_server, page, f"{CANVAS}.width < {2 * 640}")
     assert page.evaluate(SHOWN_PART) == ""
-    page.close()
-
-
-def test_a_resolution_that_the_address_asks_for_is_left_alone(show: Show) -> None:
-    page = show(wish="&fixedDpr=1.5")
-    page.wait_for_function(f"() => {CANVAS}.width === 960")
-    assert page.url.endswith("?fixedDpr=1.5")
-    page.close()
-
-
-def test_a_page_drawn_in_software_is_drawn_in_less_time(gated_server: GatedServer, show: Show) -> None:
-    page = show(SOURCES)
-    asked = page.evaluate(f"{CANVAS}.getContext('webgl2').getContextAttributes()")
-    assert not asked["antialias"] and not asked["preserveDrawingBuffer"]
-    text = "\n".join(shaders_of_a_box(gated_server, page))
-    for cheaper in (
-        "specularBRDF = vec3( 0.0 )",
-        "F = material.specularColor",
-        "if ( false ) RE_IndirectSpecular(",
-    ):
-        assert cheaper in text
-    for cheaper in ("material.dfg = vec2( 1.0, 0.0 )", "vec3 dxy = vec3( 0.0 )", "int x = j - y * size"):
-        assert cheaper in text
     page.close()
 
 
@@ -213,13 +168,4 @@ def test_shapes_are_simpler_only_while_every_page_draws_in_software(
     assert in_software.looks(Looks(), geometry, layout, alone=False) == Looks()
     other.close()
     until(lambda: in_software.all_pages, "the other page is gone")
-    page.close()
-
-
-def test_a_page_with_a_graphics_card_is_drawn_as_viser_does(gated_server: GatedServer, show: Show) -> None:
-    page = show(A_CARD, SOURCES)
-    asked = page.evaluate(f"{CANVAS}.getContext('webgl2').getContextAttributes()")
-    assert asked["antialias"] and asked["preserveDrawingBuffer"]
-    text = "\n".join(shaders_of_a_box(gated_server, page))
-    assert "specularBRDF = BRDF_GGX(" in text and "int x = j % size" in text
     page.close()

@@ -6,12 +6,10 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-import yaml
 from numpy.typing import NDArray
-from playwright.sync_api import Browser, Locator, Page, TimeoutError, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.drive.page import page_on
 from tests.drive.studio import (
@@ -22,7 +20,6 @@ from tests.drive.studio import (
     end_of_the_left_arrow,
     field,
     numbers,
-    option,
     picture,
     press,
     tool,
@@ -169,67 +166,6 @@ def test_typed_and_nudged_and_undone(page: Page) -> None:
     page.get_by_text("Lens and image", exact=True).click()
 
 
-def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) -> None:
-    at = "[document.activeElement.textContent, document.activeElement.ariaPressed]"
-    tool(page, "pose")
-    # The click before this gives the focus back once more a moment later.
-    page.evaluate("new Promise(done => setTimeout(done, 60))")
-    page.evaluate(
-        "[...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'pose').focus()"
-    )
-    page.keyboard.press("Tab")
-    page.keyboard.press("Enter")
-    # The row is replaced, and what was walked to has the focus in the new one.
-    until(lambda: page.evaluate(at) == ["eye and target", "true"], "the other way to place")
-    expect(page.get_by_text("the camera keeps looking at its target")).to_be_visible()
-    page.locator("//label[text()='Eye']/ancestor::*[.//input][1]//input").first.fill("0.6")
-    page.keyboard.press("Enter")
-    until(lambda: numbers(page, "Eye") == [0.6, 0, 0.6], "the eye")
-    until(lambda: numbers(page, "Degrees")[1] == 49.09, "the angle")
-    assert numbers(page, "Target") == [0.08, 0, 0]
-    page.evaluate("document.activeElement.blur()")
-    page.keyboard.press("Alt+ArrowLeft")
-    until(lambda: numbers(page, "Eye") == [0.6, -0.01, 0.6], "the nudge")
-    assert numbers(page, "Target") == [0.08, 0, 0]
-    for _ in range(2):
-        page.keyboard.press("Control+z")
-    until(lambda: numbers(page, "Eye") == [0.45, 0, 0.6], "both undone")
-    press(page, "pose")
-    until(lambda: "wb-on" in tool(page, "pose")["classes"], "the pose again")
-    page.locator("//label[text()='Position']/ancestor::*[.//input][1]//input").first.fill("0.6")
-    page.keyboard.press("Enter")
-    until(lambda: numbers(page, "Looks at") == [0.23, 0, 0], "the target, which goes along")
-
-
-def test_tab_goes_on_where_the_page_changes_while_it_leaves_a_part(page: Page) -> None:
-    tool(page, "pose")
-    page.evaluate(
-        """() => {
-            [...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'pose').focus();
-            addEventListener("focusout", () => document.body.append(document.createElement("i")), { once: true });
-        }"""
-    )
-    page.keyboard.press("Tab")
-    assert page.evaluate("document.activeElement.textContent") == "eye and target"
-    page.evaluate("document.activeElement.blur()")
-
-
-def test_keys_that_follow_a_click_at_once_keep_what_they_walked_to(page: Page) -> None:
-    tool(page, "pose")
-    kept = page.evaluate(
-        """async () => {
-            const pill = [...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'pose');
-            pill.dispatchEvent(new PointerEvent("pointerup", { bubbles: true }));
-            pill.dispatchEvent(new KeyboardEvent("keydown", { bubbles: true, key: "Tab" }));
-            pill.focus();
-            await new Promise(done => setTimeout(done, 100));
-            return document.activeElement.textContent;
-        }"""
-    )
-    assert kept == "pose"
-    page.evaluate("document.activeElement.blur()")
-
-
 def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
     press(page, "Look through")
     tool(page, "Back to my view")
@@ -240,25 +176,6 @@ def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
     assert np.allclose(numbers(page, "Looks at"), [0.08, 0, 0], atol=2e-4)
     press(page, "Back to my view")
     until(lambda: end_of_the_left_arrow(page) is not None, "the gizmo again")
-
-
-def test_a_copy_is_planned_and_left(page: Page, task_file: Path) -> None:
-    text = task_file.read_text()
-    unfold(page, "Add, copy, rename, remove", page.get_by_role("button", name="Rename", exact=True))
-    page.get_by_role("button", name="Rename", exact=True).click()
-    expect(page.get_by_text("Type a new name first: letters, digits, - and _.")).to_be_visible()
-    # Without a name it is given one.
-    page.get_by_role("button", name="Duplicate", exact=True).click()
-    expect(page.locator(".wb-diff-add").filter(has_text='"base_camera_2"')).to_be_visible()
-    expect(page.get_by_text("Type a new name first")).not_to_be_visible()
-    # viser's text fields are not tied to their labels.
-    page.locator("//label[text()='New name']/ancestor::*[.//input][1]//input").fill("second_camera")
-    page.get_by_role("button", name="Duplicate", exact=True).click()
-    expect(page.locator(".wb-diff-add").filter(has_text='"second_camera"')).to_be_visible()
-    page.get_by_role("button", name="Discard the change").click()
-    expect(page.locator(".wb-diff:visible")).to_have_count(0)
-    assert task_file.read_text() == text
-    page.get_by_text("Add, copy, rename, remove", exact=True).click()
 
 
 def test_turned_with_the_mouse(page: Page) -> None:
@@ -275,39 +192,6 @@ def test_turned_with_the_mouse(page: Page) -> None:
     assert numbers(page, "Position") == [0.45, 0, 0.6], "it was moved, not turned"
     page.keyboard.press("Control+z")
     until(lambda: numbers(page, "Degrees") == start, "the turn undone")
-
-
-def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path) -> None:
-    text = task_file.read_text()
-    unfold(page, "Lens and image", page.locator(field(page, "Lens as")))
-    option(page, "Lens as", "intrinsic matrix")
-    expect(page.locator(field(page, "fx, fy"))).to_be_visible()
-    page.locator(field(page, "fx, fy")).fill("150")
-    page.keyboard.press("Enter")
-    until(lambda: numbers(page, "fx, fy")[0] == 150, "the focal length")
-    page.locator(field(page, "cx, cy", 2)).fill("70")
-    page.evaluate("document.activeElement.blur()")
-    both = page.locator(".wb-diff-add").filter(has_text=re.compile(r"\[150.*70\.0"))
-
-    def shown() -> bool:
-        """The page sends a number up to 50 ms after it was typed; no person is as fast with the button."""
-        button(page, "Show the change")
-        try:
-            both.wait_for(timeout=10_000)
-        except TimeoutError:
-            return False
-        return True
-
-    until(shown, "the change with both numbers")
-    button(page, f"Save to {FILE}")
-    expect(page.get_by_text("saved to push_cube.py and verified")).to_be_visible()
-    assert "fov=1.0, near=0.01, far=10)" not in task_file.read_text() and "70" in task_file.read_text()
-    button(page, "Revert in the file")
-    expect(page.get_by_text(f"Edit reverted in {FILE}.")).to_be_visible()
-    assert task_file.read_text() == text
-    button(page, "Close")
-    press(page, "Reset to file")
-    page.get_by_text("Lens and image", exact=True).click()
 
 
 def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_file: Path) -> None:
@@ -361,55 +245,3 @@ def test_the_picture_stays_in_sight_and_is_looked_at_in_another_size(page: Page)
     expect(page.locator(".wb-took")).to_have_text(re.compile(r"^(fast|exact), \d+ ms$"))
     page.get_by_text("Matrices and files", exact=True).click()
     expect(by_matrix).to_be_hidden()
-
-
-def test_files_for_opencv_and_ros_say_what_the_page_says(page: Page) -> None:
-    unfold(page, "Matrices and files", page.get_by_role("button", name="Download", exact=True))
-    for name, suffix in (("OpenCV YAML", "opencv"), ("ROS CameraInfo", "ros")):
-        option(page, "File", name)
-        with page.expect_download() as event:
-            button(page, "Download")
-        assert event.value.suggested_filename == f"base_camera_{suffix}.yaml"
-        text = Path(event.value.path()).read_text()
-        if suffix == "ros":
-            said = yaml.safe_load(text)
-            matrix = np.array(said["camera_matrix"]["data"]).reshape(3, 3)
-            assert (said["image_width"], said["image_height"]) == (128, 128)
-        else:
-            store = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-            matrix = store.getNode("sensor_base_camera").getNode("camera_matrix").mat()
-        assert matrix[0, 0] == pytest.approx(64 / np.tan(0.5)) and matrix[0, 2] == 64
-    page.get_by_text("Matrices and files", exact=True).click()
-
-
-def test_judged_over_steps_a_press_shows_the_step_and_over_fresh_resets_it_can_be_stopped(page: Page) -> None:
-    page.evaluate("document.activeElement.blur()")
-    page.keyboard.press("Shift+R")
-    expect(page.get_by_text("env 0: step 0").first).to_be_visible()
-    for step in range(1, 4):
-        page.keyboard.press("s")
-        expect(page.get_by_text(f"env 0: step {step}").first).to_be_visible()
-    unfold(page, "Measure", page.get_by_role("button", name="Measure this camera", exact=True))
-    option(page, "Over", "this env's episode so far")
-    button(page, "Measure this camera")
-    expect(page.get_by_text("4 moments of env 0's episode, step 0 to step 3")).to_be_visible()
-    strip = page.locator(".wb-steps").first.locator("i")
-    expect(strip).to_have_count(4)
-    strip.nth(1).click()
-    expect(page.get_by_text("2 steps ago", exact=True)).to_be_visible()
-    page.evaluate("document.activeElement.blur()")
-    page.keyboard.press("End")
-    option(page, "Over", "fresh resets")
-    page.get_by_role("textbox", name="Resets").first.fill("900")
-    page.keyboard.press("Enter")
-    button(page, "Measure this camera")
-    expect(page.get_by_text(re.compile("measuring base_camera over 900 seeds"))).to_be_visible(
-        timeout=120_000
-    )
-    page.get_by_role("button", name="Stop", exact=True).first.click()
-    expect(page.get_by_role("button", name="Stop", exact=True)).to_have_count(0)
-    page.get_by_role("textbox", name="Resets").first.fill("2")
-    page.keyboard.press("Enter")
-    button(page, "Measure this camera")
-    expect(page.get_by_text("2 fresh resets")).to_be_visible(timeout=120_000)
-    page.get_by_text("Measure", exact=True).click()

@@ -83,13 +83,3 @@ def test_a_line_a_row_and_an_episode_are_pressed_with_the_mouse(shown: Shown) ->
     page.locator(".wb-sweep-episodes tr", has_text="seed 11").click()
     until(lambda: shown.opened, "an opened recording")
     assert shown.opened == [("p7s11",)]
-
-
-def test_a_value_is_pressed_and_the_others_fade(shown: Shown) -> None:
-    page = shown.page
-    rows = page.locator(".wb-sweep-scroll tbody tr")
-    page.locator(".wb-tick-text", has_text="fetch").click()
-    expect(rows).to_have_count(3)
-    expect(page.locator(".wb-left-out")).to_have_count(6)
-    page.get_by_text("Show all points again").click()
-    expect(rows).to_have_count(9)

@@ -20,8 +20,8 @@ SLIDER = ".mantine-Slider-root"
 
 
 @pytest.fixture(scope="module")
-def opened(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
-    with example_without_pictures(browser) as desk:
+def opened(example: At, browser: Browser) -> Iterator[Desk]:
+    with example(browser) as desk:
         desk.tab("Reward")
         expect(desk.page.get_by_text("elapsed steps")).to_be_visible()
         yield desk
@@ -58,9 +58,12 @@ def test_arrow_keys_walk_through_the_past_and_end_is_live(desk: Desk) -> None:
     desk.press("End")
     desk.comes_to(STEPS)
     desk.timeline_says("live")
+    desk.press("Shift+R")
+    desk.comes_to(0)
+    desk.press("Shift+U")
+    desk.comes_to(STEPS)
     desk.press("Home")
     until(lambda: "past" in desk.page.locator(".wb-timeline").inner_text(), "the first moment")
-    desk.comes_to(0)
 
 
 def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk) -> None:
@@ -183,48 +186,6 @@ def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_a
     page.keyboard.press("Enter")
     desk.timeline_says("2 steps ago")
     page.get_by_role("tab", name="Reward").click()
-
-
-@pytest.mark.slow
-def test_the_timeline_keeps_its_height_when_it_offers_to_go_on(desk: Desk) -> None:
-    panel = ".mantine-Paper-root:has(.wb-timeline)"
-    live = desk.box(panel)
-    desk.press("ArrowLeft")
-    expect(desk.page.get_by_role("button", name="Continue from here: env 0")).to_be_visible()
-    past = desk.box(panel)
-    assert abs(past["height"] - live["height"]) < 1
-
-
-def test_going_on_from_a_moment_leaves_the_old_future_in_reach(desk: Desk) -> None:
-    arcs = desk.page.locator(".wb-arc")
-    before = arcs.count()
-    desk.press("ArrowLeft", "ArrowLeft", "ArrowLeft", "ArrowLeft")
-    desk.comes_to(STEPS - 4)
-    desk.page.get_by_role("button", name="Continue from here: env 0").click()
-    desk.timeline_says("live")
-    desk.comes_to(STEPS - 4)
-    desk.page.keyboard.press("s")
-    desk.comes_to(STEPS - 3)
-    desk.timeline_says("went back")
-    assert arcs.count() == before + 1
-    desk.leave_inputs()
-    desk.press("Shift+U")
-    desk.comes_to(STEPS)
-
-
-def test_a_reset_is_undone_by_a_key(desk: Desk) -> None:
-    desk.page.keyboard.press("Shift+R")
-    desk.comes_to(0)
-    desk.press("Shift+U")
-    desk.comes_to(STEPS)
-
-
-@pytest.mark.slow
-def test_space_is_for_the_button_that_was_walked_to(desk: Desk) -> None:
-    desk.page.get_by_role("button", name="‹ step", exact=True).focus()
-    desk.page.keyboard.press("Space")
-    desk.comes_to(STEPS - 1)
-    expect(desk.page.get_by_text("paused", exact=True)).to_be_visible()
 
 
 def test_nothing_went_wrong_in_the_console(opened: Desk) -> None:

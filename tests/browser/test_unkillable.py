@@ -81,7 +81,3 @@ def test_the_log_shows_what_was_printed_and_forgets_it(desk: Desk) -> None:
     expect(desk.page.get_by_text("paused", exact=True)).to_be_visible()
     desk.button("Clear").click()
     expect(desk.page.get_by_text("Nothing printed so far.")).to_be_visible()
-
-
-def test_nothing_went_wrong_in_the_console(desk: Desk) -> None:
-    assert desk.errors == []

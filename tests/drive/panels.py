@@ -10,20 +10,25 @@ threads is done. Only controls that a page offers can be pressed; `claim` sends 
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
 import viser
 from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage, GuiUpdateMessage
 
 from workbench.ui.server.control_values import check_value, name_of
 from workbench.ui.server.viser_private import element_id
+from workbench.ui.widgets.parts import Parts
 
 Kind = Literal["button", "field"]
 """Of an input. A button and what it is for may have the same label."""
+_NOT_SEEN = {"order", "visible", "container_uuid", "parent_uuid", "_tab_container_ids"}
+"""Of what is told of a part."""
 _Roots = list[tuple[Any, bool]]
 """Containers, and whether each is seen."""
 
@@ -102,9 +107,21 @@ def held_by(server: viser.ViserServer) -> dict[str, int]:
     }
 
 
+def forget_what_was_drawn(parts: Parts[Any]) -> None:
+    """So that each part of a page is drawn with the next view, whatever its key says."""
+    for _, due in parts._parts:
+        due._drawn = None
+
+
 def told_so_far(server: viser.ViserServer) -> int:
     """How many messages the server has put on their way to all pages."""
     return server._websock_server._broadcast_buffer.message_counter
+
+
+def difference(before: dict[str, object], after: dict[str, object]) -> str:
+    """What is otherwise in the one than in the other; empty if nothing is."""
+    keys = [key for key in {**before, **after} if before.get(key) != after.get(key)]
+    return "\n".join(f"{key}: {before.get(key)!r:.300} -> {after.get(key)!r:.300}" for key in keys)
 
 
 def inputs_of(gui: viser.GuiApi) -> list[Any]:
@@ -200,6 +217,41 @@ class Panels:
         """What is in the 3-D view with `word` in its name."""
         nodes = self.server.scene._handle_from_node_name
         return [handle for name, handle in sorted(nodes.items()) if word in name]
+
+    def everything(self) -> dict[str, object]:
+        """All that can be seen, by its place on the page: to be compared with what is seen at another time."""
+        names = {element_id(handle): name_of(handle) for handle in inputs_of(self.server.gui)}
+        anonymous = re.compile("|".join(map(re.escape, names)) or "(?!)")
+
+        def plain(value: object) -> object:
+            if isinstance(value, bytes):
+                return hash(value)
+            if isinstance(value, np.ndarray):
+                return value.shape, hash(value.tobytes())
+            if isinstance(value, str):
+                return anonymous.sub(lambda found: names[found[0]], value)
+            if isinstance(value, (tuple, list)):
+                return tuple(map(plain, value))
+            return value if isinstance(value, (int, float, bool, type(None))) else repr(value)
+
+        def of(handle: Any) -> dict[str, object]:
+            props = vars(handle._impl.props if hasattr(handle._impl, "props") else handle._impl.message.props)
+            return {name: plain(value) for name, value in props.items() if name not in _NOT_SEEN}
+
+        seen: dict[str, object] = {}
+        for child, is_seen in self._walk(self._roots()):
+            label = getattr(child, "label", None) or ""
+            if is_seen and label != "·":  # what our HTML presses
+                value = plain(getattr(child._impl, "value", None))
+                key = f"{type(child).__name__} {label if isinstance(label, str) else ''}"
+                seen[f"{key} {sum(one.startswith(key) for one in seen)}"] = value, of(child)
+        for node in self.nodes(""):
+            if node.name and getattr(node, "visible", True):
+                seen[f"in the view: {node.name}"] = plain(node.position), plain(node.wxyz), of(node)
+
+        for label, (_, command) in self._commands().items():
+            seen[f"command {label}"] = of(command)
+        return seen
 
     # --- what a person does ------------------------------------------------------------------------
 

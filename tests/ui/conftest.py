@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import viser
 
+from tests.drive.live import Live
 from tests.drive.panels import Clock, Panels
 from tests.drive.scripted import Evaluate, no_success, scripted
 from tests.drive.session import wait_until
@@ -21,6 +22,20 @@ def server() -> Iterator[viser.ViserServer]:
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     yield server
     server.stop()
+
+
+@pytest.fixture
+def live_page(server: viser.ViserServer, clock: Clock) -> Live:
+    """The live page, with a hand on it."""
+    return Live(server, clock)
+
+
+@pytest.fixture(scope="module")
+def open_live() -> Iterator[Live]:
+    """A live page, made once for a file whose tests leave nothing arranged."""
+    live = Live(viser.ViserServer(host="127.0.0.1", port=0, verbose=False))
+    yield live
+    live.server.stop()
 
 
 @pytest.fixture

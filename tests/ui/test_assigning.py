@@ -6,7 +6,7 @@ the browser, under the pointer of a person about to press it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -86,6 +86,13 @@ SENT_AGAIN: tuple[tuple[str, str, object], ...] = (
 )
 
 
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
 def sent_by(server: viser.ViserServer, handle: Any, name: str, value: object) -> int:
     before = told_so_far(server)
     setattr(handle, name, value)
@@ -98,6 +105,7 @@ def test_what_is_equal_is_not_sent(server: viser.ViserServer, kind: str, name: s
     assert sent_by(server, handle, name, value) >= 1
     again = value.copy() if isinstance(value, np.ndarray) else value
     assert sent_by(server, handle, name, again) == 0
+    handle.remove()
 
 
 @pytest.mark.parametrize(("kind", "name", "value"), SENT_AGAIN)

@@ -17,9 +17,8 @@ from workbench.jobs.task import TaskOptions
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import LoadFailed
-from workbench.ui.app.go_live import ONE, GoLive, GoLivePart
+from workbench.ui.app.go_live import GoLive, GoLivePart
 from workbench.ui.app.workplace import Workplace
-from workbench.ui.review.rescore import RECORDED, TODAYS
 from workbench.ui.server.gated_server import GatedServer
 
 
@@ -110,6 +109,8 @@ def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason
 
 
 def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_yes(desk: Desk) -> None:
+    desk.live.play()
+    until(lambda: desk.live.view().playing, "the play")
     desk.go(1)
     until(lambda: desk.person.asked, "the question")
     assert desk.go_live.going() == "waiting for permission to run the code of Pull-v1"
@@ -117,6 +118,7 @@ def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_y
     desk.person.says_yes.set()
     until(lambda: desk.place.session is desk.other, "the other session")
     assert desk.opened == ["Pull-v1"] and desk.go_live.can_go_home()
+    until(lambda: not desk.live.view().playing, "the pause of the task that nobody sees")
     until(lambda: desk.other.view().timeline.entered, "the recorded state")
     desk.draw()
     assert desk.place.pages._wish == "live"
@@ -139,9 +141,3 @@ def test_a_review_that_is_shown_anew_waits_for_nothing_that_is_under_way(desk: D
     assert desk.go_live.going()
     GoLivePart(desk.place.server, desk.go_live)
     assert desk.go_live.going() == ""
-
-
-def test_the_code_and_the_envs_are_chosen(desk: Desk) -> None:
-    assert (desk.part._code.options, desk.part._envs.value) == ((TODAYS, RECORDED), ONE)
-    desk.part._code.value = RECORDED
-    assert desk.go_live.recorded_source and not desk.go_live.everywhere

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +14,10 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.session import TASKS, wait_until
 from tests.ui.tabs import handshake, messages_in
 from workbench.jobs.task import TaskOptions
-from workbench.machine.kept_choices import kept_choices
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.app.live_page import Page
 from workbench.ui.live.run_panel import RESET_ALL
-from workbench.ui.widgets.hotkeys import add_hints
 
 WAITS = """
 
@@ -132,16 +129,6 @@ def test_while_steps_go_on_a_press_is_shown_at_once_and_the_robots_move_with_eve
     wait_until(session, lambda view: view.state == "paused", "the pause")
 
 
-def test_selecting_an_env_moves_its_mark(opened: Opened) -> None:
-    opened.load()
-    opened.session.change(selected_env=2)
-    opened.draw()
-    assert opened.panels.labels() == ["env 2"]
-    assert opened.panels.control("Selected").value == 2
-    opened.panels.command("Next env")
-    assert opened.session.view().selected_env == 0
-
-
 def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
     opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,47 +189,3 @@ def test_broken_file_is_said_and_the_scene_stays(opened: Opened, task_file: Path
     assert not opened.banner()
     # The same shapes are not sent again.
     assert all(new is old for new, old in zip(opened.panels.bodies(""), shown, strict=True))
-
-
-def test_hints_are_on_the_first_page_until_they_are_closed_for_good(
-    opened: Opened, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    run = opened.panels.part("Run")
-    assert run.html("wb-hints").count("<li>") == 4
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    run.press("close the hints")
-    assert not run.html("wb-hints") and kept_choices().hints_closed
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    try:
-        add_hints(server)
-        assert not Panels(server).html("wb-hints")
-    finally:
-        server.stop()
-
-
-def test_inspect_shows_joints_as_soon_as_it_is_opened(opened: Opened) -> None:
-    opened.load()
-    inspect = opened.panels.part("Inspect")
-    assert inspect.control("Show").value == "joints" and opened.session.view().inspection is None
-    inspect.press("unfolded")
-    opened.draw()
-    view = wait_until(opened.session, lambda view: view.inspection is not None, "the joints")
-    opened.draw()
-    assert (
-        view.inspection is not None
-        and view.inspection.joints
-        and "panda_joint1" in inspect.html("wb-inspect")
-    )
-
-
-def test_buttons_name_their_keys_and_every_key_is_listed(opened: Opened) -> None:
-    told = opened.panels.html("wb-all-keys")
-    for button, key in (
-        ("Play", "Space"),
-        ("Reset this env", "Shift+S"),
-        ("‹ event", "Shift+Left arrow"),
-        ("live", "End"),
-    ):
-        escaped = json.dumps({button: key})[1:-1].replace('"', "&#34;")
-        assert escaped in told, (button, key)
-    assert told.count("<kbd>") > 30 and "<kbd>?</kbd>" in told

@@ -12,7 +12,7 @@ from workbench.core.capture.outliers import Outlier, OutlierKind
 from workbench.session.history.env_table import EnvRows
 from workbench.session.process.job_lane import JobProgress
 from workbench.session.record.save_past import SaveStatus
-from workbench.ui.app.marks import Marks, flagged_text
+from workbench.ui.app.marks import Marks
 from workbench.ui.widgets.open_tabs import OpenTabs
 
 
@@ -48,12 +48,6 @@ def test_flagged_envs_are_in_sight_and_a_press_leads_to_the_first(panels: Panels
     assert standing.content is content, "it stays under the finger that presses"
     panels.press("flagged")
     assert went == ["first"]
-
-
-def test_no_env_flagged_is_no_mark(panels: Panels) -> None:
-    marks(panels, rows_of(outliers={}), []).draw(running(6))
-    assert "wb-sight" not in panels.html()
-    assert flagged_text(rows_of(outliers={})) is None
 
 
 def test_what_is_saved_of_the_past_is_in_sight_until_it_is_saved(panels: Panels) -> None:

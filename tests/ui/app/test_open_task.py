@@ -106,14 +106,6 @@ def test_a_file_of_the_folder_opens_unasked_with_the_options_of_the_run(desk: De
     assert desk.place.home is session, "what is open is not opened again"
 
 
-@pytest.mark.parametrize("number", [0, -1, 10**7, 2**40])
-def test_a_number_that_is_not_listed_opens_nothing(desk: Desk, number: int) -> None:
-    desk.place.open_task.choose(number)
-    desk.choose("push.py")
-    desk.session_of("push.py")
-    assert len(desk.opened) == 1
-
-
 def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
     desk.choose("push.py")
     first = desk.session_of("push.py")
@@ -157,17 +149,6 @@ def test_a_file_from_elsewhere_asks_once_and_a_no_leaves_all_as_it_is(desk: Desk
     assert desk.opened[-1][1] == TaskOptions(3, env_kwargs={"size": 2}), "as it was opened last"
     assert desk.place.open_task.is_open(desk.row("other.py"))
     assert not desk.place.open_task.is_open(desk.row("push.py"))
-    desk.choose("push.py")
-    desk.session_of("push.py")
-    desk.choose("other.py")
-    desk.session_of("other.py")
-
-
-def test_going_back_to_a_file_that_was_open_in_this_run_asks_nothing(desk: Desk) -> None:
-    other = str(desk.folder / "elsewhere/other.py")
-    # As a file that was named on the command line: nobody was asked.
-    desk.place.session = desk.place.home = desk.place.open_task._open_session(other, TaskOptions(), None)
-    desk.session_of("other.py")
     desk.choose("push.py")
     desk.session_of("push.py")
     desk.choose("other.py")

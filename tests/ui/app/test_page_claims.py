@@ -21,9 +21,8 @@ from tests.drive.waiting import until
 from tests.ui.knocking import CAMERA, claim, client, close_code, say
 from tests.ui.tabs import messages_in
 from workbench.ui.server import page_guard
-from workbench.ui.server.client_messages import KINDS, MAX_BYTES
 from workbench.ui.server.control_values import LONGEST_LINE
-from workbench.ui.server.gated_server import GatedServer
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.viser_private import element_id
 
 with_fixtures = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -33,6 +32,14 @@ ANYTHING = st.recursive(
     lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
     max_leaves=8,
 )
+
+
+@pytest.fixture(scope="module")
+def gated_server() -> Iterator[GatedServer]:
+    """One for all that is tried on it."""
+    gated_server = open_server(ServerOptions(port=0))
+    yield gated_server
+    gated_server.close()
 
 
 @pytest.fixture
@@ -78,26 +85,6 @@ def caught_up(gated_server: GatedServer, connection: Connection) -> None:
     box.remove()
 
 
-@pytest.mark.parametrize(
-    "number", [1e30, -1e30, 99999999999999999999999.0, 2**64 - 1, -(2**63), float("inf"), float("nan"), 0.5]
-)
-def test_a_number_that_is_none_of_an_integers_disturbs_no_page(gated_server, bystander, capfd, number):
-    seed = gated_server.server.gui.add_number("Seed", 7, min=0, max=2**32 - 1, step=1)
-    bare = gated_server.server.gui.add_number("bare", 7)
-    with client(gated_server) as connection:
-        for control in (seed, bare):
-            say(connection, claim(control, number))
-        caught_up(gated_server, connection)
-        bystander()
-        assert (seed.value, bare.value) == (7, 7)
-    with client(gated_server) as late:  # a page that comes later gets all that is kept for it
-        caught_up(gated_server, late)
-    bystander()
-    seed.remove()
-    bare.remove()
-    assert "Traceback" not in capfd.readouterr().err
-
-
 CONTROLS: dict[str, Callable[[viser.GuiApi], viser.GuiInputHandle | viser.GuiButtonHandle]] = {
     "checkbox": lambda gui: gui.add_checkbox("box", False),
     "button": lambda gui: gui.add_button("press"),
@@ -121,8 +108,11 @@ CONTROLS: dict[str, Callable[[viser.GuiApi], viser.GuiInputHandle | viser.GuiBut
 
 
 @pytest.fixture
-def controls(gated_server: GatedServer) -> dict[str, viser.GuiInputHandle]:
-    return {name: make(gated_server.server.gui) for name, make in CONTROLS.items()}  # type: ignore[misc]
+def controls(gated_server: GatedServer) -> Iterator[dict[str, viser.GuiInputHandle]]:
+    made = {name: make(gated_server.server.gui) for name, make in CONTROLS.items()}
+    yield made  # type: ignore[misc]
+    for control in made.values():
+        control.remove()
 
 
 @pytest.fixture
@@ -131,6 +121,7 @@ def attacker(gated_server: GatedServer) -> Iterator[Connection]:
         yield connection
 
 
+@pytest.mark.filterwarnings("ignore:Do not use the `random` module")  # the connection's threads do, meanwhile
 @with_fixtures
 @given(st.sampled_from(sorted(CONTROLS)), ANYTHING | st.lists(NUMBERS, min_size=2, max_size=4))
 def test_whatever_is_claimed_a_control_holds_what_it_can_hold(gated_server, controls, attacker, name, value):
@@ -244,39 +235,7 @@ def test_what_is_typed_on_the_way_to_a_number_is_not_held_against_it(gated_serve
     number.remove()
 
 
-def test_an_option_that_went_while_it_was_clicked_is_not_taken(gated_server, bystander):
-    dropdown = gated_server.server.gui.add_dropdown("camera", ("front", "wrist"))
-    with client(gated_server) as connection:
-        dropdown.options = ("front",)
-        say(connection, claim(dropdown, "wrist"))
-        caught_up(gated_server, connection)
-        assert dropdown.value == "front"
-        dropdown.remove()
-        say(connection, claim(dropdown, "front"))  # nor a control that went
-        caught_up(gated_server, connection)
-    bystander()
-
-
-def test_many_impossible_values_are_one_line(gated_server, hands_off, capfd):
-    number = gated_server.server.gui.add_number("\x1b[31mred", 1)
-    with client(gated_server) as connection:
-        for value in (1e30, "x", None, [1], {}, 1e30) * 20:
-            say(connection, claim(number, value))
-        caught_up(gated_server, connection)
-    number.remove()
-    printed = capfd.readouterr().err
-    assert len(printed.splitlines()) <= 1
-    assert "\x1b" not in printed
-
-
 # Other kinds of messages --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", sorted(KINDS))
-def test_a_kind_has_the_fields_of_visers_own_message(kind):
-    """An upgrade of viser that adds a field would have every page's connection closed."""
-    theirs = viser._messages.__dict__[kind].__dataclass_fields__
-    assert KINDS[kind].__struct_fields__ == tuple(theirs)
 
 
 NAN, INF = float("nan"), float("inf")
@@ -327,34 +286,11 @@ def test_a_gizmo_goes_nowhere_that_is_no_place(gated_server, bystander):
     bystander()
 
 
-def test_forms_that_are_none_leave_nothing_behind(gated_server):
-    """viser keeps such a message for every later page, whatever id it has."""
-    buffer = gated_server.server._websock_server._broadcast_buffer.message_from_id
-    with client(gated_server) as connection:
-        caught_up(gated_server, connection)
-        before = len(buffer)
-        for number in range(200):
-            say(connection, {"type": "GuiFormDirtyMessage", "uuid": f"none-{number}"})
-            say(connection, {"type": "GuiFormSubmitMessage", "uuid": f"none-{number}"})
-        caught_up(gated_server, connection)
-        assert len(buffer) <= before + 10
-
-
 @pytest.mark.parametrize("item", [b"\xc0", b"\x90", b"\x80", b"\xa0", b"\x01"], ids=repr)
 def test_a_large_message_of_tiny_objects_is_not_taken_apart(gated_server, bystander, item):
     with client(gated_server) as connection:
         connection.send(b"\xdd" + (20_000_000).to_bytes(4, "big") + item * 20_000_000)
         assert close_code(connection) == 1009
-    bystander()
-
-
-def test_tiny_objects_in_a_value_are_refused(gated_server, bystander):
-    number = gated_server.server.gui.add_number("n", 1)
-    with client(gated_server) as connection:
-        say(connection, claim(number, [[]] * (MAX_BYTES - 1000)))
-        caught_up(gated_server, connection)
-        assert number.value == 1
-    number.remove()
     bystander()
 
 

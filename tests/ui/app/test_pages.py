@@ -112,18 +112,6 @@ def test_serving_the_pages_needs_no_simulator(child_process: None) -> None:
     assert not {"torch", "sapien", "mani_skill"} & set(said)
 
 
-def test_what_is_open_in_the_review_is_open_when_one_comes_back(place: Workplace) -> None:
-    place.pages.start("review")
-    review, library = place.shelf.review, place.shelf.library
-    library.refresh()
-    review.open([library.view().rows[0].id])
-    place.pages.show("live")
-    assert place.pages.wait_for("live", timeout=60)
-    place.pages.show("review")
-    assert place.pages.wait_for("review", timeout=60)
-    assert place.shelf.review is review
-
-
 def test_a_recording_that_is_wanted_is_opened_also_if_it_is_not_the_newest(
     place: Workplace, gated_server: GatedServer, tmp_path: Path
 ) -> None:

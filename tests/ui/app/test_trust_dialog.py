@@ -12,7 +12,6 @@ import pytest
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
 from workbench.session.clearance import CodeFile, Consent, Since, TrustQuestion
-from workbench.ui.app import trust_dialog
 from workbench.ui.app.trust_dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
 
 PUSH = CodeFile("/home/me/push.py", "0123456789ab", "import helper\n")
@@ -73,13 +72,6 @@ def test_only_the_first_answer_counts_and_none_comes_before_its_question(
     assert second.result(20) is Consent.NO
 
 
-def test_escape_is_a_no(dialog: TrustDialog, panels: Panels) -> None:
-    future = asked(dialog)
-    window_with(panels, "/home/me/push.py")
-    panels.command(DO_NOT)
-    assert future.result(20) is Consent.NO
-
-
 def test_questions_come_one_after_the_other(dialog: TrustDialog, panels: Panels) -> None:
     futures = {name: asked(dialog, about(name)) for name in ("a.py", "b.py", "c.py")}
     order = []
@@ -137,24 +129,3 @@ def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
     assert "Changes since then are marked; gone since: old.py" in said
     said = question_html(replace(PLAIN, trusted_before=True))
     assert "It is not known which of them has changed" in said
-
-
-def test_what_going_live_means_is_said_before() -> None:
-    said = question_html(replace(PLAIN, followed=True))
-    assert "every save of this file and of the modules beside it runs without asking" in said
-    assert "Rescore uses the file as it is then" in said
-    assert "You have allowed its present text" in question_html(replace(PLAIN, followed=True, agreed=True))
-    assert "ask again next time" in ONCE
-
-
-def test_where_imports_are_computed_no_module_is_said_to_be_imported() -> None:
-    assert "it may import everything beside it (1)" in question_html(replace(PLAIN, computed=True))
-
-
-def test_what_of_a_text_is_not_shown_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trust_dialog, "MOST_OF_ONE", 10)
-    monkeypatch.setattr(trust_dialog, "MOST_OF_ALL", 12)
-    said = question_html(PLAIN)
-    assert "The last 4 characters are not shown here: read the file itself" in said
-    assert "import hel" in said and "import help" not in said and "read the recording" not in said
-    assert "read the recording's .json" in question_html(replace(PLAIN, recorded_text=True))

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
-from workbench.ui.cameras.report import env_words, headline, histogram, object_rows, percent
+from workbench.ui.cameras.report import env_words, headline, object_rows
 
 
 def seen(
@@ -77,13 +73,6 @@ def test_the_least_seen_object_comes_first_scenery_is_left_out_and_what_is_hidde
     assert rows[2]["seen"] == "" and "hides" in rows[2]["note"]
 
 
-def test_an_object_that_some_envs_lack_is_judged_where_it_is() -> None:
-    rows = object_rows(report_of(seen("can", [50, 0], present=[True, False])))
-    assert (rows[0]["seen"], rows[0]["note"]) == ("100 %", "in 1 of 2 envs")
-    rows = object_rows(report_of(seen("can", [0, 0], present=[False, False])))
-    assert (rows[0]["seen"], rows[0]["note"]) == ("", "in none of these envs")
-
-
 @pytest.mark.parametrize(
     ("thing", "said"),
     [
@@ -114,35 +103,3 @@ def test_an_env_is_called_by_what_is_worst_in_it() -> None:
         "cube hidden",
         "cube 50 % behind objects",
     ]
-
-
-@given(st.floats(0, 1))
-def test_only_none_is_0_percent_and_only_all_is_100(share: float) -> None:
-    said = percent(share)
-    assert (said == "0 %") == (share == 0)
-    assert (said == "100 %") == (share == 1)
-
-
-def test_the_histogram_begins_and_ends_at_what_is_seen_and_marks_what_lies_behind_the_objects() -> None:
-    bars = histogram(
-        depth_of({20: 10, 30: 5}, 2, farthest_object=DEPTH_EDGES[25]), near=0.01, far=DEPTH_EDGES[31]
-    )
-    assert bars is not None
-    assert (bars.low, bars.high) == (DEPTH_EDGES[19], DEPTH_EDGES[32])
-    heights = [height for height, _ in bars.bars]
-    assert len(heights) == 13 and heights[1] == 1 and heights[11] == 0.5 and sum(heights) == 1.5
-    assert not bars.bars[1][1] and bars.bars[11][1]
-    assert bars.near is None and bars.far == pytest.approx(12)
-
-
-def test_a_picture_that_is_all_background_has_no_histogram() -> None:
-    nothing = depth_of({}, 2)
-    none = np.full(2, np.nan, np.float32)
-    assert histogram(replace(nothing, farthest_object=none), near=0.01, far=100.0) is None
-
-
-def test_over_steps_it_is_said_when_each_object_is_seen() -> None:
-    report = report_of(seen("cube", [50, 0, 10, 40], [50, 20, 40, 40], cut=(3,), present=[True] * 4))
-    (row,) = object_rows(report, "steps")
-    assert row["moods"] == ["good", "bad", "warn", "warn"]
-    assert headline(report, "steps") == "cube is not visible in 1 of 4 steps."

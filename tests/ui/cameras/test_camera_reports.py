@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from typing import Any, cast
@@ -13,14 +12,12 @@ import pytest
 from tests.drive.panels import Panels
 from tests.ui.scenes import description, running, table_scene
 from workbench.core.camera_data import CameraInfo, CameraSettings
-from workbench.core.cameras.conventions import matrix_of, pose_of
 from workbench.core.cameras.report import ObjectToSee
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.view import SessionView
 from workbench.ui.cameras.compare import BEFORE, CameraCompare, what_differs
-from workbench.ui.cameras.export import as_lists, file_name, matrices_html
-from workbench.ui.cameras.suggest import box_edges, choices_of
-from workbench.ui.widgets.progress import NewResult
+from workbench.ui.cameras.export import file_name
+from workbench.ui.cameras.suggest import choices_of
 
 SETTINGS = CameraSettings(
     position=(0.3, 0.0, 0.6),
@@ -33,8 +30,6 @@ SETTINGS = CameraSettings(
     far=100.0,
     shader_pack="minimal",
 )
-TURNED = np.array([1.0, 2.0, 3.0, math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)], np.float32)
-"""A mount, turned by 90 degrees about z."""
 
 
 def camera(mount_pose: np.ndarray | None = None, mount: str = "panda/panda_hand") -> StudioCamera:
@@ -70,12 +65,6 @@ def test_two_placements_differ_by_how_far_and_how_much_they_were_turned() -> Non
     ]
 
 
-def test_the_box_of_the_bounds_has_four_edges_along_each_axis() -> None:
-    edges = box_edges((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
-    assert edges.shape == (12, 2, 3)
-    assert sorted(np.abs(edges[:, 0] - edges[:, 1]).sum(axis=1)) == [1] * 4 + [2] * 4 + [3] * 4
-
-
 def test_hands_of_robots_are_offered_first_and_are_not_asked_for_by_themselves() -> None:
     objects = (
         ObjectToSee("cube", False),
@@ -97,33 +86,6 @@ def test_hands_of_robots_are_offered_first_and_are_not_asked_for_by_themselves()
         "hand",
         "arm",
     ]
-
-
-def test_what_was_asked_for_is_brought_into_sight_when_it_comes_and_only_then() -> None:
-    before, after, arrival = (object(),), (object(),), NewResult()
-    assert not arrival.just_came(before), "nobody asked"
-    arrival.asked(before)
-    assert not arrival.just_came(before) and not arrival.just_came(())
-    assert arrival.just_came(after) and arrival.just_came(after)
-
-
-def test_a_matrix_is_copied_with_more_digits_than_are_read() -> None:
-    matrix = matrix_of(pose_of(SETTINGS), "opencv", "world_to_camera")
-    np.testing.assert_allclose(json.loads(as_lists(matrix)), matrix, atol=1e-8)
-
-
-def test_the_matrices_say_which_way_they_go_and_where_a_mounted_camera_is() -> None:
-    html = matrices_html(camera(), "opencv", "world_to_camera")
-    assert "x right, y down, z forward" in html and "into the camera" in html
-    html = matrices_html(camera(TURNED), "maniskill", "camera_to_world")
-    assert "x forward, y left, z up" in html and "panda/panda_hand" in html
-    # 0.3 m ahead of a mount that looks along y.
-    assert "1.0000" in html and "2.3000" in html and "3.6000" in html
-
-
-def test_what_a_body_is_called_does_not_become_html() -> None:
-    html = matrices_html(camera(TURNED, "<script>"), "opencv", "world_to_camera")
-    assert "<script>" not in html and "script" in html
 
 
 @pytest.mark.parametrize(

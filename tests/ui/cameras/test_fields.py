@@ -147,16 +147,6 @@ def test_what_is_typed_is_taken_and_what_is_shown_beside_it_stays_to_the_last_di
 
 
 @with_a_fov
-def test_an_eye_is_typed_alone_where_there_are_two_handles(desk: Desk) -> None:
-    desk.two_handles[0] = True
-    now = desk.types("Eye", (0.6, 0.0, 0.61))
-    assert now.position == (0.6, 0.0, 0.61)
-    np.testing.assert_allclose(target_of(now), TARGET, atol=1e-9)
-    assert "keeps looking at its target" in desk.panels.html("wb-")
-    assert desk.panels.shows("Target") and not desk.panels.shows("Looks at")
-
-
-@with_a_fov
 def test_an_orientation_is_typed_as_a_quaternion_or_by_its_axes(desk: Desk) -> None:
     desk.panels.set("Rotation", WXYZ)
     assert desk.types("w x y z", "[0.5, 0.5, 0.5, 0.5]").quaternion == (0.5, 0.5, 0.5, 0.5)
@@ -208,12 +198,3 @@ def test_what_no_camera_has_is_refused_in_words(desk: Desk, label: str, value: A
     now = desk.types(label, value)
     assert why in desk.panels.client.notices[0]
     assert not differences(FILE, now)
-
-
-@with_a_fov
-def test_where_no_camera_is_chosen_none_is_placed(desk: Desk) -> None:
-    placing = Placing(desk.session)
-    assert placing.require()[1] == FILE
-    desk.session.studio.select(None)
-    with pytest.raises(ValueError, match="Choose a camera that can be placed first"):
-        placing.require()

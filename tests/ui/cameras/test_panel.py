@@ -64,28 +64,6 @@ def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: P
     assert panels.folders() == [BASE] and not base.shows("depth") and base.images() != [image]
 
 
-def test_a_picture_says_which_it_is_and_how_long_it_took(panels: Panels, clock: Clock) -> None:
-    panel = CamerasPanel(panels.server, RequestParts(), clock=clock)
-    view = seen(1, (camera("base"),))
-    assert view is not None
-    panel.draw(replace(view, milliseconds=0.2))
-    assert "exact, rendered in 0 ms" in panels.part(BASE).html()
-    clock.passes()
-    fast = {key: replace(picture, degree="fast") for key, picture in view.pictures.items()}
-    panel.draw(replace(view, pictures=fast, pictures_serial=2, milliseconds=7.4))
-    assert "fast, rendered in 7 ms" in panels.part(BASE).html()
-    clock.passes()
-    newer = {key: replace(picture) for key, picture in fast.items()}
-    panel.draw(replace(view, pictures=newer, pictures_serial=3, milliseconds=None))
-    assert "fast" in panels.part(BASE).html() and "rendered" not in panels.part(BASE).html()
-    clock.passes()
-    unknown = {key: replace(picture, degree=None) for key, picture in view.pictures.items()}
-    panel.draw(replace(view, pictures=unknown, pictures_serial=4, milliseconds=None))
-    assert not {"fast", "exact", "None"} & set(
-        panels.part(BASE).html().replace("<", " ").replace(">", " ").split()
-    )
-
-
 def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:
     panel = CamerasPanel(panels.server, RequestParts())
     cameras = (camera("base"),)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
-
 from workbench.checks.results import RuleResult
 from workbench.core.rules import Degree, Finding
 from workbench.session.checks.checks import ChecksView
-from workbench.ui.checks.findings import cards, count, summary, times
-from workbench.ui.checks.rule_pages import as_html, rule_page, sections
+from workbench.ui.checks.findings import cards, count, summary
 
 
 def finding(
@@ -72,33 +69,3 @@ def test_findings_of_the_version_before_come_last_and_count() -> None:
         ("success-at-reset", True),
     ]
     assert count(shown) == 2 and summary(view, shown) == "1 warn, 1 of the version before"
-
-
-@pytest.mark.parametrize(
-    ("count", "said"),
-    [
-        (1, "once"),
-        (2, "2 times"),
-        (9, "9 times"),
-        (19, "10 times and more"),
-        (12345, "10 000 times and more"),
-    ],
-)
-def test_large_counts_are_said_by_their_first_digit(count: int, said: str) -> None:
-    assert times(count) == said
-
-
-def test_the_parts_of_a_page_are_read_by_their_headings() -> None:
-    parts = sections(
-        "# a-rule\n\nIt asks.\n\n## Why\nBecause.\n\n## Mend\nSo:\n\n```python fragment\nx = 1\n```\n"
-    )
-    assert parts["Why"] == "Because." and parts["Mend"].endswith("x = 1\n```")
-
-
-def test_a_page_shows_no_tag_of_its_text_and_links_to_help() -> None:
-    html = as_html("<b>bold</b> and [more](../batched_env.md#resets)")
-    assert "&lt;b&gt;" in html and 'href="/help/batched_env#resets"' in html and 'target="_blank"' in html
-
-
-def test_a_name_that_is_no_rule_s_reads_no_file() -> None:
-    assert rule_page("../safety") is None and rule_page("no-such-rule") is None

@@ -14,7 +14,7 @@ from tests.drive.panels import Clock, Panels, told_so_far
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
 from workbench.recording.library.library import Library
-from workbench.ui.library.listing import MOST_ROWS, RANGE, TOGGLE, Action, LibraryList, walking
+from workbench.ui.library.listing import MOST_ROWS, RANGE, TOGGLE, Action
 from workbench.ui.library.panel import OPEN, LibraryPanel
 from workbench.ui.widgets.click_targets import NUMBERS
 from workbench.ui.widgets.hotkeys import register
@@ -135,6 +135,20 @@ def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
     assert table.shown() == [] and "nothing has this" in table.panels.html("wb-library")
 
 
+def test_another_search_filter_or_order_begins_on_the_first_page(table: Table) -> None:
+    for arrange in (
+        lambda: table.look_for("r"),  # all of them have it
+        lambda: table.look_for(""),
+        lambda: table.press("outcome all"),
+        lambda: table.press("sort seed"),
+        lambda: table.press("sort seed"),
+    ):
+        table.press("on")
+        assert len(table.shown()) == COUNT - MOST_ROWS
+        arrange()
+        assert len(table.shown()) == MOST_ROWS
+
+
 def test_all_selects_what_is_listed_and_leaves_the_filter(table: Table) -> None:
     table.press("outcome no success")
     failed = table.shown()
@@ -200,24 +214,6 @@ def test_keys_walk_over_the_pages(table: Table) -> None:
     table.command("Also select the previous recording")
     table.command("Also select the previous recording")
     assert table.selected() == tuple(newest(MOST_ROWS - 2, MOST_ROWS + 1))
-
-
-def test_the_cursor_is_followed_for_keys_only_and_goes_with_its_row(library: Library) -> None:
-    listed = LibraryList(library)
-    commands = {command.label: command for command in walking(listed)}
-    assert not listed.follow
-    listed.press("id07")
-    commands["Also select the next recording"].run()
-    assert listed.selected_ids() == ("id07", "id06") and listed.follow
-    listed.press("id03")
-    assert listed.selected_ids() == ("id03",) and not listed.follow, "it was seen where it was pressed"
-    assert listed.rows() is listed.rows(), "put in order once"
-    listed.choose("success")
-    listed.page(library.view())
-    listed.choose("all")
-    assert listed.cursor is None and listed.selected_ids() == (), "it was let go of"
-    commands["Select all listed recordings"].run()
-    assert len(listed.selected_ids()) == COUNT
 
 
 def test_what_is_no_longer_listed_is_no_longer_selected(table: Table, library: Library, told: Told) -> None:
@@ -309,18 +305,3 @@ def test_a_table_that_has_not_changed_is_not_sent_again(table: Table, library: L
     now = [html.content for html in table.panels.htmls()]
     (marks,) = (new for old, new in zip(shown, now, strict=True) if new != old)
     assert marks.startswith("<style"), "which are selected, and not the table"
-
-
-def test_states_of_the_folder_are_said(child_process: None, panels: Panels, tmp_path: Path) -> None:
-    library = Library(tmp_path / "none")
-    panel = LibraryPanel(panels.server, library, lambda ids: None)
-    panel.draw()
-    assert "Scanning the folder" in panels.html()
-    library.refresh()
-    panel.draw()
-    assert "is not there" in panels.html()
-    (tmp_path / "none").mkdir()
-    library.refresh()
-    panel.draw()
-    assert "There are no recordings in" in panels.html() and "wb-bad-text" not in panels.html()
-    library.close()

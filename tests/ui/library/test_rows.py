@@ -17,8 +17,6 @@ from workbench.ui.library.rows import (
     OpenVersion,
     cells,
     chosen,
-    in_words,
-    none_like_that,
     ordered,
 )
 
@@ -63,16 +61,6 @@ def ids(rows: list[LibraryRow]) -> str:
 )
 def test_every_word_must_be_found(words: str, found: str) -> None:
     assert ids(chosen(ROWS, words)) == found
-
-
-def test_outcome_and_task_are_filters_too() -> None:
-    assert [ids(chosen(ROWS, outcome=o)) for o in ("all", "success", "no success", "broken")] == [
-        "abcde",
-        "a",
-        "bcd",
-        "e",
-    ]
-    assert ids(chosen(ROWS, "name", "no success", "Pick-v1")) == "d"
 
 
 @pytest.mark.parametrize(
@@ -130,13 +118,6 @@ def test_another_version_of_the_source_than_the_open_tasks_is_marked() -> None:
     assert not any(cells(one, None, NOW)["other_version"] for one in rows)
 
 
-def test_cells_say_what_there_is_and_nothing_where_nothing_is_known() -> None:
-    said = [cells(one, None, NOW) for one in ROWS]
-    assert [one["outcome"] for one in said] == ["success", "once", "fail", "no", ""]
-    assert said[0]["total"] == "1"
-    assert [said[4][name] for name in ("task", "date", "when", "total", "remark")] == ["?", "", "", "", ""]
-
-
 @pytest.mark.parametrize(
     ("facts", "said"),
     [
@@ -151,53 +132,9 @@ def test_an_episode_that_was_cut_off_is_not_said_to_have_failed(facts: dict[str,
     assert cells(row("a", success=False, **facts), None, NOW)["outcome"] == said
 
 
-@pytest.mark.parametrize(
-    ("written", "said"),
-    [
-        (NOW, "12:00:00"),
-        (NOW - datetime.timedelta(days=1), "20 Nov 12:00"),
-        (NOW - datetime.timedelta(days=400), "17 Oct 2025"),
-    ],
-)
-def test_dates_are_as_long_as_they_must_be(written: datetime.datetime, said: str) -> None:
-    assert cells(row("a", written=written.timestamp()), None, NOW)["date"] == said
-
-
-def test_files_of_several_trajectories_are_counted_once() -> None:
-    both = (Path("x.json"), Path("x.h5"))
-    rows = [row("a", paths=both, trajectory="traj_0"), row("b", paths=both, trajectory="traj_1"), row("c")]
-    assert in_words(rows) == "3 recordings (4 files, 2 kB)"
-    assert in_words(rows[:1]) == "1 recording (2 files, 1 kB)"
-
-
-def test_an_empty_list_says_which_filter_emptied_it() -> None:
-    assert none_like_that(" zebra ", "all", None) == "No recording has “zebra”."
-    assert none_like_that("", "no success", "Push-v1") == "There is no recording without success of Push-v1."
-    assert none_like_that("x", "success", "Push-v1") == "No successful recording of Push-v1 has “x”."
-
-
 def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted() -> None:
     kept = clean_facts(row("n", total_reward=float("nan")))
     lost = row("n", total_reward=kept.total_reward)
     assert kept == clean_facts(replace(kept, total_reward=float("nan")))
     assert cells(lost, None, NOW)["total"] == "NaN"
     assert {ids(ordered((*ROWS[:2], lost), "return", down))[-1] for down in (True, False)} == {"n"}
-
-
-def test_a_row_is_read_from_the_file_that_holds_it() -> None:
-    ours = row("a", paths=(Path("x/a.json"), Path("x/a.h5"))).source
-    theirs = row("b", kind="maniskill", trajectory="traj_1", paths=(Path("x/b.json"), Path("x/b.h5"))).source
-    dataset = row("c", kind="lerobot", trajectory="3", paths=(Path("x/set/meta/info.json"),)).source
-    assert (ours.kind, ours.path, ours.part, ours.stem) == ("workbench", Path("x/a.json"), None, "a")
-    assert (theirs.kind, theirs.path, theirs.part, theirs.stem) == (
-        "maniskill",
-        Path("x/b.h5"),
-        "traj_1",
-        "b_traj_1",
-    )
-    assert (dataset.kind, dataset.path, dataset.part, dataset.stem) == (
-        "lerobot",
-        Path("x/set"),
-        "3",
-        "set_3",
-    )

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.drive.panels import Panels
+from tests.drive.live import Live
 from tests.ui.scenes import running, step_of
 from workbench.core.env.step_result import StepResult
 from workbench.session.history.curves import Curves, Group, StepCurves
 from workbench.session.live.timeline import TimelineView
 from workbench.session.live.view import SessionView
-from workbench.ui.live.reward import CurvesPanel
 
 JOINTS = ("hinge", "slide")
 
@@ -34,6 +33,13 @@ def curves(length: int, num_envs: int, env: int = 0, success: float | None = 0.0
     return steps.curves(env)
 
 
+@pytest.fixture
+def live(open_live: Live) -> Live:
+    open_live.show(running(4))
+    open_live.asked.clear()
+    return open_live
+
+
 def reward(length: int, num_envs: int, env: int) -> list[float]:
     return [env + number * num_envs for number in range(1, length + 1)]
 
@@ -47,155 +53,129 @@ def seen(length: int, num_envs: int, env: int = 0, past: int | None = None, **en
     return replace(view, step=shown, timeline=timeline, task=replace(view.task, joints=JOINTS))
 
 
-@pytest.fixture
-def asked() -> list[int]:
-    return []
-
-
-@pytest.fixture
-def panel(panels: Panels, asked: list[int]) -> CurvesPanel:
-    return CurvesPanel(panels.server, asked.append)
-
-
-def test_selected_env_against_the_mean(panels: Panels, panel: CurvesPanel) -> None:
-    panel.draw(seen(5, 4, env=2))
-    chart = panels.charts()[0]
+def test_selected_env_against_the_mean(live: Live) -> None:
+    live.show(seen(5, 4, env=2))
+    chart = live.part("Reward").charts()[0]
     x, mean, one = chart.data
     assert x.tolist() == [1, 2, 3, 4, 5]
     assert mean.tolist() == [1.5 + 4 * number for number in x] and one.tolist() == reward(5, 4, 2)
     assert [series.get("label") for series in chart.series] == ["step", "mean of the batch", "env 2"]
 
 
-def test_all_steps_are_sent_in_few_points(panels: Panels, panel: CurvesPanel) -> None:
-    panel.draw(seen(3000, 2))
-    for chart in panels.charts():
+def test_all_steps_are_sent_in_few_points(live: Live) -> None:
+    live.show(seen(3000, 2))
+    for chart in live.part("Reward").charts():
         assert {len(values) for values in chart.data} == {len(chart.data[0])} and len(chart.data[0]) < 1000
         assert chart.data[0][0] == 1 and chart.data[0][-1] == 3000
 
 
-def test_single_env_has_one_line(panels: Panels, panel: CurvesPanel) -> None:
-    panel.draw(seen(5, 1))
-    assert [series.get("label") for series in panels.charts()[0].series] == ["step", "env 0"]
-
-
-def test_other_env_shows_its_own_past(panels: Panels, panel: CurvesPanel) -> None:
-    panel.draw(seen(50, 4))
-    panel.draw(seen(50, 4, env=3))
-    chart = panels.charts()[0]
+def test_other_env_shows_its_own_past(live: Live) -> None:
+    live.show(seen(50, 4))
+    live.show(seen(50, 4, env=3))
+    chart = live.part("Reward").charts()[0]
     assert chart.data[2].tolist() == reward(50, 4, 3)
     assert chart.series[2].get("label") == "env 3"
 
 
 @pytest.mark.parametrize("length", [50, 3000])
-def test_a_moment_that_is_shown_is_a_dot_on_the_selected_envs_line(
-    panels: Panels, panel: CurvesPanel, length: int
-) -> None:
-    panel.draw(seen(length, 4, env=3, past=17))
-    drawn = panels.charts()
+def test_a_moment_that_is_shown_is_a_dot_on_the_selected_envs_line(live: Live, length: int) -> None:
+    live.show(seen(length, 4, env=3, past=17))
+    drawn = live.part("Reward").charts()
     assert [chart.title for chart in drawn] == ["reward", "success"]
     x, *_, dot = drawn[0].data
     (at,) = np.flatnonzero(np.isfinite(dot))
     assert abs(x[at] - 17) <= 8 and dot[at] == 3 + 17 * 4
     assert [series.get("label") for series in drawn[0].series][-2:] == ["env 3", "shown"]
-    panel.draw(seen(length, 4, env=3))
-    assert "shown" not in [series.get("label") for series in panels.charts()[0].series]
+    live.show(seen(length, 4, env=3))
+    assert "shown" not in [series.get("label") for series in live.part("Reward").charts()[0].series]
 
 
-def test_each_part_of_the_reward_has_a_line_of_the_selected_env(panels: Panels, panel: CurvesPanel) -> None:
+def test_each_part_of_the_reward_has_a_line_of_the_selected_env(live: Live) -> None:
     terms: dict[str, Any] = {
         "reward_terms/reach": np.array([1.0, 2, 3]),
         "reward_terms/<b>": np.array([-1.0, -2, -3]),
     }
     view = seen(4, 3, env=1, **terms)
     assert view.curves is not None
-    panel.draw(replace(view, curves=replace(view.curves, no_curve=("sum",))))
-    *_, chart = panels.charts()
+    live.show(replace(view, curves=replace(view.curves, no_curve=("sum",))))
+    *_, chart = live.part("Reward").charts()
     assert chart.title == "reward terms, env 1"
     assert [series.get("label") for series in chart.series] == ["step", "reach", "<b>"]
     assert [values.tolist() for values in chart.data[1:]] == [[2.0] * 4, [-2.0] * 4]
-    assert "No curve of sum" in panels.html() and "<b>" not in panels.html().replace("<b>⚑", "")
+    assert "No curve of sum" in live.part("Reward").html() and "<b>" not in live.part(
+        "Reward"
+    ).html().replace("<b>⚑", "")
 
 
-def test_any_entry_and_joint_can_be_chosen_and_the_choice_is_kept_for_the_task(
-    panels: Panels, panel: CurvesPanel
-) -> None:
+def test_any_entry_and_joint_can_be_chosen_and_the_choice_is_kept_for_the_task(live: Live) -> None:
     entries = {"height": np.array([0.1, 0.2]), "at": np.ones((2, 3)), "touches": np.array([True, False])}
     view = seen(3, 2, env=1, **entries)
-    panel.draw(view)
+    live.show(view)
     for entry in ((Group.EVALUATE, "height"), (Group.EVALUATE, "at"), (Group.JOINT, "slide")):
-        panels.press(f"{entry[0].value} {entry[1]}")
-    panels.press("evaluate success")
-    panel.draw(view)
-    assert [chart.title for chart in panels.charts()] == ["reward", "height", "at, env 1", "joints, env 1"]
-    _, height, at, joints = panels.charts()
+        live.part("Reward").press(f"{entry[0].value} {entry[1]}")
+    live.part("Reward").press("evaluate success")
+    live.show(view)
+    assert [chart.title for chart in live.part("Reward").charts()] == [
+        "reward",
+        "height",
+        "at, env 1",
+        "joints, env 1",
+    ]
+    _, height, at, joints = live.part("Reward").charts()
     np.testing.assert_allclose(height.data[1:], [[0.15] * 3, [0.2] * 3], rtol=1e-6)
     assert [series.get("label") for series in at.series] == ["step", "at[0]", "at[1]", "at[2]"]
     assert joints.data[1].tolist() == [1, 2, 3]
     assert view.task is not None
-    panel.draw(replace(view, task=replace(view.task, class_name="Other")))
-    assert [chart.title for chart in panels.charts()] == ["reward", "success"]
-    panel.draw(view)
-    assert [chart.title for chart in panels.charts()] == ["reward", "height", "at, env 1", "joints, env 1"]
+    live.show(replace(view, task=replace(view.task, class_name="Other")))
+    assert [chart.title for chart in live.part("Reward").charts()] == ["reward", "success"]
+    live.show(view)
+    assert [chart.title for chart in live.part("Reward").charts()] == [
+        "reward",
+        "height",
+        "at, env 1",
+        "joints, env 1",
+    ]
 
 
-def test_a_click_on_a_curve_asks_for_its_step_and_one_that_is_forgotten_is_named(
-    panels: Panels, panel: CurvesPanel, asked: list[int]
-) -> None:
+def test_a_click_on_a_curve_asks_for_its_step_and_one_that_is_forgotten_is_named(live: Live) -> None:
     view = seen(50, 2)
-    panel.draw(view)
-    panels.set("step of a curve", 7 + 10**8 * 3)
-    assert asked == [7]
+    live.show(view)
+    live.part("Reward").set("step of a curve", 7 + 10**8 * 3)
+    assert live.asked == [("past.seek_tick", 7)]
     kept = TimelineView(30, 50, 30, tick=31)
-    panel.draw(replace(view, timeline=kept))
-    assert "Step 7 is no longer in memory: the oldest that is, step 31, is shown" in panels.html()
-    panels.set("step of a curve", 40)
-    panel.draw(replace(view, timeline=replace(kept, shown=39, tick=40)))
-    assert "no longer in memory" not in panels.html()
+    live.show(replace(view, timeline=kept))
+    assert (
+        "Step 7 is no longer in memory: the oldest that is, step 31, is shown" in live.part("Reward").html()
+    )
+    live.part("Reward").set("step of a curve", 40)
+    live.show(replace(view, timeline=replace(kept, shown=39, tick=40)))
+    assert "no longer in memory" not in live.part("Reward").html()
 
 
-def test_how_parts_get_a_curve_is_said_where_a_dense_reward_names_none(
-    panels: Panels, panel: CurvesPanel
-) -> None:
-    view = seen(2, 2)
-    assert view.task is not None
-    panel.draw(view)
-    says = "put info[&#34;reward_terms&#34;]" in panels.html()
-    assert says == ("dense" in view.task.reward_mode)
-    panel.draw(replace(view, task=replace(view.task, reward_mode="normalized_dense")))
-    assert "put info" in panels.html()
-    panel.draw(replace(view, task=replace(view.task, reward_mode="sparse")))
-    assert "put info" not in panels.html()
+def test_without_a_past_nothing_is_drawn(live: Live) -> None:
+    live.show(running(4, curves=None))
+    live.show(seen(1, 4))
+    assert (
+        live.part("Reward").charts() == []
+        and "Curves appear after the second step." in live.part("Reward").html()
+    )
+    live.show(seen(2, 4))
+    assert len(live.part("Reward").charts()) == 2 and "Curves appear" not in live.part("Reward").html()
+    live.show(seen(1, 4))
+    assert live.part("Reward").charts() == []
 
 
-def test_task_without_success_has_no_curve_of_it(panels: Panels, panel: CurvesPanel) -> None:
-    panel.draw(seen(50, 4, success=None))
-    assert [chart.title for chart in panels.charts()] == ["reward"]
-    assert "Curves appear" not in panels.html()
-
-
-def test_without_a_past_nothing_is_drawn(panels: Panels, panel: CurvesPanel) -> None:
-    panel.draw(running(4, curves=None))
-    panel.draw(seen(1, 4))
-    assert panels.charts() == [] and "Curves appear after the second step." in panels.html()
-    panel.draw(seen(2, 4))
-    assert len(panels.charts()) == 2 and "Curves appear" not in panels.html()
-    panel.draw(seen(1, 4))
-    assert panels.charts() == []
-
-
-def test_envs_whose_reward_is_nan_are_counted_and_left_out_of_the_mean(
-    panels: Panels, panel: CurvesPanel
-) -> None:
+def test_envs_whose_reward_is_nan_are_counted_and_left_out_of_the_mean(live: Live) -> None:
     steps = StepCurves(4)
     for number in range(50):
         result = step(number, 4)
         if number >= 40:
             result.reward[:3] = np.nan
         steps.add(result)
-    panel.draw(replace(seen(50, 4), curves=steps.curves(0)))
-    chart = panels.charts()[0]
+    live.show(replace(seen(50, 4), curves=steps.curves(0)))
+    chart = live.part("Reward").charts()[0]
     assert chart.data[1][40:].tolist() == [3 + 4 * number for number in range(40, 50)]
     assert np.isnan(chart.data[2][40:]).all()
-    assert "NaN in 3 of 4 envs; the mean is of the others" in panels.html()
-    panel.draw(seen(50, 4))
-    assert "NaN" not in panels.html()
+    assert "NaN in 3 of 4 envs; the mean is of the others" in live.part("Reward").html()
+    live.show(seen(50, 4))
+    assert "NaN" not in live.part("Reward").html()

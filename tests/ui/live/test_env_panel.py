@@ -1,126 +1,149 @@
-"""The table's HTML and what its hidden buttons do, on a session with a hand-made scene, without a browser."""
+"""The table of envs on the live page."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.drive.panels import Clock, Panels
-from tests.drive.session import wait_until
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.ui.live.env_panel import MOST_ROWS, EnvPanel
-from workbench.ui.widgets.parts import Parts
+from tests.drive.live import Live
+from tests.ui.env_rows import FELL, rows_of
+from tests.ui.scenes import running
+from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
+from workbench.ui.live.env_panel import MOST_ROWS
+
+MANY = MOST_ROWS + 6
+TABLE = "Open or close the table of envs"
 
 
-def odd(elapsed: np.ndarray) -> dict[str, np.ndarray]:
-    return {"<b>odd</b>": elapsed % 2 == 1, "success": np.zeros(len(elapsed), bool)}
+def many(**changes: Any) -> EnvRows:
+    """So many envs that the table has two pages; those of odd numbers have failed, the last two are flagged."""
+    none, odd = np.zeros(MANY, np.int32), np.arange(MANY) % 2
+    last = LastEpisode(np.where(odd, 2, 0).astype(np.int8), none, np.zeros(MANY), {})
+    values: dict[str, Any] = {
+        "outcome": none.astype(np.int8),
+        "steps": none,
+        "end": none - 1,
+        "total": np.arange(MANY, dtype=float),
+        "followed": np.ones(MANY, bool),
+        "first": {"<b>odd</b>": odd - 1, "success": none - 1},
+        "rewards": np.full((MANY, KEPT_REWARDS), np.nan, np.float32),
+        "outliers": {MANY - 2: (FELL,), MANY - 1: (FELL,)},
+        "last": last,
+        "ended": odd,
+        "succeeded": none,
+    }
+    return rows_of(**{**values, **changes})
+
+
+class Table:
+    """The table on a page, with a hand on it."""
+
+    def __init__(self, live: Live) -> None:
+        self.live = live
+
+    def show(
+        self, step: int = 1, seconds: float = 60.0, env: int = 0, rows: EnvRows | None = None
+    ) -> list[int]:
+        self.live.show(running(MANY, step_serial=step, selected_env=env), rows or many(), seconds)
+        return self.envs()
+
+    def envs(self) -> list[int]:
+        return [int(env) for env in re.findall(r'data-env="(\d+)"', self.html)]
+
+    @property
+    def html(self) -> str:
+        return self.live.part("Envs").html()
+
+    def press(self, name: str) -> list[int]:
+        self.live.part("Envs").press(name)
+        self.live.again(0.1)  # two frames
+        return self.envs()
 
 
 @pytest.fixture
-def session(scripted_session: Callable[..., Session]) -> Session:
-    return scripted_session(MOST_ROWS + 6, odd)
+def table(live_page: Live) -> Table:
+    table = Table(live_page)
+    table.show()
+    live_page.command(TABLE)
+    table.show()
+    return table
 
 
-@dataclass
-class Envs:
-    """The table on a page."""
-
-    parts: Parts[SessionView]
-    panels: Panels
-    session: Session
-
-    def shown(self) -> list[int]:
-        self.parts.draw(self.session.view())
-        return [int(env) for env in re.findall(r'data-env="(\d+)"', self.panels.html())]
-
-
-@pytest.fixture
-def envs(panels: Panels, session: Session, clock: Clock) -> Envs:
-    envs = Envs(Parts((EnvPanel(panels.server, session),), clock), panels, session)
-    panels.press("unfolded")
-    return envs
-
-
-def test_pages_filters_and_rows_are_pressed(envs: Envs) -> None:
-    view = envs.session.view
-    assert envs.shown() == list(range(MOST_ROWS))
-    envs.panels.press("on")
-    assert envs.shown() == list(range(MOST_ROWS, MOST_ROWS + 6))
-    envs.panels.press(f"env {MOST_ROWS + 2}")
-    assert view().selected_env == MOST_ROWS + 2
-    # Nothing ended and nothing is odd, so there is no moment to go to.
-    assert view().timeline.shown is None
-    envs.panels.claim(
+def test_pages_filters_and_rows_are_pressed(table: Table) -> None:
+    assert table.envs() == list(range(MOST_ROWS))
+    assert table.press("on") == list(range(MOST_ROWS, MANY))
+    table.press(f"env {MANY - 3}")
+    assert table.live.asked == [("change", {"selected_env": MANY - 3})], "there is no moment to go to"
+    table.press(f"env {MANY - 1}")
+    assert table.live.asked[1:] == [("change", {"selected_env": MANY - 1}), ("past.seek_step", MANY - 1, 12)]
+    table.live.claim(
         "on", True, "button"
     )  # it is pressed on a page that was drawn before the last one was shown
-    assert envs.shown() == list(range(MOST_ROWS, MOST_ROWS + 6))
-    envs.panels.press("filter failed")
-    assert envs.shown() == [] and "last episode failed." in envs.panels.html()
-    envs.panels.press("filter all")
-    envs.shown()
-    envs.panels.press("sort env")
-    assert envs.shown() == list(range(MOST_ROWS + 5, 5, -1))
+    table.live.again()
+    assert table.envs() == list(range(MOST_ROWS, MANY))
+    assert table.press("filter flagged") == [MANY - 2, MANY - 1]
+    assert "&lt;b&gt;odd" in table.html and "<b>odd" not in table.html
 
 
-def test_names_of_entries_are_escaped(envs: Envs) -> None:
-    envs.shown()
-    assert "&lt;b&gt;odd" in envs.panels.html() and "<b>odd" not in envs.panels.html()
+def test_another_filter_and_another_order_begin_on_the_first_page(table: Table) -> None:
+    table.press("on")
+    assert table.press("filter running") == list(range(MOST_ROWS))
+    assert table.press("filter failed") == list(range(1, MANY, 2))
+    assert table.press("filter all") == list(range(MOST_ROWS))
+    table.press("on")
+    assert table.press("sort return") == list(range(MOST_ROWS))
+    table.press("on")
+    assert table.press("sort return") == list(range(MANY - 1, MANY - 1 - MOST_ROWS, -1))
+    assert table.press("sort env") == list(range(MOST_ROWS)), "another column begins with its smallest"
 
 
-def test_a_table_that_has_not_changed_is_not_sent_again(
-    envs: Envs, clock: Clock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    envs.shown()
-    clock.passes()
-    monkeypatch.setattr(envs.session, "env_rows", lambda: pytest.fail("asked for rows again"))
-    envs.shown()
+def test_a_step_is_in_the_table_a_moment_later_and_a_press_at_once(table: Table) -> None:
+    before = table.html
+    later = many(steps=np.full(MANY, 5, np.int32))
+    table.show(2, 0.0, rows=later)
+    assert table.html == before, "it was drawn a moment ago"
+    table.show(2, 0.0, env=3, rows=later)
+    assert "wb-selected" in table.html and table.html != before
+    before = table.html
+    table.show(3, 0.0, env=3, rows=many(steps=np.full(MANY, 6, np.int32)))
+    table.press("sort return")
+    assert table.html != before
 
 
-def test_a_step_is_in_the_table_a_moment_later_and_a_chosen_env_at_once(envs: Envs, clock: Clock) -> None:
-    envs.shown()
-    before = envs.panels.html()
-    envs.session.step()
-    wait_until(envs.session, lambda view: view.timeline.last == 1, "a step")
-    envs.shown()
-    assert envs.panels.html() == before, "it was drawn a moment ago"
-    envs.panels.press("env 3")
-    envs.shown()
-    assert "wb-selected" in envs.panels.html() and envs.panels.html() != before
-    envs.session.step()
-    wait_until(envs.session, lambda view: view.timeline.last == 2, "another step")
-    before = envs.panels.html()
-    clock.passes()
-    envs.shown()
-    assert envs.panels.html() != before
+def test_a_folded_table_is_not_drawn_while_steps_go_on(table: Table) -> None:
+    def stepped(number: int) -> str:
+        table.show(number, rows=many(steps=np.full(MANY, number, np.int32)))
+        return table.html
+
+    shown = stepped(4)
+    assert stepped(5) != shown
+    table.live.command(TABLE)
+    folded = stepped(6)
+    assert stepped(7) == folded
+    table.live.command(TABLE)
+    assert stepped(7) != folded, "unfolded it shows what is now"
 
 
-def test_a_folded_table_is_not_drawn_while_steps_go_on(
-    panels: Panels, session: Session, clock: Clock
-) -> None:
-    panel = EnvPanel(panels.server, session)
-    envs = Envs(Parts((panel,), clock), panels, session)
+def test_keys_go_round_the_envs_that_failed_and_that_are_flagged(table: Table) -> None:
+    def after(env: int, command: str) -> int:
+        table.live.asked.clear()
+        table.show(env=env)
+        table.live.command(command)
+        return table.live.asked[0][1]["selected_env"]
 
-    def stepped() -> str:
-        last = session.view().timeline.last
-        session.step()
-        wait_until(session, lambda view: view.timeline.last == last + 1, "a step")
-        clock.passes()
-        envs.shown()
-        return panels.html()
+    assert [after(env, "Next env whose last episode failed") for env in (0, 1, MANY - 1)] == [1, 3, 1]
+    assert [after(env, "Next flagged env") for env in (0, MANY - 2, MANY - 1)] == [
+        MANY - 2,
+        MANY - 1,
+        MANY - 2,
+    ]
 
-    assert envs.shown() == list(range(MOST_ROWS))  # it does not open empty
-    before = panels.html()
-    assert stepped() == before
-    panel.unfold()
-    envs.shown()
-    shown = panels.html()
-    assert shown != before and stepped() != shown
-    panel.fold()
-    envs.shown()
-    before = panels.html()
-    assert stepped() == before
+
+def test_a_press_on_an_env_that_a_smaller_version_lacks_does_nothing(table: Table) -> None:
+    table.show()
+    table.live.session.rows = rows_of()
+    table.live.part("Envs").press("env 40")
+    assert table.live.asked == []

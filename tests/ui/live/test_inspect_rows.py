@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tests.drive.live import Live
 from tests.ui.scenes import running
 from workbench.core.capture.inspection import Inspection, JointReadings, Leaf, Touching
 from workbench.ui.live.inspect_panel import (
@@ -15,8 +16,6 @@ from workbench.ui.live.inspect_panel import (
     arrows_of,
     inspect_html,
     joint_rows,
-    leaf_rows,
-    number,
     pose_rows,
 )
 
@@ -24,28 +23,6 @@ from workbench.ui.live.inspect_panel import (
 def leaf(name: str, *values: float, shape: tuple[int, ...] | None = None) -> Leaf:
     numbers = np.array(values, np.float32)
     return Leaf(name, numbers.shape if shape is None else shape, "float32", numbers, 0.0, 255.0)
-
-
-def changed(leaves: list[Leaf], before: list[Leaf] | None) -> list[list[bool]]:
-    return [[n["changed"] for n in row["numbers"]] for row in leaf_rows(leaves, before)]
-
-
-def test_numbers_that_differ_from_the_reading_before_are_marked() -> None:
-    before = [leaf("a", 1, 2, np.nan), leaf("b", 1)]
-    now = [leaf("a", 1, 2.0000002, np.nan), leaf("b", 1, 1), leaf("c", 1)]
-    # Another length, and an entry that was not there, have nothing to differ from.
-    assert changed(now, before) == [[False, True, False], [False, False], [False]]
-    assert changed([leaf("a", np.nan)], [leaf("a", 0)]) == [[True]]
-    assert changed(now, None) == [[False] * 3, [False] * 2, [False]]
-
-
-def test_what_is_too_large_to_read_is_told_by_its_range() -> None:
-    [row] = leaf_rows([leaf("rgb", *range(64), shape=(128, 128, 3))], None)
-    assert (row["kind"], row["numbers"], row["note"]) == (
-        "float32 (128, 128, 3)",
-        (),
-        "49152 numbers from 0.000 to 255.000",
-    )
 
 
 JOINTS = JointReadings(
@@ -113,15 +90,6 @@ def test_a_pose_is_copied_as_python_that_makes_it_again() -> None:
     assert row["code"] == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0, "0.000"), (1.23456, "1.235"), (1e-9, "0.000"), (2e-4, "2.0e-04"), (12345.0, "1.2e+04")]
-    + [(float("nan"), "NaN"), (True, "yes"), (7, "7")],
-)
-def test_numbers_are_short(value: object, text: str) -> None:
-    assert number(value) == text
-
-
 @pytest.mark.parametrize("choice", CHOICES)
 def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str) -> None:
     now = Inspection(
@@ -150,15 +118,17 @@ def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str)
         assert choice == "poses" or expected[choice] not in other
 
 
-def test_contacts_are_said_to_be_unknown_before_a_step_and_none_to_be_none_after_one() -> None:
-    now = Inspection(0, 5, contacts=(PRESSED,))
-    html = inspect_html("contacts", running(1), now, None, no_step_yet=True)
-    assert "known after the next step" in html and "5 N" not in html
-    assert "nothing touches anything" in inspect_html(
-        "contacts", running(1), Inspection(0, 5, contacts=()), None
-    )
+def test_what_changed_since_the_reading_before_is_marked_of_the_same_env_alone(live_page: Live) -> None:
+    inspect = live_page.part("Inspect")
+    inspect.set("Show", "state")
 
+    def changed(env: int, step: int, value: float) -> int:
+        reading = Inspection(env, step, state=(leaf("s", value),))
+        live_page.show(running(2, selected_env=env, inspection=reading, step_serial=step))
+        assert f"env {env} at step {step}" in inspect.html("wb-inspect")
+        return inspect.html("wb-inspect").count("wb-changed")
 
-def test_a_section_that_was_refused_says_why() -> None:
-    now = Inspection(0, 5, refused=(("contacts", "PhysX on the GPU keeps no list"),))
-    assert "PhysX on the GPU keeps no list" in inspect_html("contacts", running(1), now, None)
+    assert [
+        changed(*one)
+        for one in ((0, 1, 1.0), (0, 2, 2.0), (0, 3, 2.0), (1, 3, 5.0), (1, 4, 6.0), (0, 4, 9.0))
+    ] == [0, 1, 0, 0, 1, 0]

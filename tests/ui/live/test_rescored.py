@@ -1,14 +1,15 @@
-"""What the page says of a judgement, and what it draws."""
+"""The past judged with the new code, on the Reward tab."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, cast
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.drive.panels import Clock, Panels
+from tests.drive.live import Live
+from tests.drive.panels import Panels
 from tests.ui.scenes import running
 from workbench.authoring.problem import Problem
 from workbench.jobs.rescore.verdict import Verdict
@@ -16,9 +17,11 @@ from workbench.session.live.timeline import TimelineView
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
-from workbench.ui.live.rescored import PastRescorePanel, chart_data, in_a_line
+from workbench.ui.live.rescored import chart_data
 from workbench.ui.widgets.line_chart import LONGEST
-from workbench.ui.widgets.rescored import MOST_ROWS, status_html
+from workbench.ui.widgets.rescored import MOST_ROWS
+
+STOP = "Stop rescoring"
 
 
 def episode(env: int = 0, **changes: Any) -> Verdict[PastRun]:
@@ -42,186 +45,91 @@ def done(*verdicts: Verdict[PastRun], **changes: Any) -> RescoreView:
     return replace(RescoreView("done", 1, verdicts, 50, 50), **told)
 
 
-class RecordedSession:
-    """Stands where the session stands for a panel: what it has of curves, and what it was requested."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[object, ...]] = []
-        self.shown = running(40, timeline=TimelineView(first=0, last=1000))
-        self.rescorer = self
+class Rescored:
+    def __init__(self, live: Live) -> None:
+        self.live, self.panels = live, live.part("Reward")
+        live.session.answers["rescorer.curve"] = self.curve
 
     def curve(self, name: str, env: int) -> RescoredCurve | None:
-        tick = np.arange(20)
-        old = np.full(20, env, np.float32)
+        tick, old = np.arange(20), np.full(20, env, np.float32)
         return RescoredCurve(tick, tick, old, 2 * old) if name in ("reward", "success") else None
 
-    def view(self) -> object:
-        return self.shown
-
-    def show(self, env: int, serial: int) -> None:
-        self.asked.append(("show", env, serial))
-
-    def change(self, *, selected_env: int) -> None:
-        self.asked.append(("select", selected_env))
-
-    def stop(self) -> None:
-        self.asked.append(("stop",))
-
-
-@dataclass
-class Rescoring:
-    """The panel on a page, and the session that it asks."""
-
-    panel: PastRescorePanel
-    session: RecordedSession
-    panels: Panels
-    clock: Clock
-
-    def draw(self, rescored: RescoreView, **changes: Any) -> None:
-        self.clock.passes()
-        timeline = TimelineView(first=0, last=1000)
-        self.panel.draw(running(40, rescored=rescored, **{"timeline": timeline, **changes}))
+    def draw(self, rescored: RescoreView, shown: int | None = None, first: int = 0, env: int = 0) -> Panels:
+        past = TimelineView(first=first, last=1000, shown=shown)
+        self.live.show(running(40, rescored=rescored, timeline=past, selected_env=env))
+        return self.panels
 
 
 @pytest.fixture
-def rescoring(panels: Panels, clock: Clock) -> Rescoring:
-    session = RecordedSession()
-    return Rescoring(PastRescorePanel(panels.server, cast(Any, session)), session, panels, clock)
+def rescored(live_page: Live) -> Rescored:
+    return Rescored(live_page)
 
 
-@pytest.mark.parametrize(
-    ("rescored", "says"),
-    [
-        (RescoreView("none"), ""),
-        (RescoreView("loading"), "loading the new code"),
-        (RescoreView("rescoring", done=26, total=50), "50 %"),
-        (done(episode(), same(1)), "1 of 2 episodes differs."),
-        (done(same(1), differing_names={"new"}), "are unchanged. Other entries differ: new."),
-        (RescoreView("stopped", why="the file was saved again"), "the file was saved again"),
-    ],
-)
-def test_one_line_says_how_far_it_is_and_what_came_of_it(rescored: RescoreView, says: str) -> None:
-    assert in_a_line(rescored).endswith(says) and bool(in_a_line(rescored)) == bool(says)
+def test_the_stand_is_said_above_and_below_and_only_what_runs_can_be_stopped(rescored: Rescored) -> None:
+    assert not rescored.draw(RescoreView()).shows(STOP) and "wb-again" not in rescored.panels.html()
+    for state, says in (
+        ("loading", "loading the new code"),
+        ("rescoring", "26 of 50"),
+        ("done", "1 of 2 episodes differs."),
+    ):
+        shown = rescored.draw(done(episode(), same(1), state=state, serial=hash(state), done=26))
+        assert shown.shows(STOP) is (state != "done") and says in shown.html()
+    rescored.draw(RescoreView("stopped", 9, why="the file was saved again"))
+    assert "the file was saved again" in rescored.panels.html()
 
 
-def test_outcomes_are_said_before_rewards() -> None:
-    moved = episode(success=(None, 41), fail=(7, None))
-    assert (
-        verdict_text.change_text(moved) == "success now at step 41, was never, fail never now, was at step 7"
-    )
-    assert verdict_text.change_text(episode()) == "reward by up to 0.25, from step 5"
-
-
-def test_a_task_without_a_reward_has_no_return_to_tell() -> None:
-    none, flags = same(0, has=()), same(0, has=("success", "fail"))
-    assert "reward" not in verdict_text.headline([flags]) and "success and fail" in verdict_text.headline(
-        [flags]
-    )
-    assert "there is no reward" in verdict_text.headline([none])
-    assert verdict_text.totals([none]) == [] and "return" not in "".join(verdict_text.totals([flags]))
-    assert verdict_text.returns_text(none) == ""
-
-
-def test_nothing_that_differs_is_one_sentence() -> None:
-    both = same(0), same(1)
-    says = "Nothing differs in 2 episodes: reward and fail are unchanged."
-    assert verdict_text.headline(both) == says and verdict_text.totals(both) == ["mean return: 1"]
-    assert verdict_text.headline([same(0), same(1, differing=("height",))]).endswith(
-        "Other entries differ: height."
-    )
-    assert "2 episodes so far:" in verdict_text.headline(both, so_far=True)
-    assert verdict_text.headline([episode(0), episode(1)], so_far=True) == "2 of 2 episodes differ so far."
-
-
-@pytest.mark.parametrize(
-    ("metres", "radians", "says", "far"),
-    [
-        (0.0, 0.0, "to the last bit", False),
-        (4e-4, 1e-4, "at most 0.4 mm", False),
-        (0.032, 0.0, "up to 3.2 cm", True),
-        (0.0, 0.2, "11°", True),
-        (float("inf"), 0.0, "infinite", True),
-    ],
-)
-def test_drift_is_told_and_doubted_where_it_is_large(
-    metres: float, radians: float, says: str, far: bool
-) -> None:
-    found = [same(1), same(7, metres=metres, radians=radians)]
-    assert says in verdict_text.drift_summary(found)
-    assert verdict_text.count_drifted(found) == far
-    assert ("In 1 episode" in verdict_text.drift_summary(found)) == far
-    assert metres == 0 or ("env 7" in verdict_text.drift_summary(found)) == far
-
-
-def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
+def test_a_problem_is_told_with_file_and_line_as_text(rescored: Rescored) -> None:
     problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
-    html = status_html(done(state="failed", why="the new code raised", problem=problem, done=20))
-    assert "push.py:88" in html and "20 of 50" in html
-    assert "<b>" not in html and "&lt;b&gt;" in html
+    html = rescored.draw(done(state="failed", why="the new code raised", problem=problem, done=20)).html(
+        "wb-again"
+    )
+    assert "push.py:88" in html and "20 of 50" in html and "KeyError: &#39;&lt;b&gt;" in html
 
 
-def test_nothing_is_shown_before_the_first_judgement(rescoring: Rescoring) -> None:
-    rescoring.draw(RescoreView())
-    assert not any(rescoring.panels.shows(name) for name in ("Stop rescoring", "Curve"))
-    assert rescoring.panels.html("wb-again") == "" and rescoring.panels.charts() == []
-
-
-def test_only_what_runs_can_be_stopped(rescoring: Rescoring) -> None:
-    for state, stoppable in (("loading", True), ("rescoring", True), ("done", False), ("failed", False)):
-        rescoring.draw(done(state=state, serial=hash(state)))
-        assert rescoring.panels.shows("Stop rescoring") == stoppable and rescoring.panels.html("wb-again")
-
-
-def test_the_new_line_lies_over_the_recorded_one(rescoring: Rescoring) -> None:
-    rescoring.draw(done(episode(3)), selected_env=3)
-    (chart,) = rescoring.panels.charts()
+def test_the_new_line_lies_over_the_recorded_one(rescored: Rescored) -> None:
+    (chart,) = rescored.draw(done(episode(3)), env=3).charts()
     _, old, new = chart.data
     assert (old == 3).all() and (new == 6).all()
-    assert [series.get("label") for series in chart.series] == [
-        "step",
-        "as recorded",
-        "rescored",
-    ]
-    recorded, rescored = ((series.get("width"), series.get("stroke")) for series in chart.series[1:])
-    assert recorded[0] is not None and rescored[0] is not None and recorded[0] < rescored[0]
-    assert recorded[1] != rescored[1], "the record stands back"
-    rescoring.draw(done(same(3), serial=2), selected_env=3)
-    assert rescoring.panels.charts() == [] and not rescoring.panels.shows("Curve")
+    rescored.panels.set("Curve", "success")
+    assert [str(one.title)[:7] for one in rescored.draw(done(episode(3)), env=2).charts()] == ["success"]
+    rescored.panels.claim("Curve", "../../etc")
+    rescored.draw(done(same(3), serial=2), env=3)
+    assert rescored.panels.charts() == [] and not rescored.panels.shows("Curve")
 
 
-def test_a_choice_that_is_none_draws_the_reward(rescoring: Rescoring) -> None:
-    rescoring.draw(done(episode(1)))
-    rescoring.panels.claim("Curve", "../../etc")
-    rescoring.draw(done(episode(1), serial=2))
-    assert [str(chart.title)[:13] for chart in rescoring.panels.charts()] == ["reward of env"]
+def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescored: Rescored) -> None:
+    many = done(same(30), *(episode(env) for env in range(MOST_ROWS + 3)))
+    assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in rescored.draw(many).html()
+    rescored.panels.press("row 2")
+    rescored.panels.press("on")
+    assert f"{MOST_ROWS + 1} to {MOST_ROWS + 3} of" in rescored.draw(many).html(), "the page is turned"
+    rescored.panels.press("row 2")
+    rescored.panels.claim("row 3", True, "button")  # there is no such row on the last part
+    asked = rescored.live.asked
+    assert asked == [("show", 2, 25), ("show", MOST_ROWS + 2, 10 * (MOST_ROWS + 2) + 5)]
+    rescored.panels.press("back")
+    rescored.draw(many)
+    rescored.draw(many, first=500)
+    rescored.panels.press("row 0")
+    assert asked[-1] == ("change", {"selected_env": 0})
+    rescored.panels.press("on")
+    rescored.draw(RescoreView())
+    assert f"1 to {MOST_ROWS} of" in rescored.draw(replace(many, serial=5)).html(), (
+        "a new past begins with its first page"
+    )
 
 
-def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescoring: Rescoring) -> None:
-    session = rescoring.session
-    rescoring.draw(done(same(30), *(episode(env) for env in range(MOST_ROWS + 3))))
-    assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in rescoring.panels.html()
-    rescoring.panels.press("row 2")
-    rescoring.panels.press("on")
-    rescoring.panels.press("row 2")
-    rescoring.panels.claim("row 3", True, "button")  # there is no such row on the last part
-    assert session.asked == [("show", 2, 25), ("show", MOST_ROWS + 2, 10 * (MOST_ROWS + 2) + 5)]
-    session.shown = running(40, timeline=TimelineView(first=500, last=1000))
-    rescoring.panels.press("back")
-    rescoring.panels.press("row 0")
-    assert session.asked[-1] == ("select", 0)
-
-
-def test_the_key_goes_round(rescoring: Rescoring) -> None:
-    session = rescoring.session
-    rescoring.panel.go_to_difference(1)
-    assert session.asked == []
-    rescoring.draw(done(episode(0), episode(1)))
-    for wanted in (("show", 0, 5), ("show", 1, 15), ("show", 0, 5)):
-        rescoring.panel.go_to_difference(1)
-        assert session.asked[-1] == wanted
-        session.shown = running(
-            40, selected_env=wanted[1], timeline=TimelineView(first=0, last=1000, shown=wanted[2])
-        )
+def test_the_key_goes_round(rescored: Rescored) -> None:
+    key = "Next episode with a different result"
+    rescored.live.command(key)
+    assert rescored.live.asked == []
+    rescored.draw(done(episode(0), episode(1)))
+    for env, moment in ((0, 5), (1, 15), (0, 5)):
+        rescored.live.command(key)
+        assert rescored.live.asked[-1] == ("show", env, moment)
+        rescored.draw(done(episode(0), episode(1)), shown=moment, env=env)
+    rescored.live.command("Previous episode with a different result")
+    assert rescored.live.asked[-1] == ("show", 1, 15)
 
 
 def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
@@ -230,21 +138,40 @@ def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
     curve = RescoredCurve(tick, tick + 7, np.zeros(count, np.float32), np.ones(count, np.float32))
     assert chart_data(curve, None)[0][-1] == count - 1
     x, _, _, cursor = chart_data(curve, 7 + LONGEST)
-    assert len(x) == LONGEST
-    assert x[np.flatnonzero(np.isfinite(cursor))].tolist() == [LONGEST]
+    assert len(x) == LONGEST and x[np.flatnonzero(np.isfinite(cursor))].tolist() == [LONGEST]
     assert len(chart_data(curve, 10**6)) == 3
 
 
-def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
+# --- the words of a verdict, which `workbench rescore` says too ------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("metres", "radians", "says", "far"),
+    [(0.0, 0.0, "to the last bit", False), (4e-4, 1e-4, "0.4 mm", False), (0.032, 0.0, "3.2 cm", True)]
+    + [(0.0, 0.2, "11°", True), (float("inf"), 0.0, "infinite", True)],
+)  # fmt: skip
+def test_drift_is_told_and_doubted_where_it_is_large(
+    metres: float, radians: float, says: str, far: bool
+) -> None:
+    found = [same(1), same(7, metres=metres, radians=radians)]
+    told = verdict_text.drift_summary(found)
+    assert says in told and verdict_text.count_drifted(found) == far
+    assert metres == 0 or ("env 7" in told) == far
+
+
+def test_outcomes_come_before_rewards_and_nan_is_counted() -> None:
+    moved = verdict_text.change_text(episode(success=(None, 41), fail=(7, None)))
+    assert moved.index("success") < moved.index("41") < moved.index("fail") < moved.index("7")
     lost, nan = float("inf"), float("nan")
-    for returns, says in (
-        ((1.0, nan), "NaN now"),
-        ((nan, 1.0), "no longer NaN"),
-        ((nan, nan), "NaN at other steps"),
-    ):
-        assert (
-            verdict_text.change_text(episode(largest=lost, returns=returns)) == f"reward {says}, from step 5"
-        )
+    said = {
+        verdict_text.change_text(episode(largest=lost, returns=two))
+        for two in ((1.0, nan), (nan, 1.0), (nan, nan))
+    }
+    assert len(said) == 3 and all("NaN" in one for one in said)
     told = [episode(returns=(1.0, 2.0)), episode(1, returns=(1.0, nan))]
     assert verdict_text.totals(told) == ["mean return: 1 → 2, NaN in 1 of 2"]
-    assert verdict_text.totals(told[1:]) == ["mean return: 1 → NaN in 1 of 1"]
+    none, flags = same(0, has=()), same(0, has=("success", "fail"))
+    assert verdict_text.totals([none]) == [] and "return" not in "".join(verdict_text.totals([flags]))
+    assert verdict_text.returns_text(none) == "" and "2 of 2" in verdict_text.headline(
+        [episode(0), episode(1)], so_far=True
+    )

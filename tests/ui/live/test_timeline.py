@@ -11,10 +11,8 @@ import pytest
 from tests.drive.panels import Clock, Panels
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
-from tests.ui.scenes import running
 from workbench.session.live.session import Session
 from workbench.session.live.timeline import TimelineView
-from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
 from workbench.ui.app.live_page import Page
 from workbench.ui.live import timeline as panel
@@ -156,13 +154,6 @@ def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived
     assert lived.ends() == (-7, -3, -5), "the episode before"
     lived.draw()
     assert lived.ends() == (-7, -3, -5)
-
-
-def test_of_one_env_there_is_one_way_to_go_on() -> None:
-    assert panel.continue_labels(running(1)) == ("Continue from here",)
-    assert panel.continue_labels(SessionView()) == ("Continue from here",)
-    labels = panel.continue_labels(running(3, selected_env=2))
-    assert labels == ("Continue from here: env 2", "all envs", "env 2 into all envs")
 
 
 def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: EnvMoment) -> None:

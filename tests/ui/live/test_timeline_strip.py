@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,14 +12,9 @@ from workbench.ui.live.timeline import LINE_HEIGHT as HEIGHT
 from workbench.ui.live.timeline import (
     MOST_MARKS,
     POINTS,
-    megabytes,
-    polylines,
     reward_lines,
-    step_in_words,
     strip_html,
-    where,
 )
-from workbench.ui.widgets.templates import render
 
 
 def strip(**changes: object) -> Strip:
@@ -85,30 +79,6 @@ def test_what_came_from_a_recording_or_from_before_the_strip_is_said_so() -> Non
     assert re.findall(r'<path d="([^"]*)"', html) == ["M 0.0 0 Q 30.0 -26 60.0 0"]
 
 
-def test_a_shown_moment_is_told_in_steps_ago() -> None:
-    html = strip_html(strip(), running(4, selected_env=2, timeline=past(163)))
-    assert cursor(html) == 63.0 and ">live<" not in html
-    assert "37 steps ago" in html and "env 2: step 7 / 50, 0.35 s" in html
-    assert "history: 100 steps, 3.0 of 256 MB" in html
-
-
-def test_a_moment_outside_the_strip_stays_at_its_edge() -> None:
-    assert cursor(strip_html(strip(low=160), running(4, timeline=past(120)))) == 0.0
-
-
-def test_one_moment_alone_can_be_drawn() -> None:
-    one = strip(
-        low=100,
-        high=100,
-        events=((100, RESET),),
-        reward=np.zeros(1),
-        branches=(),
-        segments=((100, 100, False),),
-    )
-    html = strip_html(one, running(1, timeline=past()))
-    assert "nan" not in html and 'width="-' not in html
-
-
 @pytest.mark.parametrize("count", [2, POINTS, POINTS + 1, 15_000])
 def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
     reward = np.zeros(count, np.float32)
@@ -139,20 +109,6 @@ def test_where_there_is_no_reward_is_a_gap_and_without_a_change_a_straight_line(
     assert "<polyline" not in strip_html(strip(reward=np.zeros(101, np.float32)), without)
 
 
-def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
-    view = running(2, timeline=TimelineView(100, 200, not_carried=("actor <b>peg</b>: gone",)))
-    not_carried = "; ".join(view.timeline.not_carried)
-    for arrived in ("", "<i>Push</i>, step 3: its actions were replayed."):
-        html = render("timeline_hint", live=True, not_carried=not_carried, arrived=arrived)
-        assert "not restored: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
-        assert ("&lt;i&gt;Push&lt;/i&gt;, step 3" in html) == bool(arrived) and "<i>" not in html
-
-
-def test_fail_is_drawn_before_success() -> None:
-    html = strip_html(strip(events=((150, FAIL | SUCCESS),)), running(4, timeline=past()))
-    assert [style for _, style, _ in marks(html)] == ["fail"]
-
-
 def test_of_very_many_events_each_part_of_the_strip_shows_the_worst() -> None:
     ends = ((tick, (FAIL if tick % 1000 == 0 else TRUNCATED) | RESET) for tick in range(0, 100_000, 50))
     html = strip_html(
@@ -163,24 +119,3 @@ def test_of_very_many_events_each_part_of_the_strip_shows_the_worst() -> None:
     assert sum(style == "fail" for _, style, _ in drawn) == 100
     both = strip_html(strip(events=((190, REWARD_NONFINITE | RESET),)), running(4, timeline=past()))
     assert marks(both) == [(90.0, "odd", "reward is NaN or infinite, 10 steps ago")]
-
-
-def test_where_one_is_is_said_as_far_as_it_is_known() -> None:
-    view = running(2, selected_env=1)
-    assert view.task is not None
-    assert where(view) == "env 1: step 7 / 50, 0.35 s" and step_in_words(view) == "env 1: step 7 / 50"
-    assert step_in_words(replace(view, task=replace(view.task, max_episode_steps=None))) == "env 1: step 7"
-    assert step_in_words(running(1)) == "step 7 / 50"
-    for unknown in (replace(view, task=None), replace(view, step=None), running(2, selected_env=2)):
-        assert step_in_words(unknown) == where(unknown) == ""
-
-
-def test_sizes_have_a_digit_more_below_ten() -> None:
-    sizes = (0, 0.05, 9.94, 10, 255.6)
-    assert [megabytes(round(size * 1024**2)) for size in sizes] == ["0.0", "0.1", "9.9", "10", "256"]
-
-
-def test_a_point_alone_is_a_dot() -> None:
-    points = ["1,1", None, "2,2", "3,3", None, None, "4,4"]
-    assert polylines(points) == ["1,1 1,1", "2,2 3,3", "4,4 4,4"]
-    assert polylines([None, None]) == [] == polylines([])

@@ -13,14 +13,7 @@ from tests.drive.episodes import made
 from tests.drive.panels import Panels
 from workbench.session.review.view import Opened, ReviewView, find_events
 from workbench.ui.live.reward import NumberRow
-from workbench.ui.review.curves import ReviewCurves, compared, known
-from workbench.ui.widgets.templates import render
-
-
-def test_a_nan_that_the_task_returned_is_shown_and_what_the_first_state_lacks_is_not() -> None:
-    assert known("NaN", 0) == "—"
-    assert known("NaN", 7) == "NaN"
-    assert known("0.50", 0) == known("0.50", 7) == "0.50"
+from workbench.ui.review.curves import ReviewCurves, compared
 
 
 def test_what_only_another_recording_has_is_in_the_table() -> None:
@@ -31,15 +24,6 @@ def test_what_only_another_recording_has_is_in_the_table() -> None:
         {"name": "success", "mood": "good", "whole": False, "hint": "", "values": ["true", "false"]},
         {"name": "slope", "mood": "", "whole": False, "hint": "", "values": ["—", "0.10"]},
     ]
-
-
-def test_what_is_not_per_env_is_marked() -> None:
-    phase = NumberRow("phase", "", "", whole="<b>reach", hint="not per env: str")
-    other = NumberRow("phase", "", "", whole="push", hint="not per env: str")
-    (row,) = table = compared([phase], [([phase], 1), ([other], 2)])
-    assert (row["values"], row["whole"], row["hint"]) == (["<b>reach", "push"], True, "not per env: str")
-    html = render("review_numbers", rows=table, of=(0, 1))
-    assert "not per env</span>" in html and "&lt;b&gt;reach" in html
 
 
 def aligned(*recordings: tuple[int, int], selected: int = 0, position: int = 0) -> ReviewView:

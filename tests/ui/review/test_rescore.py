@@ -14,7 +14,6 @@ import pytest
 from tests.drive.episodes import made, write
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
-from workbench.authoring.problem import Problem
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
@@ -22,7 +21,6 @@ from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.review.review import Review
 from workbench.ui.review.rescore import (
-    IDLE,
     RECORDED,
     TODAYS,
     Code,
@@ -30,7 +28,7 @@ from workbench.ui.review.rescore import (
     RescorePanel,
     episode_files,
 )
-from workbench.ui.widgets.rescored import MOST_ROWS, status_html
+from workbench.ui.widgets.rescored import MOST_ROWS
 
 AS_RECORDED, TODAYS_CODE = Code(RECORDED, "", recorded=True), Code(TODAYS, "")
 
@@ -42,19 +40,6 @@ def verdict(id: str = "a", **changes: Any) -> Verdict:
         plain,
         **{"returns": (10.0, 10.0), "old_reward": reward, "new_reward": reward, "metres": 0.0, **changes},
     )
-
-
-def test_success_is_said_before_rewards_and_what_is_the_same_is_said_to_be() -> None:
-    moved = verdict(success=(None, 41), fail=(7, None), first_difference=7)
-    assert (
-        verdict_text.change_text(moved) == "success now at step 41, was never, fail never now, was at step 7"
-    )
-    reward = verdict(largest=0.25, first_difference=4, differing=("reward",))
-    assert verdict_text.change_text(reward) == "reward by up to 0.25, from step 4"
-    assert verdict_text.change_text(verdict()) == "unchanged"
-    assert verdict_text.change_text(verdict(differing=("height",))) == "unchanged, except height"
-    assert verdict_text.change_text(verdict(why_not="it has no step")) == "not rescored: it has no step"
-    assert verdict_text.returns_text(verdict(returns=(1.0, 2.5))) == "1 → 2.5"
 
 
 def test_all_of_them_are_one_sentence() -> None:
@@ -77,26 +62,6 @@ def test_all_of_them_are_one_sentence() -> None:
 def test_numbers_that_are_none_are_null_in_json() -> None:
     assert '"return_now": null' in verdict_text.as_json([verdict(returns=(1.0, float("nan")))])
     assert verdict_text.as_csv([]) == "\n"
-
-
-def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
-    nan = float("nan")
-    lost = verdict(
-        "lost", largest=float("inf"), first_difference=4, returns=(1.0, nan), differing=("reward",)
-    )
-    assert verdict_text.change_text(lost) == "reward NaN now, from step 4"
-    assert verdict_text.returns_text(lost) == "1 → NaN"
-    other = verdict("other", returns=(2.0, 2.0))
-    assert "Mean return: 1.5 → 2, NaN in 1 of 2." in verdict_text.summary([lost, other])
-
-
-def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
-    problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
-    html = status_html(RescoreView("failed", total=3, why="the code raised", problem=problem))
-    assert "push.py:88" in html and "<b>" not in html and "&lt;b&gt;" in html
-    assert "Select recordings" in status_html(RescoreView(), idle=IDLE)
-    told = RescoreView("rescoring", 2, (verdict(),), 1, 3, "episodes", task="Push-v1")
-    assert "rescoring with Push-v1: 1 of 3 episodes" in status_html(told)
 
 
 @pytest.fixture
@@ -126,6 +91,9 @@ class Told:
 
     def __init__(self) -> None:
         self.view, self.rescoring = RescoreView(), self
+
+    def start(self, *args: object, **named: object) -> None:
+        """Nothing is judged here."""
 
     def stop(self) -> None:
         raise AssertionError("nobody asked for that")
@@ -175,20 +143,6 @@ def test_a_row_opens_its_episode_at_the_first_difference(
     assert "wb-selected" in rescoring.panels.html()
 
 
-def test_why_nothing_could_be_judged_is_said_once(rescoring: Rescoring) -> None:
-    why = "push.py (0123456) is not trusted"
-    lost = (
-        verdict("a", why_not=why),
-        verdict("b", why_not=f"{why}: line 1"),
-        verdict("c", why_not="it has no step"),
-    )
-    rescoring.draw(RescoreView("failed", 1, lost, 3, 3, why=why))
-    assert rescoring.panels.html().count("is not trusted") == 1
-    assert "not rescored: it has no step" in rescoring.panels.html()
-    rescoring.draw(RescoreView("done", 2, lost, 3, 3))
-    assert rescoring.panels.html().count(f"not rescored: {why}") == 2, "nothing else says it"
-
-
 def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescoring: Rescoring) -> None:
     moved = {"first_difference": 4, "largest": 0.25, "differing": ("reward",), "returns": (1.0, 2.5)}
     given = (
@@ -208,16 +162,6 @@ def test_a_row_says_what_is_otherwise_and_one_that_is_as_it_was_is_paler(rescori
     assert verdict_text.PUT_IN in rescoring.panels.html("wb-again"), "of what drifted"
 
 
-def test_before_anything_was_judged_the_page_says_how_and_shows_no_list(rescoring: Rescoring) -> None:
-    rescoring.draw(RescoreView())
-    assert "Select recordings in the Library" in rescoring.panels.html("wb-again")
-    assert not rescoring.panels.shows("Stop") and not rescoring.panels.html("wb-again-table")
-    rescoring.draw(RescoreView("done", 1, (verdict(),), 1, 1))
-    assert rescoring.panels.html("wb-again-table")
-    rescoring.draw(RescoreView("rescoring", 2, (), 0, 1))
-    assert rescoring.panels.shows("Stop") and not rescoring.panels.html("wb-again-table")
-
-
 def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     many = tuple(verdict(str(k), first_difference=1, returns=(0.0, 99.0 - k), seed=k) for k in range(23))
     rescoring.draw(RescoreView("done", 1, many, 23, 23))
@@ -230,6 +174,9 @@ def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     rescoring.panels.press("on")
     rescoring.draw(RescoreView("done", 2, many, 23, 23))
     assert "21 to 23 of 23" in rescoring.panels.html()
+    rescoring.panel.rescore(["no such"])
+    rescoring.draw(RescoreView("done", 3, many, 23, 23))
+    assert "1 to 10 of 23" in rescoring.panels.html(), "what is judged anew begins with its first page"
 
 
 def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -> None:

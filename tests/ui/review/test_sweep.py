@@ -20,7 +20,8 @@ from tests.recording.sweep_files import sweep_folder
 from workbench.recording.library.library import Library
 from workbench.recording.sweeps import RESULTS, SweepEpisode, SweepResults, write_results
 from workbench.session.review.view import Opened, ReviewView
-from workbench.ui.review.sweep import SweepPanel, axes_of, best_first
+from workbench.ui.review import sweep
+from workbench.ui.review.sweep import SweepPanel, best_first
 
 
 class Tab:
@@ -105,6 +106,23 @@ def test_a_value_of_an_axis_leaves_the_other_points_out(tab: Tab) -> None:
     assert len(tab.points()) == 9
 
 
+def test_another_order_and_other_values_begin_on_the_first_page(
+    child_process: None,
+    server: viser.ViserServer,
+    folder: Path,
+    clock: Clock,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sweep, "ROWS", 2)
+    tab = Tab(server, folder, clock)
+    for press in ("sort set reach_weight", 'only robot_uids "fetch"', "clear"):
+        tab.press("on")
+        assert "3 to" in tab.panels.html("wb-sweep-scroll")
+        tab.press(press)
+        assert "1 to 2 of" in tab.panels.html("wb-sweep-scroll"), press
+    tab.library.close()
+
+
 def test_the_point_of_the_open_episode_is_shown_until_another_one_is_chosen(tab: Tab) -> None:
     place = "wb-sweep-point"
     assert "reach_weight = 2, robot_uids = panda" in tab.panels.html(place)
@@ -184,27 +202,6 @@ def test_a_link_to_results_elsewhere_is_not_followed(
     tab = Tab(server, folder, clock)
     assert tab.points() == [] and "denied" in tab.panels.html("wb-note").lower()
     tab.library.close()
-
-
-def test_axes_are_in_order_and_within_the_plot(folder: Path) -> None:
-    results = sweep_folder(folder)
-    axes = axes_of(results, results.summaries())
-    names = ["reach_weight", "robot_uids", "success", "return", "reach", "push"]
-    assert [axis.name for axis in axes] == names
-    weights = [label for label, _, _ in sorted(axes[0].ticks, key=lambda tick: -tick[1])]
-    assert weights == ["0.5", "1", "2"]
-    heights = [y for axis in axes for y in axis.heights if y is not None]
-    assert min(heights) >= 34 and max(heights) <= 196
-
-
-def test_a_term_that_is_called_success_is_a_number_and_no_rate(folder: Path) -> None:
-    results = sweep_folder(folder)
-    named = tuple(replace(row, means={"reward_terms/success": 2.0 * row.point}) for row in results.episodes)
-    results = replace(results, episodes=named)
-    *_, rate, _, term = axes_of(results, results.summaries())
-    assert rate.name == term.name == "success"
-    assert [label for label, _, _ in rate.ticks] == ["0 %", "100 %"]
-    assert [label for label, _, _ in term.ticks] == ["0", "14"]
 
 
 def test_the_earlier_success_is_better_then_the_higher_return() -> None:

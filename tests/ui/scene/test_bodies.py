@@ -12,18 +12,10 @@ from tests.ui.scenes import table_scene
 from workbench.core.scene.shapes import Material, Mesh
 from workbench.ui.scene.bodies import LEAVES_AFTER, Looks, SceneView
 from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.scene.glb import group_visuals
 
 
 def handle_named(view: SceneView, part: str) -> viser.BatchedGlbHandle:
     return next(handle for handle in view.handles if part in handle.name)
-
-
-def test_one_node_for_everything_that_the_same_bodies_wear(server: viser.ViserServer) -> None:
-    geometry, poses = table_scene(4)
-    view = SceneView(server)
-    view.build(geometry, lay_out(geometry, poses), poses)
-    assert len(view.handles) == len(group_visuals(geometry)) == 4
 
 
 def test_bodies_stand_at_their_pose_plus_their_env_s_place(server: viser.ViserServer) -> None:
@@ -74,6 +66,19 @@ def test_absent_body_is_left_out_and_hidden_when_no_env_has_it(server: viser.Vis
     assert cube.visible
 
 
+def test_what_another_env_alone_has_is_not_seen_in_this_one(server: viser.ViserServer) -> None:
+    geometry, poses = table_scene(3)
+    cube = replace(geometry.visuals[4], envs=np.array([0, 2], np.int32), bodies=np.full(2, 3, np.int32))
+    geometry = replace(geometry, visuals=(*geometry.visuals[:4], cube))
+    layout, view = lay_out(geometry, poses), SceneView(server)
+    view.build(geometry, layout, poses, only_env=2)
+    assert handle_named(view, "cube").visible
+    view.move(poses, layout, only_env=1)
+    assert not handle_named(view, "cube").visible
+    view.move(poses, layout, only_env=None)
+    assert handle_named(view, "cube").visible and len(handle_named(view, "cube").batched_positions) == 2
+
+
 def test_reload_keeps_the_nodes_that_look_as_before(server: viser.ViserServer) -> None:
     geometry, poses = table_scene(4)
     layout = lay_out(geometry, poses)
@@ -86,24 +91,6 @@ def test_reload_keeps_the_nodes_that_look_as_before(server: viser.ViserServer) -
     view.build(again, layout, poses)
     assert all(new is old for new, old in zip(view.handles[:3], before[:3], strict=True))
     assert view.handles[3] is not before[3]
-
-
-def test_number_of_envs_may_change_between_two_loads(server: viser.ViserServer) -> None:
-    view = SceneView(server)
-    for num_envs in (4, 1, 16):
-        geometry, poses = table_scene(num_envs)
-        view.build(geometry, lay_out(geometry, poses), poses)
-        assert handle_named(view, "cube").batched_positions.shape == (num_envs, 3)
-    view.clear()
-    assert view.handles == ()
-
-
-def test_scene_without_a_floor_gets_a_grid(server: viser.ViserServer) -> None:
-    geometry, poses = table_scene(2)
-    geometry = replace(geometry, visuals=geometry.visuals[1:])
-    view = SceneView(server)
-    view.build(geometry, lay_out(geometry, poses), poses)
-    assert server.scene.get_handle_by_name("/floor") is not None
 
 
 def test_a_dark_floor_is_lighter_in_the_light_theme_and_nothing_else_is_sent(

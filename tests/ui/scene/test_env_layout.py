@@ -39,29 +39,6 @@ def test_no_two_envs_of_a_grid_touch(num_envs: int, depth: float, width: float) 
     assert clear[~np.eye(num_envs, dtype=bool)].all()
 
 
-def test_grid_lies_round_the_origin_and_begins_in_front() -> None:
-    offsets = grid_offsets(16, np.array([1.5, 2.7]))
-    np.testing.assert_allclose(offsets.mean(axis=0), 0, atol=1e-5)
-    assert offsets[0, 0] == offsets[:, 0].max()
-
-
-def test_one_env_stands_at_the_origin() -> None:
-    np.testing.assert_array_equal(grid_offsets(1, np.array([2.0, 2.0])), [[0, 0, 0]])
-
-
-def test_body_that_an_env_lacks_does_not_count_for_its_box() -> None:
-    geometry, poses = table_scene(3)
-    poses[1, 2] = np.nan
-    layout = lay_out(geometry, poses)
-    assert np.isfinite(layout.low).all() and np.isfinite(layout.high).all()
-
-
-def test_scene_without_bodies_has_a_layout_too() -> None:
-    layout = lay_out(SceneGeometry(2, (), (), (), ()), np.zeros((2, 0, 7), np.float32))
-    assert not layout.has_floor
-    assert np.isfinite(layout.offsets).all()
-
-
 def test_wide_table_is_no_floor_and_a_moving_plate_is_none_either() -> None:
     geometry, poses = table_scene(1)
     normal = plane_normal(geometry.visuals[0], geometry, poses)
@@ -108,24 +85,20 @@ def test_click_takes_the_nearer_of_two_envs_in_a_row() -> None:
     assert env_under_ray(layout, front, np.array([-1.0, 0.0, 0.0])) == 0
 
 
-@pytest.mark.parametrize(
-    "direction",
-    [
-        [0.0, 0.0, 1.0],
-        [1.0, 0.0, 0.0],
-        [0.0, 1.0, -0.1],
-        [np.nan, 0.0, -1.0],
-        [0.0, np.nan, np.nan],
-        [np.inf, 0.0, -1.0],
-    ],
-)
-def test_a_click_that_looks_away_past_or_nowhere_finds_none(direction: list[float]) -> None:
-    """From above an env, which is met downwards: the others are behind, beside or no direction."""
+def test_a_click_between_envs_behind_them_or_with_broken_numbers_finds_none() -> None:
     geometry, poses = table_scene(4)
     layout = lay_out(geometry, poses)
-    above = layout.offsets[2] + [0.1, 0.1, 5.0]
-    assert env_under_ray(layout, above, np.array([0.0, 0.0, -1.0])) == 2
-    assert env_under_ray(layout, above, np.array(direction)) is None
+    above, down = layout.offsets[0] + [0.1, 0.1, 5.0], np.array([0.0, 0.0, -1.0])
+    assert env_under_ray(layout, above, down) == 0
+    assert env_under_ray(layout, above, -down) is None, "it lies behind"
+    between = (layout.offsets[0] + layout.offsets[1]) / 2 + [0.1, 0.0, 5.0]
+    assert env_under_ray(layout, between, down) is None
+    edge = layout.offsets[0] + [layout.high[0], 0.0, 5.0]
+    assert env_under_ray(layout, edge - [0.01, 0, 0], down) == 0
+    assert env_under_ray(layout, edge + [0.01, 0, 0], down) is None
+    for broken in (np.nan, np.inf):
+        assert env_under_ray(layout, above, np.array([broken, 0.0, -1.0])) is None
+        assert env_under_ray(layout, np.array([0.0, broken, 5.0]), down) is None
 
 
 def test_the_box_of_a_body_is_turned_with_it_by_the_right_hand_rule() -> None:

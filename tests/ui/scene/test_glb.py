@@ -7,20 +7,14 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from tests.ui.scenes import box_mesh, table_scene
-from workbench.core.scene.shapes import Material, Mesh, fingerprint
-from workbench.ui.scene.glb import LAYER, as_glb, face_limit, group_visuals, lift_painted_layers
+from tests.ui.scenes import box_mesh
+from workbench.core.scene.shapes import Material
+from workbench.ui.scene.glb import LAYER, as_glb, lift_painted_layers
 
 
 def read_back(glb: bytes) -> list[Any]:
     scene: Any = trimesh.load(io.BytesIO(glb), file_type="glb", force="scene")
     return [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh)]
-
-
-def test_parts_of_one_body_become_one_node() -> None:
-    geometry, _ = table_scene(3)
-    groups = group_visuals(geometry)
-    assert [len(group.visuals) for group in groups] == [1, 1, 2, 1]
 
 
 def test_glb_keeps_triangles_normals_and_colours() -> None:
@@ -55,11 +49,6 @@ def test_part_without_texture_beside_a_textured_one_gets_uvs_too() -> None:
     np.testing.assert_allclose(parts[0].visual.uv, np.column_stack([uvs[:, 0], 1 - uvs[:, 1]]), atol=1e-6)
 
 
-def test_mesh_without_normals_gets_some() -> None:
-    (part,) = read_back(as_glb([(replace(box_mesh((1, 1, 1)), normals=None), Material((1, 1, 1, 1)))]))
-    assert "vertex_normals" in part._cache.cache
-
-
 def test_painted_layers_are_pulled_apart_and_solids_are_not() -> None:
     discs = [box_mesh((0.1 / (n + 1), 0.1 / (n + 1), 2e-5 + 2e-5 * n)) for n in range(3)]
     solid = box_mesh((0.1, 0.1, 0.1))
@@ -67,25 +56,3 @@ def test_painted_layers_are_pulled_apart_and_solids_are_not() -> None:
     tops = [float(mesh.vertices[:, 2].max()) for mesh in lifted]
     assert np.diff(tops).min() > 0.9 * LAYER
     assert same is solid
-
-
-def test_fingerprint_knows_looks_again_and_tells_them_apart() -> None:
-    once, _ = table_scene(2)
-    again, _ = table_scene(2)
-    other = replace(once.visuals[4], material=Material((0.0, 0.0, 1.0, 1.0)))
-    assert fingerprint(once.visuals) == fingerprint(again.visuals)
-    assert fingerprint((once.visuals[4],)) != fingerprint((other,))
-
-
-def test_face_limit_spares_simple_shapes_and_keeps_to_the_budget() -> None:
-    geometry, _ = table_scene(10)
-    sphere = trimesh.creation.icosphere(6)
-    rich = replace(
-        geometry.visuals[2],
-        mesh=Mesh(sphere.vertices.astype(np.float32), sphere.faces.astype(np.uint32)),
-    )
-    visuals = (*geometry.visuals, rich)
-    limit = face_limit(visuals, shown_envs=10, num_envs=10, budget=100_000)
-    assert sum(min(len(v.mesh.faces), limit) * 10 for v in visuals) <= 100_000
-    assert face_limit(visuals, shown_envs=1, num_envs=10, budget=1_000_000) == len(sphere.faces)
-    assert face_limit((), 1, 1, 100) >= 1

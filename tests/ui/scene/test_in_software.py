@@ -1,12 +1,10 @@
 from __future__ import annotations
 
 import numpy as np
-import viser
 
 from tests.ui.scenes import table_scene
-from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.scene.in_software import InSoftware, pixel_of
+from workbench.ui.scene.in_software import pixel_of
 from workbench.ui.scene.pixels import Eye
 
 
@@ -20,13 +18,3 @@ def test_a_pixel_is_that_of_the_nearest_env_and_eye() -> None:
     assert np.isclose(pixel_of((far, near), layout, alone=False), 0.002)
     # One env alone stands at the origin, whichever it is.
     assert np.isclose(pixel_of((Eye(above, 0.001),), layout, alone=True), 0.002)
-
-
-def test_without_pages_that_draw_in_software_the_looks_are_those_that_were_chosen(
-    server: viser.ViserServer,
-) -> None:
-    geometry, poses = table_scene(4)
-    in_software = InSoftware(server)
-    in_software.ask()
-    looks = Looks(dark=False)
-    assert in_software.looks(looks, geometry, lay_out(geometry, poses), alone=False) == looks

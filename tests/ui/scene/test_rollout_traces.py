@@ -9,7 +9,7 @@ import pytest
 import viser
 
 from tests.drive.panels import Panels
-from workbench.ui.scene.rollout_traces import BEST, CHOSEN, STEPS, RolloutTraces, segments
+from workbench.ui.scene.rollout_traces import BEST, RolloutTraces, segments
 
 HERE = np.zeros(3, np.float32)
 
@@ -33,25 +33,6 @@ def test_a_way_is_a_line_from_its_beginning_to_its_end_and_the_best_is_drawn_las
     best = points[-4:]
     assert best[:, :, 1].max() == 0 and sorted(best[:, 0, 0]) == [0, 1, 2, 3]
     assert (colours[-4:] == BEST).all() and not (colours[:-4] == BEST).all(-1).any()
-
-
-def test_the_one_that_is_looked_at_has_a_colour_of_its_own() -> None:
-    points, colours = segments(ways(), chosen=3)
-    marked = (colours == CHOSEN).all((1, 2))
-    assert marked.sum() == 4 and (points[marked][:, :, 1] == 3).all()
-    assert (colours == BEST).all((1, 2)).sum() == 4
-
-
-def test_a_long_way_is_drawn_with_fewer_points_that_keep_its_ends() -> None:
-    points, _ = segments(ways(count=1, steps=100))
-    assert len(points) == STEPS and points[..., 0].min() == 0 and points[..., 0].max() == 100
-
-
-def test_what_is_nowhere_is_left_out() -> None:
-    paths = ways(count=2)
-    paths[1, 2] = np.nan
-    points, _ = segments(paths)
-    assert len(points) == 6 and np.isfinite(points).all()
 
 
 def test_one_node_shows_them_where_the_env_stands_and_goes_with_them(

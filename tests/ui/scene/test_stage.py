@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import viser
-
 from tests.drive.panels import Panels
 from tests.ui.scenes import table_scene
 from workbench.ui.scene.env_grid import lay_out
@@ -26,10 +24,3 @@ def test_bodies_and_light_outlive_a_page_and_nothing_else_does(panels: Panels) -
     # The next page draws the same: nothing of it is sent again.
     stage.scene.build(geometry, layout, poses)
     assert stage.scene.handles == bodies
-
-
-def test_where_one_looks_from_stays_while_the_same_is_seen(server: viser.ViserServer) -> None:
-    framing = Stage(server).framing
-    assert framing.is_new(("Push-v1", 1))
-    assert not framing.is_new(("Push-v1", 1))
-    assert framing.is_new(("Push-v1", 4))

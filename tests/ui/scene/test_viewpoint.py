@@ -11,7 +11,7 @@ from tests.ui.scenes import table_scene
 from tests.ui.tabs import camera_message, handshake
 from workbench.core.camera_data import Picture
 from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.scene.viewpoint import FOV, Framing, Viewpoint, frame_all, frame_box, frame_one
+from workbench.ui.scene.viewpoint import FOV, Framing, Viewpoint, frame_box, frame_one
 
 
 @given(
@@ -51,15 +51,6 @@ def test_the_human_camera_s_picture_is_above_what_is_covered() -> None:
         # A point of the middle plane at the picture's middle, top and bottom: where it is in the view, -1 to 1.
         z = 0.4 + part * depth * np.tan(fovy / 2)
         assert abs((z - viewpoint.position[2]) / (away * np.tan(FOV / 2)) - place) < 1e-5
-
-
-def test_more_envs_are_seen_from_further_away() -> None:
-    def distance(num_envs: int) -> float:
-        geometry, poses = table_scene(num_envs)
-        viewpoint = frame_all(lay_out(geometry, poses))
-        return float(np.linalg.norm(viewpoint.position - viewpoint.look_at))
-
-    assert distance(1) < distance(4) < distance(64)
 
 
 def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:

@@ -52,14 +52,6 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strangers, "READ_WITHIN", 1.0)
 
 
-def test_a_client_that_reads_nothing_is_let_go(caplog: pytest.LogCaptureFixture) -> None:
-    async def read_nothing(connection: ClientConnection) -> None:
-        connection.transport.pause_reading()
-
-    assert talk(read_nothing) is None
-    assert "has read nothing for 1 s" in caplog.text
-
-
 def test_one_that_reads_slowly_gets_all_of_it_however_long_it_takes() -> None:
     async def read_a_little_now_and_then(connection: ClientConnection) -> None:
         took = asyncio.create_task(connection.recv())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gzip
 import os
 import socket
-import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -14,10 +14,18 @@ import pytest
 from tests.drive.waiting import until
 from tests.ui.knocking import ask, cookie_of
 from workbench.ui.server.file_response import BLOCK, FileReply
-from workbench.ui.server.gated_server import GatedServer
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 
 LARGE = 48 * 2**20
 """More bytes than the kernel takes of a connection whose other end does not read."""
+
+
+@pytest.fixture(scope="module")
+def gated_server() -> Iterator[GatedServer]:
+    """One for all that is tried on it."""
+    gated_server = open_server(ServerOptions(port=0))
+    yield gated_server
+    gated_server.close()
 
 
 @pytest.fixture
@@ -96,7 +104,6 @@ def test_of_a_file_that_grows_no_more_comes_than_was_announced(
     raw, got = begun(gated_server, address)
     os.truncate(path, LARGE + 10 * BLOCK)
     assert rest(raw, got) == (LARGE + 100, LARGE + 100)
-    until(lambda: open_files(path) == 0, "the end of the reading")
 
 
 def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(
@@ -138,20 +145,6 @@ def test_for_who_does_not_read_no_more_is_read(gated_server: GatedServer, file: 
             before, at = at, position(path)
             still = still + 1 if at == before else 0
         assert 0 < at < LARGE, "all of it is in memory"
-
-
-def test_many_read_one_file_at_once(gated_server: GatedServer, file: tuple[str, Path]) -> None:
-    address, path = file
-    path.write_bytes(os.urandom(3 * BLOCK + 7))
-    bodies: list[bytes] = []
-    threads = [
-        threading.Thread(target=lambda: bodies.append(ask(gated_server, address)[2])) for _ in range(4)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(60)
-    assert bodies == [path.read_bytes()] * 4
 
 
 @pytest.mark.parametrize("kind", ["missing", "folder"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import gzip
 import html
-import mimetypes
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -15,7 +14,6 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from workbench.ui.server.access import Entered, RequestParts
 from workbench.ui.server.responses import (
     EVERY_REPLY,
     LONGEST_NAME,
@@ -25,14 +23,10 @@ from workbench.ui.server.responses import (
     STYLES,
     Handler,
     admitted_reply,
-    content_type,
-    entered_reply,
     folder_handler,
     page_policy,
     refusals,
-    reply,
     request_parts,
-    with_our_head,
 )
 from workbench.ui.server.strangers import RareLog
 
@@ -63,13 +57,6 @@ def says(body: bytes, kind: str = "text/plain") -> Callable[[str], tuple[int, st
     return lambda path: (200, kind, body)
 
 
-def test_the_gate_is_told_every_value_of_what_it_judges() -> None:
-    headers = Headers([("Host", "a"), ("Host", "b"), ("Origin", "c"), ("Cookie", "d"), ("Cookie", "e")])
-    headers.update([("Sec-Fetch-Site", "f"), ("Sec-Fetch-Mode", "g"), ("Sec-Fetch-Dest", "h")])
-    asked = RequestParts("/x?y", ["a", "b"], ["c"], ["d", "e"], ["f"], ["g"], ["h"], websocket=False)
-    assert request_parts(Request("/x?y", headers)) == asked
-
-
 @pytest.mark.parametrize(
     ("upgrade", "websocket"),
     [([], False), (["websocket"], True), (["WebSocket"], False), (["websocket", "websocket"], False)],
@@ -80,19 +67,6 @@ def test_a_handshake_is_what_viser_takes_for_one(upgrade: list[str], websocket: 
     )
 
 
-def test_a_reply_says_its_length_and_how_it_is_packed() -> None:
-    plain = reply(200, "text/plain", b"12345", {"X-Of-It": "1"})
-    assert (plain.status_code, plain.reason_phrase, plain.body) == (200, "OK", b"12345")
-    assert dict(plain.headers.raw_items()) == {
-        "Content-Type": "text/plain",
-        "Content-Length": "5",
-        "X-Of-It": "1",
-        **EVERY_REPLY,
-    }
-    packed = reply(200, "text/plain", b"12345", {}, gzipped=True)
-    assert (packed.headers["Content-Encoding"], packed.headers["Vary"]) == ("gzip", "Accept-Encoding")
-
-
 def test_a_refusal_says_why_and_where_to_go_in_html_that_holds_no_markup_of_theirs() -> None:
     refused = refusals("http://localhost:8080/?a=<b>")("<script>")
     text = bytes(refused.body).decode()
@@ -100,17 +74,6 @@ def test_a_refusal_says_why_and_where_to_go_in_html_that_holds_no_markup_of_thei
     assert "&lt;script&gt;" in text and html.escape("?a=<b>") in text and "<svg" in text
     assert "<script>" not in text and "{{" not in text
     assert PAGE_OF_OURS.items() <= dict(refused.headers.raw_items()).items()
-
-
-def test_the_way_in_sets_the_cookie_and_goes_on() -> None:
-    onward = entered_reply(Entered("/x?y=1", "name=token", by_page=False))
-    assert (onward.status_code, onward.headers["Location"], onward.body) == (303, "/x?y=1", b"")
-    by_page = entered_reply(Entered('/x?y="1"&z', "name=token", by_page=True))
-    assert by_page.status_code == 200 and "Location" not in by_page.headers
-    assert b'content="0;url=/x?y=&quot;1&quot;&amp;z"' in by_page.body
-    for made in (onward, by_page):
-        assert made.headers["Set-Cookie"] == "name=token"
-        assert PAGE_OF_OURS.items() <= dict(made.headers.raw_items()).items()
 
 
 @pytest.mark.parametrize("zipped", [False, True])
@@ -133,11 +96,6 @@ def test_what_viser_serves_besides_its_page_stays_as_it_is() -> None:
     assert made.headers["Content-Security-Policy"] == page_policy(AUTHORITY)
     nameless = of_viser("", b"</head>")
     assert answer("/x", viser_hook=nameless).body == b"</head>"
-
-
-def test_a_page_without_a_head_is_an_error_that_names_viser() -> None:
-    with pytest.raises(ValueError, match="viser's page has no </head>"):
-        with_our_head(b"<html>", False)
 
 
 def test_what_only_viser_takes_for_a_handshake_is_a_bad_request() -> None:
@@ -225,30 +183,6 @@ def test_a_folder_serves_its_files_and_nothing_else(tmp_path: Path) -> None:
         assert handle(path) == (404, "text/plain; charset=utf-8", NO_SUCH_FILE)
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("a.css", "text/css; charset=utf-8"),
-        ("a.html", "text/html; charset=utf-8"),
-        ("a.min.Js", "text/javascript; charset=utf-8"),
-        ("a.json", "application/json"),
-        ("a.svg", "image/svg+xml"),
-        ("a.wasm", "application/wasm"),
-        ("a.png", "image/png"),
-        ("a.no-such-ending", "application/octet-stream"),
-        ("js", "application/octet-stream"),
-    ],
-)
-def test_a_content_type_goes_by_the_end_of_the_name(name: str, kind: str) -> None:
-    assert content_type(name) == kind
-
-
-def test_a_routes_headers_come_in_place_of_the_pages() -> None:
-    made = answer("/a/x", {"/a/": (says(b""), {"Cache-Control": "max-age=1", "Referrer-Policy": "origin"})})
-    assert made.headers.get_all("Cache-Control") == ["max-age=1"]
-    assert made.headers.get_all("Referrer-Policy") == ["origin"]
-
-
 def test_what_a_browser_asked_for_writes_nothing_into_the_terminal(caplog: pytest.LogCaptureFixture) -> None:
     def fails(path: str) -> tuple[int, str, bytes]:
         raise ZeroDivisionError
@@ -270,8 +204,3 @@ def test_a_folder_beside_the_served_one_and_a_link_to_itself_are_not_served(tmp_
         assert handle("a.txt")[::2] == (200, b"a")
         for path in ("loop", "../served-not/a.txt", str(beside / "a.txt")):
             assert handle(path)[::2] == (404, NO_SUCH_FILE)
-
-
-def test_a_scripts_type_is_not_what_the_system_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mimetypes, "guess_type", lambda name: ("text/plain", None))
-    assert content_type("a.js").startswith("text/javascript") and content_type("a.png") == "text/plain"

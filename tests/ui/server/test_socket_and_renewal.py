@@ -22,7 +22,7 @@ from websockets.sync.client import unix_connect
 
 from tests.drive.waiting import until
 from tests.ui.knocking import PROTOCOL, ask, both, client, close_code, cookie_of, token_of
-from tests.ui.tabs import open_deaf_tab, tabs_of
+from tests.ui.tabs import open_deaf_tab
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.ui.server import listening
 from workbench.ui.server.access import cookie_name
@@ -74,12 +74,6 @@ def test_only_its_owner_can_connect_and_no_port_is_open(before, gated_server, fo
     found = (folder / "page.sock").lstat()
     assert stat.S_ISSOCK(found.st_mode) and stat.S_IMODE(found.st_mode) == 0o600
     assert listening_ports() <= before
-
-
-def test_the_printed_line_and_address_lead_to_it(gated_server, folder):
-    assert gated_server.ssh_hint.startswith(f"ssh -L 8080:{folder / 'page.sock'} ")
-    assert gated_server.url == f"http://localhost:8080/?token={token_of(gated_server)}"
-    assert gated_server.warning is None and gated_server.notice is None
 
 
 def test_the_gate_is_the_same_as_on_a_port(gated_server):
@@ -164,14 +158,6 @@ def test_a_folder_that_others_write_into_is_refused(folder):
     open_server(ServerOptions(socket=folder / "page.sock")).close()
 
 
-@pytest.mark.parametrize(
-    ("path", "sentence"), [("none/page.sock", "There is no folder"), ("x" * 200, "at most 107 bytes")]
-)
-def test_a_path_that_cannot_be_is_an_error_that_says_so(folder, path, sentence):
-    with pytest.raises(ServerError, match=sentence):
-        open_server(ServerOptions(socket=folder / path))
-
-
 def test_many_that_start_at_once_are_one(folder):
     made: list[listening.Listening] = []
 
@@ -189,12 +175,6 @@ def test_many_that_start_at_once_are_one(folder):
     (only,) = made
     only.connect(timeout=10).close()
     only.socket.close()
-
-
-@pytest.mark.parametrize("options", [{"token": False}, {"host": "0.0.0.0"}])
-def test_options_that_do_not_go_with_a_socket_are_refused(options):
-    with pytest.raises(ValueError):
-        ServerOptions(socket=Path("x.sock"), **options)
 
 
 # Renewal -----------------------------------------------------------------------------------------
@@ -255,15 +235,6 @@ def test_a_page_that_does_not_listen_is_closed_as_well(on_port):
             tab.recv(timeout=30)
 
 
-def test_without_a_token_there_is_none_to_renew():
-    gated_server = open_server(ServerOptions(port=0, token=False))
-    try:
-        with pytest.raises(ValueError, match="no token"):
-            gated_server.renew_token()
-    finally:
-        gated_server.close()
-
-
 def until_line(process: subprocess.Popen[str], wanted: Callable[[str], bool]) -> str:
     assert process.stdout is not None
     for line in process.stdout:
@@ -290,34 +261,6 @@ def test_the_command_renews_at_a_signal_and_ends_at_another(child_process: None,
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
         assert not place.exists()
-    finally:
-        process.kill()
-        process.communicate()
-
-
-@pytest.mark.slow
-def test_the_palette_of_the_page_renews_and_the_page_is_closed(child_process: None, tmp_path):
-    process = subprocess.Popen(
-        [*python_command("-m", "workbench.cli.main"), "review", str(tmp_path), "--port", "0"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env=child_environment(),
-    )
-    try:
-        first = until_line(process, lambda line: line.startswith("  page")).split()[1]
-        with tabs_of(first) as tabs:
-            tab = tabs.open()
-            until(lambda: tab.open, "the page")
-            tabs.trigger(tab, "Renew the token and close every page")
-            second = until_line(process, lambda line: line.startswith("  page")).split()[1]
-            assert second.partition("?")[0] == first.partition("?")[0] and second != first
-            until(lambda: not tab.open, "the end of the page")
-        with tabs_of(second) as tabs:
-            tab = tabs.open()
-            until(lambda: tab.open, "the page")
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == 0
     finally:
         process.kill()
         process.communicate()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import http.client
 import logging
 import re
 import socket
@@ -20,10 +19,8 @@ from hypothesis import strategies as st
 from tests.ui.knocking import PROTOCOL, ask, both, client, cookie_of, knock, token_of
 from workbench.ui.server import strangers
 from workbench.ui.server.access import cookie_name
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.server.strangers import RareLog
-
-LONG = 300
 
 
 def connected(gated_server: GatedServer) -> socket.socket:
@@ -120,23 +117,6 @@ def test_the_cookies_of_many_other_programs_come_with_it(gated_server):
         assert sock.recv(100).startswith(b"HTTP/1.1 431 Request Header Fields Too Large")
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/" + "x" * LONG,
-        "/workbench/" + "x" * LONG,
-        "/" + "%C3%A9" * 200,
-        "/a%00b",
-        "/workbench/%00",
-        "/" + "x/" * 1800,
-    ],
-)
-def test_a_path_that_no_file_can_have_is_not_found(gated_server, path, caplog, capfd):
-    assert ask(gated_server, path)[0] == 404
-    assert not caplog.records
-    assert capfd.readouterr().err == ""
-
-
 REQUESTS = st.lists(
     st.sampled_from(
         [
@@ -178,13 +158,6 @@ def test_whatever_a_stranger_sends_is_refused(fuzzed, raw):
     fuzz(fuzzed, raw)
 
 
-@pytest.mark.slow
-@settings(with_fixtures, max_examples=3000)
-@given(REQUESTS | st.binary(max_size=3000))
-def test_whatever_a_stranger_sends_for_long_is_refused(fuzzed, raw):
-    fuzz(fuzzed, raw)
-
-
 # What is said ------------------------------------------------------------------------------------
 
 MOST_LINES = 20
@@ -214,8 +187,7 @@ def zeros(gated_server: GatedServer) -> None:
 
 
 def long_protocol(gated_server: GatedServer) -> None:
-    with page_of(gated_server, f"viser-v{'x' * 3000}") as sock:
-        is_closed(sock)
+    page_of(gated_server, f"viser-v{'x' * 3000}").close()
 
 
 def pings(gated_server: GatedServer) -> None:
@@ -321,34 +293,3 @@ def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
     assert lines + untold == 4 * 3600
     told.happened("b", "Another\x1b[2J\nthing\u202e.")
     assert said[-1] == r"Another\x1b[2J\nthing\u202e."
-
-
-def test_what_was_not_told_yet_is_told_at_the_end_with_the_total(caplog):
-    closing = open_server(ServerOptions(port=0))
-    with caplog.at_level(logging.WARNING):
-        for _ in range(30):
-            ask(closing, f"/?token=wrong{'x' * 30}", Cookie=None)
-        assert len(caplog.records) == 1
-        closing.close()
-        closing.close()  # what was told is not told again
-    lines = [record.getMessage() for record in caplog.records]
-    assert "(29 more times since the last message.)" in lines[1] and "invalid token" in lines[1]
-    assert lines[2:] == ["30 requests were refused in total."]
-
-
-def test_no_program_is_named(gated_server):
-    for path, headers in (("/", {}), ("/none", {}), ("/", {"Cookie": None})):
-        assert ask(gated_server, path, **headers)[1]["Server"] is None
-    connection = http.client.HTTPConnection("127.0.0.1", gated_server.port, timeout=20)
-    handshake = {
-        "Upgrade": "websocket",
-        "Connection": "Upgrade",
-        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
-        "Sec-WebSocket-Version": "13",
-        "Origin": f"http://127.0.0.1:{gated_server.port}",
-        "Cookie": cookie_of(gated_server),
-    }
-    connection.request("GET", "/", headers=handshake)
-    response = connection.getresponse()
-    assert (response.status, response.headers["Server"]) == (101, None)
-    connection.close()

@@ -70,19 +70,6 @@ class Told:
         return self.making.view()
 
 
-@pytest.mark.slow
-def test_a_sheet_is_made_and_a_second_one_says_why_not(recordings: Path, tmp_path: Path) -> None:
-    told, (source,) = Told(), find_all_sources([recordings])
-    assert told.making.start(MakeRequest("sheet", (source,), tmp_path))
-    assert not told.making.start(MakeRequest("sheet", (source,), tmp_path)), "two at a time"
-    view = told.wait(lambda view: not view.running)
-    assert view.problem == ""
-    assert [path.name for path in view.made[0].paths] == [f"{source.stem}.sheet.png"]
-    assert told.making.start(MakeRequest("sheet", (source,), tmp_path))
-    view = told.wait(lambda view: not view.running)
-    assert "not written over" in view.problem and len(view.made) == 1
-
-
 def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
     told = Told()
     told.making.start(MakeRequest("film", find_all_sources([recordings]) * 20, tmp_path / "films", "eye"))
@@ -91,41 +78,6 @@ def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
     view = told.wait(lambda view: not view.running)
     assert (view.problem, view.made) == ("", ())
     assert not [path for path in (tmp_path / "films").iterdir() if path.suffix != ".mp4"]
-
-
-@pytest.mark.slow
-def test_a_dataset_is_stopped_in_the_middle_of_an_episode(recordings: Path, tmp_path: Path) -> None:
-    told = Told()
-    told.making.start(
-        MakeRequest("lerobot", find_all_sources([recordings]) * 200, tmp_path / "datasets" / "one")
-    )
-    until(lambda: list(tmp_path.glob("datasets/.one.*/videos/*/*/*")), "a film that is written")
-    told.making.stop()
-    view = told.wait(lambda view: not view.running)
-    assert view.done < 0.9 and (view.problem, view.made) == ("", ())
-    assert list((tmp_path / "datasets").iterdir()) == []
-
-
-def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
-    told = Told()
-    (tmp_path / "x.json").write_text("{}")
-    told.making.start(MakeRequest("sheet", (Source(tmp_path / "x.json"),), tmp_path))
-    assert "x" in told.wait(lambda view: not view.running).problem
-    scratch = told.making.scratch()
-    told.making.close()
-    assert not scratch.exists()
-
-
-def test_recordings_are_found_in_folders_and_by_any_of_their_files(recordings: Path, tmp_path: Path) -> None:
-    (found,) = find_all_sources([recordings])
-    for file in recordings.iterdir():
-        if not file.name.startswith("."):
-            assert find_all_sources([file, recordings]) == (found,)
-    with pytest.raises(FileNotFoundError, match="nothing at"):
-        find_all_sources([tmp_path / "none"])
-    (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(ValueError, match="no recording in"):
-        find_all_sources([tmp_path])
 
 
 def test_an_archive_unpacked_is_the_recording_again(recordings: Path, tmp_path: Path) -> None:
@@ -172,9 +124,3 @@ def test_an_archive_keeps_recordings_of_one_name_in_two_folders_apart(
     for name in ("before", "after"):
         (again,) = find_all_sources([tmp_path / "elsewhere" / name])
         assert not read_recording(again).broken_files
-
-
-def test_files_that_are_gone_make_no_archive(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="lost: its files are gone"):
-        make(MakeRequest("zip", (Source(tmp_path / "lost.json"),), tmp_path))
-    assert list(tmp_path.iterdir()) == []

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import viser
 
 from tests.drive.panels import Panels
 from workbench.recording.episode.row import Source
@@ -17,10 +16,8 @@ from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, Making, Mak
 from workbench.ui.share.panel import (
     ALL_CAMERAS,
     MOST_NAMED,
-    OPENED,
     Chosen,
     SharePanel,
-    short_names,
     will_make,
 )
 
@@ -108,46 +105,6 @@ def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(
     assert not panels.shows("Camera"), "there is no choice"
 
 
-def test_names_are_shown_without_their_time_and_the_scope_stays_as_chosen(
-    panel: SharePanel, panels: Panels
-) -> None:
-    name = "Push_seed0001_env00_2026-11-22T04-40-41"
-    panel.draw(Chosen((Source(Path(f"/recordings/{name}.json")),), ("eye",), selected=True))
-    assert ">Push_seed0001_env00<" in panels.html() and f'title="{name}"' in panels.html()
-    assert ">Push_seed0001_env00.eye.mp4<" in panels.html()
-    same = [name, name.replace("41", "42")]
-    assert short_names(same) == same
-    assert not panel.takes_opened(True) and panels.shows("Share")
-    panels.set("Share", OPENED)
-    assert panel.takes_opened(True) and not panel.takes_opened(False) and not panels.shows("Share")
-    assert panel.takes_opened(True)
-
-
-def test_a_value_that_no_page_of_ours_sends_makes_nothing(
-    panel: SharePanel, panels: Panels, making: Noted
-) -> None:
-    panel.draw(Chosen((RECORDING,), ("base_camera",)))
-    panels.claim("Camera", "../../etc")
-    panels.press("Make")
-    panels.claim("Make", "../../etc")
-    assert ["not one of the choices" in told for told in panels.client.notices] == [True] * 2
-    panels.press("Make")
-    assert [(wanted.camera, wanted.what) for wanted in making.wanted] == [(EVERY_CAMERA, "film")] * 2
-
-
-def test_a_dataset_goes_into_the_recordings_folder(
-    panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
-) -> None:
-    panels.set("Make", "LeRobot dataset")
-    panel.draw(Chosen((RECORDING,)))
-    assert panels.shows("Only successes") and panels.shows("Task") and not panels.shows("Camera")
-    panels.set("Task", "  push it  ")
-    panels.press("Make")
-    (wanted,) = making.wanted
-    assert wanted.folder.parent == tmp_path / "datasets"
-    assert (wanted.export.instruction, wanted.export.only_successes) == ("push it", True)
-
-
 def test_demonstrations_go_there_too_and_are_not_offered_to_be_saved_without_their_json(
     panel: SharePanel, panels: Panels, making: Noted, tmp_path: Path
 ) -> None:
@@ -201,13 +158,3 @@ def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(
     film.unlink()
     panel.draw(Chosen((RECORDING,), ("x",)))
     assert "/offered/" not in panels.html()
-
-
-def test_the_page_is_built_anew_without_a_trace(
-    gated_server: GatedServer, making: Noted, tmp_path: Path
-) -> None:
-    offers = Downloads(gated_server)
-    for _ in range(3):
-        SharePanel(gated_server.server, offers, making, tmp_path).draw(Chosen((RECORDING,)))
-        gated_server.server.gui.reset()
-    assert isinstance(gated_server.server, viser.ViserServer)

@@ -17,7 +17,7 @@ from workbench.core.env.keywords import HowMade, Keyword
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.tasks.env_options import EnvOptionsPanel, merged, options_html
+from workbench.ui.tasks.env_options import EnvOptionsPanel, merged
 from workbench.ui.widgets.parts import Parts
 
 ROBOT = Keyword("robot_uids", "choice", '"panda"', choices=('"panda"', '"fetch"'))
@@ -103,19 +103,6 @@ def test_only_what_was_changed_is_given_and_all_at_once(form: Form) -> None:
     ]
 
 
-def test_a_new_robot_brings_its_own_control_mode_unless_one_is_chosen(form: Form) -> None:
-    form.view = replace(form.view, options=TaskOptions(4, env_kwargs={"control_mode": "pd_joint_pos"}))
-    form.draw()
-    form.set("Robot", "fetch")
-    form.press("Apply")
-    form.set("Control", "pd_ee_pose")
-    form.press("Apply")
-    assert [one.env_kwargs for one in form.applied] == [
-        {"robot_uids": "fetch"},
-        {"control_mode": "pd_ee_pose", "robot_uids": "fetch"},
-    ]
-
-
 @pytest.mark.parametrize(("text", "why"), [("{", "where takes a value in JSON"), ("NaN", "where takes")])
 def test_a_value_that_is_none_is_refused_in_words(form: Form, text: str, why: str) -> None:
     form.set("where", text)
@@ -168,23 +155,6 @@ def test_options_that_were_taken_are_what_is_in_effect(form: Form) -> None:
     assert "--env size=0.5" in form.panels.html("wb-env-options")
     form.press("as the task does")
     assert form.applied[-1] == TaskOptions(4)
-
-
-def test_the_page_shows_driver_further_arguments_and_a_quoted_command(form: Form) -> None:
-    options = TaskOptions(4, env_kwargs={"render_backend": "none", "words": "a b"})
-    text = options_html("/w/my push.py", replace(form.view, options=options, seed=7), "id")
-    assert "pictures on llvmpipe" in text and "render_backend = &#34;none&#34;" in text
-    assert "workbench open &#39;/w/my push.py&#39; --num-envs 4 --seed 7" in text
-    assert "data-copy=" in text
-
-
-def test_while_steps_go_on_the_form_is_not_drawn_again(form: Form) -> None:
-    """It was, fifteen times a second, and asked the disk for the file's place each time."""
-    key = form.panel.key(form.view)
-    form.view = replace(running(4, step_serial=2), task=form.view.task, options=TaskOptions(4))
-    assert form.panel.key(form.view) == key
-    form.panels.set("size", 0.5)
-    assert form.panel.key(form.view) != key
 
 
 VALUES = st.booleans() | st.integers(-5, 5) | st.floats(-5, 5) | st.text(max_size=3) | st.none()

@@ -14,7 +14,6 @@ from workbench.session.tasks.recents import RecentTasks
 from workbench.session.tasks.registered import NotDrawn, RegisteredTasks, RegisteredView
 from workbench.ui.tasks.task_list import (
     CREATE,
-    MOST_RECENT,
     OPEN,
     OpenDialog,
     TaskList,
@@ -140,30 +139,6 @@ def test_a_picture_or_the_reason_why_there_is_none_is_on_each_card() -> None:
     text = html(CatalogueView((PICK, ycb), registered=known))
     assert 'src="/task_pictures/PickCube-v1.jpg"' in text and "needs a download" in text
     assert 'src="/task_pictures/Ycb-v1.jpg"' not in text
-
-
-@pytest.mark.parametrize(
-    ("view", "said"),
-    [
-        (CatalogueView(folder="/w", searching=True), "Looking for task files in /w"),
-        (CatalogueView(folder="/w", left_out="Only 3."), "No task file in /w. A task is a Python file"),
-        (CatalogueView((PUSH,), left_out="Only the first 200 task files are listed."), "Only the first 200"),
-        (CatalogueView(registered=RegisteredView(problem="ManiSkill is not installed.")), "is not installed"),
-        (CatalogueView(registered=RegisteredView(doing="listing")), "list of tasks. The first time"),
-        (
-            CatalogueView((PICK,), registered=RegisteredView(("PickCube-v1",), doing="drawing PickCube-v1")),
-            "Drawing pictures: 0 of 1",
-        ),
-    ],
-)
-def test_where_there_is_nothing_yet_the_page_says_what_is_going_on(view: CatalogueView, said: str) -> None:
-    assert said in html(view)
-
-
-def test_few_recent_tasks_are_shown_and_all_are_found() -> None:
-    recent = tuple(Entry(n, Section.RECENT, f"t{n}.py", "", f"/w/t{n}.py") for n in range(1, MOST_RECENT + 4))
-    assert html(CatalogueView(recent)).count("data-row=") == MOST_RECENT
-    assert html(CatalogueView(recent), f"t{MOST_RECENT + 3}.py").count("data-row=") == 1
 
 
 def test_the_dialog_opens_once_chooses_and_goes(panels: Panels, chosen: Chosen, clock: Clock) -> None:

@@ -9,30 +9,9 @@ import time
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.drive.panels import Panels
-from workbench.ui.widgets.click_targets import NUMBERS, PLACE_STEPS, Paged, Presses, in_turn, place_of
-from workbench.ui.widgets.templates import render
-
-
-def test_a_part_that_can_be_pressed_is_a_stop_of_the_tab_key_and_its_id_stays_an_id() -> None:
-    pill = {"name": "a", "hint": "h", "on": True, "style": "pill", "press": '"><b>'}
-    html = render("studio_tools", rows=[[pill, {**pill, "press": ""}]])
-    assert html.count('tabindex="0" role="button" aria-pressed="true"') == 1
-    assert html.count('aria-disabled="true"') == 1 and "<b>" not in html
-
-
-parts = st.integers(0, PLACE_STEPS - 1)
-
-
-@given(parts, parts, st.integers(0, 88))
-def test_a_place_comes_back_from_its_number_whatever_the_running_part(
-    column: int, row: int, running: int
-) -> None:
-    place = place_of(running * PLACE_STEPS**2 + column * PLACE_STEPS + row)
-    assert place == (column / (PLACE_STEPS - 1), row / (PLACE_STEPS - 1))
+from workbench.ui.widgets.click_targets import Paged, Presses, in_turn
 
 
 @pytest.mark.parametrize("sent", [True, "12", None, -1, 0.5, math.nan, math.inf, 2**60, 1e300, (1, 2)])
@@ -44,15 +23,6 @@ def test_what_no_page_of_ours_sends_is_no_press(panels: Panels, sent: object) ->
     for name in ("place", "number"):
         panels.claim(name, sent)
     assert came == [] and len(panels.client.notices) == 2
-
-
-@pytest.mark.parametrize("running", [0, 1, 88])
-@pytest.mark.parametrize("number", [1, 8 * 99 + 3, NUMBERS - 1])
-def test_a_number_comes_back_whatever_the_running_part(panels: Panels, number: int, running: int) -> None:
-    came: list[int] = []
-    Presses(panels.server).number_id("number", came.append)
-    panels.claim("number", float(running * NUMBERS + number))
-    assert came == [number]
 
 
 def test_what_a_page_counts_in_is_what_its_script_says(panels: Panels) -> None:
@@ -89,19 +59,6 @@ def test_a_panel_that_comes_into_a_page_presses_a_button(panels: Panels) -> None
     assert panels.html(f'data-unfolded="{pressed}"') and came == []
     panels.press("unfolded")
     assert came == ["unfolded"]
-
-
-def test_what_is_not_to_be_seen_comes_after_all_else_and_after_the_mark_of_it(panels: Panels) -> None:
-    """The style sheet hides what comes after the mark in its container."""
-    presses = Presses(panels.server)
-    panels.server.gui.add_html("shown", order=9e5)
-    presses.when_unfolded(lambda: None)
-    order = {html.content: html.order for html in panels.htmls()}
-    shown, mark, unfolded = (
-        next(at for text, at in order.items() if word in text)
-        for word in ("shown", '"wb-presses">', "data-unfolded")
-    )
-    assert shown < mark < unfolded
 
 
 class Page:

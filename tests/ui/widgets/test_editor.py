@@ -9,15 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.ui.widgets.editor import EDITORS, editor_link, no_links, parse_editor
+from workbench.ui.widgets.editor import EDITORS, editor_link, parse_editor
 from workbench.ui.widgets.templates import render
 
 REMOTE = "vscode://vscode-remote/ssh-remote+lab{file}:{line}"
-
-
-@pytest.mark.parametrize("name", EDITORS)
-def test_an_editor_is_known_by_its_name(name: str) -> None:
-    assert parse_editor(name) == EDITORS[name]
 
 
 def test_an_address_is_taken_as_it_is_and_names_file_and_line() -> None:
@@ -75,9 +70,3 @@ def test_any_name_of_a_file_stays_one_path_and_cannot_leave_its_attribute(name: 
     html = render("banner", subject="", doing="", problem=problem, kept="", link=lambda file, line: link)
     assert html.count("<a ") == 1 and html.count('href="vscode://file/home/me/') == 1
     assert "<script" not in html
-
-
-def test_without_an_editor_the_line_can_be_copied() -> None:
-    problem = SimpleNamespace(file="/home/me/push.py", line=7, code="", message="", traceback="")
-    html = render("banner", subject="", doing="", problem=problem, kept="", link=no_links)
-    assert "<a " not in html and 'data-copy="/home/me/push.py:7"' in html and ">push.py:7<" in html

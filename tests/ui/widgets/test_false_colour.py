@@ -50,10 +50,6 @@ def test_floor_to_the_horizon_does_not_flatten_the_table() -> None:
     assert span.far == pytest.approx(3.0)
 
 
-def test_nothing_met_has_no_range() -> None:
-    assert depth_range(np.zeros((4, 4), np.float32)) is None
-
-
 def test_segment_has_one_colour_everywhere_and_neighbours_differ() -> None:
     coloured = colour_segmentation(np.array([[0, 1], [2, 1]], np.int32))
     np.testing.assert_array_equal(coloured[0, 1], coloured[1, 1])
@@ -65,11 +61,6 @@ def test_segment_has_one_colour_everywhere_and_neighbours_differ() -> None:
         for identity in range(1, 60)
     ]
     assert min(apart) > 60
-
-
-@given(st.integers(0, 2**31 - 1))
-def test_every_id_has_a_colour(identity: int) -> None:
-    assert all(0 <= part <= 255 for part in segment_colour(identity))
 
 
 def test_legend_names_the_largest_first_and_counts_the_rest() -> None:

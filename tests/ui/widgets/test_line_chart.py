@@ -6,16 +6,11 @@ import numpy as np
 import viser
 
 from tests.drive.panels import Panels
-from workbench.ui.widgets.line_chart import TAKING_TURNS, YES_OR_NO, ChartLine, LineChart, span_of, with_gaps
+from workbench.ui.widgets.line_chart import TAKING_TURNS, YES_OR_NO, ChartLine, LineChart, span_of
 
 X = np.arange(3.0)
 Y = np.array([0.5, np.nan, 1.0])
 LINES = (ChartLine("one", Y),)
-
-
-def test_what_is_no_number_is_a_gap() -> None:
-    assert with_gaps(np.array([0.5, np.nan, np.inf, -np.inf, 1.0])) == [0.5, None, None, None, 1.0]
-    assert with_gaps(X) is X
 
 
 def test_new_data_go_to_the_same_chart_and_other_lines_to_another(server: viser.ViserServer) -> None:

@@ -6,19 +6,17 @@ from tests.drive.panels import Clock
 from workbench.ui.widgets.parts import DrawDue, PagePart, Parts
 
 
+class Plain(PagePart[int]):
+    def __init__(self) -> None:
+        self.drawn: list[int] = []
+
+    def draw(self, view: int) -> None:
+        self.drawn.append(view)
+
+
 @pytest.fixture
 def due(clock: Clock) -> DrawDue:
     return DrawDue(0.5, clock)
-
-
-def test_what_was_never_drawn_is_due_whatever_it_is(due: DrawDue) -> None:
-    assert due.is_due(None)
-
-
-def test_the_same_is_not_drawn_again_however_long_it_stands(due: DrawDue, clock: Clock) -> None:
-    assert due.is_due(1)
-    clock.passes(1e6)
-    assert not due.is_due(1)
 
 
 def test_something_new_waits_until_the_last_could_be_read(due: DrawDue, clock: Clock) -> None:
@@ -50,14 +48,6 @@ class Halves(PagePart[int]):
 
     def urgent(self, view: int) -> object:
         return view > 99
-
-    def draw(self, view: int) -> None:
-        self.drawn.append(view)
-
-
-class Plain(PagePart[int]):
-    def __init__(self) -> None:
-        self.drawn: list[int] = []
 
     def draw(self, view: int) -> None:
         self.drawn.append(view)

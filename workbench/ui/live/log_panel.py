@@ -147,14 +147,14 @@ class LogPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         self._vitals.content = vitals_html(view.vitals)
+        # An empty log needs no controls. One that is held needs them as soon as there are lines: to be let go.
+        for control in (self._filter, self._hold, self._clear):
+            control.visible = bool(view.printed.lines or view.printed.dropped)
         wanted = self._filter.value.strip()
         if self._hold.value and self._drawn == (wanted, self._cleared):
             return
         self._drawn = wanted, self._cleared
         self._html.content = log_html(view.printed, wanted)
-        # An empty log needs no controls.
-        for control in (self._filter, self._hold, self._clear):
-            control.visible = bool(view.printed.lines or view.printed.dropped)
 
     def _on_clear(self, clear: Callable[[], None]) -> None:
         clear()

@@ -9,14 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tests.ui.env_rows import FELL, rows_of
-from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode, Outcome
+from tests.ui.env_rows import rows_of
+from workbench.session.history.env_table import KEPT_REWARDS, EnvRows
 from workbench.ui.live.env_panel import (
     FILTERS,
-    MOST_ENTRIES,
     columns,
     entry_names,
-    gives_way,
     make_rows,
     mask,
     moment_of,
@@ -83,17 +81,6 @@ def test_cells_say_how_an_env_stands() -> None:
     assert odd.flags == ("bodies-stay: cube dropped 0.90 m (step 12)",) and odd.first_true == ("", "0")
 
 
-def test_an_outlier_of_the_episode_before_is_said_to_be_that() -> None:
-    last = LastEpisode(np.zeros(6, np.int8), np.full(6, 13, np.int32), np.zeros(6), {2: (FELL,)})
-    rows = rows_of(outliers={}, last=last)
-    row = cells_of(rows, np.array([2]))[0]
-    assert row.flags == ("bodies-stay: cube dropped 0.90 m (previous episode, step 12)",) and (
-        row.last,
-        row.last_steps,
-    ) == ("cut short", "13")
-    assert np.flatnonzero(mask(rows, "flagged")).tolist() == [2]
-
-
 def test_the_moment_of_an_env_is_its_first_outlier_else_its_end() -> None:
     rows = rows_of()
     assert [moment_of(rows, env) for env in range(6)] == [None, 33, 20, 50, None, 12]
@@ -107,12 +94,6 @@ def test_small_curves_share_one_scale_and_stay_in_their_box() -> None:
     assert all(0 <= x <= 60 and 1 <= y <= 13 for x, y in points)
 
 
-def test_a_long_episode_has_no_more_points_than_can_be_seen() -> None:
-    rewards = np.random.default_rng(0).normal(size=(6, KEPT_REWARDS)).astype(np.float32)
-    rows = cells_of(rows_of(rewards=rewards), np.arange(6))
-    assert all(len(line.split()) <= 40 for row in rows for line in row.curve)
-
-
 def test_a_reward_that_is_not_a_number_leaves_a_gap_and_no_reward_no_curve() -> None:
     rewards = rows_of().rewards.copy()
     rewards[0, -2] = np.nan
@@ -123,35 +104,3 @@ def test_a_reward_that_is_not_a_number_leaves_a_gap_and_no_reward_no_curve() -> 
     assert len(second.curve) == 1 and len(set(second.curve[0].split())) == 2
     nothing = rows_of(rewards=np.full((6, KEPT_REWARDS), np.nan, np.float32))
     assert all(row.curve == [] for row in cells_of(nothing, np.arange(6)))
-
-
-def test_a_task_with_many_entries_keeps_success_and_fail() -> None:
-    names = [f"a{i}" for i in range(9)] + ["success", "fail"]
-    rows = rows_of(first={name: np.zeros(6, np.int32) for name in names})
-    assert entry_names(rows)[:2] == ("success", "fail") and len(entry_names(rows)) == MOST_ENTRIES
-    assert Outcome.RUNNING == 0
-
-
-def test_a_return_that_is_nan_is_said_and_its_curve_has_a_gap() -> None:
-    rewards = np.full((6, KEPT_REWARDS), np.nan, np.float32)
-    rewards[:] = np.arange(KEPT_REWARDS)
-    rewards[0, 50] = np.nan
-    rows = rows_of(rewards=rewards, total=np.full(6, math.nan))
-    odd, other = cells_of(rows, np.array([0, 1]))
-    assert odd.total == "NaN" and len(odd.curve) == 2 and len(other.curve) == 1
-    assert cells_of(rows, np.array([3]))[0].total == ""
-
-
-def test_a_narrow_table_leaves_out_chosen_columns_late_and_the_sorted_one_never() -> None:
-    ranks = gives_way(("success", "fail", "a", "b"), {"a": True, "success": True, "b": False}, "last")
-    assert sorted(ranks, key=lambda column: ranks[column]) == [
-        "flags",
-        "first b",
-        "first fail",
-        "reward curve",
-        "steps",
-        "first a",
-        "first success",
-        "return",
-    ]
-    assert list(gives_way(("success",), {}, "env"))[-2:] == ["first success", "return"]

@@ -1,0 +1,120 @@
+"""The live page without a browser or a worker: open it, show it a view, press, and see what the session is asked.
+
+Everything that a test knows of how a page gets its view stands here: what follows the models of the session is this file,
+not its tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import viser
+
+from tests.drive.panels import Clock, Panels, forget_what_was_drawn
+from tests.ui.scenes import EMPTY
+from workbench.session.history.env_table import EnvRows
+from workbench.session.live.view import SessionView
+from workbench.ui.app.live_page import Page
+from workbench.ui.server import viser_private
+
+FILE = "push.py"
+
+
+class _Asked:
+    """A part of the session: what is called of it is noted, under its path, unless there is an answer to it."""
+
+    def __init__(self, path: str, session: HandedSession) -> None:
+        self._path, self._session = path, session
+
+    def __getattr__(self, name: str) -> Any:
+        path = f"{self._path}.{name}"
+        answer = self._session.answers.get(path)
+        return _Asked(path, self._session) if answer is None else answer
+
+    def __call__(self, *args: Any, **named: Any) -> None:
+        self._session.asked.append((self._path, *args, *([named] if named else [])))
+
+
+class HandedSession:
+    """Shows the view that it was handed, and notes what it is asked: ``("versions.reload", "rebuilt")``."""
+
+    def __init__(self) -> None:
+        self.shown = EMPTY
+        self.rows: EnvRows | None = None
+        self.asked: list[tuple[Any, ...]] = []
+        self.reference = self.present_reference = FILE
+        self.answers: dict[str, Any] = {
+            "versions.knows_file": lambda file: True,
+            "past.strip": lambda low, high: None,
+            "past.episode": lambda: None,
+            "rescorer.curve": lambda name, env: None,
+            "checks.after_each_save": True,
+        }
+
+    @property
+    def checks(self) -> Any:
+        return self._part("checks", self.shown.checks)
+
+    @property
+    def seeds_solver(self) -> Any:
+        return self._part("seeds_solver", self.shown.seeds)
+
+    def _part(self, name: str, view: object) -> Any:
+        self.answers[f"{name}.view"] = view
+        return _Asked(name, self)
+
+    def view(self) -> SessionView:
+        return self.shown
+
+    def env_rows(self) -> EnvRows | None:
+        return self.rows
+
+    def __getattr__(self, name: str) -> Any:
+        return _Asked(name, self)
+
+
+class Live(Panels):
+    """The live page on a server, with a hand on it."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        clock: Clock | None = None,
+        on_look: Callable[[Any], None] = lambda path: None,
+    ) -> None:
+        super().__init__(server)
+        viser_private.read_icons_once()
+        self.clock, self.session = clock or Clock(), HandedSession()
+        self._envs = self._scenes = 0
+        self.asked_by_drawing: list[tuple[Any, ...]] = []
+        """Of the session, by the last drawing."""
+        self.page = Page(server, self.session, on_look=on_look, clock=self.clock)  # type: ignore[arg-type]
+
+    @property
+    def asked(self) -> list[tuple[Any, ...]]:
+        """Of the session, by what was pressed."""
+        return self.session.asked
+
+    def show(self, view: SessionView, rows: EnvRows | None = None, seconds: float = 60.0) -> None:
+        """Draw this view, so many seconds after the one before."""
+        if view.task is not None and view.task.num_envs != self._envs:
+            self._envs, self._scenes = view.task.num_envs, self._scenes + 1
+        view = replace(view, scene_serial=view.scene_serial + self._scenes)
+        self.session.shown, self.session.rows = view, rows
+        self.clock.passes(seconds)
+        pressed, self.session.asked = self.session.asked, []
+        self.page.redraw()
+        self.asked_by_drawing, self.session.asked = self.session.asked, pressed
+
+    def all_drawn(self) -> dict[str, object]:
+        """All that can be seen once every part was drawn, whatever its key says."""
+        forget_what_was_drawn(self.page._parts)
+        self.again()
+        return self.everything()
+
+    def again(self, seconds: float = 60.0) -> None:
+        """Draw what was shown, with what was pressed since."""
+        shown = self.session.shown
+        self.show(replace(shown, scene_serial=shown.scene_serial - self._scenes), self.session.rows, seconds)

@@ -1,0 +1,70 @@
+"""The review's page on real files, without a browser: open recordings, do something with them, and see what is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import viser
+
+from tests.drive.panels import Clock, Panels, forget_what_was_drawn
+from tests.drive.waiting import until
+from workbench.jobs.task import TaskOptions
+from workbench.session.live.session import Session
+from workbench.ui.app.review_page import ReviewPage
+from workbench.ui.app.workplace import Workplace
+from workbench.ui.server.gated_server import GatedServer
+
+
+def no_session(*_: object) -> Session:
+    raise AssertionError("nobody goes live from a recording")
+
+
+class Reviewed(Panels):
+    """The review of a folder, with a hand on it; who makes one asks for the fixture `child_process`."""
+
+    def __init__(self, gated_server: GatedServer, folder: Path) -> None:
+        super().__init__(gated_server.server)
+        self.place = Workplace(gated_server, folder, no_session, TaskOptions())
+        self.review, self.library = self.place.shelf.review, self.place.shelf.library
+        self.library.refresh()
+        self.clock = Clock()
+        self.page = ReviewPage(self.place, clock=self.clock)
+
+    def draw(self) -> None:
+        self.clock.passes()
+        self.page.redraw()
+
+    def all_drawn(self) -> dict[str, object]:
+        """All that can be seen once every part was drawn, whatever its key says."""
+        forget_what_was_drawn(self.page._parts)
+        self.draw()
+        return self.everything()
+
+    def open(self, *seeds: int) -> None:
+        rows = {-1 if row.seed is None else row.seed: row.id for row in self.library.view().rows}
+        self.review.open([rows[seed] for seed in seeds])
+        until(
+            lambda: len(self.review.view().opened) == len(seeds) and not self.review.view().loading,
+            "what was opened",
+            seen=lambda: self.review.view().problems,
+        )
+        self.draw()
+
+    def seek(self, position: int) -> None:
+        self.review.seek(position)
+        self.draw()
+
+    def chart(self, title: str) -> viser.GuiUplotHandle:
+        (chart,) = (chart for chart in self.part("Curves").charts() if chart.title == title)
+        return chart
+
+
+@contextmanager
+def review_of(gated_server: GatedServer, folder: Path) -> Iterator[Reviewed]:
+    reviewed = Reviewed(gated_server, folder)
+    try:
+        yield reviewed
+    finally:
+        reviewed.place.close()

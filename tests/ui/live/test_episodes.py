@@ -1,0 +1,64 @@
+"""The Episodes tab: what can be recorded or saved, and what a press asks for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from tests.drive.live import Live
+from tests.ui.scenes import running
+from workbench.session.live.timeline import TimelineView
+from workbench.session.process.job_lane import JobProgress
+from workbench.session.record.live import RecordingStatus
+from workbench.session.record.save_past import SaveStatus
+from workbench.ui.live.episodes_panel import (
+    ALL_ENVS,
+    NEXT,
+    RECORD,
+    SAVE,
+    SAVE_BEFORE,
+    STOP,
+    STOP_SAVING,
+    STOP_WAITING,
+)
+
+PAST = TimelineView(0, 40, None, 0, 40, 40, moments=41)
+
+
+def test_what_can_be_done_is_offered_and_asked_for_of_the_chosen_envs(live_page: Live) -> None:
+    def show(recording: RecordingStatus | None = None, past: TimelineView = PAST, **changes: Any) -> None:
+        live_page.show(
+            running(3, selected_env=1, recording=recording or RecordingStatus(), timeline=past, **changes)
+        )
+
+    tab = live_page.part("Episodes")
+    show(past=replace(PAST, moments=0))
+    assert tab.control(SAVE).disabled and not tab.control(RECORD).disabled
+    show()
+    tab.press(RECORD)
+    tab.press(NEXT)
+    tab.press(SAVE)
+    tab.press(SAVE_BEFORE)
+    tab.set("Envs", ALL_ENVS)
+    tab.press(SAVE)
+    assert live_page.asked == [
+        ("start_recording", (1,)),
+        ("start_recording", (1,), {"next_episode": True}),
+        ("save_past", (1,)),
+        ("save_past", (1,), {"before": True}),
+        ("save_past", None),
+    ]
+    live_page.asked.clear()
+    show(past=replace(PAST, first_tick=33, first=33))
+    assert not tab.shows(SAVE_BEFORE), "seven steps are this episode's own"
+    show(RecordingStatus(True, (1,), 1e9, waiting=1))
+    tab.press(STOP_WAITING)
+    show(RecordingStatus(True, (1,), 1e9))
+    assert tab.control(NEXT).disabled
+    tab.press(STOP)
+    show(RecordingStatus(saving=SaveStatus(progress=JobProgress("drawing", 1, 2))))
+    assert not tab.shows(SAVE_BEFORE)
+    tab.press(STOP_SAVING)
+    assert live_page.asked == [("stop_recording",), ("stop_recording",), ("past_saver.stop",)]
+    show(task=None)
+    assert tab.control(RECORD).disabled
