@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.bring_browser import driver_complaint
 from workbench.machine.doctor import chromium_version, find_chromium, how_to_get_chromium
 
 
@@ -40,7 +39,3 @@ def test_a_browser_that_was_named_and_does_not_run_is_not_replaced_by_another(
     monkeypatch.setenv("PLAYWRIGHT_CHROMIUM", "/nonexistent/chromium")
     assert find_chromium() is None
     assert "/nonexistent/chromium" in how_to_get_chromium()
-
-
-def test_playwrights_own_node_starts(child_process: None) -> None:
-    assert driver_complaint() is None

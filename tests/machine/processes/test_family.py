@@ -18,7 +18,6 @@ from tests.drive.waiting import until
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.family import (
     children,
-    describe_exit,
     end_family,
     family,
     main_thread_ended,
@@ -219,13 +218,6 @@ def test_the_memory_of_a_family_counts_what_is_shared_once(
     assert memory.measure(keeper.pid) == 0
 
 
-def test_the_memory_of_what_detached_itself_is_counted(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
-    keeper = begin("hold")
-    alone = FamilyMemory().measure(keeper.pid)
-    assert alone == resident_memory(children(keeper.pid)[0]) > 64 * 2**20
-    end_family(keeper)
-
-
 def test_a_main_thread_that_ended_below_others_is_seen(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
     keeper = begin("pthread_exit")
     worker = children(keeper.pid)[0]
@@ -237,16 +229,3 @@ def test_a_main_thread_that_ended_below_others_is_seen(begin: Callable[..., subp
     assert keeper.poll() is None
     end_family(keeper)
     assert not main_thread_ended(worker)
-
-
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [
-        (-signal.SIGSEGV, "was killed by SIGSEGV"),
-        (-40, "was killed by signal 40"),  # a real-time one, which Python has no name for
-        (3, "ended with exit code 3"),
-        (None, "stopped answering"),
-    ],
-)
-def test_an_end_is_said_in_words(code: int | None, words: str) -> None:
-    assert describe_exit(code) == words

@@ -13,12 +13,9 @@ import pytest
 from tests.drive.session import wait_until
 from tests.session.studio import BASE, camera, moved, said
 from workbench.authoring.camera_source.cameras import RunHooks
-from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.core.camera_data import CallSite, CameraKey, CameraSettings, differences
+from workbench.core.camera_data import CameraKey, CameraSettings, differences
 from workbench.jobs.task import TaskOptions
-from workbench.session.cameras.edit_state import copy, difference_text, plan
-from workbench.session.cameras.file_edits import FileEdits
-from workbench.session.cameras.selection import StudioCameras
+from workbench.session.cameras.edit_state import copy, plan
 from workbench.session.cameras.view import EditRequest, EditState
 from workbench.session.live.session import Session
 from workbench.ui.cameras.write_to_file import edit_html
@@ -173,18 +170,6 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
     studio.file.drop_plan()
     wait_until(session, said(lambda s: s.edit_state.stage == "none"), "nothing left")
     studio.back_to_file(BASE)
-
-
-def test_a_camera_that_the_robot_brings_is_in_no_copy_of_the_task(session: Session) -> None:
-    view = session.view()
-    elsewhere = CallSite("/site-packages/robots/wristcam.py", 20, "WristCam._sensor_configs")
-    info = replace(camera(session, BASE).info, site=elsewhere, mount="panda/camera_link")
-    for task in (view.task, replace(view.task, source_files=())):
-        found = plan(
-            task, info, EditRequest("edit", BASE, replace(there(session, BASE), fov=0.9)), asking(session)
-        )
-        assert found.stage == "refused" and not found.can_copy and "wristcam.py, line 20" in found.message
-        assert 'mount=self.robot.links_map["camera_link"],' in found.snippet
 
 
 def test_an_inherited_camera_gets_a_hook_that_keeps_the_parents_others(
@@ -378,39 +363,3 @@ def test_a_read_only_file_may_be_copied_and_one_with_modules_beside_it_may_not(
         assert file is None and told.message.startswith("Not copied: gone.py cannot be read")
     finally:
         task_file.chmod(0o644)
-
-
-def test_what_was_not_done_is_said_until_something_else_happens(session: Session) -> None:
-    key: CameraKey = ("sensor", "base_camera")
-    edit = SourceEdit("/author/task.py", "a = 1\n", "a = 2\n", (), None)
-    for stage in ("written", "undone"):
-        asker = session.studio.file._asker
-        edit_state = FileEdits(
-            StudioCameras(), lambda: None, lambda *_: None, asker, lambda: None, session.past.shown_moment
-        )
-        message = "Not done: task.py was edited since the camera was written into it."
-        edit_state.view = EditState(stage, EditRequest("edit", key, None), edit, "", message, loading=True)
-        edit_state.failed_to_load()
-        assert "does not load" in edit_state.view.message and "Not done" not in edit_state.view.message
-        html = edit_html(edit_state.view, stale=False)
-        assert "edited since" not in html and "does not load" in html
-        edit_state.close()
-
-
-def test_what_is_not_as_written_is_said_with_both_numbers() -> None:
-    wanted = CameraSettings((0, 0, 1), (1, 0, 0, 0), 0.5, None, 64, 48, 0.01, 10.0, "minimal")
-    other = CameraSettings(
-        (0, 0, 2), (0, 1, 0, 0), None, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), 65, 49, 0.02, 9.0, "rt"
-    )
-    assert difference_text(wanted, wanted) == ""
-    assert difference_text(wanted, other).split("; ") == [
-        "position: (0, 0, 2), not (0, 0, 1)",
-        "orientation: (0, 1, 0, 0), not (1, 0, 0, 0)",
-        "fov: None, not 0.5",
-        "intrinsic: ((1, 0, 0), (0, 1, 0), (0, 0, 1)), not None",
-        "width: 65, not 64",
-        "height: 49, not 48",
-        "near: 0.02, not 0.01",
-        "far: 9, not 10",
-        "shader_pack: rt, not minimal",
-    ]

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 from tests.drive.session import start_over, step, wait_until
-from tests.drive.waiting import until
 from tests.session.studio import BASE, PEOPLE, camera, moved, said
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
 from workbench.core.cameras.conventions import target_of
 from workbench.jobs.task import TaskOptions
-from workbench.session.cameras.file_edits import FileEdits
 from workbench.session.cameras.view import EditRequest, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -108,23 +106,6 @@ def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView
         )
 
     return reached
-
-
-@pytest.mark.slow
-def test_a_camera_that_is_dragged_is_seen_from_where_it_came_to_rest_and_is_one_step_of_undo(
-    session: Session,
-) -> None:
-    start = camera(session, BASE).now
-    for k in range(30):
-        session.studio.place(BASE, replace(start, position=(0.01 * k, 0.0, 0.8)), control=1)
-    rest = replace(start, position=(0.29, 0.0, 0.8))
-    view = wait_until(session, seen_from(BASE, rest), "the picture from there")
-    assert moved(view) == {BASE} and view.studio.undo == "moved base_camera"
-    session.studio.undo()
-    view = wait_until(session, seen_from(BASE, start), "the picture from before")
-    assert not moved(view) and view.studio.redo == "moved base_camera"
-    session.studio.redo()
-    wait_until(session, seen_from(BASE, rest), "the placement again")
 
 
 @pytest.mark.slow
@@ -244,41 +225,6 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     session.studio.undo()
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert not differences(view.studio.camera(BASE).now, now.now)
-
-
-def test_a_hook_that_does_not_end_is_waited_for_so_long_and_the_next_plan_is_made(
-    session: Session, task_file: Path, tmp_path: Path
-) -> None:
-    good, waits = task_file.read_text(), tmp_path / "waits"
-    (hook,) = (line for line in good.splitlines(keepends=True) if "def _default_sensor_configs(" in line)
-    asks = f"        while __import__('os').path.exists({str(waits)!r}):\n            pass\n"
-    studio = session.studio
-    file = FileEdits(
-        studio._cameras,
-        lambda: None,
-        lambda *_: None,
-        studio.file._asker,
-        studio.file._load,
-        session.past.shown_moment,
-        patience=0.5,
-    )
-    try:
-        task_file.write_text(good.replace(hook, hook + asks))
-        wait_until(session, lambda v: asks in v.task.source[str(task_file)], "the version with it")
-        studio.place(BASE, replace(camera(session, BASE).now, fov=1.2))
-        waits.touch()
-        file.plan(EditRequest("edit", BASE))
-        until(lambda: file.view.stage == "refused", "the end of waiting")
-        assert "the task did not answer" in file.view.message
-        waits.unlink()
-        studio.file.plan(EditRequest("edit", BASE))
-        wait_until(session, said(lambda v: v.edit_state.stage == "planned"), "the plan of who waits longer")
-        studio.file.drop_plan()
-    finally:
-        waits.unlink(missing_ok=True)
-        file.close()
-        task_file.write_text(good)
-    wait_until(session, lambda v: asks not in v.task.source[str(task_file)], "the version without it")
 
 
 def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
@@ -447,29 +393,6 @@ def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
     assert not camera(session, BASE).moved, "our own file is in metres whatever is chosen"
     with pytest.raises(ValueError, match="no pose is in it"):
         session.studio.import_pose(BASE, "{}", None, None)
-
-
-@pytest.mark.slow
-def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
-    session: Session, task_file: Path
-) -> None:
-    start, people = camera(session, BASE).now, camera(session, PEOPLE).now
-    there, aside = replace(start, position=(0.2, 0.2, 0.9)), replace(people, fov=0.5)
-    session.studio.place(BASE, there)
-    session.studio.place(PEOPLE, aside)
-    task_file.write_text(task_file.read_text().replace("width=128", "width=96", 1))
-    view = wait_until(
-        session, lambda v: v.studio.camera(BASE).info.settings.width == 96, "the version with another width"
-    )
-    assert moved(view) == {PEOPLE} and "base_camera was changed in the file" in view.studio.problem
-    assert view.studio.undo == "reloaded base_camera from the file"
-    session.studio.undo()
-    wait_until(session, seen_from(BASE, there), "the placement, taken back from the file")
-    serial = view.task_serial
-    session.versions.restart_worker()
-    wait_until(session, lambda v: v.task_serial > serial, "another worker")
-    wait_until(session, seen_from(BASE, there), "its camera where the last one's was")
-    assert moved(session.view()) == {BASE, PEOPLE}
 
 
 def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_copy(

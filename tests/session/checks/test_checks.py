@@ -213,15 +213,6 @@ def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
     assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
 
 
-def test_it_comes_before_the_rescoring_for_the_first_seconds_alone(
-    checks: Checks, background: ScriptedBackground, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("workbench.session.checks.checks.AHEAD", 0.0)
-    checks.loaded(LOAD, same_task=True)
-    ended(checks)
-    assert background.priorities == ["low", "lowest"]
-
-
 def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
     checks: Checks, background: ScriptedBackground
 ) -> None:
@@ -282,22 +273,3 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
             "the rule checked anew",
         )
         assert all(one.rule != FIRST for one in session.view().checks.before)
-
-
-@pytest.mark.slow
-def test_the_rules_of_a_session_with_one_env_are_looked_at_on_one(
-    child_process: None, task_file: Path, tmp_path: Path
-) -> None:
-    begins = "        super().__init__(*args, robot_uids=robot_uids, **kwargs)\n"
-    only = "        if kwargs.get('num_envs', 1) != 1: raise ValueError('one env only')\n"
-    text = task_file.read_text()
-    assert begins in text
-    file = tmp_path / "one_env.py"
-    file.write_text(text.replace(begins, only + begins))
-    with live_session(file, tmp_path / "recordings", num_envs=1) as session:
-        session.check_now()
-        until(lambda: session.view().checks.state not in RUNNING, "the end of the checks", 300)
-        checks = session.view().checks
-    states = {result.rule: result.state for result in checks.results}
-    assert checks.state == "done" and not any(result.problem for result in checks.results)
-    assert states["batch-of-reset"] == "not_known" and states["success-at-reset"] == "kept"

@@ -190,10 +190,3 @@ def test_a_file_that_is_mended_gets_past_a_worker_that_hangs(
     task_file.write_text(good)
     view = wait_until(session, lambda v: v.task_serial > before, "the mended version")
     assert view.problem is None and session.worker_pid != hanging
-
-
-def test_the_authors_prints_are_kept(session: Session, task_file: Path, good: str) -> None:
-    text, _ = edited(good, "_load_scene", "print('hello from the author')")
-    task_file.write_text(text)
-    wait_until(session, lambda v: "hello from the author" in v.printed.texts, "the print")
-    task_file.write_text(good)

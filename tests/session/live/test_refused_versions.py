@@ -204,15 +204,6 @@ def test_a_file_without_a_statement_costs_no_process(
     assert mended.worker_pid == worker, mended.view().reload
 
 
-def test_a_file_that_is_no_python_costs_no_process(mended: Session, task_file: Path, good: str) -> None:
-    worker = mended.worker_pid
-    task_file.write_text(good + "\ndef broken(:\n")
-    wait_until(mended, lambda v: v.problem is not None, "the refusal")
-    task_file.write_text(good)
-    runs(mended, good)
-    assert mended.worker_pid == worker, mended.view().reload
-
-
 def test_recording_and_playing_go_on_after_a_refused_version(
     task_file: Path, good: str, tmp_path: Path
 ) -> None:

@@ -203,13 +203,6 @@ def test_of_two_tasks_in_a_file_one_can_be_chosen_and_stays_chosen(
     assert view.task.class_name == "PushCubeEnv" and view.reload.level == "patched"
 
 
-def test_the_same_id_twice_is_told_with_both_lines(session: Session, task_file: Path, good: str) -> None:
-    task_file.write_text(good + SECOND_TASK.replace("PushTheOther-v1", "WorkbenchPushCube-v1"))
-    view = wait_until(session, lambda v: v.problem is not None, "the problem")
-    assert "registered twice" in view.problem.message and "PushTheOtherEnv" in view.problem.message
-    assert view.task.class_name == "PushCubeEnv"
-
-
 # --- recording ---------------------------------------------------------------------------------------------
 
 

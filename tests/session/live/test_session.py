@@ -277,18 +277,6 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
     assert not view.playing and view.problem is None
 
 
-def test_a_policy_that_is_not_named_does_not_step(session: Session) -> None:
-    settle(session)
-    session.change(action_source="policy", policy=None)
-    session.step()
-    view = wait_until(session, lambda v: v.problem is not None, "a problem")
-    assert "name a policy: module:function or file.py:function" in view.problem.message
-    assert not view.step.elapsed_steps.any()
-    session.change(action_source="random")
-    session.step()
-    wait_until(session, lambda v: v.problem is None, "the problem's end")
-
-
 def test_a_policy_is_looked_for_beside_the_task_too_and_taken_when_it_is_mended(
     session: Session, task_file
 ) -> None:

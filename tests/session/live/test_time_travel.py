@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterator
 
 import numpy as np
@@ -76,14 +75,6 @@ def test_scrubbing_shows_what_was_and_sends_nothing_to_the_worker(session: Sessi
     session.past.seek(None)
     assert session.view().timeline.shown is None
     assert sent == []
-
-
-def test_a_step_or_play_shows_what_is_live_again(session: Session) -> None:
-    start = fresh(session)
-    step(session, 2)
-    session.past.seek(start)
-    view = step(session, 1)
-    assert view.timeline.shown is None and view.step.elapsed_steps[0] == 3
 
 
 def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session) -> None:
@@ -160,28 +151,6 @@ def test_a_reset_can_be_taken_back_and_the_one_before_it_too(session: Session) -
     assert view.step.elapsed_steps.tolist() == [3, 3, 5]
 
 
-def test_undo_leaves_alone_what_has_jumped_on_since(session: Session) -> None:
-    fresh(session)
-    step(session, 3)
-    after(session, lambda: session.reset((0, 1)))
-    step(session, 2)
-    after(session, lambda: session.reset((1,)))
-    view = step(session, 1)
-    assert view.step.elapsed_steps.tolist() == [3, 1, 6]
-    assert view.timeline.undo == "reset of env 0"
-    view = after(session, session.past.undo)
-    assert view.step.elapsed_steps.tolist() == [3, 1, 6] and view.timeline.undo == "reset of 2 envs"
-    session.change(selected_env=1)
-    assert session.view().timeline.undo == "reset of env 1"
-    assert after(session, session.past.undo).step.elapsed_steps.tolist() == [3, 2, 6]
-    assert session.view().timeline.undo == "reset of env 1", (
-        "of the two that were moved by it the other is back"
-    )
-    view = after(session, session.past.undo)
-    assert view.step.elapsed_steps.tolist() == [3, 3, 6] and view.timeline.undo == "reset of all"
-    session.change(selected_env=0)
-
-
 def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session: Session) -> None:
     start = fresh(session)
     begin = session.view().timeline.last_tick
@@ -216,13 +185,6 @@ def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     step(session, 1)
     assert session.view().recording.steps == 0, "what was not begun by a reset is not recorded"
     session.stop_recording()
-
-
-def test_the_newest_snapshot_is_a_plain_pickle(session: Session) -> None:
-    fresh(session)
-    step(session, 2)
-    snapshot = pickle.loads(session._state.newest_moment())
-    assert snapshot.num_envs == N and snapshot.memory.elapsed_steps.tolist() == [2] * N
 
 
 @pytest.mark.slow

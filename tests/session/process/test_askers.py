@@ -153,15 +153,6 @@ def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another
 
 
 @pytest.mark.slow
-def test_a_process_that_ends_with_an_error_is_quoted(background: Background, tmp_path: Path) -> None:
-    file, job = write_task(tmp_path), a_job()
-    file.write_text("import os, sys\nprint('one\\nout of luck', file=sys.stderr)\nos._exit(7)\n")
-    said = "^the process in the background ended with exit code 7: out of luck$"
-    with background.turn(job), pytest.raises(JobFailed, match=said):
-        background.ensure(job, Load(str(file), TaskOptions(num_envs=1)))
-
-
-@pytest.mark.slow
 def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job_that_asked(
     background: Background, tmp_path: Path
 ) -> None:

@@ -4,10 +4,9 @@ import unicodedata
 
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.style import Style
 
 from workbench.machine.text import plain_text
-from workbench.session.process.captured_output import PrintedLine, PrintedLog, Run
+from workbench.session.process.captured_output import PrintedLine, PrintedLog
 
 
 def a_log() -> tuple[PrintedLog, list[PrintedLine]]:
@@ -81,32 +80,6 @@ def test_a_progress_bar_is_one_line_that_is_its_last_version() -> None:
     assert told[1:] == [0] * (len(told) - 1) and len(told) < 20, "the page hears of it, and not of each"
     log.feed("stderr", b"\rdone\n")
     assert log.view().texts == ("before", "done")
-
-
-def test_a_bar_that_is_long_or_ends_with_the_return_stays_one_line() -> None:
-    log, told = a_log()
-    for number in range(10_000):
-        log.feed("stdout", f"{number} of 10000, and what else it says\r".encode())
-    assert told == [] and log.view().texts == ("9999 of 10000, and what else it says",)
-    log.feed("stdout", b"")
-    assert [line.text for line in told] == ["9999 of 10000, and what else it says"]
-    log.feed("stdout", b"windows\r\nlines\r\n")
-    assert log.view().texts[-2:] == ("windows", "lines")
-
-
-def test_colours_stand_beside_the_text_and_go_on_to_the_next_line_of_that_stream() -> None:
-    log, _ = a_log()
-    log.feed("stdout", b"\x1b[31mone\n")
-    log.feed("stderr", b"two\n")
-    log.feed("stdout", b"three\x1b[0m\nfour\n")
-    lines = log.view().lines
-    assert [line.text for line in lines] == ["one", "two", "three", "four"]
-    assert [line.runs for line in lines] == [
-        (Run("one", Style(color="color(1)")),),
-        (),
-        (Run("three", Style(color="color(1)")),),
-        (),
-    ]
 
 
 def test_an_end_of_the_stream_ends_its_colours() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from workbench.machine.processes.family import allocated_memory, resident_memory
-from workbench.session.process.memory_limit import format_size, parse_memory, total_memory
+from workbench.session.process.memory_limit import parse_memory, total_memory
 
 
 @pytest.mark.parametrize(
@@ -29,15 +29,6 @@ def test_auto_leaves_something_to_the_others() -> None:
     assert limit is not None and 0.5 * total_memory() < limit < 0.9 * total_memory()
 
 
-def test_memory_of_a_process_is_seen_and_of_none_is_nothing() -> None:
-    before = resident_memory(os.getpid())
-    # Of the kernel and not of the heap, which may have as much to give from before.
-    with mmap.mmap(-1, 64 * 2**20) as held:
-        held.write(b"x" * len(held))
-        assert resident_memory(os.getpid()) - before > 0.9 * len(held)
-    assert resident_memory(2**22 + 1) == 0
-
-
 def test_what_a_process_allocates_is_told_from_the_files_that_it_maps(tmp_path: Path) -> None:
     size = 64 * 2**20
     (tmp_path / "library").write_bytes(b"x" * size)
@@ -51,7 +42,3 @@ def test_what_a_process_allocates_is_told_from_the_files_that_it_maps(tmp_path: 
     assert allocated_memory(os.getpid()) - before > 0.9 * size
     held.close()
     assert allocated_memory(2**22 + 1) == 0
-
-
-def test_format_size() -> None:
-    assert (format_size(8 * 2**30), format_size(310 * 2**20)) == ("8.0 GB", "310 MB")

@@ -197,15 +197,6 @@ def test_long_work_is_told_again_and_again_and_that_it_is_over() -> None:
         assert one.busy[-1] is None and one.busy.count(None) == 1
 
 
-@pytest.mark.slow
-def test_drawing_may_take_longer() -> None:
-    with minded() as one:
-        one.worker.send(do("draw 1.2"))
-        one.worker.send(do("say drawn"))
-        one.until(lambda: "drawn" in one.said, "the picture")
-        assert one.busy == []
-
-
 def test_an_interrupt_leaves_work_and_nothing_that_is_idle_or_held() -> None:
     with minded() as one:
         one.worker.interrupt()
@@ -358,27 +349,6 @@ def test_a_greeting_that_fails_loses_the_worker_and_is_tried_again(caplog: pytes
     assert "nothing to say" in caplog.text
 
 
-@pytest.mark.slow
-def test_a_greeting_that_fails_three_times_in_a_row_is_tried_again_when_somebody_asks() -> None:
-    with minded() as one:
-        first_requests = one.worker._first_requests
-        failures = iter(range(3))
-
-        def fails() -> list[Request]:
-            if next(failures, None) is not None:
-                raise RuntimeError("nothing to say")
-            return first_requests()
-
-        one.worker._first_requests = fails
-        one.worker.replace()
-        one.until_dead(4)
-        assert [death.gives_up for death in one.deaths] == [False, False, False, True]
-        assert one.worker.pid is None
-        one.worker.replace()
-        one.until_greeted(2)
-        assert len(one.deaths) == 4
-
-
 def test_where_no_worker_can_be_started_it_gives_up_until_somebody_asks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -432,16 +402,6 @@ def test_memory_beyond_the_limit_ends_the_worker_and_what_it_holds_is_told() -> 
         assert "--memory-limit" in death.why and death.end is End.DIED
 
 
-@pytest.mark.slow
-def test_every_worker_listens_for_a_debugger_and_only_the_first_waits_for_it() -> None:
-    with minded(WorkerOptions(debug_port=1234, debug_wait=True)) as one:
-        assert one.events[0] == Loading("debugger at 1234, waits: True")
-        one.worker.replace()
-        one.until_greeted(2)
-        listens = [e.activity for e in one.events if isinstance(e, Loading) and "debugger" in e.activity]
-        assert listens == ["debugger at 1234, waits: True", "debugger at 1234, waits: False"]
-
-
 def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
     with minded() as one:
         one.worker.send(do("work_on 60"))
@@ -450,11 +410,6 @@ def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
     assert pid is not None
     one.until(lambda: not Path(f"/proc/{pid}").exists(), "its end")
     assert [thread.name for thread in threading.enumerate() if thread.name == "session"] == []
-
-
-def test_nothing_is_kept_beside_the_worker_that_nobody_asked_for() -> None:
-    kept = WorkerOptions()
-    assert (kept.spare, kept.memory_limit, kept.debug_port, kept.debug_wait) == (False, None, None, False)
 
 
 @pytest.mark.slow

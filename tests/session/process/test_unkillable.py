@@ -296,13 +296,6 @@ def test_a_file_that_never_loaded_costs_one_worker_and_is_waited_for(tmp_path: P
     assert not psutil.pid_exists(waiting)
 
 
-@pytest.mark.slow
-def test_a_worker_that_is_killed_while_it_waits_comes_back(session: Session) -> None:
-    before = session.view()
-    os.kill(session.worker_pid, signal.SIGKILL)
-    assert "was killed by SIGKILL" in died_and_came_back(session, before).problem.message
-
-
 def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None:
     """The kernel may give a signal for the process to a thread of torch's, and then nothing leaves the loop."""
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])

@@ -17,10 +17,8 @@ from tests.ui.scenes import description, table_scene
 from workbench.jobs.task import Stepped
 from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.recording.reader.read_episode import read_episode
-from workbench.session.process.job_lane import JobProgress
 from workbench.session.record import live
-from workbench.session.record.live import LiveRecorder, RecordingStatus, recovered_text
-from workbench.session.record.save_past import SaveStatus
+from workbench.session.record.live import LiveRecorder
 from workbench.ui.live.episodes_panel import recording_html
 
 
@@ -58,12 +56,6 @@ def test_what_is_stopped_in_the_middle_of_an_episode_is_written(child_process: N
         recorder.close()
 
 
-def test_of_many_that_were_mended_three_are_named() -> None:
-    assert recovered_text([]) == ""
-    said = "4 episodes that an earlier session left half written were recovered: a, b, c and 1 more"
-    assert recovered_text(list("abcd")) == said
-
-
 def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_not_the_thread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,17 +75,6 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
     finally:
         recorder.close()
         stop_listening(said.append)
-
-
-def test_how_far_keeping_is_and_what_came_of_it_stand_on_the_page() -> None:
-    under_way = SaveStatus(progress=JobProgress("rendering it again", 3, 12))
-    html = recording_html(RecordingStatus(saving=under_way))
-    assert "saving: rendering it again, 3 of 12 moments" in html and "width: 25%" in html
-    assert "Each episode becomes" not in html
-    failed = recording_html(RecordingStatus(saving=SaveStatus("there is no step yet", failed=True)))
-    assert "there is no step yet" in failed and "wb-bad-text" in failed and "wb-again-bar" not in failed
-    kept = recording_html(RecordingStatus(saving=SaveStatus("kept 1 episode")))
-    assert "kept 1 episode" in kept and "wb-bad-text" not in kept
 
 
 def step_of(size: int) -> Stepped:

@@ -20,7 +20,7 @@ from workbench.session.history.history import History
 from workbench.session.process.askers import Background
 from workbench.session.protocol.messages import Load
 from workbench.session.rescore.background import StoppedBy
-from workbench.session.rescore.past import MOST_ENTRIES, PastRescorer, RescoredPast
+from workbench.session.rescore.past import PastRescorer, RescoredPast
 
 BODIES = 2
 
@@ -151,27 +151,6 @@ def test_the_run_in_sight_is_judged_first_then_the_newest_and_each_begins_with_a
     assert rescored.steps == 6
 
 
-def test_a_snapshot_that_many_runs_begin_with_goes_to_the_worker_once() -> None:
-    old, new, _ = drawn(0, 6, 64)
-    jumped = np.zeros((6, 64), bool)
-    jumped[0], jumped[4, :2] = True, True
-    rescored = RescoredPast(recorded(old, jumped))
-    (rows,) = rescored.runs()
-    sent = {row: rescored.moment_to_rescore(row) for row in rows}
-    assert {row: one.env_idx for row, one in sent.items() if one.snapshot} == {0: tuple(range(64)), 4: (0, 1)}
-    for row in rows:
-        rescored.add(row, new[row])
-    begins = [int(verdict.of.serials[0]) for verdict in rescored.verdicts()]
-    assert begins.count(0) == 64 and begins.count(4) == 2
-
-
-def test_a_record_that_begins_in_the_middle_of_an_episode_begins_with_its_first_moment() -> None:
-    old, _, _ = drawn(1, 5, 2)
-    rescored = RescoredPast(recorded(old, np.zeros((5, 2), bool)))
-    assert rescored.runs() == [range(5)]
-    assert rescored.moment_to_rescore(0).snapshot is not None and rescored.steps == 4
-
-
 def test_the_record_ends_at_a_jump_that_cannot_be_put_back() -> None:
     old, _, _ = drawn(2, 6, 2)
     jumped = np.zeros((6, 2), bool)
@@ -258,46 +237,6 @@ def test_an_entry_that_only_one_version_has_differs_and_comes_first() -> None:
     assert curve is not None and np.isnan(curve.old).all() and np.isfinite(curve.new).all()
 
 
-def test_of_very_many_entries_the_first_are_compared() -> None:
-    old, _, jumped = drawn(3, 5, 2)
-    many = {f"entry {k}": old[0].reward for k in range(MOST_ENTRIES + 2)}
-    rescored = RescoredPast(recorded([replace(step, evaluate=many) for step in old], jumped))
-    assert MOST_ENTRIES == 24, "each takes 8 bytes for every moment and env"
-    assert rescored.names()[0] == ("reward", *list(many)[:MOST_ENTRIES])
-
-
-def test_of_nothing_that_was_lived_through_nothing_is_judged() -> None:
-    rescored = RescoredPast(History(table(drawn(0, 2, 2)[0][0]), 10**9))
-    assert (rescored.steps, rescored.rescored_steps, rescored.num_envs) == (0, 0, 0)
-    assert rescored.verdicts() == []
-    assert rescored.names() == (("reward",), frozenset())
-
-
-def test_a_run_is_compared_from_its_first_step_on_and_what_was_judged_is_counted() -> None:
-    old, new, _ = drawn(4, 5, 2)
-    jumped = np.zeros((5, 2), bool)
-    jumped[0] = True
-    rescored = RescoredPast(recorded(old, jumped))
-    rescored.add(0, new[0])
-    assert rescored.verdicts() == [] and rescored.rescored_steps == 0
-    rescored.add(1, new[1])
-    assert [verdict.length for verdict in rescored.verdicts()] == [1, 1] and rescored.rescored_steps == 1
-
-
-def test_steps_are_those_of_the_episode_also_where_its_beginning_is_not_kept() -> None:
-    old, new, _ = drawn(1, 6, 2)
-    jumped = np.zeros((6, 2), bool)
-    elapsed = [np.full(2, 40 + row, np.int32) for row in range(6)]
-    same = [replace(old[row], elapsed_steps=elapsed[row], evaluate={}) for row in range(6)]
-    rescored = RescoredPast(recorded(same, jumped))
-    for row in range(6):
-        rescored.add(row, same[row])
-    rescored.add(4, replace(same[4], reward=same[4].reward + 1))
-    verdict = rescored.verdicts()[1]
-    assert (verdict.first_difference, verdict.look_at, verdict.of.begin) == (44, 44, 40)
-    assert verdict.of.at(44) == 4
-
-
 def test_drift_is_that_of_each_env_in_its_own_run() -> None:
     old, _, _ = drawn(1, 6, 2)
     jumped = np.zeros((6, 2), bool)
@@ -327,13 +266,6 @@ def test_what_is_not_judged_yet_has_no_new_value() -> None:
     np.testing.assert_array_equal(curve.new, [new[1].reward[1] + 1, new[2].reward[1] + 1, np.nan, np.nan])
     assert rescored.curve("pose", 0) is None
     assert rescored.curve("reward", 2) is None and rescored.curve("reward", -1) is None
-
-
-def test_other_bodies_cannot_be_compared() -> None:
-    old, new, jumped = drawn(5, 3, 2)
-    rescored = RescoredPast(recorded(old, jumped))
-    with pytest.raises(ValueError, match="bodies"):
-        rescored.add(0, replace(new[0], poses=np.zeros((2, BODIES + 1, 7), np.float32)))
 
 
 def test_drift_is_the_furthest_body_in_metres_and_radians() -> None:

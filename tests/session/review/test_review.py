@@ -20,7 +20,7 @@ from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.review.review import MOST_OPEN, Review
+from workbench.session.review.review import Review
 from workbench.session.review.view import (
     ACTION,
     TERMS,
@@ -198,13 +198,6 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
     assert [o.id for o in view.opened] == ["a"], "what was open stays"
 
 
-def test_more_than_can_be_open_are_left_out_with_a_word() -> None:
-    review, _ = review_of(**{f"e{i}": made(2) for i in range(MOST_OPEN + 3)})
-    review.open([f"e{i}" for i in range(MOST_OPEN + 3)])
-    view = reach(review, lambda view: bool(view.opened), "opening")
-    assert len(view.opened) == MOST_OPEN and f"At most {MOST_OPEN}" in view.problems[0]
-
-
 def test_what_is_open_at_once_may_take_so_much_memory_and_no_more() -> None:
     shelf, held = Shelf({f"e{i}": made(2) for i in range(6)}), []
 
@@ -274,38 +267,6 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
     assert [o.id for o in view.opened] == ["b", "c", "d", "e"], "what was closed does not come back"
     assert (view.selected, view.position, view.playing, view.last) == (0, 15, True, 30)
     assert "first success" in view.alignments
-
-
-def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workbench.session.review.review.FIRST_SHOWN", 0.0)
-    shelf = Shelf({"a": made(10), "b": made(20), "c": made(30)})
-    reached, go_on = threading.Event(), threading.Event()
-
-    def read(row: Row, *_: object) -> Episode:
-        if row.id == "b":
-            reached.set()
-            assert go_on.wait(60)
-        return shelf.read(row)
-
-    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
-    before = set(threading.enumerate())
-    review.open("ab")
-    assert reached.wait(60)
-    (first,) = set(threading.enumerate()) - before
-    opened(review, "c")
-    go_on.set()
-    first.join(60)
-    assert [o.id for o in review.view().opened] == ["c"] and not review.view().loading
-
-
-def test_waits_for_the_next_position_while_it_plays() -> None:
-    _, shelf = review_of(a=made(100))
-    real = Review(shelf, shelf.read)  # type: ignore[arg-type]
-    opened(real, "a")
-    real.toggle_play()
-    seen = real.view()
-    serial = real.wait(seen.serial, timeout=30.0)
-    assert serial > seen.serial and real.view().position > seen.position
 
 
 def test_real_files_come_back_with_scene_pictures_and_numbers(child_process: None, tmp_path: Path) -> None:

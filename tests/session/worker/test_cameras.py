@@ -134,56 +134,6 @@ def test_sensors_come_first_and_each_kind_as_soon_as_it_is_there(desk: Desk) -> 
     assert desk.first == [False, True] and desk.heartbeat.read().doing == "drawing"
 
 
-def test_after_a_round_there_is_a_pause_in_proportion(desk: Desk) -> None:
-    desk.cameras.watch(0, (SENSOR,))
-    desk.makes()
-    desk.clock.now += 2.0
-    (pictures,) = desk.makes()
-    assert pictures.milliseconds == pytest.approx(2000)
-    desk.cameras.scene_changed()
-    assert desk.wait() == pytest.approx(0.6)
-    assert desk.makes() == [] and desk.wait() == pytest.approx(0.6), "not begun before"
-    desk.clock.now += 0.61
-    desk.makes()
-    assert shown(desk.makes()) == [BASE]
-    desk.cameras.scene_changed()
-    assert desk.wait() == pytest.approx(1 / 15), "nor oftener than 15 times a second"
-    desk.cameras.watch(1, (SENSOR,))
-    assert desk.wait() == 0.0, "somebody waits for these"
-
-
-def test_how_long_a_picture_took_is_not_told_where_steps_took_part_of_the_time(desk: Desk) -> None:
-    """*Fast, rendered in 450 ms* stood below a picture that had taken 4."""
-    desk.cameras.watch(0, (SENSOR,))
-    desk.makes()
-    desk.held.steps.number += 1
-    (pictures,) = desk.makes()
-    assert pictures.milliseconds is None
-    desk.cameras.scene_changed()
-    desk.clock.now += 1.0
-    desk.makes()
-    (pictures,) = desk.makes()
-    assert pictures.milliseconds is not None
-
-
-def test_a_picture_is_fetched_when_it_should_be_ready_by_what_the_last_ones_took(desk: Desk) -> None:
-    desk.cameras.watch(0, (SENSOR,))
-    desk.makes()
-    desk.clock.tick = 0.2  # the renderer is waited for
-    (pictures,) = desk.makes()
-    desk.clock.tick = 0.0
-    for expected in (pictures.milliseconds / 1000, 0.9 * pictures.milliseconds / 1000):
-        desk.cameras.scene_changed()
-        desk.clock.now += 1.0
-        desk.cameras.make(may_block=False)
-        assert desk.wait() == pytest.approx(expected)
-        desk.cameras.make(may_block=False)
-        assert desk.heard() == [], "not while there is something else to do"
-        desk.clock.now += expected + 0.001
-        desk.cameras.make(may_block=False)
-        assert shown(desk.heard()) == [BASE], "and was not waited for: the next is looked for earlier"
-
-
 def test_pictures_are_fast_while_something_moves_and_exact_when_it_stands_still(desk: Desk) -> None:
     def next_picture(*degree: str) -> Any:
         desk.makes()
@@ -209,15 +159,6 @@ def test_pictures_are_fast_while_something_moves_and_exact_when_it_stands_still(
     desk.clock.now += 0.31
     np.testing.assert_array_equal(next_picture("exact"), exact)
     assert desk.wait() is None, "until something moves again"
-
-
-def test_what_is_watched_already_is_not_begun_again(desk: Desk) -> None:
-    desk.cameras.watch(0, (SENSOR,))
-    desk.makes()
-    desk.cameras.watch(0, (SENSOR,))
-    assert shown(desk.makes()) == [BASE]
-    desk.cameras.watch(0, (SENSOR,))
-    assert desk.wait() is None
 
 
 def test_of_placements_that_wait_the_last_is_made_after_the_picture_and_its_picture_comes_first(

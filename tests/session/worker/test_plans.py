@@ -80,14 +80,6 @@ def test_a_plan_goes_on_while_its_episode_does_and_begins_anew_with_another(
     assert further.returns[further.plan] != further.returns[further.hold]
 
 
-def test_another_number_of_rollouts_and_another_body_count_from_the_next_plan_on(
-    push: OpenedTask, plan: Callable[..., tuple[PlannedEnv, ...]]
-) -> None:
-    push.env.reset(3)
-    (one,) = plan([1], PlanOptions(rollouts=8, horizon=0.2, every=3), "cube")
-    assert len(one.returns) == 8 and one.actions.shape == (3, 7) and one.traced == "cube"
-
-
 def test_a_task_with_other_bodies_in_each_env_has_no_plan_and_says_what_to_do() -> None:
     opened = opened_with(TASKS / "different_objects.py", 2, render_backend="none")
     plans = WorkerPlans(lambda: False)

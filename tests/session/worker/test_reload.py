@@ -19,7 +19,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from workbench.authoring.problem import TaskError
-from workbench.core import backends
 from workbench.core.cameras.render import take_pictures
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
@@ -102,20 +101,6 @@ def state_of(task: TaskEnv) -> list[bytes]:
     return [*task.snapshot().simulation.packed]  # type: ignore[union-attr]
 
 
-def test_a_registration_that_comes_and_goes_is_said(desk: Desk) -> None:
-    (line,) = [line for line in desk.good.splitlines() if line.startswith("@register_env")]
-    report = desk.edit(f"{line}\n", "")
-    assert report.level == "rebuilt" and report.carried
-    assert (
-        report.reason
-        == "PushCubeEnv is no longer registered as WorkbenchPushCube-v1, and so has no time limit"
-    )
-    report = desk.edit('@register_env("WorkbenchPushCube-v1"', '@register_env("Another-v1"')
-    assert report.reason == "PushCubeEnv is registered as Another-v1 now"
-    report = desk.save(desk.good)
-    assert report.reason == "PushCubeEnv is registered as WorkbenchPushCube-v1 now, and not as Another-v1"
-
-
 # --- patched ---------------------------------------------------------------------------------------
 
 
@@ -131,23 +116,6 @@ def test_an_edited_reward_is_computed_anew_for_this_moment_and_nothing_else_happ
     np.testing.assert_array_equal(now.poses, before.poses)
     np.testing.assert_array_equal(now.elapsed_steps, before.elapsed_steps)
     assert desk.step().elapsed_steps[0] == before.elapsed_steps[0] + 1
-
-
-def test_a_gpu_that_is_left_alone_is_told_of_in_every_version(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: None)
-    desk.edit("return reward\n", "return reward + 1\n")
-    assert "--backend gpu" in desk.running.opened.description.notices[-1]
-    desk.save(desk.good, "rebuilt")
-    assert "--backend gpu" in desk.running.opened.description.notices[-1]
-
-
-def test_right_after_a_reset_there_is_no_reward_yet(desk: Desk) -> None:
-    first = desk.task.reset(seed=1)
-    desk.running = Running(desk.running.request, desk.running.opened, first)
-    desk.edit("return reward\n", "return reward + 1\n")
-    assert (desk.running.last.reward == 0).all() and desk.running.last.action is None
 
 
 def test_an_edited_evaluate_and_observation_are_seen_at_once(desk: Desk) -> None:
@@ -272,12 +240,6 @@ def test_a_level_that_is_asked_for_is_taken(desk: Desk, level: LoadLevel) -> Non
     assert (desk.task.env is env) == (level != "rebuilt")
     report = desk.edit("return reward\n", "return reward + 1\n", level)
     assert report.level == level
-
-
-def test_a_patch_that_was_not_found_safe_says_what_would_have_been_chosen(desk: Desk) -> None:
-    report = desk.edit("CUBE_HALF_SIZE = 0.02", "CUBE_HALF_SIZE = 0.03", "patched")
-    assert report.level == "patched"
-    assert "rebuilt would have been chosen" in report.reason and "CUBE_HALF_SIZE" in report.reason
 
 
 def test_a_worker_that_was_started_anew_goes_on_from_the_snapshot_that_it_is_given(desk: Desk) -> None:
