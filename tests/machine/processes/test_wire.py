@@ -30,7 +30,7 @@ EVENTS: tuple[type, ...] = get_args(Event)
 
 
 @pytest.mark.parametrize("kind", [*EVENTS, *QUESTIONS], ids=lambda kind: kind.__name__)
-@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(st.data())
 def test_whatever_is_made_of_the_schema_is_that_message_and_what_is_not_is_unreadable(
     kind: type, data: st.DataObject
