@@ -53,13 +53,11 @@ def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(ses
     assert plan.paths.shape == (16, 7, 3) and plan.traced == "panda/panda_hand_tcp"
     # What is predicted and what comes is of one size: the best of the last plan is a success.
     assert np.isfinite(view.solve.predicted).all() and view.solve.predicted[-1] == pytest.approx(1, abs=0.6)
-
-
-@pytest.mark.slow
-def test_the_solved_episode_is_saved_like_any_other(session: Session) -> None:
     session.save_past((0,))
     view = wait_until(session, lambda view: bool(view.recording.saving.message), "the recording")
-    assert view.recording.saving.message.startswith("saved ") and not view.recording.saving.failed
+    assert view.recording.episodes_written == 1 and not view.recording.saving.failed, (
+        "it is kept like any other"
+    )
 
 
 def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(session: Session) -> None:
@@ -70,9 +68,10 @@ def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(ses
     wait_until(session, lambda view: view.step is not None and view.step.elapsed_steps[0] >= 2, "two steps")
     session.pause()
     view = wait_until(session, lambda view: not view.playing and view.solve.state == "none", "the pause")
-    time.sleep(0.5)
-    assert session.view().step_serial - view.step_serial <= 1
-    assert session.view().solve.state == "none"
+    serial = session.view().step_serial
+    session.inspect(("joints",))
+    view = wait_until(session, lambda v: v.inspection is not None, "an answer of the worker")
+    assert view.step_serial - serial <= 1 and view.solve.state == "none"
 
 
 def test_a_wish_that_comes_after_the_pause_was_sent_is_not_planned_for(session: Session) -> None:
