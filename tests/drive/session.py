@@ -23,7 +23,7 @@ from workbench.core.camera_data import CameraKey
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Restored, Stepped, TaskDescription, TaskOptions
 from workbench.session.cameras.view import StudioCamera, StudioView
-from workbench.session.history.history import Moment
+from workbench.session.history.history import History, Moment
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.process.supervisor import Death, End, Supervisor, Vitals, WorkerOptions
@@ -170,7 +170,7 @@ class Told:
         at = moment_at(self.session, origin)
         undoes, success = restored.pop("undoes", None), restored.pop("success", ())
         told = Restored(envs, source, origin, undoes, restored.pop("not_carried", {}), **restored)
-        elapsed = np.zeros(len(envs), np.int32) if at is None else at.step.elapsed_steps[list(source)]
+        elapsed = np.ones(len(envs), np.int32) if at is None else at.step.elapsed_steps[list(source)]
         self._jump(envs, elapsed, restored=told, success=success)
 
     def resume(self) -> None:
@@ -328,10 +328,15 @@ def wait_until(session: Session, reached: Callable[[SessionView], object], what:
     return until(wanted, what, seen=seen)
 
 
+def history_of(session: Session) -> History:
+    """All that it keeps of the running scene."""
+    assert session._state.timeline is not None
+    return session._state.timeline.history
+
+
 def moment_at(session: Session, serial: int) -> Moment | None:
     """What the session keeps of a moment."""
-    timeline = session._state.timeline
-    return None if timeline is None else timeline.history.at(serial)
+    return None if session._state.timeline is None else history_of(session).at(serial)
 
 
 def moments_of(session: Session) -> list[Moment]:

@@ -242,22 +242,6 @@ def test_arguments_from_elsewhere_name_no_files(
         SceneProcess()._make(None, read_episode(foreign), lambda: None, print)  # type: ignore[arg-type]
 
 
-def test_each_text_is_asked_about_once_and_all_can_be_refused_at_once(foreign: Path) -> None:
-    file = foreign.parents[1] / "push.py"
-    wanted = [todays(foreign), todays(foreign)]
-    for name in ("a", "b"):
-        other = file.with_name(f"{name}.py")
-        other.write_text(f"# {name}\n")
-        wanted.append(replace(wanted[0], reference=RecordedTask("Push-v1", str(other))))
-    person = Person(Consent.NONE)
-    cleared = Clearances(ask=person).clear_all(wanted)
-    assert [question.more for question in person.asked] == [2]
-    assert all(isinstance(one, NotCleared) for one in cleared) and len(cleared) == 4
-    person = Person(Consent.NO)
-    Clearances(ask=person).clear_all(wanted)
-    assert [Path(question.file).name for question in person.asked] == ["push.py", "a.py", "b.py"]
-
-
 # --- the seal ----------------------------------------------------------------------------------------
 
 
@@ -382,25 +366,6 @@ def test_a_store_that_others_may_write_to_trusts_nothing(
     assert not TrustStore().trusts(content)
 
 
-def test_without_a_folder_to_keep_it_in_it_is_asked_every_run_and_recording_goes_on(
-    foreign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    (tmp_path / "file").write_text("")
-    another_user(tmp_path / "file" / "below", monkeypatch)
-    person = Person(Consent.ALWAYS)
-    clearances = Clearances(ask=person)
-    clearances.clear(todays(foreign))
-    clearances.clear(todays(foreign))
-    assert len(person.asked) == 1 and len(asked(todays(foreign))) == 1
-    told = [record.message for record in caplog.records]
-    assert len([message for message in told if "cannot be kept" in message]) == 1
-    again = write(foreign.parents[1] / "recordings", made(2), pictures=False)
-    write(foreign.parents[1] / "recordings", made(3), pictures=False)
-    assert made_here(info_of(again)) is MadeHere.NO
-    told = [record.message for record in caplog.records]
-    assert len([message for message in told if "cannot be sealed as made here" in message]) == 1
-
-
 # --- a file that a person chose from a list -----------------------------------------------------------
 
 
@@ -442,10 +407,3 @@ def test_a_no_opens_nothing_and_once_lasts_for_this_run(tmp_path: Path) -> None:
         Clearances(ask=person).clear_file(file)
     with pytest.raises(NotCleared):
         Clearances().clear_file(listed(tmp_path, TEXT + "#\n"))
-
-
-def test_what_a_person_named_or_trusts_as_a_whole_is_not_asked_about(tmp_path: Path) -> None:
-    file, person = listed(tmp_path), Person()
-    assert Clearances(lambda: [file], person).clear_file(file, "Push") == f"{file}:Push"
-    assert Clearances(ask=person, all_trusted=True).clear_file(file) == str(file)
-    assert person.asked == []

@@ -17,10 +17,8 @@ import pytest
 from tests.drive.waiting import until
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.family import (
-    children,
     end_family,
     family,
-    main_thread_ended,
     proportional_memory,
     resident_memory,
 )
@@ -145,15 +143,6 @@ def test_what_detached_itself_goes_with_the_worker_and_the_exit_code_is_the_work
     assert gone(all_of_it)
 
 
-def test_a_worker_that_is_killed_takes_its_family_along(
-    begin: Callable[..., subprocess.Popen[bytes]],
-) -> None:
-    keeper = begin("wait")
-    all_of_it = members(keeper.pid)
-    os.kill(children(keeper.pid)[0], signal.SIGKILL)
-    assert keeper.wait(timeout=20) == -signal.SIGKILL and gone(all_of_it)
-
-
 def test_a_family_is_ended_when_asked_and_nobody_else(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
     one, other = begin("wait"), begin("wait")
     ours = subprocess.Popen(["sleep", "600"], start_new_session=True)
@@ -216,16 +205,3 @@ def test_the_memory_of_a_family_counts_what_is_shared_once(
     assert 64 * 2**20 < memory.measure(keeper.pid, limit=2 * 64 * 2**20) < 2 * 64 * 2**20
     end_family(keeper)
     assert memory.measure(keeper.pid) == 0
-
-
-def test_a_main_thread_that_ended_below_others_is_seen(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
-    keeper = begin("pthread_exit")
-    worker = children(keeper.pid)[0]
-    assert not main_thread_ended(worker)
-    assert keeper.stdin is not None
-    keeper.stdin.write(b"\n")
-    keeper.stdin.close()
-    until(lambda: main_thread_ended(worker), "the end of its main thread")
-    assert keeper.poll() is None
-    end_family(keeper)
-    assert not main_thread_ended(worker)

@@ -11,10 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import start_over, step, wait_until
-from tests.session.studio import BASE, PEOPLE, camera, moved, said
+from tests.drive.session import BASE, PEOPLE, camera, in_studio, moved, start_over, step, wait_until
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
-from workbench.core.cameras.conventions import target_of
 from workbench.jobs.task import TaskOptions
 from workbench.session.cameras.view import EditRequest, StudioView
 from workbench.session.live.session import Session
@@ -54,12 +52,14 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, 
         there = replace(camera(session, BASE).now, position=(0.31, 0.02, 0.55))
         session.studio.place(BASE, there)
         session.studio.file.plan(EditRequest("edit", BASE))
-        refused = wait_until(session, said(lambda s: s.edit_state.stage == "refused"), "the refusal")
+        refused = wait_until(session, in_studio(lambda s: s.edit_state.stage == "refused"), "the refusal")
         session.studio.file.copy_task()
-        planned = wait_until(session, said(lambda s: s.edit_state.stage == "planned"), "the plan in the copy")
+        planned = wait_until(
+            session, in_studio(lambda s: s.edit_state.stage == "planned"), "the plan in the copy"
+        )
         session.studio.file.write()
         ended = wait_until(
-            session, said(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
+            session, in_studio(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
         )
         session.studio.file.drop_plan()
         named = str(session.present_reference)
@@ -159,35 +159,18 @@ def test_a_preview_in_another_size_leaves_the_camera_and_the_observation_alone(s
     assert view.studio.preview is None
 
 
-def test_a_moment_of_the_past_is_drawn_again_when_the_camera_moves(session: Session) -> None:
-    start = camera(session, BASE).now
-    session.step()
-    wait_until(session, lambda v: v.step.elapsed_steps.any() and BASE in v.pictures, "a step")
-    session.past.seek_by(-1)
-    wait_until(session, lambda v: v.timeline.shown is not None, "the past")
-    there = replace(start, position=(0.4, 0.1, 0.7))
-    session.studio.place(BASE, there)
-    wait_until(session, lambda v: v.timeline.wants_pictures, "the old picture being outdated")
-
-    def drawn(view: SessionView) -> bool:
-        # As the page does: what was on its way when the camera stood there at last is wanted once more.
-        if view.timeline.wants_pictures:
-            session.past.draw()
-        return seen_from(BASE, there)(view)
-
-    wait_until(session, drawn, "the past seen from there")
-
-
 def test_what_cannot_be_is_refused_in_words_and_changes_nothing(session: Session) -> None:
     start = camera(session, BASE).now
     session.studio.place(BASE, replace(start, near=5.0, far=1.0))
-    view = wait_until(session, said(lambda s: "near must be" in s.problem), "the reason")
+    view = wait_until(session, in_studio(lambda s: "near must be" in s.problem), "the reason")
     assert not moved(view)
     session.studio.place(BASE, replace(start, shader_pack="nonsense"))
-    view = wait_until(session, said(lambda s: "there is no shader pack" in s.problem), "the worker's reason")
+    view = wait_until(
+        session, in_studio(lambda s: "there is no shader pack" in s.problem), "the worker's reason"
+    )
     assert not moved(view)
     session.studio.place(("sensor", "nobody"), start)
-    wait_until(session, said(lambda s: "there is no sensor camera nobody" in s.problem), "the reason")
+    wait_until(session, in_studio(lambda s: "there is no sensor camera nobody" in s.problem), "the reason")
 
 
 def test_a_placement_is_written_compared_and_taken_back(session: Session, task_file: Path) -> None:
@@ -197,11 +180,13 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     start = camera(session, BASE).now
     studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
     studio.file.plan(EditRequest("edit", BASE))
-    view = wait_until(session, said(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
+    view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
     assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
     assert task_file.read_bytes() == before and "+" in view.studio.edit_state.edit.diff
     studio.file.write()
-    view = wait_until(session, said(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check")
+    view = wait_until(
+        session, in_studio(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
+    )
     assert view.studio.edit_state.stage == "checked", view.studio.edit_state.message
     assert view.reload.level == "cameras" and not moved(view)
     now = camera(session, BASE)
@@ -210,7 +195,7 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     studio.file.undo_write()
     view = wait_until(
         session,
-        said(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
+        in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
         "the file of before",
     )
     assert task_file.read_bytes() == before
@@ -234,14 +219,14 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
     studio.place(BASE, there)
     studio.file.plan(EditRequest("remove", BASE))
-    view = wait_until(session, said(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
+    view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
     assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
     studio.file.write()
-    wait_until(session, said(lambda s: s.edit_state.stage == "checked"), "the version without it")
+    wait_until(session, in_studio(lambda s: s.edit_state.stage == "checked"), "the version without it")
     studio.file.undo_write()
     wait_until(
         session,
-        said(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
+        in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
         "the file of before",
     )
     assert task_file.read_text() == before
@@ -250,32 +235,11 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     studio.file.drop_plan()
 
 
-def test_the_target_that_the_file_gives_is_known(session: Session, task_file: Path) -> None:
-    good = task_file.read_text()
-
-    def target(view: SessionView) -> object:
-        """Of the file."""
-        return pytest.approx(target_of(view.studio.camera(BASE).info.settings), abs=1e-6)
-
-    assert target(session.view()) == (0.08, 0, 0)
-    task_file.write_text(good.replace("target=[0.08, 0, 0]", "target=[0.08, 0, 0.2]"))
-    view = wait_until(session, lambda v: target(v) == (0.08, 0, 0.2), "the other")
-    session.studio.place(BASE, replace(view.studio.camera(BASE).now, position=(0.2, 0.1, 0.7)))
-    view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement")
-    assert target(view) == (0.08, 0, 0.2)
-    task_file.write_text(good)
-    wait_until(session, lambda v: target(v) == (0.08, 0, 0), "the first")
-    wait_until(session, said(lambda s: "follows it" in s.problem), "that the placement is dropped")
-    session.studio.undo()
-    view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
-    assert view.studio.problem == "", "what was said before a person did something about it"
-    session.studio.back_to_file(BASE)
-    wait_until(session, lambda v: not moved(v), "as the file says")
-
-
 def settled(session: Session, reached: Callable[[StudioView], bool], what: str) -> StudioView:
     """The studio once its work in the background is done."""
-    view = wait_until(session, said(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what)
+    view = wait_until(
+        session, in_studio(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what
+    )
     assert not view.studio.problem, view.studio.problem
     return view.studio
 
@@ -364,16 +328,16 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     studio.reports.measure(500)
     wait_until(
         session,
-        said(lambda s: s.results.measuring and s.results.report is not None),
+        in_studio(lambda s: s.results.measuring and s.results.report is not None),
         "what is known, as from before",
     )
     wait_until(
-        session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
+        session, in_studio(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
     )
     studio.reports.stop()
-    wait_until(session, said(lambda s: s.progress is None and not s.results.measuring), "its end")
+    wait_until(session, in_studio(lambda s: s.progress is None and not s.results.measuring), "its end")
     studio.reports.suggest(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
-    wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
+    wait_until(session, in_studio(lambda s: "no object 'nothing'" in s.problem), "why not")
 
 
 def test_cameras_go_out_and_poses_come_in(session: Session) -> None:

@@ -12,7 +12,6 @@ import pytest
 
 from tests.drive.session import live_session, wait_until
 from tests.drive.waiting import until
-from workbench.authoring.problem import Problem
 from workbench.checks.results import RuleResult
 from workbench.core.rules import Finding
 from workbench.jobs.task import TaskOptions
@@ -224,21 +223,6 @@ def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
     view = checks.view
     assert view.state == "none" and [one.rule for one in view.before] == [FIRST] and not view.results
     assert len(background.asked) == 2
-
-
-def test_with_every_rule_off_nothing_is_asked(checks: Checks, background: ScriptedBackground) -> None:
-    checks.loaded(replace(LOAD, options=TaskOptions(rules="off")), same_task=True)
-    assert checks.view.state == "off" and background.asked == []
-
-
-def test_a_version_that_cannot_be_loaded_there_is_told_with_its_problem(
-    checks: Checks, background: ScriptedBackground
-) -> None:
-    problem = Problem("build", "KeyError: 'x'", "/home/me/push.py", 3, "x", "")
-    background.fails = JobFailed("the task failed", problem)
-    checks.loaded(LOAD, same_task=True)
-    view = ended(checks)
-    assert view.state == "failed" and view.problem == problem and "could not be loaded" in view.why
 
 
 # --- with processes -----------------------------------------------------------------------------------

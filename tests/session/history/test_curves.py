@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from tests.session.moments import N, stepped
+from tests.drive.session import moment
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.session.history.curves import (
     MOST,
@@ -25,12 +25,13 @@ from workbench.session.history.curves import (
     spans_of,
 )
 
+N = 3
 REACH = Column(Group.TERM, "reach")
 
 
 def step(number: int, **terms: Any) -> StepResult:
     entries = {f"reward_terms/{name}": np.asarray(value, np.float32) for name, value in terms.items()}
-    result = stepped(number, success=(2,) if number == 2 else ()).step
+    result = moment(np.full(N, number), success=(2,) if number == 2 else ()).step
     return replace(result, evaluate={**result.evaluate, **entries})
 
 
@@ -74,7 +75,7 @@ def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
     rewards: NDArray[np.float32],
 ) -> None:
     steps = StepCurves(2)
-    base = stepped(1).step
+    base = moment(np.full(N, 1)).step
     for number in range(rewards.shape[1]):
         steps.add(replace(base, reward=rewards[:, number], evaluate={}))
     curves = steps.curves(1)
@@ -94,32 +95,6 @@ def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
     np.testing.assert_array_equal(rewards[1][x[drawn].astype(int) - 1], one[drawn])
     lost = ~np.isfinite(rewards[1])
     assert np.isnan(one).any() == lost.any()
-
-
-def test_entries_terms_and_joints_have_columns_by_their_names() -> None:
-    steps = StepCurves(N, joints=("hinge", "slide"))
-    entries = {
-        "height": np.arange(3.0),
-        "at": np.zeros((N, 3)),
-        "picture": np.zeros((N, 64)),
-        "none": np.zeros((N, 0)),
-    }
-    result = step(1, reach=[1, 2, 0])
-    mean = OtherEntry("float", numbers=np.array(0.5))
-    steps.add(
-        replace(
-            result,
-            evaluate={**result.evaluate, **entries},
-            others={"mean": mean, "phase": OtherEntry("str", ("push",))},
-            qpos=np.array([[0.1, 1.0], [0.2, 2.0], [0.3, 3.0]], np.float32),
-        )
-    )
-    curves = steps.curves(2)
-    assert [column.label for column in curves.columns] == [
-        *("reward", "success", "reach", "fail", "height", "at[0]", "at[1]", "at[2]", "mean", "hinge", "slide")
-    ]
-    assert line(curves, Column(Group.JOINT, "slide"))[1] == [3.0]
-    assert line(curves, Column(Group.EVALUATE, "mean"))[1] == [0.5]
 
 
 def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,12 @@ def good(task_file: Path, session: Session) -> str:
     return task_file.read_text()
 
 
+@pytest.fixture(autouse=True)
+def good_again(session: Session, task_file: Path, good: str) -> Iterator[None]:
+    yield
+    save(session, task_file, good)
+
+
 def test_a_good_edit_replaces_the_running_version(session: Session, task_file: Path, good: str) -> None:
     session.change(selected_env=1)
     before = session.view()
@@ -62,7 +69,7 @@ BROKEN = [
     ("_load_scene", "self.nothing_there", "build", "nothing_there"),
     ("_get_obs_extra", "assert False, 'obs'", "observation", "obs"),
     ("_initialize_episode", "breakpoint()", "reset", "--debug"),
-    ("evaluate", "return {'success': __import__('torch').zeros((2, 1), dtype=bool)}", "evaluate", "evaluate"),
+    ("evaluate", "return {'success': __import__('torch').zeros((2, 1), dtype=bool)}", "returns", "evaluate"),
 ]
 
 
@@ -102,7 +109,6 @@ def test_a_file_that_does_not_import_is_shown_with_its_line(
     view = wait_until(session, lambda v: v.problem is not None, "the problem")
     assert view.problem.stage == stage
     assert line is None or view.problem.line == line
-    save(session, task_file, good)
 
 
 def test_a_module_beside_the_task_is_followed_too(session: Session, task_file: Path, good: str) -> None:
@@ -118,7 +124,6 @@ def test_a_module_beside_the_task_is_followed_too(session: Session, task_file: P
     beside.write_text("SHIFT = \n")
     view = wait_until(session, lambda v: v.problem is not None, "the broken module")
     assert (view.problem.file, view.problem.line) == (str(beside), 1)
-    save(session, task_file, good)
 
 
 def test_a_file_that_becomes_a_link_to_itself_ends_no_worker(

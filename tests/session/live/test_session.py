@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 
 from tests.drive.session import live_session, start_over, step, wait_until
-from tests.recording.verify_rrd import verify_rrd
-from workbench.recording.rerun.read import read_properties
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
@@ -26,16 +24,6 @@ def settle(session: Session) -> None:
     session.change(action_source="random")
     session.change(episode_end="reset")
     start_over(session, 0)
-
-
-def test_a_single_step_moves_every_env_once(session: Session) -> None:
-    settle(session)
-    session.step()
-    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
-    assert view.step.elapsed_steps.tolist() == [1, 1]
-    assert view.step.poses.shape == (2, len(view.task.geometry.body_names), 7)
-    assert {"success", "fail"} <= view.step.evaluate.keys()
-    assert len(view.curves.newest) == 2
 
 
 def test_playing_goes_on_until_paused(session: Session) -> None:
@@ -79,20 +67,6 @@ def test_resetting_one_env_leaves_the_other(session: Session) -> None:
     assert not np.array_equal(after.poses[1], before.poses[1], equal_nan=True)
 
 
-def test_the_same_seed_gives_the_same_start(session: Session) -> None:
-    settle(session)
-    first = session.view().step.poses
-    session.set_seed(7)
-    other = wait_until(
-        session, lambda v: not np.allclose(v.step.poses, first, equal_nan=True), "another start"
-    )
-    session.set_seed(0)
-    again = wait_until(
-        session, lambda v: np.array_equal(v.step.poses, first, equal_nan=True), "the first start again"
-    )
-    assert other.step_serial < again.step_serial
-
-
 def test_a_slider_moves_one_joint_of_one_env_from_the_targets_that_the_robot_has(
     child_process: None, tmp_path: Path
 ) -> None:
@@ -125,18 +99,6 @@ def told(session: Session, reached: Callable[[SessionView], bool] = lambda view:
     view = wait_until(session, lambda v: v.told is not None and reached(v), "what the robots are told")
     assert view.told is not None
     return view.told
-
-
-def test_holding_still_keeps_the_robot_where_it_is(session: Session) -> None:
-    settle(session)
-    session.change(action_source="hold")
-    names = session.view().task.geometry.body_names
-    hand = next(i for i, name in enumerate(names) if name.endswith("panda_hand"))
-    start = session.view().step.poses[:, hand, :3]
-    for count in range(1, 6):
-        session.step()
-        wait_until(session, lambda v, n=count: v.step.elapsed_steps[0] == n, "a step")
-    assert np.abs(session.view().step.poses[:, hand, :3] - start).max() < 2e-3
 
 
 def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, tmp_path) -> None:
@@ -294,18 +256,3 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 2, "another step")
     assert not session.view().pictures, "nobody looks any more"
     session.change(cameras=())
-
-
-@pytest.mark.slow
-def test_recording_writes_an_episode_that_rerun_verifies(session: Session) -> None:
-    settle(session)
-    session.start_recording((1,))
-    wait_until(session, lambda v: v.recording.active and v.step.elapsed_steps[1] == 0, "a fresh episode")
-    for count in (1, 2, 3, 4):
-        session.step()
-        wait_until(session, lambda v, n=count: v.recording.steps == n, f"recorded step {count}")
-    session.stop_recording()
-    view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the file")
-    assert not view.recording.active and view.recording.problem is None
-    assert verify_rrd(view.recording.last_file) is None
-    assert "WorkbenchPushCube-v1" in str(read_properties(Path(view.recording.last_file)))

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from workbench.session.process.heartbeat import (
-    as_traceback,
     author_place,
     death_problem,
     fatal_error,
@@ -52,12 +51,3 @@ def test_a_crash_says_what_it_was(child_process: None, tmp_path: Path) -> None:
     assert problem.message == "the worker process was killed by SIGSEGV (Segmentation fault) in evaluate"
     assert (problem.file, problem.line, problem.code) == (str(file), 3, "ctypes.string_at(0)")
     assert problem.traceback.startswith("Traceback") and problem.traceback.endswith("last words")
-
-
-def test_lines_are_those_of_the_version_that_ran(child_process: None, tmp_path: Path) -> None:
-    file = tmp_path / "task.py"
-    frames = parse_stack(dump_of(file, "faulthandler.dump_traceback(all_threads=False)"))
-    ran = file.read_text()
-    file.write_text("\n" * 10)
-    assert "    faulthandler.dump_traceback" in as_traceback(frames, {str(file): ran})
-    assert "faulthandler.dump_traceback" not in as_traceback(frames, {str(file): "\n"})

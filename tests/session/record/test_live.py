@@ -13,8 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, live_session, step, wait_until
-from tests.session.studio import BASE, camera, moved
+from tests.drive.session import BASE, TASKS, camera, live_session, moved, step, wait_until
 from workbench.authoring.loading.load import load_task
 from workbench.recording.episode.episode import Episode
 from workbench.recording.lerobot.export import ExportOptions, export_lerobot

@@ -22,7 +22,6 @@ pytestmark = pytest.mark.thorough
 TASKS = Path(__file__).parents[3] / "tasks"
 TEXT = (TASKS / "push_cube.py").read_text()
 STEPS = 30
-REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
 
 
@@ -82,18 +81,6 @@ def test_unchanged_code_says_what_was_recorded_to_the_last_bit(
         assert not verdict.differs and verdict.differing == () and verdict.missed == {}
         assert verdict.metres == 0 and not verdict.start_differs
         np.testing.assert_array_equal(verdict.new_reward, verdict.old_reward)
-
-
-@pytest.mark.parametrize("num_envs", [1, 3, 5])
-def test_a_doubled_reward_is_the_double_whatever_the_number_of_envs(
-    tmp_path: Path, recorded: Recorded, num_envs: int
-) -> None:
-    for k, verdict in enumerate(rescored(tmp_path, recorded, {REWARD: f"{REWARD} * 2"}, num_envs)):
-        old = recorded.run(k).reward[: STEPS - 3 * k]
-        np.testing.assert_array_equal(verdict.new_reward, 2 * old)
-        assert verdict.returns == pytest.approx((float(old.sum()), float(2 * old.sum())), rel=1e-6)
-        assert verdict.first_difference == 1 and verdict.metres == 0
-        assert verdict.largest == pytest.approx(float(old.max()), rel=1e-6)
 
 
 def test_another_success_is_found_at_the_state_at_which_a_direct_look_finds_it(

@@ -22,14 +22,9 @@ from workbench.recording.library.library import Library
 from workbench.session.protocol.messages import CameraRequest
 from workbench.session.review.review import Review
 from workbench.session.review.view import (
-    ACTION,
-    TERMS,
     PictureReader,
     ReviewView,
     column_at,
-    curves,
-    find_events,
-    outcome_text,
 )
 
 
@@ -109,22 +104,6 @@ def test_plays_at_the_control_rate_and_stops_at_the_end() -> None:
     assert review.view().position == 0 and review.view().playing
 
 
-def test_goes_frame_by_frame_and_from_event_to_event() -> None:
-    review, _ = review_of(a=made(10, success_from=7))
-    opened(review, "a")
-    review.seek_by(1)
-    assert review.view().position == 1
-    review.seek_event(1)
-    assert review.view().position == 7
-    review.seek_event(1)
-    assert review.view().position == 10, "the end is where the last jump leads"
-    review.seek_event(-1)
-    review.seek_event(-1)
-    assert review.view().position == 0
-    review.seek(10**9)
-    assert review.view().position == 10
-
-
 def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
     review, _ = review_of(a=made(10, success_from=7), b=made(6, success_from=2), c=made(4))
     view = opened(review, "a", "b", "c")
@@ -149,27 +128,6 @@ def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
     review.toggle_play()
     review.seek_by(1)
     review.seek_event(1)
-
-
-def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "workbench.session.review.review.FIRST_SHOWN", 0.0
-    )  # it is seen before the other is read
-    review, _ = review_of(
-        new=made(4, written_at="2026-11-22T10:00:00+00:00"),
-        old=made(6, written_at="2026-11-21T10:00:00+00:00"),
-    )
-    review.open(["new", "old"])
-    view = reach(review, lambda view: len(view.opened) == 2 and not view.loading, "opening")
-    assert [one.id for one in view.opened] == ["old", "new"] and view.selected == 0
-    review.select(1)
-    review.seek(3)
-    review.swap(0, 1)
-    view = review.view()
-    assert [one.id for one in view.opened] == ["new", "old"]
-    assert view.chosen is not None and view.chosen.id == "new" and view.states == (3, 3)
-    review.swap(0, 7)
-    assert [one.id for one in review.view().opened] == ["new", "old"]
 
 
 def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
@@ -312,22 +270,6 @@ def test_half_a_recording_and_a_broken_one(child_process: None, tmp_path: Path) 
     half, broken = view.problems
     assert rows[1].name in half and rows[2].name in broken
     library.close()
-
-
-def test_events_and_curves_of_an_episode() -> None:
-    episode = made(10, success_from=4)
-    episode.evaluate["grasped"] = np.array([0, 0, 1, 1, 0, 0, 1, 0, 0, 0, np.nan])
-    episode.reward[8] = np.nan
-    found = [(h.state, h.name) for h in find_events(episode)]
-    assert found == [
-        (0, "reset"), (2, "grasped"), (4, "success"), (6, "grasped"), (9, "reward is NaN or infinite"),
-    ]  # fmt: skip
-    lines = curves(episode)
-    assert list(lines[ACTION]) == ["arm/joint1", "gripper"] and list(lines[TERMS]) == ["reach"]
-    states, values = lines["reward"]["reward"]
-    assert states[0] == 1 and values[0] == 1
-    assert outcome_text(episode) == ("success", "good")
-    assert outcome_text(made(3)) == ("no success", "bad")
 
 
 @given(

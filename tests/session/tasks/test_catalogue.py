@@ -172,20 +172,6 @@ def test_a_typed_path_is_a_row(
     )
 
 
-def test_a_typed_class_is_opened_and_words_are_no_path(
-    made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    catalogue, work = made(), tmp_path / "work"
-    monkeypatch.chdir(work)
-    (work / "lab").mkdir()
-    (work / "lab/push.py").write_text(TASK)
-    for text in ("lab/push.py:Task", " 'lab/push.py:Task' ", "lab.push:Task"):
-        entry = catalogue.typed(text)
-        assert entry is not None and entry.reference == f"{work}/lab/push.py:Task"
-    for text in ("", "   ", "push", "lab", "push cube", "PickCube-v1", "nolab.push:Task"):
-        assert catalogue.typed(text) is None
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

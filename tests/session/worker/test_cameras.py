@@ -186,19 +186,6 @@ def test_of_placements_that_wait_the_last_is_made_after_the_picture_and_its_pict
     assert desk.makes() == [] and shown(desk.makes()) == [BASE]
 
 
-def test_what_waits_is_placed_before_other_cameras_are_watched_and_nothing_without_a_task(desk: Desk) -> None:
-    there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
-    desk.cameras.place(PlaceCamera(BASE, there))
-    desk.cameras.update_watched()
-    assert [event.settings for event in desk.heard()] == [there]
-    desk.cameras.place(PlaceCamera(BASE, None))
-    desk.held.opened = None
-    desk.cameras.watch(0, (SENSOR,))
-    desk.cameras.put_back()
-    desk.cameras.draw_past(DrawPast(np.zeros((0, 7), np.float32), 0, (SENSOR,), 1))
-    assert desk.heard() == [] and desk.wait() is None and desk.makes() == []
-
-
 def test_a_sensor_of_another_size_is_observed_in_it_and_one_that_is_not_there_is_not_placed(
     desk: Desk,
 ) -> None:

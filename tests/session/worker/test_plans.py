@@ -67,19 +67,6 @@ def test_each_env_gets_a_plan_of_its_own_and_what_its_rollouts_earned(
     assert np.abs(one.paths[:, 0] - poses[0, hand, :3]).max() < 1e-5
 
 
-def test_a_plan_goes_on_while_its_episode_does_and_begins_anew_with_another(
-    push: OpenedTask, plan: Callable[..., tuple[PlannedEnv, ...]]
-) -> None:
-    push.env.reset(3)
-    (first,) = plan([0])
-    (again,) = plan([0])  # from the same moment: nothing was followed
-    assert np.allclose(first.actions, again.actions, atol=1e-4)
-    push.env.step(np.stack([again.actions[0], np.zeros(7, np.float32)]))
-    (further,) = plan([0])
-    # The plan itself is among the candidates: it is not holding still any more.
-    assert further.returns[further.plan] != further.returns[further.hold]
-
-
 def test_a_task_with_other_bodies_in_each_env_has_no_plan_and_says_what_to_do() -> None:
     opened = opened_with(TASKS / "different_objects.py", 2, render_backend="none")
     plans = WorkerPlans(lambda: False)
@@ -88,15 +75,6 @@ def test_a_task_with_other_bodies_in_each_env_has_no_plan_and_says_what_to_do() 
         plans.answer(opened, {"render_backend": "none"}, question, lambda done, total: None)
     plans.close()
     opened.env.close()
-
-
-def test_a_live_env_with_other_bodies_than_the_rollouts_have_gets_no_plan(push: OpenedTask) -> None:
-    plans = WorkerPlans(lambda: False)
-    (bodies,) = bodies_in(push, [0])
-    question = PlanActions(pickle.dumps(push.env.snapshot([0])), ({**bodies, "cube": b"larger"},), SMALL)
-    with pytest.raises(CannotAnswer, match="^cube: another one"):
-        plans.answer(push, MADE, question, lambda done, total: None)
-    plans.close()
 
 
 def test_a_plan_is_asked_for_once_and_dropped_if_anything_else_moved_the_envs(push: OpenedTask) -> None:
