@@ -33,8 +33,7 @@ def test_ubuntus_stub_for_the_snap_is_not_taken_for_a_browser(
 
 
 def test_a_browser_that_was_named_and_does_not_run_is_not_replaced_by_another(
-    child_process: None,
-    monkeypatch: pytest.MonkeyPatch,
+    child_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PLAYWRIGHT_CHROMIUM", "/nonexistent/chromium")
     assert find_chromium() is None

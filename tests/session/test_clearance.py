@@ -207,9 +207,7 @@ def test_an_answer_to_a_file_that_has_changed_meanwhile_runs_nothing(foreign: Pa
         Clearances(ask=ask).clear(todays(foreign))
 
 
-@pytest.mark.parametrize(
-    "env_id", ["/w/evil.py", "/w/evil.py:Evil", "./evil.py", "evil.py", "~/evil", "..\\evil"]
-)
+@pytest.mark.parametrize("env_id", ["/w/evil.py", "evil.py:Evil", "..\\evil"])
 def test_a_path_in_place_of_an_id_is_never_opened_and_what_to_do_is_said(foreign: Path, env_id: str) -> None:
     wanted = CodeToRun(RecordedTask(env_id), info_of(foreign))
     with pytest.raises(NotCleared, match="never opened: .* with --task FILE"):
@@ -220,10 +218,8 @@ def test_a_path_in_place_of_an_id_is_never_opened_and_what_to_do_is_said(foreign
     "values",
     [
         {"env_kwargs": {"episode_json": "/etc/passwd"}},
-        {"env_kwargs": {"sensor_configs": {"shaders": ["../evil"]}}},
         {"reset_options": {"~/model": 1}},
         {"env_kwargs": {"model": "evil.urdf"}},
-        {"control_mode": "a\\b"},
     ],
 )
 def test_arguments_from_elsewhere_name_no_files(
@@ -250,16 +246,10 @@ def test_arguments_from_elsewhere_name_no_files(
     [
         {"task": "Other-v1"},
         {"source": {"push.py": "evil", "helper.py": "A = 1\n"}},
-        {"source_file": "helper.py"},
         {"env_kwargs": {"robot_uids": "evil"}},
-        {"reset_options": {"reconfigure": True}},
-        {"control_mode": "other"},
         {"side_files": {"mesh.obj": "0" * 12}},
-        {"files": {}},
-        {"id": "another"},
         {"made_here": None},
         {"made_here": {"content": "0" * 64, "place": "0" * 64}},
-        {"made_here": {"content": "\ud800", "place": ""}},
     ],
 )
 def test_an_edited_recording_has_lost_its_seal(recording: Path, values: dict[str, Any]) -> None:
@@ -315,7 +305,7 @@ def test_a_side_file_that_could_be_imported_does_not_get_beside_the_recorded_tex
 # --- where it is kept --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("key", ["", "00", "no key\n", None])
+@pytest.mark.parametrize("key", ["", "no key\n", None])
 def test_without_its_key_a_recording_is_anybodys_and_the_next_has_a_new_one(
     recording: Path, key: str | None, tmp_path: Path
 ) -> None:
@@ -331,9 +321,6 @@ def test_without_its_key_a_recording_is_anybodys_and_the_next_has_a_new_one(
     "store",
     [
         "",
-        "{",
-        "[]",
-        '{"trusted": [1]}',
         '{"trusted": [{"hash": 1}]}',
         '{"trusted": [{"hash": "1", "file": "", "when": "", "files": [1]}]}',
         "[" * 100_000,

@@ -16,12 +16,7 @@ import pytest
 
 from tests.drive.waiting import until
 from workbench.machine.processes.child_python import child_environment, python_command
-from workbench.machine.processes.family import (
-    end_family,
-    family,
-    proportional_memory,
-    resident_memory,
-)
+from workbench.machine.processes.family import end_family, family, proportional_memory, resident_memory
 from workbench.session.process.memory_limit import FamilyMemory
 
 _MEMBER = '''

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.session import BASE, camera, in_studio, moved, wait_until
-from workbench.core.camera_data import CameraKey, CameraSettings, differences
+from tests.drive.session import BASE, camera, in_studio, wait_until
+from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
 from workbench.session.cameras.view import EditRequest, EditState
 from workbench.session.live.session import Session
@@ -68,41 +68,6 @@ def there(session: Session, key: CameraKey) -> CameraSettings:
     found = camera(session, key).info.settings
     assert found is not None
     return found
-
-
-def names(session: Session) -> list[str]:
-    return [c.key[1] for c in session.view().studio.cameras if c.key[0] == "human"]
-
-
-@pytest.mark.slow
-def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_each_time(
-    session: Session, task_file: Path
-) -> None:
-    studio, before = session.studio, task_file.read_text()
-    new = replace(there(session, ("human", "render_camera")), position=(0.6, 0.0, 0.7), fov=0.9)
-    studio.file.plan(EditRequest("add", ("human", "side"), new))
-    assert written(session).message == f"side: added to {task_file.name} and verified."
-    assert not differences(there(session, ("human", "side")), new, close=3e-4), "but for what is rounded"
-    assert session.view().studio.selected == ("human", "side"), "one wants to place what one has added"
-    # What is not written yet is in the copy, and stays with the original.
-    away = replace(new, position=(0.61, 0.1, 0.7))
-    studio.place(("human", "side"), away)
-    studio.file.plan(EditRequest("duplicate", ("human", "side"), name="other"))
-    assert "a copy of side" in written(session).message
-    assert names(session) == ["render_camera", "side", "other"]
-    assert ("human", "side") in moved(session.view())
-    assert camera(session, ("human", "other")).now.position == away.position
-    studio.file.plan(EditRequest("rename", ("human", "side"), name="front"))
-    assert written(session).message == f"side: renamed to front in {task_file.name} and verified."
-    assert names(session) == ["render_camera", "front", "other"]
-    assert camera(session, ("human", "front")).now.position == away.position, "the placement is lost"
-    for name in ("front", "other"):
-        studio.file.plan(EditRequest("remove", ("human", name)))
-        assert f"{name}: removed from" in written(session).message
-    assert names(session) == ["render_camera"] and task_file.read_text().count(
-        "CameraConfig("
-    ) == before.count("CameraConfig(")
-    studio.file.drop_plan()
 
 
 def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_between(

@@ -145,10 +145,7 @@ A_STEP_EACH = [0.62, 0.61, 0.6]
     ids=["followed at once", "after a pause", "by turns", "a drag that rests", "nobody's"],
 )
 def test_what_one_hand_does_without_a_pause_is_one_step_of_undo(
-    one: Told,
-    calls: list[tuple[object, float, float]],
-    heights: list[float],
-    monkeypatch: pytest.MonkeyPatch,
+    one: Told, calls: list[tuple[object, float, float]], heights: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     studio = one.session.studio
     for height, (hand, seconds, pause) in zip((0.61, 0.62, 0.63), calls, strict=True):

@@ -108,57 +108,6 @@ def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView
     return reached
 
 
-@pytest.mark.slow
-def test_size_and_lens_change_the_live_camera_and_the_observation(session: Session) -> None:
-    start = camera(session, BASE).now
-    other = replace(start, width=40, height=30, fov=0.8)
-    session.studio.place(BASE, other)
-    view = wait_until(session, seen_from(BASE, other), "the picture of that size")
-    info = view.studio.camera(BASE).info
-    assert (info.width, info.height, round(info.fovy, 6)) == (40, 30, 0.8)
-    assert info.settings == start, "what the file says is no longer told"
-    session.step()
-    view = wait_until(session, lambda v: v.step.elapsed_steps.any() or v.problem is not None, "a step")
-    assert view.problem is None
-    people = camera(session, PEOPLE).now
-    session.studio.place(PEOPLE, replace(people, position=(1.0, 0.0, 1.0)))
-    wait_until(session, seen_from(PEOPLE, replace(people, position=(1.0, 0.0, 1.0))), "the other camera")
-    # One picture may be of the moment before; and both may be there before the reset has been looked at.
-    serial = session.view().pictures_serial
-    session.reset()
-    wait_until(session, lambda v: not v.step.elapsed_steps.any(), "the reset")
-    wait_until(session, lambda v: v.pictures_serial > serial + 1 and seen_from(BASE, other)(v), "it stayed")
-
-
-def test_a_preview_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
-    start = camera(session, BASE).now
-    session.studio.set_preview_scale(0.25)
-    there = replace(start, position=(0.31, 0.02, 0.55))
-    session.studio.place(BASE, there)
-
-    def looked(view: SessionView) -> bool:
-        session.studio.draw_preview()  # as the page does
-        picture = view.studio.preview
-        return picture is not None and np.allclose(picture.pose[:3], there.position, atol=1e-6)
-
-    view = wait_until(session, looked, "the look from there")
-    size = (start.width, start.height)
-    assert (
-        view.studio.preview.rgb.shape == (size[1] // 4, size[0] // 4, 3) and view.studio.preview.rgb.std() > 5
-    )
-    depth, bodies = view.studio.preview.depth, view.studio.preview.segmentation
-    assert depth is not None and bodies is not None
-    assert (
-        depth.shape == bodies.shape == (size[1] // 4, size[0] // 4)
-        and np.ptp(depth) > 0.1
-        and np.ptp(bodies) > 0
-    )
-    assert (camera(session, BASE).now.width, camera(session, BASE).info.width) == (size[0], size[0])
-    session.studio.set_preview_scale(1.0)
-    view = wait_until(session, seen_from(BASE, there), "the picture in its own size")
-    assert view.studio.preview is None
-
-
 def test_what_cannot_be_is_refused_in_words_and_changes_nothing(session: Session) -> None:
     start = camera(session, BASE).now
     session.studio.place(BASE, replace(start, near=5.0, far=1.0))

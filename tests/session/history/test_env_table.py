@@ -228,10 +228,7 @@ def test_what_was_odd_goes_with_the_moment_that_an_env_is_put_to_and_stays_of_an
     rows = told.session.env_rows()
     assert rows.outliers == {} and {
         env: [o.step for o in seen] for env, seen in rows.last.outliers.items()
-    } == {
-        0: [2],
-        1: [2],
-    }
+    } == {0: [2], 1: [2]}
     assert rows.last.outcome.tolist() == [Outcome.RUNNING] * N and rows.ended.tolist() == [0] * N
     told.step(reward=lost())
     told.reset((0,))

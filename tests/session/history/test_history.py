@@ -12,14 +12,7 @@ import numpy as np
 
 from tests.drive.session import Told, moment, moments_of, told_session
 from workbench.core.camera_data import CameraKind, Picture
-from workbench.session.history.history import (
-    FAIL,
-    RESET,
-    REWARD_NONFINITE,
-    SUCCESS,
-    TRUNCATED,
-    WENT_BACK,
-)
+from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.protocol.messages import CameraRequest, PastPictures, Pictures
 
 EYE = CameraRequest("eye", "sensor")

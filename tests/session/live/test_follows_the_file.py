@@ -96,10 +96,7 @@ def test_a_hook_that_is_wrong_is_shown_with_its_line_and_the_last_good_version_r
 
 @pytest.mark.parametrize(
     ("text", "stage", "line"),
-    [
-        ("def broken(:\n    pass\n", "syntax", 1),
-        ("x = 1\n", "import", None),
-    ],
+    [("def broken(:\n    pass\n", "syntax", 1), ("x = 1\n", "import", None)],
     ids=["syntax", "no-task"],
 )
 def test_a_file_that_does_not_import_is_shown_with_its_line(

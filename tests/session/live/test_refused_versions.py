@@ -119,10 +119,7 @@ def test_what_a_version_set_that_ran_goes_with_its_line(
     np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
 
 
-LATE = {
-    "a raise": ("pass", False),
-    "a default type": ("torch.set_default_dtype(torch.float64)", True),
-}
+LATE = {"a raise": ("pass", False), "a default type": ("torch.set_default_dtype(torch.float64)", True)}
 
 
 @pytest.mark.parametrize("what", LATE)

@@ -119,12 +119,7 @@ def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, t
     ("text", "reference", "says", "line"),
     [
         ("def act(obs):\n    return 1 / 0\n", "act", "ZeroDivisionError", 2),
-        (
-            "\ndef act(obs):\n    return obs[:, :3]\n",
-            "act",
-            "(2, 3)",
-            2,
-        ),
+        ("\ndef act(obs):\n    return obs[:, :3]\n", "act", "(2, 3)", 2),
         ("def act(obs):\n    return None\n", "missing", "no function missing", None),
     ],
 )

@@ -74,21 +74,6 @@ def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session)
     assert np.array_equal(branches[0], first_run, equal_nan=True)
 
 
-def test_one_env_goes_back_alone(session: Session) -> None:
-    start = fresh(session)
-    step(session, 4)
-    before = session.view().step
-    session.change(selected_env=1)
-    session.past.seek(start + 1)
-    origin = session.view().timeline.tick
-    view = jump(session, lambda: session.past.continue_from_shown("this"))
-    assert view.step.elapsed_steps.tolist() == [4, 1, 4]
-    assert is_close(view.step.poses[1], poses(session, start + 1)[1])
-    assert is_close(view.step.poses[[0, 2]], before.poses[[0, 2]])
-    assert session.past.strip(0, 10**6).branches[-1] == (view.timeline.last_tick, origin)
-    session.change(selected_env=0)
-
-
 def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
     start = fresh(session)
     step(session, 6)

@@ -229,37 +229,3 @@ def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk
     desk.edit(REWARD, f"{REWARD} * 3")
     desk.rescored("stopped", "done")
     assert background_pid(desk.session) == second
-
-
-@pytest.mark.slow
-def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with_the_judgement(
-    desk: Desk, record
-) -> None:
-    """Keeping an episode goes first, and the judgement comes to what it comes to without it."""
-    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
-    desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
-    desk.rescored("rescoring")
-    process, session = background_pid(desk.session), desk.session
-    session.save_past((0,), before=True)
-    wait_until(
-        session,
-        lambda v: v.recording.saving.progress is None and v.recording.saving.message,
-        "what was kept",
-    )
-    view = session.view()
-    assert view.recording.saving.message.startswith("saved ") and not view.recording.saving.failed
-    assert view.rescored.state == "rescoring", "it has not ended meanwhile"
-    desk.note()
-    assert desk.rescored("rescoring").done < view.rescored.total
-    session.save_past((1,), before=True)
-    desk.note()
-    desk.edit(REWARD, f"{REWARD} * 3")
-    rewards = np.array([moment.step.reward for moment in steps_of(record)])
-    assert desk.rescored().stopped_by is None
-    wait_until(
-        session, lambda v: v.recording.saving.progress is None and v.recording.saving.message, "the second"
-    )
-    assert not session.view().recording.saving.failed
-    for env in range(N):
-        np.testing.assert_array_equal(session.rescorer.curve("reward", env).new, 3 * rewards[:, env])
-    assert background_pid(session) == process

@@ -21,11 +21,7 @@ from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.session.protocol.messages import CameraRequest
 from workbench.session.review.review import Review
-from workbench.session.review.view import (
-    PictureReader,
-    ReviewView,
-    column_at,
-)
+from workbench.session.review.view import PictureReader, ReviewView, column_at
 
 
 @dataclass(frozen=True)
@@ -273,10 +269,7 @@ def test_half_a_recording_and_a_broken_one(child_process: None, tmp_path: Path) 
 
 
 @given(
-    length=st.integers(0, 30),
-    anchor=st.integers(0, 30),
-    first=st.integers(-40, 0),
-    last=st.integers(0, 40),
+    length=st.integers(0, 30), anchor=st.integers(0, 30), first=st.integers(-40, 0), last=st.integers(0, 40)
 )
 def test_a_line_over_positions_has_each_number_at_its_place(
     length: int, anchor: int, first: int, last: int

@@ -145,14 +145,10 @@ def test_the_list_follows_its_folder_and_stays_the_same_while_nothing_changes(
     [
         "{work}/my task.py",
         "my task.py",
-        "./my task.py",
-        "../work/my task.py",
         "  {work}/my task.py \t",
-        "'{work}/my task.py'",
         '"my task.py" ',
         "file://{work}/my%20task.py",
         "~/work/my task.py",
-        "{work}/my task.py:88",
         "my task.py:88:4",
     ],
 )
@@ -177,10 +173,7 @@ def test_a_typed_path_is_a_row(
     [
         ("/no/such/push.py", "/no/such"),
         ("pusch.py", "push.py"),
-        ("{work}", "push.py"),
-        ("~", "folder"),
         ("notes.txt", "not a .py file"),
-        ("~nosuchuser/push.py", "~nosuchuser"),
         ("/dev/null", "/dev/null"),
         ("/" + "x" * 300 + ".py", "xxx"),
     ],

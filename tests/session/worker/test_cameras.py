@@ -23,7 +23,6 @@ from workbench.machine.processes.wire import MessageSocket
 from workbench.session.process.heartbeat import HeartbeatReader, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
     CameraRequest,
-    CannotAnswer,
     DrawPast,
     Event,
     LoadFailed,
@@ -32,7 +31,7 @@ from workbench.session.protocol.messages import (
     PlaceCamera,
     Placed,
 )
-from workbench.session.protocol.questions import CaptureMoment, DrawCamera
+from workbench.session.protocol.questions import CaptureMoment
 from workbench.session.worker import cameras as under_test
 from workbench.session.worker.cameras import WorkerCameras
 from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
@@ -214,18 +213,6 @@ def test_a_moment_of_the_past_is_drawn_after_what_waits_and_a_failure_is_told(de
     (failed,) = desk.heard()
     assert isinstance(failed, LoadFailed) and "nothing" in failed.problem.message
     assert desk.makes() == [] and shown(desk.makes()) == [BASE], "the one that was left is made anew"
-
-
-def test_a_question_is_answered_as_the_cameras_were_asked_to_stand_or_why_not(desk: Desk) -> None:
-    opened = desk.held.opened
-    assert opened is not None
-    there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
-    desk.cameras.place(PlaceCamera(BASE, there))
-    picture: Any = desk.cameras.answer(opened, DrawCamera(BASE, None, 1), lambda done, total: None)
-    assert np.allclose(picture.pose[:3], there.position, atol=1e-5)
-    with pytest.raises(CannotAnswer, match="env 9"):
-        desk.cameras.answer(opened, DrawCamera(BASE, None, 9), lambda done, total: None)
-    assert desk.heartbeat.read().doing == "idle"
 
 
 def test_a_moment_is_captured_with_pictures_of_the_envs_that_are_named(desk: Desk) -> None:

@@ -15,7 +15,7 @@ from workbench.jobs.open_task import OpenedTask, Opening, build_task
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import bodies_of
-from workbench.session.protocol.messages import CannotAnswer, FollowPlan, PlanDropped, PlanWanted, Settings
+from workbench.session.protocol.messages import FollowPlan, PlanDropped, PlanWanted, Settings
 from workbench.session.protocol.questions import PlanActions, PlannedEnv
 from workbench.session.worker.plans import MOST_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
 
@@ -65,16 +65,6 @@ def test_each_env_gets_a_plan_of_its_own_and_what_its_rollouts_earned(
     # They begin where the hand is.
     hand = push.description.geometry.body_names.index("panda/panda_hand_tcp")
     assert np.abs(one.paths[:, 0] - poses[0, hand, :3]).max() < 1e-5
-
-
-def test_a_task_with_other_bodies_in_each_env_has_no_plan_and_says_what_to_do() -> None:
-    opened = opened_with(TASKS / "different_objects.py", 2, render_backend="none")
-    plans = WorkerPlans(lambda: False)
-    question = PlanActions(pickle.dumps(opened.env.snapshot([0])), bodies_in(opened, [0]), SMALL)
-    with pytest.raises(CannotAnswer, match="build the same bodies in each env"):
-        plans.answer(opened, {"render_backend": "none"}, question, lambda done, total: None)
-    plans.close()
-    opened.env.close()
 
 
 def test_a_plan_is_asked_for_once_and_dropped_if_anything_else_moved_the_envs(push: OpenedTask) -> None:
