@@ -106,7 +106,7 @@ class Told:
         self.session, self._worker = session, worker
         self.rescored: list[object] = []
         """Loads with which the past was to be rescored; no process does it."""
-        session.rescorer.rescore = lambda load, past: self.rescored.append(load)
+        session.rescorer.rescore = lambda load, rescored: self.rescored.append(load)
         self._elapsed = np.zeros(0, np.int32)
         self._number = 0
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,10 +70,10 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Told]:
         yield told
 
 
-def told_as(entries: list[dict[str, bool]]) -> dict[str, object]:
+def told_as(entries: list[dict[str, bool]]) -> dict[str, Any]:
     """How a worker tells of these."""
     values = {name: np.array([entry[name] for entry in entries]) for name in entries[0]}
-    found: dict[str, object] = {"evaluate": {**values, "distance": np.zeros(N, np.float32)}}
+    found: dict[str, Any] = {"evaluate": {**values, "distance": np.zeros(N, np.float32)}}
     return found | {name: tuple(np.flatnonzero(values[name])) for name in ("success", "fail")}
 
 
@@ -236,7 +237,7 @@ def test_what_was_odd_goes_with_the_moment_that_an_env_is_put_to_and_stays_of_an
 
 
 def test_a_rule_that_is_off_flags_no_env_and_one_that_is_on_is_a_finding(told: Told) -> None:
-    rules = dict(told_rules(told))
+    rules = told_rules(told)
     told.load("rebuilt", outlier_rules={"reward-finite": rules["reward-finite"]})
     told.reset()
     for _ in range(2):
@@ -253,6 +254,6 @@ def test_a_rule_that_is_off_flags_no_env_and_one_that_is_on_is_a_finding(told: T
     assert told.view.odd == () and len(told.session.env_rows().outliers) == 2
 
 
-def told_rules(told: Told) -> dict:
+def told_rules(told: Told) -> dict[str, Any]:
     told.load()
-    return told.view.task.outlier_rules
+    return dict(told.view.task.outlier_rules)

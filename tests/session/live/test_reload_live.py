@@ -142,7 +142,7 @@ def test_a_save_while_a_reload_runs_wins(session: Session, task_file: Path, good
     last = reward_plus(good, 21)
     task_file.write_text(last)
     view = runs(session, last)
-    session.versions.reload("same")
+    session.versions.reload()
     view = wait_until(session, lambda v: v.task_serial > view.task_serial, "another load")
     assert view.task.source[str(task_file)] == last, "the older one came after it"
 

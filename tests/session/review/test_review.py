@@ -21,7 +21,7 @@ from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.session.protocol.messages import CameraRequest
 from workbench.session.review.review import Review
-from workbench.session.review.view import PictureReader, ReviewView, column_at
+from workbench.session.review.view import PictureReader, ReviewView, column_at, curves, find_events
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,22 @@ def test_plays_at_the_control_rate_and_stops_at_the_end() -> None:
     review.set_loop(True)
     shelf.now += 0.05 * 11 / 2 + 1e-3
     assert review.view().position == 0 and review.view().playing
+
+
+def test_goes_frame_by_frame_and_from_event_to_event() -> None:
+    review, _ = review_of(a=made(10, success_from=7))
+    opened(review, "a")
+    review.seek_by(1)
+    assert review.view().position == 1
+    review.seek_event(1)
+    assert review.view().position == 7
+    review.seek_event(1)
+    assert review.view().position == 10, "the end is where the last jump leads"
+    review.seek_event(-1)
+    review.seek_event(-1)
+    assert review.view().position == 0
+    review.seek(10**9)
+    assert review.view().position == 10
 
 
 def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
@@ -223,6 +239,28 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
     assert "first success" in view.alignments
 
 
+def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workbench.session.review.review.FIRST_SHOWN", 0.0)
+    shelf = Shelf({"a": made(10), "b": made(20), "c": made(30)})
+    reached, go_on = threading.Event(), threading.Event()
+
+    def read(row: Row, *_: object) -> Episode:
+        if row.id == "b":
+            reached.set()
+            assert go_on.wait(60)
+        return shelf.read(row)
+
+    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
+    before = set(threading.enumerate())
+    review.open("ab")
+    assert reached.wait(60)
+    (first,) = set(threading.enumerate()) - before
+    opened(review, "c")
+    go_on.set()
+    first.join(60)
+    assert [o.id for o in review.view().opened] == ["c"] and not review.view().loading
+
+
 def test_real_files_come_back_with_scene_pictures_and_numbers(child_process: None, tmp_path: Path) -> None:
     write(tmp_path, made(4, success_from=3))
     library = Library(tmp_path)
@@ -266,6 +304,17 @@ def test_half_a_recording_and_a_broken_one(child_process: None, tmp_path: Path) 
     half, broken = view.problems
     assert rows[1].name in half and rows[2].name in broken
     library.close()
+
+
+def test_events_of_an_episode_are_where_an_entry_becomes_true() -> None:
+    episode = made(10, success_from=4)
+    episode.evaluate["grasped"] = np.array([0, 0, 1, 1, 0, 0, 1, 0, 0, 0, np.nan])
+    episode.reward[8] = np.nan
+    found = [(h.state, h.name) for h in find_events(episode)]
+    assert found[:4] == [(0, "reset"), (2, "grasped"), (4, "success"), (6, "grasped")]
+    assert [state for state, _ in found[4:]] == [9], "the reward that is no number"
+    states, values = curves(episode)["reward"]["reward"]
+    assert (states[0], values[0]) == (1, 1)
 
 
 @given(
