@@ -243,3 +243,23 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
         assert ran(foreign) and [[one.name for one in q.modules] for q in asked] == [["marks.py"]] * 2
     finally:
         rescorer.rescoring.close()
+
+
+def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
+    asking = []
+
+    def ask(question: TrustQuestion, stopped) -> Consent:
+        asking.append(question)
+        until(stopped, "the withdrawal")
+        return Consent.NO
+
+    rescorer = Rescorer(Clearances(ask=ask))
+    try:
+        rescorer.start(find_all_sources((foreign / "recordings",)))
+        until(lambda: asking, "the question")
+        assert rescorer.rescoring.view.state == "asking"
+        rescorer.rescoring.stop()
+        rescored(rescorer, "stopped")
+    finally:
+        rescorer.rescoring.close()
+    assert len(asking) == 1 and not ran(foreign)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -235,17 +236,23 @@ def test_the_ground_before_a_mounted_camera_is_that_of_the_env(told: Told) -> No
 # --- the file ----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def with_file(tmp_path: Path) -> Iterator[tuple[Told, Path]]:
-    file = tmp_path / "push.py"
+@contextmanager
+def opened(folder: Path) -> Iterator[tuple[Told, Path]]:
+    file = folder / "push.py"
     file.write_text('@register_env("Alone-v1")\nclass PushEnv:\n    """Nothing but a place."""\n')
-    with told_session(tmp_path / "recordings", str(file)) as told:
+    with told_session(folder / "recordings", str(file)) as told:
+        source = {str(file): file.read_text()}
         info = replace(scene_camera(), settings=FILE)
-        told.load(
-            file=str(file), source_files=(str(file),), source={str(file): file.read_text()}, cameras=(info,)
-        )
+        told.load(file=str(file), source_files=(str(file),), source=source, cameras=(info,))
+        told.reset()
         told.asked(object)
         yield told, file
+
+
+@pytest.fixture
+def with_file(tmp_path: Path) -> Iterator[tuple[Told, Path]]:
+    with opened(tmp_path) as made:
+        yield made
 
 
 def asks(told: Told) -> Call:
@@ -289,3 +296,23 @@ def test_a_save_and_a_death_end_what_waits_for_the_worker_and_the_next_is_asked(
         assert asks(told).number != call.number
         told.die()
         until(lambda: told.view.studio.edit_state.stage == "refused", "the end of the second")
+
+
+def test_no_thread_of_a_session_is_left_when_it_is_closed_whatever_waited(tmp_path: Path) -> None:
+    before = set(threading.enumerate())
+    with opened(tmp_path) as (told, _):
+        session = told.session
+        asks(told)
+        session.studio.select(BASE)
+        session.studio.set_preview_scale(0.5)
+        session.studio.draw_preview()
+        session.studio.reports.pick(0.5, 0.5)
+        heard: list[Call] = []
+        until(lambda: heard.extend(told.asked(Call)) or len(heard) == 2, "both questions")
+        session.start_recording()
+        told.reset()
+        told.step(2)
+        assert len(set(threading.enumerate()) - before) >= 5
+    left = [thread.name for thread in set(threading.enumerate()) - before if thread.is_alive()]
+    assert left == []
+    assert session.wait(-1, 60.0) >= 0, "a page that waits is woken"

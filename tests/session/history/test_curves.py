@@ -97,6 +97,32 @@ def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
     assert np.isnan(one).any() == lost.any()
 
 
+def test_entries_terms_and_joints_have_columns_by_their_names() -> None:
+    steps = StepCurves(N, joints=("hinge", "slide"))
+    entries = {
+        "height": np.arange(3.0),
+        "at": np.zeros((N, 3)),
+        "picture": np.zeros((N, 64)),
+        "none": np.zeros((N, 0)),
+    }
+    result = step(1, reach=[1, 2, 0])
+    mean = OtherEntry("float", numbers=np.array(0.5))
+    steps.add(
+        replace(
+            result,
+            evaluate={**result.evaluate, **entries},
+            others={"mean": mean, "phase": OtherEntry("str", ("push",))},
+            qpos=np.array([[0.1, 1.0], [0.2, 2.0], [0.3, 3.0]], np.float32),
+        )
+    )
+    curves = steps.curves(2)
+    assert [column.label for column in curves.columns] == [
+        *("reward", "success", "reach", "fail", "height", "at[0]", "at[1]", "at[2]", "mean", "hinge", "slide")
+    ]
+    assert line(curves, Column(Group.JOINT, "slide"))[1] == [3.0]
+    assert line(curves, Column(Group.EVALUATE, "mean"))[1] == [0.5]
+
+
 def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
     steps = StepCurves(N)
     result = step(1, reach=[1, 2, 3], both=[[1, 2]] * N)

@@ -78,7 +78,7 @@ def told_as(entries: list[dict[str, bool]]) -> dict[str, Any]:
 
 
 @settings(max_examples=40)
-@given(events=st.lists(event, max_size=40))
+@given(events=st.lists(event, max_size=25))
 def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(
     shared: Told, events: list[tuple]
 ) -> None:

@@ -34,6 +34,7 @@ from workbench.session.protocol.messages import (
     Status,
 )
 from workbench.session.protocol.messages import Told as ToldRobots
+from workbench.session.rescore.background import RescoreView
 
 EYE = CameraRequest("eye", "sensor")
 GONE_WRONG = Finding("r", "warn", "m", None, None, "", "", 1, 0)
@@ -102,6 +103,8 @@ def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_show
     told = np.ones((3, 2), np.float32)
     played.tell(pictures(2), ToldRobots(told), Inspection(2, 3), RulesBroken((GONE_WRONG,)))
     played.tell(CameraFailed(EYE.key, "no shader"))
+    session.rescorer.rescoring.begin(RescoreView("rescoring", total=3), lambda job: None)
+    until(lambda: played.view.rescored.state == "done", "the judgement of this past")
     before = played.view
     assert (
         before.pictures
@@ -116,6 +119,7 @@ def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_show
     assert (after.scene_serial, after.cameras_serial) == (before.scene_serial + 1, before.cameras_serial + 1)
     assert after.pictures_serial > before.pictures_serial and after.rules_serial > before.rules_serial
     assert (after.pictures, after.told, after.inspection, after.rules) == ({}, None, None, None)
+    assert after.rescored.state == "none" and after.rescored.total == 0
     assert not after.failed_cameras and after.selected_env == 1 and after.timeline_cleared
     assert (after.timeline.first, after.timeline.moments) == (4, 1) and after.curves.serial == 0
 

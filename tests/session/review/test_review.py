@@ -142,6 +142,27 @@ def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
     review.seek_event(1)
 
 
+def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "workbench.session.review.review.FIRST_SHOWN", 0.0
+    )  # it is seen before the other is read
+    review, _ = review_of(
+        new=made(4, written_at="2026-11-22T10:00:00+00:00"),
+        old=made(6, written_at="2026-11-21T10:00:00+00:00"),
+    )
+    review.open(["new", "old"])
+    view = reach(review, lambda view: len(view.opened) == 2 and not view.loading, "opening")
+    assert [one.id for one in view.opened] == ["old", "new"] and view.selected == 0
+    review.select(1)
+    review.seek(3)
+    review.swap(0, 1)
+    view = review.view()
+    assert [one.id for one in view.opened] == ["new", "old"]
+    assert view.chosen is not None and view.chosen.id == "new" and view.states == (3, 3)
+    review.swap(0, 7)
+    assert [one.id for one in review.view().opened] == ["new", "old"]
+
+
 def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
     review, _ = review_of(
         a=made(3),

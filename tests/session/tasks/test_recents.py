@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from workbench.jobs.task import TaskOptions
-from workbench.session.tasks.recents import MOST_KEPT, RECENT_FILE, RecentTasks
+from workbench.session.tasks.recents import MOST_KEPT, RECENT_FILE, RecentTasks, lasting
 
 
 @pytest.fixture
@@ -43,6 +43,16 @@ def test_two_runs_do_not_take_each_others_and_only_the_newest_are_kept(folder: P
     first.add("Last-v1", TaskOptions())
     kept = [task.reference for task in recents(folder).list()]
     assert kept[0] == "Last-v1" and len(kept) == MOST_KEPT and "Task0-v1" not in kept
+
+
+def test_a_name_lasts_in_another_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab/envs.py").touch()
+    assert lasting("push.py") == str(tmp_path / "push.py")
+    assert lasting("push.py:Push") == f"{tmp_path}/push.py:Push"
+    assert lasting("lab.envs:Push") == f"{tmp_path}/lab/envs.py:Push"
+    assert lasting("PickCube-v1") == "PickCube-v1"
 
 
 HOSTILE = [
@@ -82,3 +92,10 @@ def test_a_file_that_others_may_write_is_not_believed(folder: Path) -> None:
     recents(folder).add("PickCube-v1", TaskOptions())
     (folder / RECENT_FILE).chmod(0o666)
     assert recents(folder).list() == []
+
+
+def test_where_nothing_can_be_written_they_last_for_this_run(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    one = RecentTasks(lambda: tmp_path / "file" / "state")
+    one.add("PickCube-v1", TaskOptions())
+    assert [task.reference for task in one.list()] == ["PickCube-v1"]
