@@ -66,14 +66,6 @@ def test_backports_comes_from_the_mirror_of_the_release_itself_and_is_trusted_th
     ]
 
 
-def test_an_inline_key_travels_whole() -> None:
-    key = "\n -----BEGIN PGP PUBLIC KEY BLOCK-----\n .\n mQINBF==\n -----END PGP PUBLIC KEY BLOCK-----"
-    text = f"Types: deb\nURIs: http://m/debian\nSuites: trixie\nComponents: main\nSigned-By:{key}\n"
-    written = backports_source(parse_deb822_format(text), "trixie")
-    assert written is not None
-    assert parse_deb822_format(written)[0].options == {"Signed-By": key}
-
-
 def test_no_backports_source_without_a_mirror_of_the_release() -> None:
     security = "deb http://m/debian-security bookworm-security main\ndeb http://vendor/apt bookworm vendor"
     assert backports_source(parse_one_line_format(security), "bookworm") is None

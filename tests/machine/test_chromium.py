@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.bring_browser import driver_complaint
 from workbench.machine.doctor import chromium_version, find_chromium, how_to_get_chromium
 
 
@@ -34,13 +33,8 @@ def test_ubuntus_stub_for_the_snap_is_not_taken_for_a_browser(
 
 
 def test_a_browser_that_was_named_and_does_not_run_is_not_replaced_by_another(
-    child_process: None,
-    monkeypatch: pytest.MonkeyPatch,
+    child_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PLAYWRIGHT_CHROMIUM", "/nonexistent/chromium")
     assert find_chromium() is None
     assert "/nonexistent/chromium" in how_to_get_chromium()
-
-
-def test_playwrights_own_node_starts(child_process: None) -> None:
-    assert driver_complaint() is None

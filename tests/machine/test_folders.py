@@ -21,7 +21,6 @@ from workbench.machine.folders import (
     locked,
     read_private,
     set_aside,
-    user_folder,
     write_private,
 )
 
@@ -101,21 +100,6 @@ def test_a_full_disk_leaves_nothing(folder: Path, write: Callable[[str, bytes], 
     assert read_private("a.json") == b"one" and names(folder) == ["a.json"]
 
 
-def test_no_descriptor_is_left_open(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_private("a.json", b"one")
-    before = psutil.Process().num_fds()
-    for call in ("fsync", "replace"):
-        with monkeypatch.context() as patch, pytest.raises(OSError):
-            failing(patch, call)
-            write_private("a.json", b"two")
-    read_private("a.json")
-    with locked("a.json"):
-        pass
-    with pytest.raises(ZeroDivisionError), locked("a.json"):
-        _ = 1 / 0
-    assert psutil.Process().num_fds() == before
-
-
 def test_a_lock_lets_one_at_a_time_in(folder: Path) -> None:
     inside, seen = [0], []
 
@@ -185,18 +169,3 @@ def test_what_is_no_ordinary_file_is_not_read(folder: Path) -> None:
         assert psutil.Process().num_fds() == before
     os.truncate(folder / "large", MOST_BYTES)
     assert len(read_private("large") or b"") == MOST_BYTES
-
-
-def test_without_a_home_there_is_no_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        module.platformdirs, "user_config_path", lambda *_, **__: Path("relative") / "workbench"
-    )
-    with pytest.raises(NoUserFolder, match="no absolute path"):
-        user_folder()
-
-    def none(*_: object, **__: object) -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr(module.platformdirs, "user_config_path", none)
-    with pytest.raises(NoUserFolder, match="no home folder"):
-        user_folder()

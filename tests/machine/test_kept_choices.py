@@ -42,13 +42,6 @@ def test_what_is_kept_is_bounded() -> None:
     assert len(kept["/last"]) == MOST_POLICIES and kept["/last"][0] == f"{MOST_POLICIES + 4}.py:act"
 
 
-def test_closed_hints_stay_closed_and_policies_stay() -> None:
-    keep_policy(Path("/lab"), "a.py:act")
-    assert not kept_choices().hints_closed
-    close_hints()
-    assert kept_choices().hints_closed and used_policies(Path("/lab")) == ("a.py:act",)
-
-
 @pytest.mark.parametrize("content", [b"", b"[]", b'{"hints_closed": 3}', b"\xff", b"[" * 100_000])
 def test_a_broken_file_is_no_choice_and_is_told(content: bytes, caplog: pytest.LogCaptureFixture) -> None:
     write_private(FILE, content)

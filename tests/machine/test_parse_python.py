@@ -21,7 +21,7 @@ def test_threads_parse_at_once_while_garbage_is_collected() -> None:
     def parse(depth: int) -> None:
         if depth:
             return parse(depth - 1)
-        for _ in range(60):
+        for _ in range(25):
             try:
                 parse_python(text)
             except SystemError as error:

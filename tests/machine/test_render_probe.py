@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.machine.render_probe import driver_files, probe_render_device
+from workbench.machine.render_probe import probe_render_device
 from workbench.machine.software_vulkan import ensure_render_device
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -66,18 +66,6 @@ def test_where_something_renders_nothing_is_installed(
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     assert ensure_render_device(install=True).ok
     assert not called.exists()
-
-
-def test_driver_files_follow_the_loaders_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    manifest = tmp_path / "vulkan" / "icd.d" / "mine.json"
-    manifest.parent.mkdir(parents=True)
-    manifest.write_text("{}")
-    monkeypatch.delenv("VK_DRIVER_FILES", raising=False)
-    monkeypatch.delenv("VK_ICD_FILENAMES", raising=False)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    assert manifest in driver_files()
-    monkeypatch.setenv("VK_DRIVER_FILES", f"{tmp_path / 'gone.json'}:{manifest}")
-    assert driver_files() == [manifest]
 
 
 def _let_python_be(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:

@@ -1,4 +1,4 @@
-"""A real session with a real worker process on a real task, shared where a test leaves it usable."""
+"""Sessions that tests share: with a real worker on a real task, and with a worker that is the test."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.session import live_session
+from tests.drive.session import Told, live_session, told_session
 from workbench.session.live.session import Session
 
 
@@ -23,3 +23,19 @@ def session(
         task_file, tmp_path_factory.mktemp("recordings"), draw=getattr(request.module, "DRAWS", False)
     ) as session:
         yield session
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Iterator[Told]:
+    """Its worker has said nothing yet."""
+    with told_session(tmp_path / "recordings") as told:
+        told.asked(object)
+        yield told
+
+
+@pytest.fixture
+def played(told: Told) -> Told:
+    """A reset of three envs and three steps: moments 0 to 3."""
+    told.play(3)
+    told.asked(object)
+    return told

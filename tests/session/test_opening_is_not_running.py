@@ -178,29 +178,6 @@ def test_without_a_terminal_it_is_refused_with_an_exit_code_that_is_its_own(
     assert run([recordings, "--task", str(foreign / "push_cube.py")], capfd)[0] == 0 and ran(foreign)
 
 
-def test_an_env_that_is_to_read_files_is_made_with_trust_only(
-    stock: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    document = json.loads(stock.read_text())
-    document["episodes"][0]["reset_kwargs"]["options"] = {"layout": "../layout.json"}
-    stock.write_text(json.dumps(document))
-    pair = str(stock.with_suffix(".h5"))
-    code, told = run([pair], capfd)
-    assert code == Exit.NOT_TRUSTED and "--trust" in told and "../layout.json" in told
-    assert run([pair, "--trust"], capfd)[0] == Exit.DONE
-
-
-def test_a_path_in_place_of_an_id_is_not_judged_with_and_the_way_out_is_said(
-    stock: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    name_evil(stock)
-    pair = str(stock.with_suffix(".h5"))
-    for more in ([], ["--trust"]):
-        code, told = run([pair, *more], capfd)
-        assert code == Exit.REFUSED and "never opened" in told and "--task FILE" in told
-        assert "import failed" not in told and not (tmp_path / "evil_ran").exists()
-
-
 def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
     foreign: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,9 +18,7 @@ BEGIN = "from workbench.machine.processes.debugger import refuse_breakpoints\nre
     ("named", "call", "raises"),
     [
         ("", "breakpoint()", True),
-        ("pdb.set_trace", "breakpoint()", True),
         ("0", "breakpoint()", False),
-        ("builtins.print", "breakpoint()", False),
         ("0", "from pdb import set_trace\nset_trace(header='here')", True),
     ],
 )
@@ -40,4 +38,3 @@ def test_it_raises_at_its_line_or_does_what_python_was_told(
     assert ("went on" in done.stdout) != raises
     line = len(BEGIN.splitlines()) + len(call.splitlines())
     assert (f"line {line}, in <module>\n    {call.splitlines()[-1]}" in done.stderr) == raises
-    assert ("no terminal to ask in: remove this line" in done.stderr) == raises

@@ -16,15 +16,7 @@ import pytest
 
 from tests.drive.waiting import until
 from workbench.machine.processes.child_python import child_environment, python_command
-from workbench.machine.processes.family import (
-    children,
-    describe_exit,
-    end_family,
-    family,
-    main_thread_ended,
-    proportional_memory,
-    resident_memory,
-)
+from workbench.machine.processes.family import end_family, family, proportional_memory, resident_memory
 from workbench.session.process.memory_limit import FamilyMemory
 
 _MEMBER = '''
@@ -146,15 +138,6 @@ def test_what_detached_itself_goes_with_the_worker_and_the_exit_code_is_the_work
     assert gone(all_of_it)
 
 
-def test_a_worker_that_is_killed_takes_its_family_along(
-    begin: Callable[..., subprocess.Popen[bytes]],
-) -> None:
-    keeper = begin("wait")
-    all_of_it = members(keeper.pid)
-    os.kill(children(keeper.pid)[0], signal.SIGKILL)
-    assert keeper.wait(timeout=20) == -signal.SIGKILL and gone(all_of_it)
-
-
 def test_a_family_is_ended_when_asked_and_nobody_else(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
     one, other = begin("wait"), begin("wait")
     ours = subprocess.Popen(["sleep", "600"], start_new_session=True)
@@ -217,36 +200,3 @@ def test_the_memory_of_a_family_counts_what_is_shared_once(
     assert 64 * 2**20 < memory.measure(keeper.pid, limit=2 * 64 * 2**20) < 2 * 64 * 2**20
     end_family(keeper)
     assert memory.measure(keeper.pid) == 0
-
-
-def test_the_memory_of_what_detached_itself_is_counted(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
-    keeper = begin("hold")
-    alone = FamilyMemory().measure(keeper.pid)
-    assert alone == resident_memory(children(keeper.pid)[0]) > 64 * 2**20
-    end_family(keeper)
-
-
-def test_a_main_thread_that_ended_below_others_is_seen(begin: Callable[..., subprocess.Popen[bytes]]) -> None:
-    keeper = begin("pthread_exit")
-    worker = children(keeper.pid)[0]
-    assert not main_thread_ended(worker)
-    assert keeper.stdin is not None
-    keeper.stdin.write(b"\n")
-    keeper.stdin.close()
-    until(lambda: main_thread_ended(worker), "the end of its main thread")
-    assert keeper.poll() is None
-    end_family(keeper)
-    assert not main_thread_ended(worker)
-
-
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [
-        (-signal.SIGSEGV, "was killed by SIGSEGV"),
-        (-40, "was killed by signal 40"),  # a real-time one, which Python has no name for
-        (3, "ended with exit code 3"),
-        (None, "stopped answering"),
-    ],
-)
-def test_an_end_is_said_in_words(code: int | None, words: str) -> None:
-    assert describe_exit(code) == words

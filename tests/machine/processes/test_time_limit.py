@@ -24,7 +24,7 @@ def run(code: str) -> subprocess.CompletedProcess[str]:
         [sys.executable, "-c", NATIVE + code],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=90,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
 
@@ -35,16 +35,7 @@ def test_what_does_not_return_ends_with_its_message() -> None:
     assert ended.stderr.strip() == "the picture of eye"
 
 
-def test_what_returns_goes_on_and_time_between_does_not_count() -> None:
-    code = "end_after(1.5)\nfor _ in range(3):\n    with limited('short'): sleep(1)\nsleep(2)\nprint('over')"
-    ended = run(code)
+def test_what_returns_or_raises_goes_on_and_time_between_does_not_count() -> None:
+    short = "try:\n    with limited('short'): sleep(1); raise OSError\nexcept OSError: sleep(1)\n"
+    ended = run(f"with limited('no limit yet'): sleep(0)\nend_after(1.8)\n{short * 2}print('over')")
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "over\n", "")
-
-
-def test_a_raised_error_ends_it_too() -> None:
-    code = "end_after(1)\ntry:\n    with limited('raises'): raise OSError\nexcept OSError: sleep(2)\nprint('over')"
-    assert run(code).stdout == "over\n"
-
-
-def test_without_a_limit_nothing_is_watched() -> None:
-    assert run("with limited('long'): sleep(2)\nprint('over')").stdout == "over\n"

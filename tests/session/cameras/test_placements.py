@@ -1,113 +1,133 @@
-"""Cameras that are placed by hand: what is one step of undo, and how far each of them looks."""
+"""Cameras that are placed by hand: what is asked of the worker, what is one step of undo, and how far each looks."""
 
 from __future__ import annotations
 
 import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.session.studio import BARE, EYE, FILE, INFO, KEY, LENS, TARGET
-from tests.ui.scenes import description, step_of, table_scene
+from tests.drive.session import BASE, Told, camera, moved, told_session
+from tests.drive.waiting import until
+from tests.ui.scenes import camera as scene_camera
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.conventions import LookAt, pose_from_look_at, target_of, with_pose
+from workbench.machine.processes.wire import Call
 from workbench.session.cameras import selection
-from workbench.session.cameras.selection import StudioCameras
-from workbench.session.cameras.view import StudioCamera
+from workbench.session.cameras.view import EditRequest
+from workbench.session.protocol.messages import PlaceCamera, Placed
+from workbench.session.protocol.questions import RunCameras
+
+EYE, TARGET = (0.45, 0.0, 0.6), (0.08, 0.0, 0.2)
+"""It looks at something above the ground, which a line of sight does not tell."""
+LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0, None, 128, 128, 0.01, 10.0, "minimal")
+BARE = with_pose(LENS, pose_from_look_at(LookAt(EYE, TARGET)))
+"""As a file has it that names no target."""
+FILE = replace(BARE, distance=math.dist(EYE, TARGET))
+MOVED = replace(FILE, position=(0.45, 0.3, 0.6))
+NOTHING = ("sensor", "nothing")
 
 
-def opened(*said: CameraSettings, mount: str | None = None) -> StudioCameras:
-    """With versions that say this of the camera, one after the other."""
-    geometry, poses = table_scene(2)
-    cameras = StudioCameras()
-    for settings in said:
-        info = replace(INFO, settings=settings, mount=mount)
-        cameras.task = description(geometry, (info,))
-        cameras.placements.loaded({KEY: settings})
-        cameras.drawn = step_of(poses), 1
-        cameras.all_cameras()
-    return cameras
+def at(height: float) -> CameraSettings:
+    return replace(FILE, position=(0.45, 0.0, height))
 
 
-def shown(cameras: StudioCameras) -> StudioCamera:
-    (found,) = cameras.all_cameras()
+def loaded(
+    told: Told, settings: CameraSettings | None = FILE, level: str | None = None, mount: str | None = None
+) -> None:
+    """A version that says this of the camera; None if it has none."""
+    info = replace(scene_camera(), settings=settings, mount=mount)
+    told.load(level, cameras=() if settings is None else (info,), source_hash=str(settings))
+    told.reset()
+    told.view  # noqa: B018  (as a page draws it)
+
+
+@pytest.fixture
+def one(told: Told) -> Told:
+    loaded(told)
+    told.asked(object)
+    return told
+
+
+def now(told: Told) -> CameraSettings:
+    found = camera(told.session, BASE).now
+    assert found is not None
     return found
 
 
-def looks_at(cameras: StudioCameras) -> object:
-    now = shown(cameras).now
-    assert now is not None
-    return pytest.approx(target_of(now), abs=1e-6)
+def looks_at(told: Told) -> object:
+    return pytest.approx(target_of(now(told)), abs=1e-6)
 
 
-def test_the_target_is_the_one_that_the_file_gives_and_follows_it() -> None:
-    """It was where the line of sight meets the ground."""
-    assert looks_at(opened(FILE)) == TARGET
-    # The file names another point that is seen the same way.
-    further = replace(FILE, distance=1.5 * math.dist(EYE, TARGET))
-    assert looks_at(opened(FILE, further)) == tuple(np.add(EYE, 1.5 * np.subtract(TARGET, EYE)))
+def test_what_is_placed_is_asked_of_the_worker_and_what_stands_so_already_is_not(one: Told) -> None:
+    studio = one.session.studio
+    studio.place(BASE, MOVED)
+    studio.place(BASE, MOVED)
+    assert one.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)] == list(studio.placed_cameras())
+    assert moved(one.view) == {BASE} and now(one) == MOVED
+    for do, settings in (
+        (studio.undo, None),
+        (studio.redo, MOVED),
+        (lambda: studio.back_to_file(BASE), None),
+    ):
+        do()
+        assert one.asked(PlaceCamera) == [PlaceCamera(BASE, settings)]
+    studio.place(NOTHING, MOVED)
+    assert one.asked(PlaceCamera) == [] and "there is no sensor camera nothing" in one.view.studio.problem
+    with pytest.raises(ValueError, match="nothing"):
+        studio.import_pose(NOTHING, "", None, None)
+    with pytest.raises(ValueError, match="nothing"):
+        studio.export([BASE, NOTHING], "json")
 
 
-def test_moved_it_looks_as_far_as_it_did_and_back_in_its_place_at_what_the_file_gives() -> None:
-    cameras = opened(FILE)
-    moved = replace(FILE, position=(0.45, 0.3, 0.6))
-    assert cameras.placements.place(KEY, moved)
-    assert looks_at(cameras) == (0.08, 0.3, 0.2) and shown(cameras).moved
-    assert not cameras.placements.place(KEY, replace(moved, distance=2.0)), "no step of its own"
-    found = shown(cameras).now
-    assert found is not None and found.distance == 2.0
-    cameras.placements.undo()
-    assert looks_at(cameras) == TARGET and not shown(cameras).moved
-    cameras.placements.redo()
-    found = shown(cameras).now
-    assert found is not None and found.distance == 2.0, "as it was set there"
+def test_one_that_could_not_be_placed_is_asked_for_where_it_stood_once_each_time(one: Told) -> None:
+    for height in (0.7, 0.8):
+        one.session.studio.place(BASE, at(height))
+        one.asked(object)
+        one.tell(Placed(BASE, at(height), None, why_not="it is far away"))
+        assert (
+            one.asked(PlaceCamera) == [PlaceCamera(BASE, None)]
+            and "it is far away" in one.view.studio.problem
+        )
+        one.tell(Placed(BASE, None, None, why_not="nor can this"))
+        assert one.asked(PlaceCamera) == [] and not moved(one.view)
 
 
-def test_how_far_one_looks_that_was_not_moved_is_set_too_and_is_no_placement() -> None:
-    cameras = opened(FILE)
-    assert not cameras.placements.place(KEY, replace(FILE, distance=0.2))
-    found = shown(cameras)
-    assert found.now is not None and found.now.distance == 0.2
-    assert not found.moved and cameras.placements.undo_label is None
-
-
-def test_without_a_target_in_the_file_it_looks_at_the_ground_and_moved_it_goes_on_to_look_so_far() -> None:
-    cameras = opened(BARE)
-    assert looks_at(cameras) == (-0.105, 0, 0)
-    now = shown(cameras).now
-    assert now is not None
-    cameras.placements.place(KEY, replace(now, position=(0.45, 0.0, 0.9)))
-    assert looks_at(cameras) == (-0.105, 0, 0.3)
-    # The version with it in the file names no target either.
-    cameras.placements.loaded({KEY: replace(BARE, position=(0.45, 0.0, 0.9))}, frozenset({KEY}))
-    assert looks_at(cameras) == (-0.105, 0, 0.3) and not shown(cameras).moved
-
-
-@pytest.mark.parametrize("forward", [(1.0, 0.0, 0.0), (0.0, 0.6, 0.8), (0.999, 0.0, -0.0447)])
-def test_where_the_ground_is_not_before_it_or_far_away_it_looks_a_metre_ahead(
-    forward: tuple[float, float, float],
+def test_placements_are_sent_again_to_each_version_and_worker_until_the_file_says_otherwise(
+    one: Told,
 ) -> None:
-    ahead = tuple(np.add(EYE, forward))
-    cameras = opened(with_pose(LENS, pose_from_look_at(LookAt(EYE, ahead))))
-    now = shown(cameras).now
-    assert now is not None and now.distance == 1.0
+    studio = one.session.studio
+    studio.select(BASE)
+    studio.place(NOTHING, MOVED)
+    assert one.view.studio.problem
+    studio.place(BASE, MOVED)
+    for level in ("patched", "rebuilt", None):
+        one.asked(object)
+        loaded(one, level=level)
+        assert one.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)] and one.view.studio.problem == ""
+        assert one.view.studio.selected == BASE
+    loaded(one, at(0.9), "cameras")
+    assert one.asked(PlaceCamera) == [PlaceCamera(BASE, None)] and now(one) == at(0.9)
+    assert "base_camera" in one.view.studio.problem
+    studio.undo()
+    assert now(one) == MOVED
+    kept = one.session.kept_work()
+    loaded(one, None, "cameras")
+    assert one.view.studio.selected is None and one.view.studio.cameras == ()
+    with told_session(Path("nowhere"), kept=kept) as later:
+        loaded(later, at(0.9))
+        assert later.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)]
+        assert later.view.studio.selected == BASE and now(later) == MOVED
 
 
-def test_the_ground_before_a_mounted_camera_is_that_of_the_env() -> None:
-    """The hand is 0.5 m above it and upright: the camera looks from 0.1 m above the hand straight to the ground."""
-    down = with_pose(LENS, pose_from_look_at(LookAt((0, 0, 0.1), (0, 0, 0))))
-    now = shown(opened(down, mount="arm/hand")).now
-    assert now is not None and now.distance == pytest.approx(0.6)
-    # While it is not known where the hand is, nothing is settled.
-    cameras = opened(down, mount="arm/hand")
-    cameras.placements.loaded({})
-    cameras.placements.loaded({KEY: down})
-    cameras.drawn = None, 0
-    now = shown(cameras).now
-    assert now is not None and now.distance is None
-
+# --- undo ------------------------------------------------------------------------------------------------
 
 DRAG = object()
 A_STEP_EACH = [0.62, 0.61, 0.6]
@@ -126,56 +146,173 @@ A_STEP_EACH = [0.62, 0.61, 0.6]
     ids=["followed at once", "after a pause", "by turns", "a drag that rests", "nobody's"],
 )
 def test_what_one_hand_does_without_a_pause_is_one_step_of_undo(
-    calls: list[tuple[object, float, float]], heights: list[float], monkeypatch: pytest.MonkeyPatch
+    one: Told, calls: list[tuple[object, float, float]], heights: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    placements = opened(FILE).placements
-    for height, (hand, at, pause) in zip((0.61, 0.62, 0.63), calls, strict=True):
-        monkeypatch.setattr(selection, "time", SimpleNamespace(monotonic=lambda at=at: at))
-        assert placements.place(KEY, replace(FILE, position=(0.45, 0.0, height)), hand, pause)
+    studio = one.session.studio
+    for height, (hand, seconds, pause) in zip((0.61, 0.62, 0.63), calls, strict=True):
+        monkeypatch.setattr(selection, "time", SimpleNamespace(monotonic=lambda seconds=seconds: seconds))
+        studio.place(BASE, at(height), hand, pause)
     undone = []
-    while (taken := placements.undo()) is not None:
-        undone.append(taken.before.position[2])
+    while one.view.studio.undo is not None:
+        studio.undo()
+        undone.append(now(one).position[2])
     assert undone == heights
 
 
-def test_what_is_made_again_is_whole() -> None:
-    placements = opened(FILE).placements
-    moved, further = (replace(FILE, position=(0.45, 0.0, height)) for height in (0.7, 0.8))
-    placements.place(KEY, moved, DRAG)
-    placements.undo()
-    placements.redo()
-    placements.place(KEY, further, DRAG)
-    placements.undo()
-    assert placements.now(KEY) == moved
+def test_what_was_taken_back_can_be_made_again_until_something_else_is_done(one: Told) -> None:
+    studio = one.session.studio
+
+    def labels() -> tuple[str | None, str | None]:
+        return one.view.studio.undo, one.view.studio.redo
+
+    studio.undo()
+    studio.redo()
+    assert labels() == (None, None)
+    studio.place(BASE, at(0.7), DRAG)
+    assert labels() == ("moved base_camera", None)
+    studio.undo()
+    assert labels() == (None, "moved base_camera") and now(one) == FILE
+    studio.redo()
+    studio.place(BASE, at(0.8), DRAG)
+    studio.undo()
+    assert now(one) == at(0.7), "what was made again is whole: no drag goes on from it"
+    studio.place(BASE, at(0.9))
+    studio.redo()
+    assert now(one) == at(0.9) and labels() == ("moved base_camera", None)
 
 
-def test_what_was_taken_back_can_be_made_again_until_something_else_is_done() -> None:
-    placements = opened(FILE).placements
-    moved, other = (replace(FILE, position=(0.45, 0.0, height)) for height in (0.7, 0.8))
-    assert placements.undo() is None and placements.redo() is None
-    assert (placements.undo_label, placements.redo_label) == (None, None)
-    placements.place(KEY, moved)
-    assert (placements.undo_label, placements.redo_label) == ("moved base_camera", None)
-    placements.undo()
-    assert (placements.undo_label, placements.redo_label) == (None, "moved base_camera")
-    placements.place(KEY, other)
-    assert placements.redo() is None and placements.now(KEY) == other
+# --- how far it looks --------------------------------------------------------------------------------------
 
 
-def test_a_placement_that_is_out_of_the_file_again_is_a_step_of_undo_and_one_made_since_stays() -> None:
-    written, since = (replace(FILE, position=(0.45, 0.0, height)) for height in (0.7, 0.8))
-    placements = opened(FILE, written, FILE).placements
-    assert placements.edit_undone(KEY, written, FILE) and placements.now(KEY) == FILE
-    assert placements.undo_label == "reverted the change of base_camera"
-    placements.undo()
-    assert placements.now(KEY) == written
-    placements.place(KEY, since)
-    assert not placements.edit_undone(KEY, written, FILE)
-    assert placements.now(KEY) == since and placements.undo_label == "moved base_camera"
+def test_the_target_is_the_one_that_the_file_gives_and_follows_it(one: Told) -> None:
+    assert looks_at(one) == TARGET, "not where the line of sight meets the ground"
+    loaded(one, replace(FILE, distance=1.5 * math.dist(EYE, TARGET)), "cameras")
+    assert looks_at(one) == tuple(np.add(EYE, 1.5 * np.subtract(TARGET, EYE)))
 
 
-def test_a_camera_that_there_is_not_cannot_be_exported() -> None:
-    cameras = opened(FILE)
-    assert cameras.to_export(KEY).settings == FILE
-    with pytest.raises(ValueError, match="no sensor camera nothing whose settings are known"):
-        cameras.to_export(("sensor", "nothing"))
+def test_moved_it_looks_as_far_as_it_did_and_back_in_its_place_at_what_the_file_gives(one: Told) -> None:
+    studio = one.session.studio
+    studio.place(BASE, replace(FILE, distance=0.2))
+    assert now(one).distance == 0.2 and not moved(one.view) and one.view.studio.undo is None, "no placement"
+    studio.place(BASE, FILE)
+    studio.place(BASE, MOVED)
+    assert looks_at(one) == (0.08, 0.3, 0.2)
+    studio.place(BASE, replace(MOVED, distance=2.0))
+    assert now(one).distance == 2.0
+    studio.undo()
+    assert looks_at(one) == TARGET and not moved(one.view), "no step of its own"
+    studio.redo()
+    assert now(one).distance == 2.0, "as it was set there"
+
+
+def test_without_a_target_in_the_file_it_looks_at_the_ground_and_moved_it_goes_on_to_look_so_far(
+    told: Told,
+) -> None:
+    loaded(told, BARE)
+    assert looks_at(told) == (-0.105, 0, 0)
+    told.session.studio.place(BASE, replace(now(told), position=(0.45, 0.0, 0.9)))
+    assert looks_at(told) == (-0.105, 0, 0.3)
+    loaded(told, replace(BARE, position=(0.45, 0.0, 0.9)), "cameras")
+    assert looks_at(told) == (-0.105, 0, 0.3) and not moved(told.view), (
+        "the file has it now, without a target"
+    )
+
+
+@pytest.mark.parametrize("forward", [(1.0, 0.0, 0.0), (0.0, 0.6, 0.8), (0.999, 0.0, -0.0447)])
+def test_where_the_ground_is_not_before_it_or_far_away_it_looks_a_metre_ahead(
+    told: Told, forward: tuple[float, float, float]
+) -> None:
+    loaded(told, with_pose(LENS, pose_from_look_at(LookAt(EYE, tuple(np.add(EYE, forward))))))
+    assert now(told).distance == 1.0
+
+
+def test_the_ground_before_a_mounted_camera_is_that_of_the_env(told: Told) -> None:
+    """The hand is 0.5 m above it and upright: the camera looks from 0.1 m above the hand straight to the ground."""
+    down = with_pose(LENS, pose_from_look_at(LookAt((0, 0, 0.1), (0, 0, 0))))
+    loaded(told, down, mount="arm/hand")
+    assert now(told).distance == pytest.approx(0.6)
+
+
+# --- the file ----------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[tuple[Told, Path]]:
+    file = folder / "push.py"
+    file.write_text('@register_env("Alone-v1")\nclass PushEnv:\n    """Nothing but a place."""\n')
+    with told_session(folder / "recordings", str(file)) as told:
+        source = {str(file): file.read_text()}
+        info = replace(scene_camera(), settings=FILE)
+        told.load(file=str(file), source_files=(str(file),), source=source, cameras=(info,))
+        told.reset()
+        told.asked(object)
+        yield told, file
+
+
+@pytest.fixture
+def with_file(tmp_path: Path) -> Iterator[tuple[Told, Path]]:
+    with opened(tmp_path) as made:
+        yield made
+
+
+def asks(told: Told) -> Call:
+    """A plan, for which the worker is asked what comes of it, and which waits for the answer."""
+    told.session.studio.file.plan(EditRequest("add", ("human", "side"), FILE))
+    found: list[Any] = []
+
+    def asked() -> bool:
+        found.extend(call for call in told.asked(Call) if isinstance(call.request, RunCameras))
+        return bool(found)
+
+    until(asked, "the worker being asked")
+    return found[0]
+
+
+def test_the_end_of_a_session_ends_what_waits_for_its_worker_and_begins_nothing_more(
+    with_file: tuple[Told, Path],
+) -> None:
+    told, file = with_file
+    asks(told)
+    told.session.studio.file.plan(EditRequest("edit", BASE, MOVED))  # behind it
+    closing = threading.Thread(target=told.session.close)
+    closing.start()
+    closing.join(20)
+    assert not closing.is_alive(), "it waits for an answer that nobody gives"
+    state = told.view.studio.edit_state
+    assert state.stage == "refused" and state.request is not None and state.request.what == "add"
+    told.session.studio.file.plan(EditRequest("edit", BASE, MOVED))
+    assert told.asked(Call) == [] and told.view.studio.edit_state == state
+
+
+def test_a_save_and_a_death_end_what_waits_for_the_worker_and_the_next_is_asked(
+    with_file: tuple[Told, Path],
+) -> None:
+    told, file = with_file
+    for end in (told.die, lambda: file.write_text(file.read_text() + "\n")):
+        call = asks(told)
+        end()
+        until(lambda: told.view.studio.edit_state.stage == "refused", "the end of the plan")
+        assert "did not answer" in told.view.studio.edit_state.message
+        assert asks(told).number != call.number
+        told.die()
+        until(lambda: told.view.studio.edit_state.stage == "refused", "the end of the second")
+
+
+def test_no_thread_of_a_session_is_left_when_it_is_closed_whatever_waited(tmp_path: Path) -> None:
+    before = set(threading.enumerate())
+    with opened(tmp_path) as (told, _):
+        session = told.session
+        asks(told)
+        session.studio.select(BASE)
+        session.studio.set_preview_scale(0.5)
+        session.studio.draw_preview()
+        session.studio.reports.pick(0.5, 0.5)
+        heard: list[Call] = []
+        until(lambda: heard.extend(told.asked(Call)) or len(heard) == 2, "both questions")
+        session.start_recording()
+        told.reset()
+        told.step(2)
+        assert len(set(threading.enumerate()) - before) >= 5
+    left = [thread.name for thread in set(threading.enumerate()) - before if thread.is_alive()]
+    assert left == []
+    assert session.wait(-1, 60.0) >= 0, "a page that waits is woken"

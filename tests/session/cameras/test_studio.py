@@ -11,13 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import start_over, step, wait_until
-from tests.drive.waiting import until
-from tests.session.studio import BASE, PEOPLE, camera, moved, said
+from tests.drive.session import BASE, PEOPLE, camera, in_studio, moved, start_over, step, wait_until
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
-from workbench.core.cameras.conventions import target_of
 from workbench.jobs.task import TaskOptions
-from workbench.session.cameras.file_edits import FileEdits
 from workbench.session.cameras.view import EditRequest, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -56,12 +52,14 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, 
         there = replace(camera(session, BASE).now, position=(0.31, 0.02, 0.55))
         session.studio.place(BASE, there)
         session.studio.file.plan(EditRequest("edit", BASE))
-        refused = wait_until(session, said(lambda s: s.edit_state.stage == "refused"), "the refusal")
+        refused = wait_until(session, in_studio(lambda s: s.edit_state.stage == "refused"), "the refusal")
         session.studio.file.copy_task()
-        planned = wait_until(session, said(lambda s: s.edit_state.stage == "planned"), "the plan in the copy")
+        planned = wait_until(
+            session, in_studio(lambda s: s.edit_state.stage == "planned"), "the plan in the copy"
+        )
         session.studio.file.write()
         ended = wait_until(
-            session, said(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
+            session, in_studio(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
         )
         session.studio.file.drop_plan()
         named = str(session.present_reference)
@@ -110,103 +108,18 @@ def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView
     return reached
 
 
-@pytest.mark.slow
-def test_a_camera_that_is_dragged_is_seen_from_where_it_came_to_rest_and_is_one_step_of_undo(
-    session: Session,
-) -> None:
-    start = camera(session, BASE).now
-    for k in range(30):
-        session.studio.place(BASE, replace(start, position=(0.01 * k, 0.0, 0.8)), control=1)
-    rest = replace(start, position=(0.29, 0.0, 0.8))
-    view = wait_until(session, seen_from(BASE, rest), "the picture from there")
-    assert moved(view) == {BASE} and view.studio.undo == "moved base_camera"
-    session.studio.undo()
-    view = wait_until(session, seen_from(BASE, start), "the picture from before")
-    assert not moved(view) and view.studio.redo == "moved base_camera"
-    session.studio.redo()
-    wait_until(session, seen_from(BASE, rest), "the placement again")
-
-
-@pytest.mark.slow
-def test_size_and_lens_change_the_live_camera_and_the_observation(session: Session) -> None:
-    start = camera(session, BASE).now
-    other = replace(start, width=40, height=30, fov=0.8)
-    session.studio.place(BASE, other)
-    view = wait_until(session, seen_from(BASE, other), "the picture of that size")
-    info = view.studio.camera(BASE).info
-    assert (info.width, info.height, round(info.fovy, 6)) == (40, 30, 0.8)
-    assert info.settings == start, "what the file says is no longer told"
-    session.step()
-    view = wait_until(session, lambda v: v.step.elapsed_steps.any() or v.problem is not None, "a step")
-    assert view.problem is None
-    people = camera(session, PEOPLE).now
-    session.studio.place(PEOPLE, replace(people, position=(1.0, 0.0, 1.0)))
-    wait_until(session, seen_from(PEOPLE, replace(people, position=(1.0, 0.0, 1.0))), "the other camera")
-    # One picture may be of the moment before; and both may be there before the reset has been looked at.
-    serial = session.view().pictures_serial
-    session.reset()
-    wait_until(session, lambda v: not v.step.elapsed_steps.any(), "the reset")
-    wait_until(session, lambda v: v.pictures_serial > serial + 1 and seen_from(BASE, other)(v), "it stayed")
-
-
-def test_a_preview_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
-    start = camera(session, BASE).now
-    session.studio.set_preview_scale(0.25)
-    there = replace(start, position=(0.31, 0.02, 0.55))
-    session.studio.place(BASE, there)
-
-    def looked(view: SessionView) -> bool:
-        session.studio.draw_preview()  # as the page does
-        picture = view.studio.preview
-        return picture is not None and np.allclose(picture.pose[:3], there.position, atol=1e-6)
-
-    view = wait_until(session, looked, "the look from there")
-    size = (start.width, start.height)
-    assert (
-        view.studio.preview.rgb.shape == (size[1] // 4, size[0] // 4, 3) and view.studio.preview.rgb.std() > 5
-    )
-    depth, bodies = view.studio.preview.depth, view.studio.preview.segmentation
-    assert depth is not None and bodies is not None
-    assert (
-        depth.shape == bodies.shape == (size[1] // 4, size[0] // 4)
-        and np.ptp(depth) > 0.1
-        and np.ptp(bodies) > 0
-    )
-    assert (camera(session, BASE).now.width, camera(session, BASE).info.width) == (size[0], size[0])
-    session.studio.set_preview_scale(1.0)
-    view = wait_until(session, seen_from(BASE, there), "the picture in its own size")
-    assert view.studio.preview is None
-
-
-def test_a_moment_of_the_past_is_drawn_again_when_the_camera_moves(session: Session) -> None:
-    start = camera(session, BASE).now
-    session.step()
-    wait_until(session, lambda v: v.step.elapsed_steps.any() and BASE in v.pictures, "a step")
-    session.past.seek_by(-1)
-    wait_until(session, lambda v: v.timeline.shown is not None, "the past")
-    there = replace(start, position=(0.4, 0.1, 0.7))
-    session.studio.place(BASE, there)
-    wait_until(session, lambda v: v.timeline.wants_pictures, "the old picture being outdated")
-
-    def drawn(view: SessionView) -> bool:
-        # As the page does: what was on its way when the camera stood there at last is wanted once more.
-        if view.timeline.wants_pictures:
-            session.past.draw()
-        return seen_from(BASE, there)(view)
-
-    wait_until(session, drawn, "the past seen from there")
-
-
 def test_what_cannot_be_is_refused_in_words_and_changes_nothing(session: Session) -> None:
     start = camera(session, BASE).now
     session.studio.place(BASE, replace(start, near=5.0, far=1.0))
-    view = wait_until(session, said(lambda s: "near must be" in s.problem), "the reason")
+    view = wait_until(session, in_studio(lambda s: "near must be" in s.problem), "the reason")
     assert not moved(view)
     session.studio.place(BASE, replace(start, shader_pack="nonsense"))
-    view = wait_until(session, said(lambda s: "there is no shader pack" in s.problem), "the worker's reason")
+    view = wait_until(
+        session, in_studio(lambda s: "there is no shader pack" in s.problem), "the worker's reason"
+    )
     assert not moved(view)
     session.studio.place(("sensor", "nobody"), start)
-    wait_until(session, said(lambda s: "there is no sensor camera nobody" in s.problem), "the reason")
+    wait_until(session, in_studio(lambda s: "there is no sensor camera nobody" in s.problem), "the reason")
 
 
 def test_a_placement_is_written_compared_and_taken_back(session: Session, task_file: Path) -> None:
@@ -216,11 +129,13 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     start = camera(session, BASE).now
     studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
     studio.file.plan(EditRequest("edit", BASE))
-    view = wait_until(session, said(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
+    view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
     assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
     assert task_file.read_bytes() == before and "+" in view.studio.edit_state.edit.diff
     studio.file.write()
-    view = wait_until(session, said(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check")
+    view = wait_until(
+        session, in_studio(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
+    )
     assert view.studio.edit_state.stage == "checked", view.studio.edit_state.message
     assert view.reload.level == "cameras" and not moved(view)
     now = camera(session, BASE)
@@ -229,7 +144,7 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     studio.file.undo_write()
     view = wait_until(
         session,
-        said(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
+        in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
         "the file of before",
     )
     assert task_file.read_bytes() == before
@@ -246,41 +161,6 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     assert not differences(view.studio.camera(BASE).now, now.now)
 
 
-def test_a_hook_that_does_not_end_is_waited_for_so_long_and_the_next_plan_is_made(
-    session: Session, task_file: Path, tmp_path: Path
-) -> None:
-    good, waits = task_file.read_text(), tmp_path / "waits"
-    (hook,) = (line for line in good.splitlines(keepends=True) if "def _default_sensor_configs(" in line)
-    asks = f"        while __import__('os').path.exists({str(waits)!r}):\n            pass\n"
-    studio = session.studio
-    file = FileEdits(
-        studio._cameras,
-        lambda: None,
-        lambda *_: None,
-        studio.file._asker,
-        studio.file._load,
-        session.past.shown_moment,
-        patience=0.5,
-    )
-    try:
-        task_file.write_text(good.replace(hook, hook + asks))
-        wait_until(session, lambda v: asks in v.task.source[str(task_file)], "the version with it")
-        studio.place(BASE, replace(camera(session, BASE).now, fov=1.2))
-        waits.touch()
-        file.plan(EditRequest("edit", BASE))
-        until(lambda: file.view.stage == "refused", "the end of waiting")
-        assert "the task did not answer" in file.view.message
-        waits.unlink()
-        studio.file.plan(EditRequest("edit", BASE))
-        wait_until(session, said(lambda v: v.edit_state.stage == "planned"), "the plan of who waits longer")
-        studio.file.drop_plan()
-    finally:
-        waits.unlink(missing_ok=True)
-        file.close()
-        task_file.write_text(good)
-    wait_until(session, lambda v: asks not in v.task.source[str(task_file)], "the version without it")
-
-
 def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     session: Session, task_file: Path
 ) -> None:
@@ -288,14 +168,14 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
     studio.place(BASE, there)
     studio.file.plan(EditRequest("remove", BASE))
-    view = wait_until(session, said(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
+    view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
     assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
     studio.file.write()
-    wait_until(session, said(lambda s: s.edit_state.stage == "checked"), "the version without it")
+    wait_until(session, in_studio(lambda s: s.edit_state.stage == "checked"), "the version without it")
     studio.file.undo_write()
     wait_until(
         session,
-        said(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
+        in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
         "the file of before",
     )
     assert task_file.read_text() == before
@@ -304,32 +184,11 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     studio.file.drop_plan()
 
 
-def test_the_target_that_the_file_gives_is_known(session: Session, task_file: Path) -> None:
-    good = task_file.read_text()
-
-    def target(view: SessionView) -> object:
-        """Of the file."""
-        return pytest.approx(target_of(view.studio.camera(BASE).info.settings), abs=1e-6)
-
-    assert target(session.view()) == (0.08, 0, 0)
-    task_file.write_text(good.replace("target=[0.08, 0, 0]", "target=[0.08, 0, 0.2]"))
-    view = wait_until(session, lambda v: target(v) == (0.08, 0, 0.2), "the other")
-    session.studio.place(BASE, replace(view.studio.camera(BASE).now, position=(0.2, 0.1, 0.7)))
-    view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement")
-    assert target(view) == (0.08, 0, 0.2)
-    task_file.write_text(good)
-    wait_until(session, lambda v: target(v) == (0.08, 0, 0), "the first")
-    wait_until(session, said(lambda s: "follows it" in s.problem), "that the placement is dropped")
-    session.studio.undo()
-    view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
-    assert view.studio.problem == "", "what was said before a person did something about it"
-    session.studio.back_to_file(BASE)
-    wait_until(session, lambda v: not moved(v), "as the file says")
-
-
 def settled(session: Session, reached: Callable[[StudioView], bool], what: str) -> StudioView:
     """The studio once its work in the background is done."""
-    view = wait_until(session, said(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what)
+    view = wait_until(
+        session, in_studio(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what
+    )
     assert not view.studio.problem, view.studio.problem
     return view.studio
 
@@ -418,16 +277,16 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     studio.reports.measure(500)
     wait_until(
         session,
-        said(lambda s: s.results.measuring and s.results.report is not None),
+        in_studio(lambda s: s.results.measuring and s.results.report is not None),
         "what is known, as from before",
     )
     wait_until(
-        session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
+        session, in_studio(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
     )
     studio.reports.stop()
-    wait_until(session, said(lambda s: s.progress is None and not s.results.measuring), "its end")
+    wait_until(session, in_studio(lambda s: s.progress is None and not s.results.measuring), "its end")
     studio.reports.suggest(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
-    wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
+    wait_until(session, in_studio(lambda s: "no object 'nothing'" in s.problem), "why not")
 
 
 def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
@@ -447,29 +306,6 @@ def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
     assert not camera(session, BASE).moved, "our own file is in metres whatever is chosen"
     with pytest.raises(ValueError, match="no pose is in it"):
         session.studio.import_pose(BASE, "{}", None, None)
-
-
-@pytest.mark.slow
-def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
-    session: Session, task_file: Path
-) -> None:
-    start, people = camera(session, BASE).now, camera(session, PEOPLE).now
-    there, aside = replace(start, position=(0.2, 0.2, 0.9)), replace(people, fov=0.5)
-    session.studio.place(BASE, there)
-    session.studio.place(PEOPLE, aside)
-    task_file.write_text(task_file.read_text().replace("width=128", "width=96", 1))
-    view = wait_until(
-        session, lambda v: v.studio.camera(BASE).info.settings.width == 96, "the version with another width"
-    )
-    assert moved(view) == {PEOPLE} and "base_camera was changed in the file" in view.studio.problem
-    assert view.studio.undo == "reloaded base_camera from the file"
-    session.studio.undo()
-    wait_until(session, seen_from(BASE, there), "the placement, taken back from the file")
-    serial = view.task_serial
-    session.versions.restart_worker()
-    wait_until(session, lambda v: v.task_serial > serial, "another worker")
-    wait_until(session, seen_from(BASE, there), "its camera where the last one's was")
-    assert moved(session.view()) == {BASE, PEOPLE}
 
 
 def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_copy(

@@ -12,7 +12,6 @@ import pytest
 
 from tests.drive.session import live_session, wait_until
 from tests.drive.waiting import until
-from workbench.authoring.problem import Problem
 from workbench.checks.results import RuleResult
 from workbench.core.rules import Finding
 from workbench.jobs.task import TaskOptions
@@ -213,15 +212,6 @@ def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
     assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
 
 
-def test_it_comes_before_the_rescoring_for_the_first_seconds_alone(
-    checks: Checks, background: ScriptedBackground, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("workbench.session.checks.checks.AHEAD", 0.0)
-    checks.loaded(LOAD, same_task=True)
-    ended(checks)
-    assert background.priorities == ["low", "lowest"]
-
-
 def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
     checks: Checks, background: ScriptedBackground
 ) -> None:
@@ -233,21 +223,6 @@ def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
     view = checks.view
     assert view.state == "none" and [one.rule for one in view.before] == [FIRST] and not view.results
     assert len(background.asked) == 2
-
-
-def test_with_every_rule_off_nothing_is_asked(checks: Checks, background: ScriptedBackground) -> None:
-    checks.loaded(replace(LOAD, options=TaskOptions(rules="off")), same_task=True)
-    assert checks.view.state == "off" and background.asked == []
-
-
-def test_a_version_that_cannot_be_loaded_there_is_told_with_its_problem(
-    checks: Checks, background: ScriptedBackground
-) -> None:
-    problem = Problem("build", "KeyError: 'x'", "/home/me/push.py", 3, "x", "")
-    background.fails = JobFailed("the task failed", problem)
-    checks.loaded(LOAD, same_task=True)
-    view = ended(checks)
-    assert view.state == "failed" and view.problem == problem and "could not be loaded" in view.why
 
 
 # --- with processes -----------------------------------------------------------------------------------
@@ -282,22 +257,3 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
             "the rule checked anew",
         )
         assert all(one.rule != FIRST for one in session.view().checks.before)
-
-
-@pytest.mark.slow
-def test_the_rules_of_a_session_with_one_env_are_looked_at_on_one(
-    child_process: None, task_file: Path, tmp_path: Path
-) -> None:
-    begins = "        super().__init__(*args, robot_uids=robot_uids, **kwargs)\n"
-    only = "        if kwargs.get('num_envs', 1) != 1: raise ValueError('one env only')\n"
-    text = task_file.read_text()
-    assert begins in text
-    file = tmp_path / "one_env.py"
-    file.write_text(text.replace(begins, only + begins))
-    with live_session(file, tmp_path / "recordings", num_envs=1) as session:
-        session.check_now()
-        until(lambda: session.view().checks.state not in RUNNING, "the end of the checks", 300)
-        checks = session.view().checks
-    states = {result.rule: result.state for result in checks.results}
-    assert checks.state == "done" and not any(result.problem for result in checks.results)
-    assert states["batch-of-reset"] == "not_known" and states["success-at-reset"] == "kept"

@@ -62,10 +62,3 @@ def test_a_task_that_fails_says_where(solver: SeedsSolver, tmp_path: Path) -> No
 def test_a_task_that_a_recording_names_is_not_run_from_the_disk(solver: SeedsSolver) -> None:
     solver.solve(Load(RecordedTask("PushCube-v1"), MADE), 2, FEW)
     assert solver.view.state == "failed" and "open its file" in solver.view.why
-
-
-@pytest.mark.slow
-def test_nothing_is_left_of_it_when_the_session_closes(solver: SeedsSolver) -> None:
-    solver.solve(Load(str(TASKS / "push_cube.py"), MADE), 2, FEW)
-    solver.close()
-    assert solver.view.state == "stopped"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from tests.session.moments import N, stepped
+from tests.drive.session import moment
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.session.history.curves import (
     MOST,
@@ -25,12 +25,13 @@ from workbench.session.history.curves import (
     spans_of,
 )
 
+N = 3
 REACH = Column(Group.TERM, "reach")
 
 
 def step(number: int, **terms: Any) -> StepResult:
     entries = {f"reward_terms/{name}": np.asarray(value, np.float32) for name, value in terms.items()}
-    result = stepped(number, success=(2,) if number == 2 else ()).step
+    result = moment(np.full(N, number), success=(2,) if number == 2 else ()).step
     return replace(result, evaluate={**result.evaluate, **entries})
 
 
@@ -49,12 +50,6 @@ def test_a_step_is_a_point_of_each_env_and_of_the_mean() -> None:
     assert line(curves, REACH) == ([1, 2, 3], [2, 4, 6])
     assert line(curves, REACH, mean=True) == ([1, 2, 3], [1, 2, 3])
     assert line(steps.curves(2), SUCCESS)[1] == [0, 1, 0]
-
-
-def test_a_task_has_empty_curves_before_its_first_step() -> None:
-    curves = StepCurves(N).curves(0)
-    assert (curves.serial, curves.columns) == (0, ())
-    assert [part.tolist() for part in curves.lines([])] == [[], []]
 
 
 def test_curves_that_were_taken_do_not_change() -> None:
@@ -80,7 +75,7 @@ def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
     rewards: NDArray[np.float32],
 ) -> None:
     steps = StepCurves(2)
-    base = stepped(1).step
+    base = moment(np.full(N, 1)).step
     for number in range(rewards.shape[1]):
         steps.add(replace(base, reward=rewards[:, number], evaluate={}))
     curves = steps.curves(1)
@@ -100,17 +95,6 @@ def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
     np.testing.assert_array_equal(rewards[1][x[drawn].astype(int) - 1], one[drawn])
     lost = ~np.isfinite(rewards[1])
     assert np.isnan(one).any() == lost.any()
-
-
-def test_a_spike_of_one_step_among_many_is_drawn_at_its_step() -> None:
-    steps = StepCurves(N)
-    for number in range(1, 10_001):
-        result = step(1)
-        result.reward[1] = 50 if number == 7_777 else 1
-        steps.add(result)
-    x, values = line(steps.curves(1), REWARD)
-    assert [at for at, value in zip(x, values, strict=True) if value == 50] == [7_777]
-    assert x[0] == 1 and x[-1] == 10_000 and 400 <= len(x) <= 801
 
 
 def test_entries_terms_and_joints_have_columns_by_their_names() -> None:
@@ -139,13 +123,6 @@ def test_entries_terms_and_joints_have_columns_by_their_names() -> None:
     assert line(curves, Column(Group.EVALUATE, "mean"))[1] == [0.5]
 
 
-def test_a_term_that_comes_later_has_no_line_before() -> None:
-    steps = StepCurves(N)
-    steps.add(step(1, reach=[1, 2, 0]))
-    steps.add(step(2, reach=[3, 4, 0], push=[5, 6, 7]))
-    np.testing.assert_array_equal(line(steps.curves(0), Column(Group.TERM, "push"))[1], [np.nan, 5])
-
-
 def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
     steps = StepCurves(N)
     result = step(1, reach=[1, 2, 3], both=[[1, 2]] * N)
@@ -160,12 +137,6 @@ def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
     assert steps.curves(0).no_curve == ("reward_terms",)
     steps.add(step(1, reach=[1, 2, 3]))
     assert steps.curves(0).no_curve == ()
-
-
-def test_a_success_of_several_numbers_counts_by_its_first() -> None:
-    steps = StepCurves(N)
-    steps.add(replace(step(1), evaluate={"success": np.array([[0, 1], [1, 0], [1, 1]], np.float32)}))
-    assert [line(steps.curves(env), SUCCESS)[1] for env in range(N)] == [[0], [1], [1]]
 
 
 def test_columns_are_bounded_and_those_that_a_version_has_dropped_make_room() -> None:

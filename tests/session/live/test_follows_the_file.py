@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.drive.session import wait_until
+from tests.drive.session import save, step, wait_until
 from workbench.session.live.session import Session
 
 
@@ -39,6 +40,12 @@ def good(task_file: Path, session: Session) -> str:
     return task_file.read_text()
 
 
+@pytest.fixture(autouse=True)
+def good_again(session: Session, task_file: Path, good: str) -> Iterator[None]:
+    yield
+    save(session, task_file, good)
+
+
 def test_a_good_edit_replaces_the_running_version(session: Session, task_file: Path, good: str) -> None:
     session.change(selected_env=1)
     before = session.view()
@@ -60,46 +67,37 @@ BROKEN = [
     ("evaluate", "1 / 0", "evaluate", "ZeroDivisionError"),
     ("compute_dense_reward", "raise ValueError('no reward')", "reward", "no reward"),
     ("_load_scene", "self.nothing_there", "build", "nothing_there"),
-    ("_initialize_episode", "raise KeyError('cube')", "reset", "cube"),
     ("_get_obs_extra", "assert False, 'obs'", "observation", "obs"),
-    ("_initialize_episode", "breakpoint()", "reset", "remove this line, or open with --debug"),
-    ("evaluate", "import pdb; pdb.set_trace()", "evaluate", "remove this line, or open with --debug"),
+    ("_initialize_episode", "breakpoint()", "reset", "--debug"),
+    ("evaluate", "return {'success': __import__('torch').zeros((2, 1), dtype=bool)}", "returns", "evaluate"),
 ]
 
 
 @pytest.mark.parametrize(
     ("hook", "line", "stage", "says"), BROKEN, ids=[f"{b[0]}-{b[1][:12]}" for b in BROKEN]
 )
-def test_a_hook_that_raises_is_shown_with_its_line_and_the_last_good_version_runs_on(
+def test_a_hook_that_is_wrong_is_shown_with_its_line_and_the_last_good_version_runs_on(
     session: Session, task_file: Path, good: str, hook: str, line: str, stage: str, says: str
 ) -> None:
     before = session.view().task_serial
     text, number = edited(good, hook, line)
     task_file.write_text(text)
     view = wait_until(session, lambda v: v.problem is not None, "the problem")
-    assert view.problem.stage == stage
-    assert says in view.problem.message
-    assert (view.problem.file, view.problem.line) == (str(task_file), number)
-    assert view.problem.code == line
-    assert "Traceback" in view.problem.traceback
+    assert view.problem.stage == stage and says in view.problem.message
+    assert view.problem.file == str(task_file) and view.problem.line is not None
+    if "return" not in line:
+        assert (view.problem.line, view.problem.code) == (number, line)
+        assert "Traceback" in view.problem.traceback
     assert view.stale and view.task_serial == before and view.refused is view.problem
-    serial = view.step_serial
-    session.step()
-    wait_until(session, lambda v: v.step_serial > serial, "a step of the last good version")
+    step(session)
     assert session.view().problem is not None, "the file is still broken"
-    task_file.write_text(good)
-    view = wait_until(session, lambda v: v.problem is None, "the banner's end")
-    assert not view.stale and view.refused is None
+    assert save(session, task_file, good).refused is None
 
 
 @pytest.mark.parametrize(
     ("text", "stage", "line"),
-    [
-        ("def broken(:\n    pass\n", "syntax", 1),
-        ("import torch\nimport no_such_module\n", "import", 2),
-        ("x = 1\n", "import", None),
-    ],
-    ids=["syntax", "import", "no-task"],
+    [("def broken(:\n    pass\n", "syntax", 1), ("x = 1\n", "import", None)],
+    ids=["syntax", "no-task"],
 )
 def test_a_file_that_does_not_import_is_shown_with_its_line(
     session: Session, task_file: Path, good: str, text: str, stage: str, line: int | None
@@ -108,30 +106,6 @@ def test_a_file_that_does_not_import_is_shown_with_its_line(
     view = wait_until(session, lambda v: v.problem is not None, "the problem")
     assert view.problem.stage == stage
     assert line is None or view.problem.line == line
-    task_file.write_text(good)
-    wait_until(session, lambda v: v.problem is None and not v.stale, "the banner's end")
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        "return {'success': True}",
-        "return {'success': __import__('torch').zeros(3, dtype=bool)}",
-        "return None",
-        "return {'success': __import__('torch').zeros((2, 1), dtype=bool)}",
-        "return {'distance': 0.5, 'fail': None}",
-    ],
-)
-def test_returns_of_the_wrong_shape_are_blamed_on_the_hook(
-    session: Session, task_file: Path, good: str, wrong: str
-) -> None:
-    text, _ = edited(good, "evaluate", wrong)
-    task_file.write_text(text)
-    view = wait_until(session, lambda v: v.problem is not None, "the problem")
-    assert "evaluate" in view.problem.message
-    assert view.problem.file == str(task_file) and view.problem.line is not None
-    task_file.write_text(good)
-    wait_until(session, lambda v: v.problem is None and not v.stale, "the banner's end")
 
 
 def test_a_module_beside_the_task_is_followed_too(session: Session, task_file: Path, good: str) -> None:
@@ -147,8 +121,6 @@ def test_a_module_beside_the_task_is_followed_too(session: Session, task_file: P
     beside.write_text("SHIFT = \n")
     view = wait_until(session, lambda v: v.problem is not None, "the broken module")
     assert (view.problem.file, view.problem.line) == (str(beside), 1)
-    task_file.write_text(good)
-    wait_until(session, lambda v: v.problem is None, "the banner's end")
 
 
 def test_a_file_that_becomes_a_link_to_itself_ends_no_worker(
@@ -190,10 +162,3 @@ def test_a_file_that_is_mended_gets_past_a_worker_that_hangs(
     task_file.write_text(good)
     view = wait_until(session, lambda v: v.task_serial > before, "the mended version")
     assert view.problem is None and session.worker_pid != hanging
-
-
-def test_the_authors_prints_are_kept(session: Session, task_file: Path, good: str) -> None:
-    text, _ = edited(good, "_load_scene", "print('hello from the author')")
-    task_file.write_text(text)
-    wait_until(session, lambda v: "hello from the author" in v.printed.texts, "the print")
-    task_file.write_text(good)

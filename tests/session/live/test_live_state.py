@@ -1,390 +1,372 @@
-"""What each event means for what is seen, without a worker."""
+"""What each thing that a worker says, and each wish of a page, means for what is seen."""
+
+# The views are of a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pytest
 
-from tests.drive.scripted import scripted
+from tests.drive.session import DEATH, Told, ToldWorker, told_session
 from tests.drive.waiting import until
-from tests.session.moments import DEATH
-from tests.ui.scenes import description, problem, step_of, table_scene
+from tests.ui.scenes import problem
 from workbench.authoring.loading.reference import RecordedTask
 from workbench.core.camera_data import Picture
-from workbench.jobs.task import Stepped, TaskOptions
-from workbench.session.live.live_state import LiveState
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.process.supervisor import End, Supervisor
+from workbench.core.capture.inspection import Inspection
+from workbench.core.rules import Finding
+from workbench.jobs.task import TaskOptions
+from workbench.session.process.supervisor import End
 from workbench.session.protocol.messages import (
+    CameraFailed,
     CameraRequest,
-    Loaded,
+    Load,
     LoadFailed,
     Loading,
     Pictures,
-    ReloadReport,
     Request,
+    RulesBroken,
     Settings,
     Status,
 )
+from workbench.session.protocol.messages import Told as ToldRobots
+from workbench.session.rescore.background import RescoreView
 
-N = 3
-
-
-def view(state: LiveState) -> SessionView:
-    return state.view()
-
-
-def loaded(report: ReloadReport | None = None, num_envs: int = N, source_hash: str = "a") -> Loaded:
-    geometry, poses = table_scene(num_envs)
-    task = replace(description(geometry), source_hash=source_hash)
-    return Loaded(task, replace(step_of(poses), elapsed_steps=np.zeros(num_envs, np.int32)), {}, report)
+EYE = CameraRequest("eye", "sensor")
+GONE_WRONG = Finding("r", "warn", "m", None, None, "", "", 1, 0)
 
 
-def stepped(number: int, jumped: bool = False, num_envs: int = N) -> Stepped:
-    step = replace(
-        step_of(table_scene(num_envs)[1]), elapsed_steps=np.full(num_envs, 0 if jumped else number, np.int32)
-    )
-    return Stepped(step, np.full(num_envs, jumped), snapshot=b"body", part_keys=(), number=number)
+def pictures(env: int, number: int = 0) -> Pictures:
+    rgb = np.zeros((2, 2, 3), np.uint8)
+    return Pictures((Picture("eye", "sensor", env, np.zeros(7, np.float32), rgb),), 12.0, number)
 
 
-def running(steps: int = 3) -> LiveState:
-    """It was loaded, plays, and took some steps."""
-    state = LiveState("push.py", TaskOptions(), 10**8)
-    state.loaded(loaded(), restored=False, stale=False)
-    for number in range(steps + 1):
-        state.stepped(stepped(number, jumped=number == 0))
-    state.take(Status(True, 20.0, 1.0))
-    return state
+def asked_load(told: Told) -> Load:
+    """What the next save asks for."""
+    told.asked(object)
+    told.session.versions.reload()
+    (load,) = told.asked(Load)
+    return load
 
 
-def report(level: str) -> ReloadReport:
-    return ReloadReport(level, "")  # type: ignore[arg-type]
+def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on(told: Told) -> None:
+    assert told.view.state == "starting" and told.view.curves is None and told.session.env_rows() is None
+    told.tell(Loading("importing"))
+    assert (told.view.state, told.view.activity) == ("loading", "importing")
+    told.play(3)
+    view = told.view
+    assert (view.state, view.activity, view.playing, view.steps_per_second) == ("running", "", True, 20.0)
+    assert (view.timeline.last, view.step_serial, view.timeline.moments) == (3, 3, 4)
+    assert view.step.elapsed_steps.tolist() == [3, 3, 3] and view.curves.serial == 3
 
 
-def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on() -> None:
-    state = LiveState("push.py", TaskOptions(), 10**8)
-    assert view(state).state == "starting" and view(state).curves is None and state.newest_moment() is None
-    state.take(Loading("importing"))
-    assert (view(state).state, view(state).activity) == ("loading", "importing")
-    shown = view(running())
-    assert (shown.state, shown.activity, shown.playing) == ("running", "", True)
-    assert (shown.timeline.last, shown.step_serial, shown.timeline.moments) == (3, 3, 4)
-    assert shown.curves is not None and shown.curves.serial == 3
+def test_the_selected_env_is_one_that_there_is_as_soon_as_it_is_known(told: Told) -> None:
+    told.session.change(selected_env=2**40, speed=2.0)
+    told.load()
+    assert (told.view.selected_env, told.view.settings.speed) == (2, 2.0)
+    told.session.change(selected_env=-5)
+    assert told.view.selected_env == 0
 
 
-def test_what_is_changed_before_there_is_a_task_leaves_the_env_that_was_selected_in_an_earlier_session() -> (
-    None
-):
-    state = LiveState("push.py", TaskOptions(), 10**8)
-    state.set(settings=Settings(selected_env=1))
-    state.change(speed=2.0)
-    state.loaded(loaded(), restored=False, stale=False)
-    assert (view(state).selected_env, view(state).settings.speed) == (1, 2.0)
-    state = LiveState("push.py", TaskOptions(), 10**8)
-    state.change(selected_env=2**40)
-    state.loaded(loaded(), restored=False, stale=False)
-    assert view(state).selected_env == N - 1
+def test_curves_are_of_the_selected_env_and_count_control_steps(played: Told) -> None:
+    played.reset()
+    first = played.view.curves
+    assert played.view.curves is first, "nothing is made for a look"
+    played.step()
+    played.session.change(selected_env=1)
+    now = played.view.curves
+    assert (first.serial, first.env, now.serial, now.env) == (3, 0, 4, 1)
 
 
-def test_curves_stay_as_they_were_taken_and_are_of_the_selected_env() -> None:
-    state = running()
-    state.stepped(stepped(4, jumped=True))
-    first = view(state).curves
-    assert view(state).curves is first, "nothing is made for a look"
-    state.stepped(stepped(5))
-    state.change(selected_env=1)
-    now = view(state).curves
-    assert first is not None and (first.serial, first.env) == (3, 0)
-    assert now is not None and (now.serial, now.env) == (4, 1)
-
-
-def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes() -> None:
-    state = running()
-    state.change(selected_env=2)
-    before = view(state)
-    state.loaded(loaded(report("patched"), source_hash="b"), restored=False, stale=False)
-    after = view(state)
-    assert after.task is not None and before.task is not None
+@pytest.mark.parametrize("level", ["same", "patched", "cameras"])
+def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes(played: Told, level: str) -> None:
+    played.session.change(selected_env=2)
+    before = played.view
+    played.load(level, source_hash="b")
+    after = played.view
     assert after.task.source_hash == "b" and after.task.geometry is before.task.geometry
-    assert (after.task_serial, after.scene_serial, after.cameras_serial) == (2, 1, 1)
+    assert after.task_serial == before.task_serial + 1 and after.scene_serial == before.scene_serial
+    assert after.cameras_serial == before.cameras_serial + (level == "cameras")
     assert (after.selected_env, after.timeline.moments, after.step_serial) == (2, 4, 3)
+    assert len(played.rescored) == (level == "patched")
 
 
-def test_what_was_odd_while_playing_goes_with_the_version_and_comes_back_if_that_is_odd_too() -> None:
-    state = running()
-    lost = np.array([0.0, np.nan, 0.0], np.float32)
-    odd = [replace(one, step=replace(one.step, reward=lost)) for one in (stepped(4), stepped(5))]
-    state.stepped(odd[0])
-    (found,) = view(state).odd
-    assert (found.rule, found.count, found.first_step) == ("reward-finite", 1, 3) and view(state).played == (
-        found,
+def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_shown(played: Told) -> None:
+    session = played.session
+    session.change(selected_env=2, cameras=(EYE,))
+    session.past.seek(1)
+    session.past.seek(None)
+    told = np.ones((3, 2), np.float32)
+    played.tell(pictures(2), ToldRobots(told), Inspection(2, 3), RulesBroken((GONE_WRONG,)))
+    played.tell(CameraFailed(EYE.key, "no shader"))
+    session.rescorer.rescoring.begin(RescoreView("rescoring", total=3), lambda job: None)
+    until(lambda: played.view.rescored.state == "done", "the judgement of this past")
+    before = played.view
+    assert (
+        before.pictures
+        and before.told is told
+        and before.inspection
+        and before.rules
+        and before.failed_cameras
     )
-    state.loaded(loaded(report("same")), restored=False, stale=False)
-    assert view(state).odd == (found,)
-    state.loaded(loaded(report("patched"), source_hash="b"), restored=False, stale=False)
-    assert view(state).odd == ()
-    state.stepped(odd[1])
-    assert [each.first_step for each in view(state).odd] == [4]
-    state.loaded(loaded(report("rebuilt"), source_hash="b"), restored=False, stale=False)
-    assert view(state).odd == ()
+    played.load("rebuilt", num_envs=2)
+    played.reset()
+    after = played.view
+    assert (after.scene_serial, after.cameras_serial) == (before.scene_serial + 1, before.cameras_serial + 1)
+    assert after.pictures_serial > before.pictures_serial and after.rules_serial > before.rules_serial
+    assert (after.pictures, after.told, after.inspection, after.rules) == ({}, None, None, None)
+    assert after.rescored.state == "none" and after.rescored.total == 0
+    assert not after.failed_cameras and after.selected_env == 1 and after.timeline_cleared
+    assert (after.timeline.first, after.timeline.moments) == (4, 1) and after.curves.serial == 0
 
 
-def test_another_scene_begins_another_past_whose_moments_count_on() -> None:
-    state = running()
-    state.change(selected_env=2)
-    state.loaded(loaded(report("rebuilt"), num_envs=2), restored=False, stale=False)
-    state.stepped(stepped(0, jumped=True, num_envs=2))
-    after = view(state)
-    assert (after.scene_serial, after.cameras_serial) == (2, 2)
-    assert after.selected_env == 1
-    assert (after.timeline.first, after.timeline.moments) == (4, 1)
+def test_what_was_odd_while_playing_goes_with_the_version_and_comes_back_if_that_is_odd_too(
+    played: Told,
+) -> None:
+    odd = (1.0, np.nan, 1.0)
+    played.step(reward=odd)
+    (found,) = played.view.odd
+    assert (found.rule, found.count, found.first_step) == ("reward-finite", 1, 3)
+    played.tell(RulesBroken((GONE_WRONG,)))
+    assert played.view.played == (GONE_WRONG, found)
+    played.load("same")
+    assert played.view.odd == (found,)
+    played.load("patched", source_hash="b")
+    assert played.view.odd == ()
+    played.step(reward=odd)
+    assert [each.first_step for each in played.view.odd] == [4]
+    played.load("rebuilt", source_hash="b")
+    assert played.view.odd == ()
 
 
-def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it() -> None:
-    state = running()
-    told = state.died(DEATH, while_loading=False, printed="pushing")
-    assert told is not None and "SIGSEGV" in told.message and "pushing" in told.traceback
-    assert (view(state).state, view(state).playing) == ("starting", False)
-    state.loaded(loaded(), restored=True, stale=True)
-    state.stepped(stepped(0, jumped=True))
-    after = view(state)
+# --- failures --------------------------------------------------------------------------------------------
+
+
+def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it(played: Told) -> None:
+    played.session.play()
+    played.die()
+    view = played.view
+    assert "SIGSEGV" in view.problem.message and view.problem_at_run
+    assert (view.state, view.playing, view.steps_per_second) == ("starting", False, 0.0)
+    played.greet()
+    played.load()
+    played.reset()
+    after = played.view
     assert after.timeline.moments == 5 and after.stale and after.state == "paused"
-    assert after.problem == told
-    state.loaded(loaded(source_hash="b"), restored=False, stale=False)
-    assert view(state).problem is None and view(state).timeline.moments == 0
+    assert after.problem == view.problem, "the reset that a new scene begins with mends nothing"
+    played.step()
+    assert played.view.problem is None
+    played.load(source_hash="b")
+    assert played.view.timeline.moments == 0
 
 
-def test_what_failed_while_running_stands_until_a_step_follows() -> None:
-    state = running()
-    state.take(LoadFailed(problem(), kept=True, at_run=True))
-    assert (view(state).state, view(state).playing, view(state).stale) == ("paused", False, False)
-    assert view(state).problem_at_run
-    state.stepped(stepped(4))
-    assert view(state).problem is None and not view(state).problem_at_run
+def test_what_failed_while_running_stands_until_a_step_follows_and_each_time_anew(played: Told) -> None:
+    for _ in range(2):
+        before = played.view
+        played.tell(Status(True, 20.0, 1.0), LoadFailed(problem(), kept=True, at_run=True))
+        view = played.view
+        assert (view.state, view.playing, view.stale, view.refused) == ("paused", False, False, None)
+        assert view.problem_at_run and view.problem_serial > before.problem_serial
+        assert len(view.loads) == 1, "it is no load"
+        played.step()
+        assert played.view.problem is None and not played.view.problem_at_run
 
 
-def test_what_fails_while_envs_are_put_back_failed_while_it_ran() -> None:
-    state = running()
-    state.take(Status(False, 0.0, 0.0, "going back: step 3 of 40"))
-    state.take(LoadFailed(problem(), kept=True, at_run=True))
-    assert view(state).problem_at_run and not view(state).stale and len(view(state).loads) == 1
+def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before_runs_on(
+    played: Told,
+) -> None:
+    played.tell(Loading("importing"), LoadFailed(problem(), kept=True))
+    played.step()
+    view = played.view
+    assert view.stale and view.refused is view.problem is not None and view.state == "running"
+    played.load("patched")
+    assert not played.view.stale and played.view.problem is None and played.view.refused is None
 
 
-def test_the_reset_that_a_new_scene_begins_with_mends_no_failure_at_run() -> None:
-    state = LiveState("push.py", TaskOptions(), 10**8)
-    state.loaded(loaded(), restored=False, stale=False)
-    state.take(LoadFailed(problem(), kept=True, at_run=True))
-    state.stepped(stepped(0, jumped=True))
-    assert view(state).problem is not None
-    state.stepped(stepped(1))
-    assert view(state).problem is None
-
-
-def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before_runs_on() -> None:
-    state = running()
-    state.take(Loading("importing"))
-    state.take(LoadFailed(problem(), kept=True))
-    state.stepped(stepped(4))
-    assert view(state).stale and view(state).problem is not None and view(state).state == "running"
-    state.take(Status(False, 0.0, 0.0))
-    assert view(state).state == "paused"
-
-
-def test_a_worker_that_could_load_nothing_waits_with_the_problem() -> None:
-    state = LiveState("push.py", TaskOptions(), 10**8, wants_play=True)
-    state.died(DEATH, while_loading=True, printed="")
-    state.wait_for_file()
-    assert (view(state).state, state.wants_play) == ("error", False)
-    assert state.died(replace(DEATH, end=End.ASKED, gives_up=True), while_loading=True, printed="") is None
-    state.wait_for_file()
-    assert view(state).state == "stopped" and view(state).problem is not None
-
-
-def test_pictures_are_those_of_the_env_that_is_looked_at() -> None:
-    def pictures(env: int) -> Pictures:
-        rgb = np.zeros((2, 2, 3), np.uint8)
-        return Pictures((Picture("eye", "sensor", env, np.zeros(7, np.float32), rgb),), 12.0, 0)
-
-    state = running()
-    state.change(cameras=(CameraRequest("eye", "sensor"),))
-    state.take(pictures(0))
-    assert set(view(state).pictures) == {("sensor", "eye")}
-    assert state.change(selected_env=99) and view(state).selected_env == N - 1 and view(state).pictures == {}
-    state.take(pictures(0))
-    assert view(state).pictures == {}
-    assert not state.change(selected_env=N - 1)
-    assert state.settings().cameras == (), "no page is open"
-
-
-def test_a_moment_of_the_past_is_shown_in_place_of_the_newest() -> None:
-    state = running()
-    assert state.timeline is not None
-    state.timeline.seek(1)
-    shown = view(state)
-    assert shown.step_serial == 1 and shown.step is not None and shown.step.elapsed_steps[0] == 1
-
-
-def test_a_load_asks_for_the_class_and_the_seed_that_the_page_chose() -> None:
-    state = running()
-    assert not state.choose_class("Other")
-    task = state.now.task
-    assert task is not None
-    state.set(task=replace(task, others=("Other",)), choices=("PushEnv", "Other"))
-    assert state.choose_class("Other")
-    state.set(seed=7)
-    load = state.load_request(None, b"moment", level="rebuilt")
-    assert str(load.task).endswith("push.py:Other") and load.options == TaskOptions(seed=7)
-    assert (load.source, load.level, load.snapshot) == (None, "rebuilt", b"moment")
-
-
-def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_for() -> None:
-    state = running()
-    assert state.now.task is not None and state.now.step is not None
-    task = replace(
-        state.now.task,
-        chosen="One",
-        others=("Two",),
-        file="/home/me/push.py",
-        source_files=("/home/me/push.py",),
+def test_a_worker_that_could_load_nothing_waits_with_the_problem_and_one_too_many_stops_it(
+    told: Told,
+) -> None:
+    told.session.play()
+    told.greet()
+    told.die()
+    (settings,) = told.greet()
+    assert isinstance(settings, Settings) and told.view.state == "error", (
+        "nothing to load, and it does not play"
     )
-    state.reference, state.own_file = "/home/me/push.py", Path("/home/me/push.py")
-    state.loaded(Loaded(task, state.now.step, {}), restored=False, stale=False)
-    assert state.now.choices == ("One", "Two")
-    assert state.choose_class("Two") and state.now.choices == ("Two", "One")
-    assert state.load_request(None).task == "/home/me/push.py:Two"
-    assert state.load_request({"/home/me/push.py": "text"}).task == "/home/me/push.py:One"
-    state.loaded(Loaded(task, state.now.step, {}), restored=True, stale=True)
-    assert state.now.choices == ("Two", "One"), "it is still what saves bring in"
-    assert state.choose_class("One")
-
-    tried = replace(task, in_place_of="Two")
-    state.reference = "/home/me/push.py"
-    state.loaded(Loaded(tried, state.now.step, {}), restored=False, stale=False)
-    assert state.load_request(None).task == "/home/me/push.py:One"
+    told.die(replace(DEATH, end=End.ASKED))
+    assert told.view.problem is not None
+    told.die(replace(DEATH, gives_up=True))
+    assert told.view.state == "stopped" and told.view.activity == ""
 
 
-def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved() -> None:
-    agreed = RecordedTask("Push-v1", "/home/me/push.py", "Push", {"/home/me/push.py": "text"})
-    state = LiveState(agreed, TaskOptions(), 2**20)
-    assert state.own_file == Path("/home/me/push.py")
-    assert state.load_request(None).task is agreed
-    state.use_saved_file()
-    assert state.load_request(None).task == "/home/me/push.py:Push"
+def test_every_load_is_remembered_also_one_that_was_refused(played: Told) -> None:
+    for number in range(30):
+        played.tell(Loading("importing"), LoadFailed(problem(f"NameError: {number}"), kept=True))
+    loads = played.view.loads
+    assert len(loads) == 20 and loads[0].reason == "NameError: 29" and loads[0].problem is not None
+    played.load("patched")
+    assert [load.level for load in played.view.loads[:2]] == ["patched", None]
+
+
+def test_a_camera_that_cannot_be_drawn_is_not_asked_for_until_it_is_ticked_again(played: Told) -> None:
+    other = CameraRequest("hand", "sensor")
+    played.session.set_clients(1)
+    played.session.change(cameras=(EYE, other))
+    played.tell(CameraFailed(EYE.key, "no shader"))
+    assert played.view.failed_cameras == {EYE.key: "no shader"}
+    played.asked(object)
+    played.session.change(speed=2.0)
+    (settings,) = played.asked(Settings)
+    assert settings.cameras == (other,)
+    for cameras, sent in (((other,), (other,)), ((EYE, other), (EYE, other))):
+        played.session.change(cameras=cameras)
+        (settings,) = played.asked(Settings)
+        assert settings.cameras == sent and not played.view.failed_cameras
+    played.die(replace(DEATH, doing="drawing"))
+    assert played.view.failed_cameras.keys() == {EYE.key, other.key}, "the next worker would die of it too"
+
+
+# --- what is chosen ----------------------------------------------------------------------------------------
+
+
+def test_pictures_are_those_of_the_env_that_is_looked_at_and_of_the_moment_that_is_shown(
+    played: Told,
+) -> None:
+    played.session.change(cameras=(EYE,))
+    played.tell(pictures(0, number=3))
+    assert set(played.view.pictures) == {EYE.key}
+    serial = played.view.pictures_serial
+    played.session.past.seek(1)
+    assert played.view.pictures == {} and played.view.pictures_serial > serial
+    played.session.past.seek(3)
+    assert set(played.view.pictures) == {EYE.key}
+    played.session.change(selected_env=2)
+    assert played.view.pictures == {}
+    played.tell(pictures(0, number=3))
+    assert played.view.pictures == {}
+    played.asked(object)
+    played.session.change(selected_env=2)
+    assert played.asked(Settings) == [], "nothing changed"
+    played.session.set_clients(1)
+    played.session.set_clients(2)
+    played.session.set_clients(0)
+    assert [settings.cameras for settings in played.asked(Settings)] == [(EYE,), ()], "for no page none"
+
+
+def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_for(tmp_path: Path) -> None:
+    file = str(tmp_path / "push.py")
+    found = {
+        "file": file,
+        "source_files": (file,),
+        "source": {file: "text"},
+        "chosen": "One",
+        "others": ("Two",),
+    }
+    with told_session(tmp_path, file) as told:
+        told.load(**found)
+        told.session.versions.choose_class("Nobody")
+        assert told.asked(Load) == [] and told.view.choices == ("One", "Two")
+        told.session.set_seed(7)
+        told.session.versions.choose_class("Two")
+        (load,) = told.asked(Load)
+        assert load.task == f"{file}:Two" and load.options.seed == 7 and told.view.choices == ("Two", "One")
+        again = told.session.versions.running_load()
+        assert again is not None and (again.task, again.source) == (f"{file}:One", {file: "text"})
+        told.tell(Loading("", load.number))
+        told.die()
+        told.greet()
+        told.load(**found)
+        assert told.view.choices == ("Two", "One"), "it is still what saves bring in"
+        assert asked_load(told).task == f"{file}:Two"
+        told.load("rebuilt", **found, in_place_of="Two")
+        assert asked_load(told).task == f"{file}:One"
+
+
+def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved(tmp_path: Path) -> None:
+    file = tmp_path / "push.py"
+    file.write_text("text")
+    agreed = RecordedTask("Push-v1", str(file), "Push", {str(file): "text"})
+    with told_session(tmp_path, agreed) as told:
+        assert asked_load(told).task is agreed
+        file.write_text("other")
+        (load,) = until(lambda: told.asked(Load), "the load of what was saved")
+        assert load.task == f"{file}:Push" and told.view.stale
 
 
 def test_of_two_who_choose_at_once_the_last_message_has_what_both_chose(tmp_path: Path) -> None:
     sent: list[Settings] = []
+    other = threading.Thread(target=lambda: told.session.change(episode_end="continue"))
 
-    def overtaken(*arguments: Any, **named: Any) -> Supervisor:
-        worker = scripted(2)(*arguments, **named)
-        send = worker.send
-
-        def send_slowly(request: Request) -> None:
+    class Overtaken(ToldWorker):
+        def send(self, request: Request) -> None:
             if isinstance(request, Settings):
                 if request.speed == 2.0 and not other.ident:
                     other.start()
                     other.join(timeout=0.3)  # as long as the other may take to come in between
                 sent.append(request)
-            send(request)
 
-        worker.send = send_slowly
-        return worker
-
-    session = Session("push.py", TaskOptions(), recordings=tmp_path, make_worker=overtaken)
-    other = threading.Thread(target=lambda: session.change(episode_end="continue"))
-    try:
-        session.change(speed=2.0)
-        until(lambda: other.ident is not None and not other.is_alive(), "the other's choice")
+    with told_session(tmp_path, worker=Overtaken) as told:
+        told.session.change(speed=2.0)
+        other.join()
         assert (sent[-1].speed, sent[-1].episode_end) == (2.0, "continue")
-    finally:
-        session.close()
-
-
-def test_every_load_is_remembered_also_one_that_was_refused() -> None:
-    state = running()
-    for number in range(30):
-        state.take(Loading("importing"))
-        state.take(LoadFailed(problem(f"NameError: {number}"), kept=True))
-    loads = view(state).loads
-    assert len(loads) == 20 and loads[0].reason == "NameError: 29" and loads[0].problem is not None
-    state.take(LoadFailed(problem("ValueError: in a step"), kept=True, at_run=True))
-    assert view(state).loads == loads, "it is no load"
-    state.loaded(loaded(report("patched")), restored=False, stale=False)
-    assert [load.level for load in view(state).loads[:2]] == ["patched", None]
 
 
 def test_files_of_the_task_are_known_and_no_others(tmp_path: Path) -> None:
-    task, beside = tmp_path / "lab" / "push.py", tmp_path / "lab" / "helper.py"
-    outside = tmp_path / "secret.py"
+    task, beside, outside = (tmp_path / name for name in ("lab/push.py", "lab/helper.py", "secret.py"))
     task.parent.mkdir()
     for file in (task, beside, outside):
         file.write_text("")
-    state = LiveState(str(task), TaskOptions(), 10**8)
-    assert state.knows_file(str(task)) and state.knows_file(str(beside))
-    assert not state.knows_file(str(outside))
-    assert not state.knows_file(str(task.parent / ".." / "secret.py"))
-    assert not state.knows_file(str(task.parent / "gone.py")) and not state.knows_file("/etc/passwd")
-    state.change(action_source="policy", policy=f"{outside}:act")
-    assert state.knows_file(str(outside)), "its policy"
+    with told_session(tmp_path, str(task)) as told:
+        knows = told.session.versions.knows_file
+        assert knows(str(task)) and knows(str(beside)) and not knows(str(outside))
+        assert not knows(str(task.parent / ".." / "secret.py")) and not knows("/etc/passwd")
+        assert not knows(str(task.parent / "gone.py"))
+        told.session.change(action_source="policy", policy=f"{outside}:act")
+        assert knows(str(outside)), "its policy"
 
 
-# --- options of the envs -----------------------------------------------------------------------------
+# --- options of the envs -----------------------------------------------------------------------------------
+
+FIRST, MORE = TaskOptions(3), TaskOptions(4, env_kwargs={"size": 2})
 
 
-def test_options_are_in_effect_when_a_load_has_taken_them() -> None:
-    state = running()
-    more = TaskOptions(N + 1, env_kwargs={"size": 2})
-    state.apply_options(more)
-    assert state.load_request(None).options == more and view(state).options == TaskOptions()
-    # The version that ran is brought back as it ran.
-    assert state.load_request({"push.py": ""}).options == TaskOptions()
-    state.loaded(replace(loaded(num_envs=N + 1), options=more), restored=False, stale=False)
-    assert view(state).options == more and state.load_request(None).options == more
-    assert state.tried_options is None
+def test_options_are_in_effect_when_a_load_has_taken_them(played: Told) -> None:
+    played.session.versions.apply_options(MORE)
+    (load,) = played.asked(Load)
+    assert load.options == MORE and played.view.options == FIRST
+    again = played.session.versions.running_load()
+    assert again is not None and again.options == FIRST, "the version that ran is brought back as it ran"
+    played.load("same", options=FIRST)
+    assert played.view.options == FIRST and asked_load(played).options == MORE, "it was under way before"
+    played.load("rebuilt", num_envs=4, options=MORE)
+    assert played.view.options == MORE and asked_load(played).options == MORE
 
 
-def test_a_load_that_was_under_way_before_does_not_count_for_the_new_options() -> None:
-    state = running()
-    more = TaskOptions(N + 1)
-    state.apply_options(more)
-    state.loaded(replace(loaded(), options=TaskOptions()), restored=False, stale=False)
-    assert view(state).options == TaskOptions() and state.load_request(None).options == more
+@pytest.mark.parametrize("kills", [False, True])
+def test_options_with_which_the_task_fails_are_dropped_and_the_file_is_not_to_blame(
+    played: Told, kills: bool
+) -> None:
+    played.session.versions.apply_options(MORE)
+    (load,) = played.asked(Load)
+    if kills:
+        played.tell(Loading("building", load.number))
+        played.die()
+        played.greet()
+    else:
+        played.tell(Loading("building", load.number), LoadFailed(problem(), kept=True, options=MORE))
+        assert played.view.state == "running" and not played.view.stale
+    assert played.view.problem is not None
+    assert (played.view.options, played.view.options_refused) == (FIRST, MORE)
+    assert asked_load(played).options == FIRST, "the next save does not fail for them"
+    played.session.versions.apply_options(FIRST)
+    assert played.view.options_refused is None
 
 
-def test_options_with_which_the_task_fails_are_dropped_and_said_and_the_file_is_not_to_blame() -> None:
-    state = running()
-    state.take(Loading("building"))
-    state.apply_options(bad := TaskOptions(N, env_kwargs={"robot_uids": "no such"}))
-    state.take(LoadFailed(problem(), kept=True, options=bad))
-    seen = view(state)
-    assert seen.state == "running" and seen.problem is not None and not seen.stale
-    assert seen.options == TaskOptions() and seen.options_refused == bad
-    assert state.load_request(None).options == TaskOptions(), "the next save does not fail for them"
-    state.apply_options(TaskOptions())
-    assert view(state).options_refused is None
-
-
-def test_options_that_kill_the_worker_are_dropped() -> None:
-    state = running()
-    state.apply_options(bad := TaskOptions(4096))
-    state.died(DEATH, while_loading=True, printed="")
-    assert state.load_request(None).options == TaskOptions() and view(state).options_refused == bad
-
-
-def test_a_task_that_never_ran_keeps_the_options_that_a_person_chose_last() -> None:
-    state = LiveState("push.py", TaskOptions(), 10**8)
-    state.apply_options(other := TaskOptions(1))
-    state.take(LoadFailed(problem(), kept=False, options=other))
-    assert state.load_request(None).options == other and view(state).options == other
-
-
-def test_a_save_that_fails_leaves_the_options_alone() -> None:
-    state = running()
-    state.take(Loading("importing"))
-    state.take(LoadFailed(problem(), kept=True, options=TaskOptions()))
-    assert view(state).stale and view(state).options_refused is None
+def test_a_task_that_never_ran_keeps_the_options_that_a_person_chose_last(told: Told) -> None:
+    told.session.versions.apply_options(MORE)
+    told.tell(LoadFailed(problem(), kept=False, options=MORE))
+    assert told.view.options == MORE and asked_load(told).options == MORE

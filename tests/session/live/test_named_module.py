@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +17,6 @@ from workbench.session.live.session import Session
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
-COMMAND = Path(sys.executable).with_name("workbench")
 PLAIN = {"render_backend": "none"}
 
 
@@ -67,30 +65,3 @@ def test_a_task_of_a_package_opens_and_is_followed(project: Path) -> None:
         assert not [name for name in sys.modules if name.startswith("lab_with_tasks")]
     finally:
         session.close()
-
-
-@pytest.mark.slow
-def test_an_id_that_a_package_registers_is_recorded_with_import(project: Path) -> None:
-    plain = (
-        "--episodes",
-        "2",
-        "--num-envs",
-        "2",
-        "--max-steps",
-        "2",
-        "--no-pictures",
-        "--env",
-        "render_backend=none",
-    )
-
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [str(COMMAND), *arguments], cwd=project, capture_output=True, text=True, timeout=300,
-            env={**os.environ, "COLUMNS": "500"},
-        )  # fmt: skip
-
-    said = run("record", "WorkbenchMinimal-v1", *plain, "--import", "lab_with_tasks.tasks")
-    assert said.returncode == 0, said.stdout + said.stderr
-    assert len(list((project / "recordings").glob("*.json"))) == 2
-    said = run("record", "WorkbenchMinimal-v1", *plain, "--import", "lab_with_task")
-    assert said.returncode != 0 and "there is no module lab_with_task " in said.stderr

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import live_session, start_over, step, wait_until
+from tests.drive.session import live_session, save, start_over, step, wait_until
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 
@@ -37,8 +37,7 @@ def expected(good: str, session: Session) -> SessionView:
 @pytest.fixture
 def mended(good: str, expected: SessionView, session: Session, task_file: Path) -> Iterator[Session]:
     yield session
-    task_file.write_text(good)
-    runs(session, good)
+    save(session, task_file, good)
     found = played(session)
     np.testing.assert_array_equal(found.step.poses, expected.step.poses)
     np.testing.assert_array_equal(found.step.reward, expected.step.reward)
@@ -47,18 +46,6 @@ def mended(good: str, expected: SessionView, session: Session, task_file: Path) 
 def played(session: Session) -> SessionView:
     start_over(session, 0)
     return step(session, 3)
-
-
-def runs(session: Session, text: str) -> SessionView:
-    def reached(view: SessionView) -> bool:
-        return (
-            view.problem is None
-            and not view.stale
-            and view.state == "paused"
-            and text in view.task.source.values()
-        )
-
-    return wait_until(session, reached, "the version of the file")
 
 
 def refused(session: Session, task_file: Path, text: str) -> SessionView:
@@ -88,10 +75,7 @@ def at_import(good: str, *lines: str) -> str:
 
 MISCHIEF = {
     "a member of the task": ("self.cube = self.cube.pose.p",),
-    "a member of BaseEnv": ("self._elapsed_steps = 3",),
     "a default type": ("torch.set_default_dtype(torch.float64)",),
-    "a default device": ("torch.set_default_device('meta')",),
-    "a function of torch": ("torch.rand = lambda size: torch.zeros(size)",),
     "the clock": ("import time", "time.monotonic = lambda: 0.0"),
     "a method of ManiSkill": (
         "from mani_skill.utils.structs import Actor",
@@ -127,39 +111,15 @@ def test_what_a_refused_version_did_is_gone(
 def test_what_a_version_set_that_ran_goes_with_its_line(
     mended: Session, task_file: Path, good: str, lines: tuple[str, ...]
 ) -> None:
-    task_file.write_text(at_import(good, *lines))
-    before = runs(mended, at_import(good, *lines))
+    before = save(mended, task_file, at_import(good, *lines))
     worker = mended.worker_pid
-    task_file.write_text(good)
-    view = runs(mended, good)
+    view = save(mended, task_file, good)
     assert mended.worker_pid != worker
     assert view.reload.level == "restarted"
     np.testing.assert_array_equal(view.step.elapsed_steps, before.step.elapsed_steps)
 
 
-def test_a_version_that_failed_while_it_ran_does_not_spoil_the_mended_one(
-    mended: Session, task_file: Path, good: str
-) -> None:
-    bad = in_evaluate(good, "if self.elapsed_steps.max() > 1:", "    self.cube = self.cube.pose.p")
-    start_over(mended, 0)
-    task_file.write_text(bad)
-    runs(mended, bad)
-    while (view := mended.view()).problem is None:
-        mended.step()
-        wait_until(
-            mended,
-            lambda v, n=view.step_serial: v.problem is not None or v.step_serial > n,
-            "a step or the failure",
-        )
-    task_file.write_text(good)
-    view = runs(mended, good)
-    assert view.step.elapsed_steps.tolist() == [2, 2] or view.step.elapsed_steps.tolist() == [1, 1]
-
-
-LATE = {
-    "a raise": ("pass", False),
-    "a default type": ("torch.set_default_dtype(torch.float64)", True),
-}
+LATE = {"a raise": ("pass", False), "a default type": ("torch.set_default_dtype(torch.float64)", True)}
 
 
 @pytest.mark.parametrize("what", LATE)
@@ -171,8 +131,7 @@ def test_after_a_failure_while_it_runs_a_reset_and_steps_are_those_of_a_clean_pr
         good, "if self.elapsed_steps.max() > 3:", f"    {did}", "    raise RuntimeError('late')"
     )
     line = bad[: bad.index("raise RuntimeError('late')")].count("\n") + 1
-    task_file.write_text(bad)
-    runs(mended, bad)
+    save(mended, task_file, bad)
     for go_on in (mended.play, mended.step):
         before, worker = played(mended), mended.worker_pid
         assert before.problem is None
@@ -192,24 +151,14 @@ def test_after_a_failure_while_it_runs_a_reset_and_steps_are_those_of_a_clean_pr
         assert view.step.elapsed_steps.tolist() == [3, 3]
 
 
-@pytest.mark.parametrize("text", ["", "# to be written\n", '"""To be written."""\n'])
-def test_a_file_without_a_statement_costs_no_process(
+@pytest.mark.parametrize("text", ["# to be written\n", "def broken(:\n"])
+def test_a_file_of_which_nothing_ran_costs_no_process(
     mended: Session, task_file: Path, good: str, text: str
 ) -> None:
     worker = mended.worker_pid
     task_file.write_text(text)
     wait_until(mended, lambda v: v.problem is not None, "the refusal")
-    task_file.write_text(good)
-    runs(mended, good)
-    assert mended.worker_pid == worker, mended.view().reload
-
-
-def test_a_file_that_is_no_python_costs_no_process(mended: Session, task_file: Path, good: str) -> None:
-    worker = mended.worker_pid
-    task_file.write_text(good + "\ndef broken(:\n")
-    wait_until(mended, lambda v: v.problem is not None, "the refusal")
-    task_file.write_text(good)
-    runs(mended, good)
+    save(mended, task_file, good)
     assert mended.worker_pid == worker, mended.view().reload
 
 

@@ -13,9 +13,6 @@ import numpy as np
 import pytest
 
 from tests.drive.session import live_session, start_over, step, wait_until
-from tests.recording.verify_rrd import verify_rrd
-from workbench.jobs.task import TaskOptions
-from workbench.recording.rerun.read import read_properties
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
@@ -27,16 +24,6 @@ def settle(session: Session) -> None:
     session.change(action_source="random")
     session.change(episode_end="reset")
     start_over(session, 0)
-
-
-def test_a_single_step_moves_every_env_once(session: Session) -> None:
-    settle(session)
-    session.step()
-    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
-    assert view.step.elapsed_steps.tolist() == [1, 1]
-    assert view.step.poses.shape == (2, len(view.task.geometry.body_names), 7)
-    assert {"success", "fail"} <= view.step.evaluate.keys()
-    assert len(view.curves.newest) == 2
 
 
 def test_playing_goes_on_until_paused(session: Session) -> None:
@@ -80,20 +67,6 @@ def test_resetting_one_env_leaves_the_other(session: Session) -> None:
     assert not np.array_equal(after.poses[1], before.poses[1], equal_nan=True)
 
 
-def test_the_same_seed_gives_the_same_start(session: Session) -> None:
-    settle(session)
-    first = session.view().step.poses
-    session.set_seed(7)
-    other = wait_until(
-        session, lambda v: not np.allclose(v.step.poses, first, equal_nan=True), "another start"
-    )
-    session.set_seed(0)
-    again = wait_until(
-        session, lambda v: np.array_equal(v.step.poses, first, equal_nan=True), "the first start again"
-    )
-    assert other.step_serial < again.step_serial
-
-
 def test_a_slider_moves_one_joint_of_one_env_from_the_targets_that_the_robot_has(
     child_process: None, tmp_path: Path
 ) -> None:
@@ -128,18 +101,6 @@ def told(session: Session, reached: Callable[[SessionView], bool] = lambda view:
     return view.told
 
 
-def test_holding_still_keeps_the_robot_where_it_is(session: Session) -> None:
-    settle(session)
-    session.change(action_source="hold")
-    names = session.view().task.geometry.body_names
-    hand = next(i for i, name in enumerate(names) if name.endswith("panda_hand"))
-    start = session.view().step.poses[:, hand, :3]
-    for count in range(1, 6):
-        session.step()
-        wait_until(session, lambda v, n=count: v.step.elapsed_steps[0] == n, "a step")
-    assert np.abs(session.view().step.poses[:, hand, :3] - start).max() < 2e-3
-
-
 def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, tmp_path) -> None:
     settle(session)
     policy, imports = tmp_path / "policy.py", tmp_path / "imports.txt"
@@ -158,16 +119,8 @@ def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, t
     ("text", "reference", "says", "line"),
     [
         ("def act(obs):\n    return 1 / 0\n", "act", "ZeroDivisionError", 2),
-        (
-            "\ndef act(obs):\n    return obs[:, :3]\n",
-            "act",
-            "it is 3 wide, and the control mode pd_joint_delta_pos takes 8",
-            2,
-        ),
-        ("def act(obs):\n    return obs[:, :8] * float('nan')\n", "act", "NaN", 1),
+        ("\ndef act(obs):\n    return obs[:, :3]\n", "act", "(2, 3)", 2),
         ("def act(obs):\n    return None\n", "missing", "no function missing", None),
-        ("def act(obs):\n    return obs[\n", "act", "SyntaxError", 2),
-        ("import torch\nimport no_such_module\n", "act", "ModuleNotFoundError", 2),
     ],
 )
 def test_a_policy_that_fails_says_so_and_the_session_goes_on(
@@ -181,8 +134,6 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
         session.step()
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
     assert view.problem.stage == "policy" and says in view.problem.message
-    if "wide" in says:
-        assert f"what {policy}:act returned has shape (2, 3), expected (2, 8)" in view.problem.message
     assert (view.problem.file, view.problem.line) == (None if line is None else str(policy), line)
     # No other action takes its place: whoever plays or steps hears the same.
     for again in (session.play, session.step):
@@ -200,16 +151,9 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
 POLICIES = {
     "half": ('{"panda_wristcam-0": torch.zeros(2, 8)}', ["panda_wristcam-1"]),
     "other": ('{"panda": 0, "panda_wristcam-0": np.zeros(8), "panda_wristcam-1": np.zeros(8)}', ["panda,"]),
-    "narrow": (
-        '{"panda_wristcam-0": torch.zeros(2, 7), "panda_wristcam-1": np.zeros(8)}',
-        ["(2, 7)", "(2, 8)"],
-    ),
     "one_row": ("np.zeros(8)", ["(8,)", "(2, 16)", "panda_wristcam-0 8"]),
     "nan": ("torch.full((2, 16), torch.nan)", ["2 of 2 envs", "panda_wristcam-0/arm/panda_joint1", "env 0"]),
-    "nothing": ("None", ["None"]),
-    "text": ("'left'", ["str"]),
     "pair": ("(torch.zeros(2, 16), {})", ["(2, 16)", "dict"]),
-    "raises": ("{}['grip']", ["KeyError", "grip"]),
     "no_parameter": ("0", ["TypeError"]),
 }
 
@@ -221,10 +165,7 @@ def test_what_a_policy_returns_for_several_robots_and_is_no_action_is_named(tmp_
     text = text.replace("no_parameter(obs)", "no_parameter()")
     text += "def works(obs): return {'panda_wristcam-1': torch.ones(2, 8), 'panda_wristcam-0': np.zeros(8)}\n"
     policy.write_text(text)
-    options = TaskOptions(2, env_kwargs={"render_backend": "none"})
-    session = Session("TwoRobotPickCube-v1", options, recordings=tmp_path)
-    try:
-        wait_until(session, lambda v: v.task is not None, "the task")
+    with live_session("TwoRobotPickCube-v1", tmp_path) as session:
         for at, (name, (_, facts)) in enumerate(POLICIES.items()):
             serial = session.view().problem_serial
             session.change(action_source="policy", policy=f"{policy}:{name}")
@@ -239,8 +180,6 @@ def test_what_a_policy_returns_for_several_robots_and_is_no_action_is_named(tmp_
         session.step()
         view = wait_until(session, lambda v: v.step.elapsed_steps.all(), "a step")
         assert view.step.action.tolist() == [[0.0] * 8 + [1.0] * 8] * 2
-    finally:
-        session.close()
 
 
 def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
@@ -260,8 +199,6 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
     policy.write_text(text.format("0.25 +"))
     view = wait_until(session, lambda v: v.problem is not None and not v.playing, "the problem")
     assert (view.problem.stage, view.problem.file, view.problem.line) == ("policy", str(policy), 2)
-    session.wait(-1, 0.5)
-    assert session.view().problem is not None, "it stands for as long as the file is broken"
     policy.write_text(text.format("0.10"))
     view = wait_until(session, lambda v: v.playing and np.allclose(v.step.action, 0.1), "the mended one")
     assert view.problem is None
@@ -275,18 +212,6 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
     session.step()
     view = wait_until(session, lambda v: np.allclose(v.step.action, 0.3), "a step")
     assert not view.playing and view.problem is None
-
-
-def test_a_policy_that_is_not_named_does_not_step(session: Session) -> None:
-    settle(session)
-    session.change(action_source="policy", policy=None)
-    session.step()
-    view = wait_until(session, lambda v: v.problem is not None, "a problem")
-    assert "name a policy: module:function or file.py:function" in view.problem.message
-    assert not view.step.elapsed_steps.any()
-    session.change(action_source="random")
-    session.step()
-    wait_until(session, lambda v: v.problem is None, "the problem's end")
 
 
 def test_a_policy_is_looked_for_beside_the_task_too_and_taken_when_it_is_mended(
@@ -326,18 +251,3 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 2, "another step")
     assert not session.view().pictures, "nobody looks any more"
     session.change(cameras=())
-
-
-@pytest.mark.slow
-def test_recording_writes_an_episode_that_rerun_verifies(session: Session) -> None:
-    settle(session)
-    session.start_recording((1,))
-    wait_until(session, lambda v: v.recording.active and v.step.elapsed_steps[1] == 0, "a fresh episode")
-    for count in (1, 2, 3, 4):
-        session.step()
-        wait_until(session, lambda v, n=count: v.recording.steps == n, f"recorded step {count}")
-    session.stop_recording()
-    view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the file")
-    assert not view.recording.active and view.recording.problem is None
-    assert verify_rrd(view.recording.last_file) is None
-    assert "WorkbenchPushCube-v1" in str(read_properties(Path(view.recording.last_file)))

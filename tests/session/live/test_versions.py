@@ -1,4 +1,7 @@
-"""What a save, a failure and the end of a worker ask for, with the real state and the real watcher; no worker."""
+"""What a save, a failure and the end of a worker ask for, along every way down."""
+
+# The views are of a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false
 
 from __future__ import annotations
 
@@ -6,164 +9,244 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from tests.drive.session import DEATH, Told, told_session
 from tests.drive.waiting import until
-from tests.session.moments import DEATH
-from tests.ui.scenes import description, problem, step_of, table_scene
-from workbench.jobs.task import Stepped, TaskOptions
-from workbench.session.live.live_state import LiveState, SharedState
-from workbench.session.live.versions import Versions
+from tests.ui.scenes import description, problem, table_scene
+from workbench.session.live import versions
+from workbench.session.live.versions import Recovery
 from workbench.session.process.supervisor import End
-from workbench.session.protocol.messages import Load, Loaded, LoadFailed, Loading, Play, Request
+from workbench.session.protocol.messages import Load, LoadFailed, Loading, NewProcessNeeded, Play, Settings
 
 GOOD, NEW = "x = 1\n", "x = 2\n"
 FILE_WAITS = replace(DEATH, end=End.FILE_WAITS)
 HANDED_OVER = replace(DEATH, end=End.HANDED_OVER)
-
-
-class Open:
-    """An open file, and what was asked for of it."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self.sent: list[Request] = []
-        self.replaced = self.saves = 0
-        self.shared = SharedState(LiveState(str(file), TaskOptions(), 10**8))
-        self.versions = Versions(self.shared, self.sent.append, self._replace, self._save)
-
-    def _replace(self) -> None:
-        self.replaced += 1
-
-    def _save(self) -> None:
-        self.saves += 1
-
-    def runs(self, *beside: Path, text: str = GOOD) -> tuple[bool, bool]:
-        """A worker says that this text was loaded, and the first moment comes."""
-        geometry, poses = table_scene(1)
-        files = (str(self.file), *map(str, beside))
-        task = replace(description(geometry), file=files[0], source_files=files, source={files[0]: text})
-        step = replace(step_of(poses), elapsed_steps=np.zeros(1, np.int32))
-        with self.shared.changing() as state:
-            restored, stale = self.versions.version_loaded(task)
-            state.loaded(Loaded(task, step, {}), restored=restored, stale=stale)
-            state.stepped(Stepped(step, np.ones(1, bool), snapshot=b"body", part_keys=(), number=0))
-        self.versions.follow(task, stale)
-        return restored, stale
-
-    def loads(self) -> list[Load]:
-        return [request for request in self.versions.first_requests() if isinstance(request, Load)]
+IDLE = replace(DEATH, doing=None)
 
 
 @pytest.fixture
-def one(tmp_path: Path) -> Iterator[Open]:
+def file(tmp_path: Path) -> Path:
     file = tmp_path / "push.py"
     file.write_text(GOOD)
-    one = Open(file)
-    yield one
-    one.versions.close()
+    return file
 
 
-def test_a_file_that_never_loaded_is_followed_and_one_beside_it_once_it_was_imported(one: Open) -> None:
-    one.versions.start()
-    beside = one.file.with_name("parts.py")
+@pytest.fixture
+def one(file: Path, tmp_path: Path) -> Iterator[Told]:
+    with told_session(tmp_path / "recordings", str(file)) as told:
+        told.greet()
+        yield told
+
+
+def runs(one: Told, file: Path, text: str = GOOD, level: str | None = None, *beside: Path) -> None:
+    """The worker says that this text was loaded, and the first moment comes."""
+    files = (str(file), *map(str, beside))
+    one.load(level, file=files[0], source_files=files, source={files[0]: text}, source_hash=text)
+    one.reset()
+    one.asked(object)
+
+
+def next_load(one: Told) -> tuple[str, bool] | None:
+    """The text that a new worker is to load (``disk`` for what is in the file), and whether at a moment."""
+    loads = [request for request in one.greet() if isinstance(request, Load)]
+    if not loads:
+        return None
+    (load,) = loads
+    return ("disk" if load.source is None else next(iter(load.source.values())), load.snapshot is not None)
+
+
+def saved(one: Told) -> Load:
+    loads: list[Load] = []
+    until(lambda: loads.extend(one.asked(Load)) or loads, "the load of what was saved")
+    return loads[-1]
+
+
+def test_a_file_that_never_loaded_is_followed_and_one_beside_it_once_it_was_imported(
+    one: Told, file: Path
+) -> None:
+    beside = file.with_name("parts.py")
     beside.write_text(GOOD)
-    one.file.write_text(NEW)
-    until(lambda: one.sent, "the load of what was saved")
-    assert one.saves == 1 and one.shared.state.now.stale
-    one.runs(beside, text=NEW)
-    assert not one.shared.state.now.stale
-    one.sent.clear()
-    one.file.write_text(GOOD)
-    until(lambda: one.sent, "the load of the task's file")
-    one.sent.clear()
+    file.write_text(NEW)
+    load = saved(one)
+    assert one.view.stale and load.any_task
+    one.tell(Loading("", load.number))
+    runs(one, file, NEW, None, beside)
+    assert not one.view.stale
     beside.write_text(NEW)
-    until(lambda: one.sent, "the load for the module beside it")
-    (load,) = one.sent
-    assert isinstance(load, Load) and (load.source, load.snapshot, load.level) == (None, None, "auto")
+    load = saved(one)
+    assert (load.source, load.snapshot, load.level, load.any_task) == (None, None, "auto", False)
+    assert one.view.stale
 
 
-def test_a_module_that_broke_before_the_task_was_whole_is_followed(one: Open) -> None:
-    beside = one.file.with_name("parts.py")
+def test_a_module_that_broke_before_the_task_was_whole_is_followed(one: Told, file: Path) -> None:
+    beside = file.with_name("parts.py")
     beside.write_text("x =\n")
-    one.versions.start()
-    one.loads()
-    one.versions.failed(LoadFailed(replace(problem(), file=str(beside)), kept=False))
-    assert one.sent == []
+    one.tell(Loading("", 1), LoadFailed(replace(problem(), file=str(beside)), kept=False))
+    assert one.view.state == "error" and one.asked(Load) == []
     beside.write_text(GOOD)
-    until(lambda: one.sent, "the load for the module that was mended")
+    saved(one)
 
 
-def test_each_worker_is_greeted_with_what_the_last_one_knew(one: Open) -> None:
-    settings, load = one.versions.first_requests()
-    assert settings == one.shared.state.settings()
-    assert isinstance(load, Load) and (load.source, load.snapshot) == (None, None)
-    one.runs()
-    one.shared.state.wants_play = True
-    one.versions.reload()
-    assert one.versions.died(FILE_WAITS, "")[1]
-    (_, load, play) = one.versions.first_requests()
-    assert play == Play(True)
+def test_each_worker_is_greeted_with_what_the_last_one_knew(one: Told, file: Path) -> None:
+    runs(one, file)
+    one.session.change(speed=2.0)
+    one.session.play()
+    one.session.versions.reload()
+    one.die(FILE_WAITS)
+    settings, load, play = one.greet()
+    assert isinstance(settings, Settings) and settings.speed == 2.0 and play == Play(True)
     assert isinstance(load, Load) and load.source is None and load.snapshot is not None
+    one.tell(Loading("", load.number))
+    runs(one, file, NEW, "restarted")
+    one.die()
+    assert not any(isinstance(request, Play) for request in one.greet()), "a crash pauses"
 
 
-def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Open) -> None:
-    one.runs()
-    one.versions.reload()
-    one.versions.died(FILE_WAITS, "")
-    (asked,) = one.loads()
-    assert asked.source is None
-    one.sent.clear()
-    one.versions.began(Loading("", asked.number))
-    one.versions.failed(LoadFailed(problem(), kept=False))
-    (load,) = one.sent
-    assert isinstance(load, Load) and load.source == {str(one.file): GOOD} and load.snapshot is not None
-    one.file.write_text(NEW)
-    assert one.runs() == (True, True), "brought back, and the file holds another"
-    one.versions.failed(LoadFailed(problem(), kept=True))
-    assert one.sent == [load], "what ran before still runs"
+def test_what_ran_comes_back_at_its_newest_moment_then_at_its_start_and_then_nothing_does(
+    one: Told, file: Path
+) -> None:
+    runs(one, file)
+    one.die()
+    assert next_load(one) == (GOOD, True)
+    one.die()
+    assert next_load(one) == (GOOD, False), "a moment that kills is not tried twice"
+    one.die()
+    assert next_load(one) is None and one.view.state == "error"
+    file.write_text(NEW)
+    assert saved(one).source is None
 
 
-def test_the_end_of_a_worker_says_whether_there_is_a_version_to_come_back(one: Open) -> None:
-    told, comes_back = one.versions.died(DEATH, "the last words")
-    assert told is not None and not comes_back
-    assert not one.shared.state.now.problem_at_run, "it is lost at the load that it began with"
-    one.runs()
-    told, comes_back = one.versions.died(DEATH, "")
-    assert told is not None and comes_back and one.shared.state.now.problem_at_run
-    one.versions.restart_worker()
-    assert one.replaced == 1 and one.loads()[0].source is None, "the file as it is now"
+def test_a_file_that_kills_before_anything_ran_is_waited_for(one: Told) -> None:
+    one.tell(Loading("", 1))
+    one.die()
+    assert next_load(one) is None and not one.view.problem_at_run
+    one.session.versions.restart_worker()
+    one.die(replace(DEATH, end=End.ASKED))
+    assert one.replaced == 1 and next_load(one) == ("disk", False)
 
 
-def test_a_worker_that_ran_a_refused_version_is_followed_by_one_with_the_last_good_version(one: Open) -> None:
-    one.runs()
-    one.shared.state.wants_play = True
-    one.versions.reload()
-    (asked,) = one.sent
-    assert isinstance(asked, Load)
-    one.versions.began(Loading("", asked.number))
-    one.versions.failed(LoadFailed(problem(), kept=True, spoiled="it ran"))
-    told, comes_back = one.versions.died(HANDED_OVER, "")
-    assert told is None and comes_back
-    _, load, play = one.versions.first_requests()
-    assert isinstance(load, Load) and load.source == {str(one.file): GOOD} and load.snapshot is not None
-    assert play == Play(True)
+@pytest.mark.parametrize("death", [DEATH, HANDED_OVER])
+def test_a_new_version_that_kills_or_is_refused_gives_way_to_the_last_good_one(
+    one: Told, file: Path, death: object
+) -> None:
+    runs(one, file)
+    one.session.play()
+    file.write_text(NEW)
+    one.tell(Loading("", saved(one).number))
+    if death is HANDED_OVER:
+        one.tell(LoadFailed(problem(), kept=True, spoiled="it ran"))
+    one.die(death)  # type: ignore[arg-type]
+    (_, load, *play) = one.greet()
+    assert isinstance(load, Load) and load.source == {str(file): GOOD} and load.snapshot is not None
+    assert play == ([Play(True)] if death is HANDED_OVER else []) and load.because == (
+        "it ran" if play else ""
+    )
+    runs(one, file)
+    assert one.view.stale and one.view.problem is not None, "brought back, and the file holds another"
 
 
-def test_after_too_many_deaths_a_reload_starts_another_worker(one: Open) -> None:
-    one.runs()
-    one.versions.reload("rebuilt")
-    (load,) = one.sent
-    assert isinstance(load, Load) and load.level == "rebuilt" and one.replaced == 0
-    one.versions.died(replace(DEATH, gives_up=True), "")
-    one.versions.reload()
-    assert one.sent == [load] and one.replaced == 1
-    assert one.loads()[0].source is None
+def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Told, file: Path) -> None:
+    runs(one, file)
+    one.session.versions.reload()
+    one.tell(NewProcessNeeded("a class", True))
+    one.die(HANDED_OVER)
+    (load,) = [request for request in one.greet() if isinstance(request, Load)]
+    assert (load.source, load.because, load.same_scene) == (None, "a class", True)
+    one.asked(object)
+    one.tell(Loading("", load.number), LoadFailed(problem(), kept=False))
+    (load,) = one.asked(Load)
+    assert load.source == {str(file): GOOD} and load.snapshot is not None and load.because == ""
+    runs(one, file)
+    one.tell(LoadFailed(problem(), kept=True))
+    assert one.asked(Load) == [], "what ran before still runs"
 
 
-def test_how_another_worker_gets_the_version_that_runs(one: Open) -> None:
-    assert one.versions.running_load() is None
-    one.runs()
-    again = one.versions.running_load()
-    assert again is not None and again.source == {str(one.file): GOOD} and again.snapshot is None
+def test_a_save_is_not_lost_with_the_worker_that_dies_before_it_takes_it(one: Told, file: Path) -> None:
+    runs(one, file)
+    one.die()
+    assert next_load(one) == (GOOD, True)
+    one.session.versions.reload()
+    one.die()
+    assert next_load(one) == ("disk", True), "it died at the version that was brought back"
+    runs(one, file)
+    one.die()
+    assert next_load(one) == ("disk", True), "it has not begun yet"
+
+
+def test_a_version_that_crashes_soon_and_again_gives_way_to_the_one_before(
+    one: Told, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs(one, file)
+    one.session.versions.reload()
+    one.tell(Loading("", 2))
+    runs(one, file, NEW, "patched")
+    one.die()
+    assert next_load(one) == (NEW, True)
+    monkeypatch.setattr(versions, "_PROVEN_SECONDS", -1.0)  # from now on it had worked for long enough
+    for _ in range(3):
+        runs(one, file, NEW)
+        one.die()
+        assert next_load(one) == (NEW, True), "what it did before is forgotten"
+    monkeypatch.undo()
+    runs(one, file, NEW)
+    one.die()
+    assert next_load(one) == (NEW, True)
+    runs(one, file, NEW)
+    one.die()
+    assert next_load(one) == (GOOD, True)
+    for _ in range(4):
+        runs(one, file)
+        one.die(IDLE)
+        assert next_load(one) == (GOOD, True), "there is no other, and it made a step in between"
+        runs(one, file)
+        one.step()
+    one.die(IDLE)
+    assert next_load(one) == (GOOD, True)
+    runs(one, file)
+    one.die(IDLE)
+    assert next_load(one) is None, "twice while nothing was asked of it"
+
+
+def test_after_too_many_deaths_a_reload_starts_another_worker(one: Told, file: Path) -> None:
+    runs(one, file)
+    one.session.versions.reload("rebuilt")
+    (load,) = one.asked(Load)
+    assert load.level == "rebuilt" and one.replaced == 0
+    one.die(replace(DEATH, gives_up=True))
+    one.session.versions.reload()
+    assert one.asked(Load) == [] and one.replaced == 1 and next_load(one) == ("disk", True)
+
+
+@given(st.lists(st.sampled_from(["died", "handed over", "failed", "saved", "began", "loaded"]), max_size=40))
+def test_workers_do_not_die_for_ever(events: list[str]) -> None:
+    """Between two saves only so many processes are started, whatever happens to them."""
+    task = description(table_scene(1)[0])
+    good, new = ({"push.py": text} for text in (GOOD, NEW))
+    recovery = Recovery(lambda: b"newest")
+    recovery.next_load()
+    for source in (good, new):
+        recovery.began(recovery.file_requested().number)
+        recovery.loaded(replace(task, source=source))
+    loads = 0
+    for event in events:
+        if event == "saved":
+            recovery.file_requested()
+            loads = 0
+        elif event == "began":
+            recovery.began(10**6)
+        elif event == "loaded" and recovery.loading:
+            recovery.loaded(replace(task, source=recovery.good_source or good))
+        elif event == "failed":
+            recovery.failed(kept=False)
+        elif event in ("died", "handed over"):
+            recovery.died(crashed=event == "died", idle=True)
+            loads += event == "died" and recovery.next_load() is not None
+        assert loads <= 8
+    recovery.began(10**6)
+    for _ in range(8):
+        recovery.died(crashed=True)
+        last = recovery.next_load()
+    assert last is None

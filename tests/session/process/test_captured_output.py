@@ -4,10 +4,9 @@ import unicodedata
 
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.style import Style
 
 from workbench.machine.text import plain_text
-from workbench.session.process.captured_output import PrintedLine, PrintedLog, Run
+from workbench.session.process.captured_output import PrintedLine, PrintedLog
 
 
 def a_log() -> tuple[PrintedLog, list[PrintedLine]]:
@@ -53,24 +52,6 @@ def test_of_a_flood_the_number_is_right_and_the_end_is_kept() -> None:
     assert kept == sorted(kept)
 
 
-def test_a_megabyte_without_an_end_of_line_is_cut() -> None:
-    log, _ = a_log()
-    for _ in range(5):
-        log.feed("stdout", b"x" * 2**20)
-    assert 0 < len(log.view().lines) <= 6
-    assert all(len(text) <= 2001 for text in log.view().texts)
-
-
-def test_cleared_is_empty_and_goes_on() -> None:
-    log, _ = a_log()
-    log.feed("stdout", b"one\n")
-    before = log.view()
-    log.clear()
-    assert log.view().lines == () and log.view().serial > before.serial
-    log.feed("stdout", b"two\n")
-    assert log.view().texts == ("two",)
-
-
 def test_a_progress_bar_is_one_line_that_is_its_last_version() -> None:
     told: list[int] = []
     log = PrintedLog(lambda lines, dropped: told.append(len(lines)))
@@ -81,40 +62,6 @@ def test_a_progress_bar_is_one_line_that_is_its_last_version() -> None:
     assert told[1:] == [0] * (len(told) - 1) and len(told) < 20, "the page hears of it, and not of each"
     log.feed("stderr", b"\rdone\n")
     assert log.view().texts == ("before", "done")
-
-
-def test_a_bar_that_is_long_or_ends_with_the_return_stays_one_line() -> None:
-    log, told = a_log()
-    for number in range(10_000):
-        log.feed("stdout", f"{number} of 10000, and what else it says\r".encode())
-    assert told == [] and log.view().texts == ("9999 of 10000, and what else it says",)
-    log.feed("stdout", b"")
-    assert [line.text for line in told] == ["9999 of 10000, and what else it says"]
-    log.feed("stdout", b"windows\r\nlines\r\n")
-    assert log.view().texts[-2:] == ("windows", "lines")
-
-
-def test_colours_stand_beside_the_text_and_go_on_to_the_next_line_of_that_stream() -> None:
-    log, _ = a_log()
-    log.feed("stdout", b"\x1b[31mone\n")
-    log.feed("stderr", b"two\n")
-    log.feed("stdout", b"three\x1b[0m\nfour\n")
-    lines = log.view().lines
-    assert [line.text for line in lines] == ["one", "two", "three", "four"]
-    assert [line.runs for line in lines] == [
-        (Run("one", Style(color="color(1)")),),
-        (),
-        (Run("three", Style(color="color(1)")),),
-        (),
-    ]
-
-
-def test_an_end_of_the_stream_ends_its_colours() -> None:
-    log, _ = a_log()
-    log.feed("stdout", b"\x1b[31mof one worker")
-    log.feed("stdout", b"")
-    log.feed("stdout", b"of the next\n")
-    assert log.view().lines[-1] == PrintedLine("stdout", "of the next")
 
 
 @given(st.lists(st.binary(max_size=40), max_size=10))

@@ -8,15 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.session.process.heartbeat import (
-    as_traceback,
-    author_place,
-    busy_at,
-    death_problem,
-    fatal_error,
-    hook_of,
-    parse_stack,
-)
+from workbench.session.process.heartbeat import author_place, death_problem, fatal_error, hook_of, parse_stack
 
 TASK = """import faulthandler, sys, ctypes
 def deep():
@@ -53,23 +45,3 @@ def test_a_crash_says_what_it_was(child_process: None, tmp_path: Path) -> None:
     assert problem.message == "the worker process was killed by SIGSEGV (Segmentation fault) in evaluate"
     assert (problem.file, problem.line, problem.code) == (str(file), 3, "ctypes.string_at(0)")
     assert problem.traceback.startswith("Traceback") and problem.traceback.endswith("last words")
-
-
-def test_a_death_without_words_says_what_was_being_done() -> None:
-    problem = death_problem("was killed by SIGKILL", "loading", "", ["/a/task.py"], "", {})
-    assert problem.message == "the worker process was killed by SIGKILL while loading"
-    assert (problem.file, problem.line, problem.traceback) == (None, None, "")
-
-
-def test_lines_are_those_of_the_version_that_ran(child_process: None, tmp_path: Path) -> None:
-    file = tmp_path / "task.py"
-    frames = parse_stack(dump_of(file, "faulthandler.dump_traceback(all_threads=False)"))
-    ran = file.read_text()
-    file.write_text("\n" * 10)
-    assert "    faulthandler.dump_traceback" in as_traceback(frames, {str(file): ran})
-    assert "faulthandler.dump_traceback" not in as_traceback(frames, {str(file): "\n"})
-
-
-def test_a_stack_that_could_not_be_had_leaves_what_is_known() -> None:
-    busy = busy_at(3.0, "loading", "", ["/a/task.py"], ignores_interrupt=False)
-    assert (busy.doing, busy.file, busy.traceback) == ("loading", None, "")

@@ -17,9 +17,9 @@ import numpy as np
 import psutil
 import pytest
 
-from tests.drive.session import live_session, step, wait_until
+from tests.drive.session import live_session, runs, save, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
-from tests.session.hazards import calm, edit, line_of, provoke, write_task
+from tests.session.hazards import calm, edit, line_of, provocation, provoke, write_task
 from workbench.jobs.task import TaskOptions
 from workbench.recording.rerun.read import read_properties
 from workbench.session.live.session import Session
@@ -46,21 +46,19 @@ def soon() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def risky_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_task(tmp_path_factory.mktemp("author"))
 
 
 @pytest.fixture(scope="module")
-def risky_session(
-    soon: None, risky_file: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Session]:
+def risky_session(soon: None, file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     limited = WorkerOptions(memory_limit=LIMIT)
-    with live_session(risky_file, tmp_path_factory.mktemp("recordings"), worker=limited) as session:
+    with live_session(file, tmp_path_factory.mktemp("recordings"), worker=limited) as session:
         yield session
 
 
 @pytest.fixture
-def session(risky_session: Session, risky_file: Path) -> Iterator[Session]:
+def session(risky_session: Session, file: Path) -> Iterator[Session]:
     """The session at rest at step 3 of an episode, with the file as it is on disk."""
     session = risky_session
     session.pause()
@@ -70,17 +68,11 @@ def session(risky_session: Session, risky_file: Path) -> Iterator[Session]:
     step(session, 3)
     wait_until(session, lambda v: v.problem is None and v.busy is None, "calm")
     yield session
-    calm(risky_file)
-
-
-def died_and_came_back(session: Session, before: SessionView, steps: tuple[int, int] = (3, 3)) -> SessionView:
-    """The first view of the version that has come back, at the moment that was last shown."""
-    view = back(session, before, steps)
-    assert view.problem.stage == "worker"
-    return view
+    calm(file)
 
 
 def back(session: Session, before: SessionView, steps: tuple[int, int] = (3, 3)) -> SessionView:
+    """The first view of the version that has come back, at the moment that was last shown."""
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the version again")
     assert view.task.source_hash == before.task.source_hash and not view.playing
     np.testing.assert_allclose(view.step.poses, before.step.poses, atol=1e-5)
@@ -88,44 +80,73 @@ def back(session: Session, before: SessionView, steps: tuple[int, int] = (3, 3))
     return view
 
 
+# --- hangs ---------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("place", ["evaluate", "reward"])
 def test_a_loop_in_a_step_is_told_and_can_be_left_with_its_traceback(
-    session: Session, risky_file: Path, place: str
+    session: Session, file: Path, place: str
 ) -> None:
     before, worker = session.view(), session.worker_pid
-    provoke(risky_file, place, "loop")
+    provoke(file, place, "loop")
     session.step()
     busy = wait_until(session, lambda v: v.busy is not None, "busy").busy
-    assert busy.doing == f"in {place}" and busy.seconds >= supervisor._BUSY and not busy.ignores_interrupt
-    assert busy.file == str(risky_file) and busy.code in ("while True:", "pass")
+    assert place in busy.doing and busy.seconds >= supervisor._BUSY and not busy.ignores_interrupt
+    assert busy.file == str(file) and busy.code in ("while True:", "pass")
     session.step()
     session.step()
     session.play()
     session.interrupt()
     view = wait_until(session, lambda v: v.problem is not None and v.busy is None, "the interrupt")
     assert view.problem.stage == place and view.problem.interrupted
-    assert "Interrupted: stopped by hand after" in view.problem.message
-    assert view.problem.file == str(risky_file) and f'hazard("{place}")' in view.problem.traceback
-    calm(risky_file)
+    assert view.problem.file == str(file) and f'hazard("{place}")' in view.problem.traceback
+    calm(file)
     # Nothing of the step that was left remains: the next one is the one that it would have been.
     session.step()
     view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the fourth step")
     assert view.problem is None and session.worker_pid == worker and view.task_serial == before.task_serial
 
 
-@pytest.mark.parametrize("place", ["import", "build", "reset"])
+def test_a_loop_in_the_middle_of_a_replay_is_left_and_the_batch_is_where_it_was(
+    session: Session, file: Path
+) -> None:
+    before, worker = step(session, 3), session.worker_pid
+    session.past.seek(before.timeline.last - 2)
+    provoke(file, "evaluate", "loop")
+    session.past.continue_from_shown("all")
+    wait_until(session, lambda v: v.busy is not None, "busy")
+    session.interrupt()
+    view = wait_until(session, lambda v: v.problem is not None and v.busy is None, "the interrupt")
+    assert view.problem.interrupted and view.problem.file == str(file) and view.problem_at_run
+    assert view.timeline.last == before.timeline.last, "it went nowhere"
+    calm(file)
+    session.step()
+    view = wait_until(session, lambda v: v.timeline.last > before.timeline.last, "the next step")
+    assert (
+        view.step.elapsed_steps.tolist() == [7, 7] and view.problem is None and session.worker_pid == worker
+    )
+    # What was asked for then can be asked for again, and comes to the moment.
+    session.past.seek(before.timeline.last - 2)
+    shown, last = session.view().step.poses, view.timeline.last
+    session.past.continue_from_shown("all")
+    view = wait_until(session, lambda v: v.timeline.last > last, "the going back")
+    assert view.step.elapsed_steps.tolist() == [4, 4]
+    np.testing.assert_allclose(view.step.poses, shown, atol=1e-5)
+
+
+@pytest.mark.parametrize("place", ["import", "reset", pytest.param("build", marks=pytest.mark.slow)])
 def test_a_loop_in_a_load_can_be_left_and_the_last_good_version_stays(
-    session: Session, risky_file: Path, place: str
+    session: Session, file: Path, place: str
 ) -> None:
     before = session.view()
-    provoke(risky_file, place, "loop")
-    edit(risky_file)
-    wait_until(session, lambda v: v.busy is not None and v.busy.file == str(risky_file), "busy")
+    provoke(file, place, "loop")
+    edit(file)
+    wait_until(session, lambda v: v.busy is not None and v.busy.file == str(file), "busy")
     session.interrupt()
     view = wait_until(session, lambda v: v.problem is not None, "the interrupt")
-    assert view.problem.stage == place and view.problem.file == str(risky_file)
+    assert view.problem.stage == place and view.problem.file == str(file)
     assert view.stale and view.task_serial == before.task_serial
-    calm(risky_file)
+    calm(file)
     session.step()
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
     session.versions.reload()
@@ -133,53 +154,76 @@ def test_a_loop_in_a_load_can_be_left_and_the_last_good_version_stays(
 
 
 def test_a_hang_that_a_save_waits_for_is_left_and_the_new_version_loaded_where_it_never_ran(
-    session: Session, risky_file: Path
+    session: Session, file: Path
 ) -> None:
     before, worker = session.view(), session.worker_pid
-    provoke(risky_file, "evaluate", "loop")
+    provoke(file, "evaluate", "loop")
     session.step()
     wait_until(session, lambda v: v.busy is not None, "busy")
-    calm(risky_file)
-    edit(risky_file)
+    calm(file)
+    edit(file)
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the new version")
     assert session.worker_pid != worker and not view.stale
     assert view.problem is None and view.reload is not None and view.reload.level == "restarted"
 
 
-@pytest.mark.parametrize("what", ["native", pytest.param("catch", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "what", ["native", *(pytest.param(one, marks=pytest.mark.slow) for one in ("catch", "half"))]
+)
 def test_what_cannot_be_interrupted_is_said_and_a_restart_brings_the_moment_back(
-    session: Session, risky_file: Path, what: str
+    session: Session, file: Path, what: str
 ) -> None:
     before = session.view()
-    provoke(risky_file, "evaluate", what)
+    provoke(file, "evaluate", what)
     session.step()
     wait_until(session, lambda v: v.busy is not None, "busy")
-    session.interrupt()
-    busy = wait_until(
-        session, lambda v: v.busy is not None and v.busy.ignores_interrupt, "that it is deaf"
-    ).busy
-    assert (
-        busy.doing == "in evaluate"
-        and busy.file == str(risky_file)
-        and 'hazard("evaluate")' in busy.traceback
-    )
-    calm(risky_file)
+    if what != "half":  # a message that stops in the middle
+        session.interrupt()
+        busy = wait_until(session, lambda v: v.busy and v.busy.ignores_interrupt, "that it is deaf").busy
+        assert busy.file == str(file) and 'hazard("evaluate")' in busy.traceback
+    calm(file)
     session.versions.restart_worker()
     assert back(session, before).problem is None, "the file as it is now is not the one that hung"
 
 
+def test_what_is_only_slow_is_told_and_left_alone(session: Session, file: Path) -> None:
+    before, worker = session.view(), session.worker_pid
+    provoke(file, "build", "slow")
+    edit(file)
+    # For longer than a load waits for what cannot be interrupted.
+    long = supervisor._LOAD_WAITS + supervisor._LONGEST_SILENCE + 0.5
+    busy = wait_until(session, lambda v: v.busy is not None and v.busy.seconds > long, "busy").busy
+    assert "build" in busy.doing and busy.code == "_time.sleep(0.1)"
+    calm(file)
+    view = wait_until(
+        session, lambda v: v.task_serial > before.task_serial and v.busy is None, "the slow one"
+    )
+    assert view.problem is None and session.worker_pid == worker
+
+
+def another_version(session: Session, file: Path) -> SessionView:
+    """One that has not ended a process yet: one that does so twice soon gives way to the version before it."""
+    edit(file)
+    return runs(session, file.read_text())
+
+
+# --- ends ------------------------------------------------------------------------------------------------
+
 WAYS = [
-    ("exit", "called os._exit(3) in evaluate", "_os._exit(3)"),
-    ("segfault", "was killed by SIGSEGV (Segmentation fault) in evaluate", "_ctypes.string_at(0)"),
-    ("abort", "was killed by SIGABRT (Aborted) in evaluate", "_os.abort()"),
-    ("kill", "was killed by SIGKILL while stepping", None),
-    ("children", "was killed by SIGKILL while stepping", None),
-    ("memory", "more than the 2.0 GB that --memory-limit allows, in evaluate", 'eaten.append(b"x" * 2**24)'),
+    ("segfault", "SIGSEGV", "_ctypes.string_at(0)"),
+    ("exit", "os._exit(3)", "_os._exit(3)"),
+    ("abort", "SIGABRT", "_os.abort()"),
+    ("children", "SIGKILL", None),
+    ("detach", "SIGKILL", None),
+    ("memory", "--memory-limit", 'eaten.append(b"x" * 2**24)'),
+    ("garbage", "unreadable data", ...),
+    ("wrong", "unreadable data", ...),
+    ("misfit", "unusable data", ...),
+    ("headless", "main thread", ...),
+    ("thread", "exit code 1", ...),
 ]
-
-
-QUICK = ("segfault",)
-"""The others end the process in the same way, or as a recording's worker is killed below, and each costs a new one."""
+QUICK = ("segfault", "garbage")
+"""The others end the process in the same ways, and each costs a new one."""
 
 
 @pytest.mark.parametrize(
@@ -187,96 +231,58 @@ QUICK = ("segfault",)
     [pytest.param(*way, id=way[0], marks=() if way[0] in QUICK else pytest.mark.slow) for way in WAYS],
 )
 def test_a_death_is_told_with_its_line_and_the_moment_comes_back(
-    session: Session, risky_file: Path, what: str, says: str, code: str | None
+    session: Session, file: Path, what: str, says: str, code: object
 ) -> None:
-    before, worker = session.view(), session.worker_pid
-    provoke(risky_file, "evaluate", what)
+    before, worker = another_version(session, file), session.worker_pid
+    provoke(file, "evaluate", what)
     session.step()
     wait_until(session, lambda v: v.problem is not None and v.problem.stage == "worker", "the death")
-    calm(risky_file)
-    view = died_and_came_back(session, before)
-    assert says in view.problem.message
-    assert view.problem.code == code
-    if code is not None:
-        assert view.problem.line == line_of(risky_file, code)
-    assert not view.stale
+    calm(file)
+    if what == "thread":  # it ends a while after the step
+        view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the version again")
+        assert view.step.elapsed_steps[0] in (3, 4)
+    else:
+        view = back(session, before)
+    assert says in view.problem.message and view.problem.stage == "worker" and not view.stale
+    if code is not ...:
+        assert view.problem.code == code
+        assert code is None or view.problem.line == line_of(file, code)
     assert session.worker_pid != worker and not psutil.pid_exists(worker)
+    innocent = [p for p in psutil.process_iter(["cmdline"]) if p.info["cmdline"] == ["innocent", "3600"]]
+    assert not innocent, "what the task detached was left behind"
 
 
 @pytest.mark.slow
-def test_a_new_version_that_kills_whoever_imports_it_costs_one_worker(
-    session: Session, risky_file: Path
-) -> None:
-    before, good = session.view(), risky_file.read_text()
-    risky_file.write_text(good + "\n\n_ctypes.string_at(0)\n")
+def test_a_new_version_that_kills_whoever_imports_it_costs_one_worker(session: Session, file: Path) -> None:
+    before, good = session.view(), file.read_text()
+    file.write_text(good + "\n\n_ctypes.string_at(0)\n")
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the last good version")
     assert view.stale and "SIGSEGV" in view.problem.message
     assert view.problem.line == len(good.splitlines()) + 3
     session.step()
     view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
     assert view.problem is not None, "the file is still broken"
-    risky_file.write_text(good)
-    wait_until(session, lambda v: v.problem is None and not v.stale, "the mended version")
+    save(session, file, good)
 
 
-def test_what_is_only_slow_is_told_and_left_alone(session: Session, risky_file: Path) -> None:
-    before, worker = session.view(), session.worker_pid
-    provoke(risky_file, "build", "slow")
-    edit(risky_file)
-    # For longer than a load waits for what cannot be interrupted.
-    long = supervisor._LOAD_WAITS + supervisor._LONGEST_SILENCE + 0.5
-    busy = wait_until(session, lambda v: v.busy is not None and v.busy.seconds > long, "busy").busy
-    assert busy.doing == "in build" and busy.code == "_time.sleep(0.1)"
-    calm(risky_file)
-    view = wait_until(
-        session, lambda v: v.task_serial > before.task_serial and v.busy is None, "the slow one"
-    )
-    assert view.problem is None and session.worker_pid == worker
-
-
-@pytest.mark.parametrize(("what", "says"), [("read", "EOFError"), ("leave", "SystemExit: enough")])
-def test_what_would_wait_or_leave_is_an_error_like_others(
-    session: Session, risky_file: Path, what: str, says: str
-) -> None:
-    worker = session.worker_pid
-    provoke(risky_file, "reward", what)
-    session.step()
-    view = wait_until(session, lambda v: v.problem is not None, "the problem")
-    assert view.problem.stage == "reward" and says in view.problem.message
-    assert session.worker_pid == worker
-
-
-def test_a_flood_of_prints_is_counted_and_its_end_kept(session: Session, risky_file: Path) -> None:
-    session.clear_printed()
-    provoke(risky_file, "evaluate", "flood")
-    session.step()
-    view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the step behind the flood")
-    # The slower it is drained the more lines are kept for a while; those are pushed out by newer ones, and not counted.
-    view = wait_until(session, lambda v: v.printed.dropped > 150_000, "most of the flood")
-    assert len(view.printed.lines) <= 1000
-    assert view.printed.lines[-1].stream == "stdout" and "no play" in view.printed.texts[-1]
-    assert view.problem is None
-
-
-def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, risky_file: Path) -> None:
-    written = session.view().recording.episodes_written
+def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, file: Path) -> None:
+    written = another_version(session, file).recording.episodes_written
     session.start_recording((1,))
     for count in (1, 2, 3, 4, 5):
         session.step()
         wait_until(session, lambda v, n=count: v.recording.steps == n, f"recorded step {count}")
     before, worker = session.view(), session.worker_pid
-    provoke(risky_file, "reward", "kill")
+    provoke(file, "reward", "kill")
     session.step()
     view = wait_until(session, lambda v: v.recording.episodes_written > written, "the file")
-    calm(risky_file)
+    calm(file)
     assert not view.recording.active and view.recording.problem is None
     assert verify_rrd(view.recording.last_file) is None
     assert "5" in str(read_properties(Path(view.recording.last_file)))
     # A recording begins an episode of its own.
-    view = died_and_came_back(session, before, steps=(8, 5))
-    assert "was killed by SIGKILL while stepping" in view.problem.message and view.problem.code is None
+    view = back(session, before, steps=(8, 5))
+    assert "SIGKILL" in view.problem.message and view.problem.code is None
     assert not view.stale and session.worker_pid != worker and not psutil.pid_exists(worker)
-    wait_until(session, lambda v: v.state == "paused", "the version again")
 
 
 @pytest.mark.slow
@@ -296,11 +302,118 @@ def test_a_file_that_never_loaded_costs_one_worker_and_is_waited_for(tmp_path: P
     assert not psutil.pid_exists(waiting)
 
 
+# --- what is an error like others --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("place", "what", "says", "code"),
+    [
+        ("reward", "read", "EOFError", 'input("your name? ")'),
+        ("reward", "leave", "SystemExit", '_sys.exit("enough")'),
+        ("evaluate", "ctrl_c", "KeyboardInterrupt", "raise KeyboardInterrupt"),
+        ("reward", "interrupt_main", "KeyboardInterrupt", "_signal.raise_signal(_signal.SIGINT)"),
+        ("reset", "own_base", "GeneratorExit", 'raise GeneratorExit("of this")'),
+    ],
+)
+def test_what_would_wait_or_leave_or_is_no_ordinary_exception_is_named_with_its_line(
+    session: Session, file: Path, place: str, what: str, says: str, code: str
+) -> None:
+    worker = session.worker_pid
+    provoke(file, place, what)
+    (session.reset if place == "reset" else session.step)()
+    view = wait_until(session, lambda v: v.problem is not None, "the problem")
+    assert says in view.problem.message and view.problem.stage == place
+    assert (view.problem.file, view.problem.line) == (str(file), line_of(file, code))
+    assert view.problem.code == code and session.worker_pid == worker
+
+
+@pytest.mark.parametrize(
+    ("place", "error"), [("evaluate", 'KeyboardInterrupt("two")'), ("import", 'GeneratorExit("two")')]
+)
+def test_what_a_saved_version_raises_is_shown_with_the_text_of_that_version(
+    session: Session, file: Path, place: str, error: str
+) -> None:
+    good, worker = file.read_text(), session.worker_pid
+    hook = f'hazard("{place}")'
+    (line,) = [line for line in good.splitlines() if line.strip() == hook]
+    raised = line.replace(hook, f"raise {error}")
+    # In the place of a line that says something else in the version that is kept.
+    file.write_text(good.replace(f"{line}\n", f"{raised}\n{line}\n"))
+    view = wait_until(session, lambda v: v.problem is not None, "the problem")
+    number, code = line_of(file, raised.strip()), raised.strip()
+    save(session, file, good)
+    assert (view.problem.line, view.problem.code) == (number, code)
+    shown = [text.strip() for text in view.problem.traceback.splitlines()]
+    assert any(
+        f"line {number}, in" in above and below == code
+        for above, below in zip(shown, shown[1:], strict=False)
+    )
+    assert session.worker_pid != worker, "a version that was refused costs its process"
+
+
+@pytest.mark.parametrize("what", ["device", pytest.param("large", marks=pytest.mark.slow)])
+def test_a_task_file_that_is_no_file_any_more_is_told_and_the_mended_one_loaded(
+    session: Session, file: Path, what: str
+) -> None:
+    good, before = file.read_text(), session.view()
+    resident = psutil.Process().memory_info().rss
+    other = file.with_name("other")
+    if what == "device":
+        other.symlink_to("/dev/zero")
+    else:
+        with other.open("wb") as written:
+            written.truncate(2**40)
+    other.replace(file)
+    try:
+        view = wait_until(session, lambda v: v.problem is not None, "the problem")
+        named = "/dev/zero" if what == "device" else str(file)
+        assert named in view.problem.message and view.task_serial == before.task_serial
+        session.step()
+        wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
+        assert psutil.Process().memory_info().rss - resident < 200 * 2**20
+    finally:
+        other.write_text(good)
+        other.replace(file)
+        runs(session, good)
+
+
+def test_a_flood_of_prints_is_counted_and_its_end_kept(session: Session, file: Path) -> None:
+    session.clear_printed()
+    provoke(file, "evaluate", "flood")
+    session.step()
+    wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the step behind the flood")
+    # The slower it is drained the more lines are kept for a while; those are pushed out by newer ones, and not counted.
+    view = wait_until(session, lambda v: v.printed.dropped > 150_000, "most of the flood")
+    assert len(view.printed.lines) <= 1000 and view.problem is None
+    assert view.printed.lines[-1].stream == "stdout" and "no play" in view.printed.texts[-1]
+
+
 @pytest.mark.slow
-def test_a_worker_that_is_killed_while_it_waits_comes_back(session: Session) -> None:
-    before = session.view()
-    os.kill(session.worker_pid, signal.SIGKILL)
-    assert "was killed by SIGKILL" in died_and_came_back(session, before).problem.message
+def test_a_task_that_goes_to_another_folder_is_reloaded_and_recorded_as_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = write_task(tmp_path)
+    (tmp_path / "act.py").write_text("def zero(obs):\n    import torch\n    return torch.zeros(1, 8)\n")
+    monkeypatch.chdir(tmp_path)
+    with live_session("risky.py", Path("recordings"), num_envs=1) as session:
+        before = session.view()
+        provoke(file, "evaluate", "chdir")
+        step(session)
+        assert not provocation(file).exists()
+        session.change(action_source="policy", policy="act.py:zero")
+        view = step(session)
+        assert view.problem is None, view.problem
+        edit(file)
+        wait_until(
+            session, lambda v: v.task_serial > before.task_serial and v.problem is None, "the new version"
+        )
+        session.start_recording()
+        wait_until(session, lambda v: v.recording.active, "the recording")
+        session.step()
+        wait_until(session, lambda v: v.recording.steps == 1, "a recorded step")
+        session.stop_recording()
+        view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the file")
+        assert Path(view.recording.last_file).resolve().parent == tmp_path / "recordings"
 
 
 def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None:

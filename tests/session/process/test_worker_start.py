@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 
 from tests.drive.processes import workers_of
 from tests.drive.session import live_session, wait_until
-from tests.drive.waiting import until
+from tests.drive.waiting import PATIENCE, until
 from tests.session.hazards import write_task
 from workbench.session.process import worker_process, worker_start
 from workbench.session.process.worker_process import WorkerProcess
@@ -54,8 +53,20 @@ def listens(worker: WorkerProcess) -> bool:
     return until(lambda: worker.beat().doing == "idle", "its first sleep")
 
 
-def command_of(worker: WorkerProcess) -> str:
-    return " ".join(psutil.Process(worker.pid).cmdline())
+def is_fork(worker: WorkerProcess) -> bool:
+    return "fork_server" in " ".join(psutil.Process(worker.pid).cmdline())
+
+
+def ends_as_asked(worker: WorkerProcess) -> bool:
+    """With as much time as a busy machine may need."""
+    worker.stop(grace=PATIENCE)
+    return worker.exit_code() == 0
+
+
+def until_gone(worker: WorkerProcess) -> int | None:
+    with pytest.raises(EOFError):
+        until(lambda: worker.receive(0.1), "its end")
+    return until(worker.exit_code, "its exit code")
 
 
 def has_ended(process: psutil.Process) -> bool:
@@ -68,16 +79,24 @@ def has_ended(process: psutil.Process) -> bool:
 def test_workers_are_forks_that_end_apart_from_each_other_and_say_how(forks: WorkerForks) -> None:
     one, other = started(), started()
     assert listens(one) and listens(other)
-    assert len({os.getpid(), one.pid, other.pid}) == 3
-    assert all("fork_server" in command_of(worker) for worker in (one, other))
+    assert len({os.getpid(), one.pid, other.pid}) == 3 and is_fork(one) and is_fork(other)
     os.kill(one.pid, signal.SIGSEGV)
-    with pytest.raises(EOFError):
-        until(lambda: one.receive(0.1), "its end")
-    assert one.exit_code() == -signal.SIGSEGV and "Segmentation fault" in one.crash_report()
+    assert until_gone(one) == -signal.SIGSEGV and "Segmentation fault" in one.crash_report()
     one.stop(0)
-    assert listens(other)
-    other.stop(grace=30)
-    assert other.exit_code() == 0 and not workers_of(psutil.Process())
+    assert listens(other) and ends_as_asked(other)
+    until(lambda: not workers_of(psutil.Process()), "the end of both")
+
+
+def test_those_that_are_ended_at_once_leave_the_others_alone(forks: WorkerForks) -> None:
+    worker = started()
+    assert listens(worker)
+    for pause in (0.0, 0.0, 0.005, 0.01, 0.02, 0.04, 0.08):
+        ended = started()
+        time.sleep(pause)
+        ended.stop(0)
+    assert worker.exit_code() is None
+    until(lambda: len(workers_of(psutil.Process())) == 1, "the end of the others")
+    assert ends_as_asked(worker)
 
 
 def test_two_forks_do_not_draw_the_same_random_numbers(tmp_path: Path) -> None:
@@ -90,7 +109,28 @@ def test_two_forks_do_not_draw_the_same_random_numbers(tmp_path: Path) -> None:
             view = wait_until(session, lambda view: any("drawn" in str(t) for t in view.printed.texts), "it")
             (line,) = {text for text in view.printed.texts if "drawn" in text}
             drawn.append(line.split()[-2:])
-    assert all(a != b for a, b in zip(*drawn))
+    assert all(a != b for a, b in zip(*drawn, strict=True))
+
+
+def test_a_worker_that_would_be_of_something_else_is_no_fork(
+    forks: WorkerForks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workers = [started()]
+    assert listens(workers[0]) and is_fork(workers[0])
+    (tmp_path / "nvidiactl").touch()
+    for change in (
+        lambda to: to.setenv("MS_ASSET_DIR", str(tmp_path)),
+        lambda to: to.chdir(tmp_path),
+        lambda to: to.setattr(worker_start, "_GPUS", (str(tmp_path / "no"), str(tmp_path / "nvidiactl"))),
+    ):
+        with monkeypatch.context() as changed:
+            change(changed)
+            workers.append(started())
+            assert not is_fork(workers[-1])
+    workers.append(started())
+    assert is_fork(workers[-1])
+    for worker in workers:
+        worker.stop(0)
 
 
 @pytest.mark.slow
@@ -102,32 +142,11 @@ def test_after_a_save_of_what_was_imported_a_worker_imports_it_itself(
     (tmp_path / "sitecustomize.py").write_text("import usercustomize\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     before = started()
-    assert listens(before) and "fork_server" in command_of(before)
+    assert listens(before) and is_fork(before)
     library.write_text("number = 22\n")
     after = started()
-    assert listens(after) and "fork_server" not in command_of(after)
-    for worker in (before, after):
-        worker.stop()
-        assert worker.exit_code() == 0
-
-
-def test_a_worker_of_another_environment_or_folder_is_no_fork(
-    forks: WorkerForks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first = started()
-    assert listens(first)
-    with monkeypatch.context() as changed:
-        changed.setenv("MS_ASSET_DIR", str(tmp_path))
-        other = started()
-        assert "fork_server" not in command_of(other)
-    with monkeypatch.context() as changed:
-        changed.chdir(tmp_path)
-        elsewhere = started()
-        assert "fork_server" not in command_of(elsewhere)
-    again = started()
-    assert "fork_server" in command_of(again)
-    for worker in (first, other, elsewhere, again):
-        worker.stop(0)
+    assert listens(after) and not is_fork(after)
+    assert ends_as_asked(before) and ends_as_asked(after)
 
 
 @pytest.mark.slow
@@ -138,9 +157,7 @@ def test_what_cannot_be_imported_is_said_by_each_worker(
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     said: list[bytes] = []
     worker = WorkerProcess(lambda name, piece: bool(said.append(piece)))
-    with pytest.raises(EOFError):
-        until(lambda: worker.receive(0.1), "its end")
-    assert worker.exit_code() == 1
+    assert until_gone(worker) == 1
     worker.stop(0)
     assert b"ImportError: broken by the test" in b"".join(said)
 
@@ -151,7 +168,7 @@ def test_one_that_is_ended_before_it_has_been_forked_never_runs(own_forks: Worke
     began = time.monotonic()
     worker.stop(0)
     assert worker.exit_code() == -signal.SIGTERM
-    assert time.monotonic() - began < 2, "it waited for the imports"
+    assert time.monotonic() - began < 4, "it waited for the imports"
     another = started()
     assert listens(another) and len(workers_of(psutil.Process())) == 1
     another.stop(0)
@@ -167,48 +184,10 @@ def test_when_the_fork_server_is_killed_its_workers_end_and_the_next_has_another
     assert server is not None
     task = psutil.Process(worker.pid)
     server.kill()
-    with pytest.raises(EOFError):
-        until(lambda: worker.receive(0.1), "its end")
-    assert worker.exit_code() == -signal.SIGKILL
+    assert until_gone(worker) == -signal.SIGKILL
     worker.stop(0)
     until(lambda: has_ended(task), "the end of the task's process")
     following = [started(), started()]
     assert all(listens(one) for one in following)
     for one in following:
         one.stop(0)
-
-
-def test_with_a_gpu_of_nvidia_no_worker_is_a_fork(
-    forks: WorkerForks, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "nvidiactl").touch()
-    monkeypatch.setattr(worker_start, "_GPUS", (str(tmp_path / "no"), str(tmp_path / "nvidiactl")))
-    worker = started()
-    assert "fork_server" not in command_of(worker)
-    worker.stop(0)
-
-
-def test_those_that_are_ended_at_once_leave_the_others_alone(forks: WorkerForks) -> None:
-    worker = started()
-    assert listens(worker)
-    for pause in (0.0, 0.0, 0.005, 0.01, 0.02, 0.04, 0.08):
-        ended = started()
-        time.sleep(pause)
-        ended.stop(0)
-    unread = started()
-    until(lambda: len(workers_of(psutil.Process())) == 2, "the fork")
-    unread._process._told.close()  # type: ignore[attr-defined]
-    unread._process._code = -signal.SIGTERM  # type: ignore[attr-defined]
-    unread.stop(0)
-    assert worker.exit_code() is None
-    until(lambda: len(workers_of(psutil.Process())) == 1, "the end of the others")
-    worker.stop()
-    assert worker.exit_code() == 0
-
-
-def test_a_wait_for_one_that_runs_ends_in_time(forks: WorkerForks) -> None:
-    worker = started()
-    assert listens(worker)
-    with pytest.raises(subprocess.TimeoutExpired):
-        worker._process.wait(timeout=0.05)
-    worker.stop(0)

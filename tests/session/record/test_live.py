@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, live_session, start_over, step, wait_until
-from tests.session.studio import BASE, camera, moved
+from tests.drive.session import BASE, TASKS, camera, live_session, moved, step, wait_until
 from workbench.authoring.loading.load import load_task
-from workbench.core.camera_data import CameraSettings
-from workbench.core.cameras.report import ObjectSummary
 from workbench.recording.episode.episode import Episode
 from workbench.recording.lerobot.export import ExportOptions, export_lerobot
 from workbench.recording.lerobot.format import WORKBENCH_FILE
@@ -25,7 +22,6 @@ from workbench.recording.maniskill.export import export_maniskill
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.live.status_line import slowed_by
 
 STEPS = 4
 EYE = "eye=[0.45, 0, 0.6]"
@@ -131,67 +127,6 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
 
 
 @pytest.mark.slow
-def test_what_is_begun_later_comes_first_and_what_gave_way_comes_to_the_same(session: Session) -> None:
-    """A keep to a camera that is judged over seeds; that, and a search, to a keep."""
-    reports = session.studio.reports
-    session.studio.select(BASE)
-
-    def save(begun: Callable[[SessionView], bool] = lambda view: True) -> None:
-        session.save_past((0,))
-        wait_until(session, lambda view: bool(view.recording.saving.message) or begun(view), "a keep")
-
-    def kept() -> Episode:
-        wait_until(session, lambda view: bool(view.recording.saving.message), "what was kept")
-        return written(session, session.view().recording.episodes_written)[-1]
-
-    def drawing(view: SessionView) -> bool:
-        progress = view.recording.saving.progress
-        return progress is not None and progress.what == "rendering it again" and progress.done > 0
-
-    def measure() -> None:
-        reports.measure(60)
-
-    def measured() -> tuple[tuple[int, ...], ObjectSummary]:
-        view = wait_until(session, lambda view: view.studio.progress is None, "the judgement")
-        report = view.studio.results.report
-        assert report is not None and view.studio.results.report_seeds == 60 and not view.studio.problem
-        return report.envs, report.wanted_objects(("cube",))[0].summary()
-
-    def search() -> None:
-        reports.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
-
-    def found() -> list[tuple[float, CameraSettings]]:
-        view = wait_until(session, lambda view: view.studio.progress is None, "the search")
-        return [(offer.score, offer.settings) for offer in view.studio.results.suggestions]
-
-    def is_at_it(view: SessionView) -> bool:
-        return view.studio.progress is not None and view.studio.progress.done > 0
-
-    start_over(session, 5)
-    step(session, 20)
-    save()
-    episode = kept()
-    assert episode.length == 20
-    measure()
-    alone = measured()
-    search()
-    offers = found()
-    assert offers and not session.view().studio.problem
-
-    save(drawing)
-    measure()
-    assert measured() == alone and not session.view().recording.saving.message, "the keep came first"
-    assert_same(kept(), episode)
-    for begin, came, of in ((measure, measured, alone), (search, found, offers)):
-        begin()
-        wait_until(session, is_at_it, "its beginning")
-        save()
-        assert_same(kept(), episode)
-        assert session.view().studio.progress is not None, "the keep came last"
-        assert came() == of
-
-
-@pytest.mark.slow
 def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it(session: Session) -> None:
     count = session.view().recording.episodes_written
     session.reset()
@@ -268,27 +203,6 @@ def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session)
     assert episode.length == 2 and episode.info.acted_by == ((0, "random"), (1, "zero"))
 
 
-@pytest.mark.slow
-def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Session) -> None:
-    session.reset()
-    wait_until(session, lambda view: view.step is not None and not view.step.elapsed_steps.any(), "a reset")
-    first = session.view().timeline.first
-    session.past.seek(session.view().timeline.last)
-    assert first == 0  # the history is whole, so what is refused is an episode without a step
-    session._state.timeline.history.limit = 1  # type: ignore[union-attr]
-    step(session, 2)
-    session.save_past((0,))
-    view = wait_until(session, lambda view: view.recording.saving.failed, "the refusal")
-    assert "its beginning is no longer in memory" in view.recording.saving.message
-    session.change(selected_env=1)
-    assert not session.view().recording.saving.message, "it is of env 0"
-    session.change(selected_env=0)
-    assert session.view().recording.saving.failed
-    step(session)
-    assert not session.view().recording.saving.message, "it is of the moment before"
-    session._state.timeline.history.limit = 2**30  # type: ignore[union-attr]
-
-
 def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
     session: Session, tmp_path: Path
 ) -> None:
@@ -351,16 +265,3 @@ def test_what_is_recorded_says_where_a_moved_camera_was_and_where_the_file_has_i
             [0.31, 0.02, 0.55],
             list(in_file.position),
         ]
-
-
-def test_playing_that_recording_makes_slow_says_so(session: Session) -> None:
-    session.change(action_source="random", speed=4.0)
-    session.start_recording()
-    session.play()
-    view = wait_until(session, lambda view: view.recorded_share > 0.5, "the share of the recording")
-    assert view.real_time_factor < 4
-    short, long = slowed_by(view) or ("", "")
-    assert "2 cameras" in short and "2 envs" in long
-    session.stop_recording()
-    wait_until(session, lambda view: view.recorded_share < 0.1, "faster steps")
-    session.pause()

@@ -1,4 +1,4 @@
-"""The recorder's own threads: what it recovers at the start, and what it does when something of it fails."""
+"""Recording with a worker that is the test: what is recovered, refused, and what a failure ends."""
 
 from __future__ import annotations
 
@@ -6,22 +6,18 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from tests.drive.episodes import begin, made
+from tests.drive.session import Told, moment, moment_at, told_session
 from tests.drive.waiting import until
-from tests.session.moments import stepped
-from tests.ui.scenes import description, table_scene
-from workbench.jobs.task import Stepped
 from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.recording.reader.read_episode import read_episode
-from workbench.session.process.job_lane import JobProgress
+from workbench.session.protocol.messages import Reset, SetCapture
 from workbench.session.record import live
-from workbench.session.record.live import LiveRecorder, RecordingStatus, recovered_text
-from workbench.session.record.save_past import SaveStatus
-from workbench.ui.live.episodes_panel import recording_html
+from workbench.session.record.live import LiveRecorder
 
 
 def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
@@ -29,80 +25,82 @@ def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
 ) -> None:
     begin(tmp_path, made(5, seed=8))
     said: list[str] = []
-    recorder = LiveRecorder(tmp_path, lambda: None, lambda envs: None, said.append)
-    try:
+    with told_session(tmp_path, on_notice=said.append) as told:
         until(lambda: said, "a word of it")
         (rrd,) = tmp_path.glob("*.rrd")
-        assert said == [f"1 episode that an earlier session left half written was recovered: {rrd}"]
-        assert recorder.status().recovered == (str(rrd),)
-        assert rrd.name in recording_html(recorder.status())
-    finally:
-        recorder.close()
+        assert len(said) == 1 and str(rrd) in said[0]
+        assert told.view.recording.recovered == (str(rrd),)
 
 
-def test_what_is_stopped_in_the_middle_of_an_episode_is_written(child_process: None, tmp_path: Path) -> None:
-    recorder = LiveRecorder(tmp_path, lambda: None, lambda envs: None)
-    try:
-        assert (recorder.recording, recorder.one_each) == ((), False)
-        recorder.start(description(table_scene(3)[0]), (0, 2))
-        assert recorder.recording == (0, 2)
-        recorder.take(stepped(0, jumped=(2,)))
-        recorder.take(stepped(1))
-        recorder.stop()
-        status = until(lambda: s if (s := recorder.status()).episodes_written else None, "the files")
-        assert (status.episodes_written, status.active, status.problem) == (1, False, None)
-        (rrd,) = tmp_path.glob("*.rrd")
-        episode = read_episode(rrd)
-        assert (episode.info.env_index, episode.length) == (2, 1)
-    finally:
-        recorder.close()
-
-
-def test_of_many_that_were_mended_three_are_named() -> None:
-    assert recovered_text([]) == ""
-    said = "4 episodes that an earlier session left half written were recovered: a, b, c and 1 more"
-    assert recovered_text(list("abcd")) == said
+def test_what_is_stopped_or_dies_in_the_middle_of_an_episode_is_written(
+    child_process: None, tmp_path: Path
+) -> None:
+    with told_session(tmp_path) as told:
+        told.session.start_recording()
+        assert told.asked(SetCapture) == [], "before there is a task"
+        told.play(0)
+        for count, end in enumerate((told.session.stop_recording, told.die), 1):
+            told.asked(object)
+            told.session.start_recording((0, 2))
+            assert [type(one) for one in told.asked((SetCapture, Reset))] == [SetCapture, Reset]  # type: ignore[arg-type]
+            told.reset((2,))
+            told.step()
+            end()
+            status = until(
+                lambda count=count: s if (s := told.view.recording).episodes_written == count else None,
+                "the file",
+            )
+            assert (status.active, status.problem, status.being_written) == (False, None, 0)
+            assert read_episode(Path(str(status.last_file))).info.env_index == 2
+        assert len(list(tmp_path.glob("*.rrd"))) == 2
 
 
 def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_not_the_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    played: Told,
 ) -> None:
     said: list[str] = []
     listen(said.append)
-    recorder = LiveRecorder(tmp_path, lambda: None, lambda envs: None)
     try:
-        task: Any = SimpleNamespace()  # no task at all: the gatherer takes it and fails at the first reset
         for _ in range(2):
-            recorder.start(task, (0,))
-            until(lambda: recorder._gatherer is not None, "the gatherer")
-            recorder.take(stepped(0, jumped=(0, 1, 2)))
-            until(lambda: recorder.status().problem is not None, "the problem")
-            assert not recorder.status().active
-            assert str(recorder.status().problem).startswith("the recording ended: ")
-        assert said[0].startswith("A step could not be recorded: AttributeError")
+            played.session.start_recording((0,))
+            assert played.view.recording.problem is None, "that of the one before is forgotten"
+            played.reset((0,))
+            now: Any = played.view.step
+            bad: Any = {"state": SimpleNamespace(nbytes=0)}  # what is no array
+            played.tell(replace(moment(now.elapsed_steps + 1), columns=bad))
+            until(lambda: played.view.recording.problem is not None, "the problem")
+            assert not played.view.recording.active
+        assert said
     finally:
-        recorder.close()
         stop_listening(said.append)
 
 
-def test_how_far_keeping_is_and_what_came_of_it_stand_on_the_page() -> None:
-    under_way = SaveStatus(progress=JobProgress("rendering it again", 3, 12))
-    html = recording_html(RecordingStatus(saving=under_way))
-    assert "saving: rendering it again, 3 of 12 moments" in html and "width: 25%" in html
-    assert "Each episode becomes" not in html
-    failed = recording_html(RecordingStatus(saving=SaveStatus("there is no step yet", failed=True)))
-    assert "there is no step yet" in failed and "wb-bad-text" in failed and "wb-again-bar" not in failed
-    kept = recording_html(RecordingStatus(saving=SaveStatus("kept 1 episode")))
-    assert "kept 1 episode" in kept and "wb-bad-text" not in kept
-
-
-def step_of(size: int) -> Stepped:
-    """A step that begins no episode, of so many bytes, 396 of them arrays."""
-    return replace(stepped(1), snapshot=bytes(size - 396))
-
-
-def until_taken(recorder: LiveRecorder) -> None:
-    until(recorder._queue.empty, "the steps to be taken")
+def test_what_cannot_be_saved_of_the_past_is_refused_for_what_is_shown_alone(tmp_path: Path) -> None:
+    with told_session(tmp_path, history_bytes=20_000) as told:
+        told.session.save_past((0,))
+        assert told.view.recording.saving.failed, "no task"
+        told.play(0)
+        told.session.save_past((0,))
+        assert told.view.recording.saving.failed, "no step"
+        told.step(100)
+        assert told.view.timeline.first > 0 and not told.view.recording.saving.message
+        told.session.save_past((0,))
+        refused = told.view.recording.saving
+        assert refused.failed and "no longer in memory" in refused.message and refused.progress is None
+        told.session.change(selected_env=1)
+        assert not told.view.recording.saving.message, "it is of env 0"
+        told.session.change(selected_env=0)
+        assert told.view.recording.saving.failed
+        told.step()
+        assert not told.view.recording.saving.message, "it is of the moment before"
+        told.reset()
+        told.step(2)
+        told.reset()
+        told.session.save_past((0,), before=True)
+        assert told.view.recording.saving.failed, "the one before began earlier than what is kept"
+        told.session.start_recording()
+        assert not told.view.recording.saving.message, "something else is recorded"
+        assert moment_at(told.session, 0) is None
 
 
 def test_what_the_disk_has_taken_does_not_wait_any_more(
@@ -110,27 +108,54 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
 ) -> None:
     """However much a recording holds in all: it ends only where too much waits at once, and the next begins anew."""
     monkeypatch.setattr(live, "_MOST_WAITING", 10_500)
-    go = threading.Event()
+    go, changes = threading.Event(), list[int]()
+
+    def on_change() -> None:
+        changes.append(1)
+        if threading.current_thread().name == "recorder":
+            assert go.wait(60)
+
+    def taken(recorder: LiveRecorder) -> None:
+        """All that it was given before this: it tells of a recording that begins."""
+        before = len(changes)
+        recorder.start(task, (0,), goes_on=True)
+        until(lambda: len(changes) > before, "the steps to be taken")
+
+    task: Any = SimpleNamespace()
+    elapsed: Any = SimpleNamespace(nbytes=396)
+    step: Any = SimpleNamespace(step=elapsed, columns={}, captured=(), snapshot=bytes(604), new_parts={})
+    monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: Taker())
     go.set()
-    recorder = LiveRecorder(tmp_path, lambda: None if go.wait(20) else None, lambda envs: None)
+    recorder = LiveRecorder(tmp_path, on_change, lambda envs: None)
     try:
         for _ in range(2):
-            recorder.start(cast(Any, SimpleNamespace()), (0,))
-            for _ in range(30):
-                until_taken(recorder)
-                recorder.take(step_of(1000))
-                assert recorder.status().problem is None
-            until_taken(recorder)
+            recorder.start(task, (0,))
+            for _ in range(4):
+                for _ in range(8):
+                    recorder.take(step)
+                taken(recorder)
+                assert recorder.status().problem is None and recorder.status().active
             go.clear()
-            recorder.start(cast(Any, SimpleNamespace()), (0,))  # whose thread now waits in `on_change`
-            taken = 0
-            while recorder.status().active and taken < 100:
-                recorder.take(step_of(1000))
-                taken += 1
-            assert 9 <= taken <= 11
-            assert "the disk is slower than the simulation" in str(recorder.status().problem)
+            recorder.start(task, (0,))  # whose thread now waits in `on_change`
+            count = 0
+            while recorder.status().active and count < 100:
+                recorder.take(step)
+                count += 1
+            assert 9 <= count <= 11 and recorder.status().problem is not None
             go.set()
-            until_taken(recorder)
     finally:
         go.set()
         recorder.close()
+
+
+class Taker:
+    """Takes every step."""
+
+    env_idx = (0,)
+    under_way = ()
+
+    def take(self, stepped: object) -> None:
+        """It is on the disk."""
+
+    def finish(self) -> None:
+        """Nothing is left of it."""

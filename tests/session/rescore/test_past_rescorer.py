@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, live_session, wait_until
+from tests.drive.session import TASKS, background_pid, live_session, moments_of, wait_until
 from tests.drive.waiting import until
 from workbench.session.history.history import Moment
 from workbench.session.live.session import Session
@@ -62,8 +62,7 @@ class Desk:
         last = session.view().timeline.last
         session.reset()
         wait_until(session, lambda v: v.timeline.last > last and v.step.elapsed_steps.max() == 0, "the reset")
-        history = session._state.timeline.history
-        return list(history.between(history.first, history.last))
+        return moments_of(session)
 
     def rescored(self, *states: str) -> RescoreView:
         before = self.serial
@@ -120,15 +119,6 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
         assert verdict.returns[1] == pytest.approx(2 * verdict.returns[0])
     assert view.differing_names == {"reward"}
     assert not view.warnings
-
-
-@pytest.mark.slow
-def test_code_that_comes_to_the_same_differs_nowhere(desk: Desk, record) -> None:
-    desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
-    view = desk.rescored()
-    assert len(view.verdicts) == episodes_of(record) >= 3 * N
-    assert not any(verdict.differing or verdict.metres for verdict in view.verdicts)
-    assert view.differing_names == frozenset()
 
 
 def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk, record) -> None:
@@ -206,12 +196,12 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
     desk.rescored("rescoring")
     until(loops.exists, "the loop")
     desk.note()
-    process = desk.session._background.pid
+    process = background_pid(desk.session)
     desk.session.rescorer.stop()
     view = desk.rescored("stopped")
     assert view.done < view.total and view.stopped_by is StoppedBy.HAND
     wait_until(
-        desk.session, lambda v: desk.session._background.pid is None, "the end of the process that hangs"
+        desk.session, lambda v: background_pid(desk.session) is None, "the end of the process that hangs"
     )
     assert not Path(f"/proc/{process}").exists()
     desk.note()
@@ -224,7 +214,7 @@ def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk
     slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD}")
     desk.rescored("rescoring")
-    first = desk.session._background.pid
+    first = background_pid(desk.session)
     desk.note()
     os.kill(first, signal.SIGKILL)
     view = desk.rescored("failed")
@@ -232,44 +222,10 @@ def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 2")
     desk.rescored("done")
-    second = desk.session._background.pid
+    second = background_pid(desk.session)
     assert second not in (None, first)
     # The process is kept for the next time.
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 3")
     desk.rescored("stopped", "done")
-    assert desk.session._background.pid == second
-
-
-@pytest.mark.slow
-def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with_the_judgement(
-    desk: Desk, record
-) -> None:
-    """Keeping an episode goes first, and the judgement comes to what it comes to without it."""
-    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
-    desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
-    desk.rescored("rescoring")
-    process, session = desk.session._background.pid, desk.session
-    session.save_past((0,), before=True)
-    wait_until(
-        session,
-        lambda v: v.recording.saving.progress is None and v.recording.saving.message,
-        "what was kept",
-    )
-    view = session.view()
-    assert view.recording.saving.message.startswith("saved ") and not view.recording.saving.failed
-    assert view.rescored.state == "rescoring", "it has not ended meanwhile"
-    desk.note()
-    assert desk.rescored("rescoring").done < view.rescored.total
-    session.save_past((1,), before=True)
-    desk.note()
-    desk.edit(REWARD, f"{REWARD} * 3")
-    rewards = np.array([moment.step.reward for moment in steps_of(record)])
-    assert desk.rescored().stopped_by is None
-    wait_until(
-        session, lambda v: v.recording.saving.progress is None and v.recording.saving.message, "the second"
-    )
-    assert not session.view().recording.saving.failed
-    for env in range(N):
-        np.testing.assert_array_equal(session.rescorer.curve("reward", env).new, 3 * rewards[:, env])
-    assert session._background.pid == process
+    assert background_pid(desk.session) == second

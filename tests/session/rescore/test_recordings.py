@@ -22,7 +22,6 @@ pytestmark = pytest.mark.thorough
 TASKS = Path(__file__).parents[3] / "tasks"
 TEXT = (TASKS / "push_cube.py").read_text()
 STEPS = 30
-REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
 
 
@@ -84,18 +83,6 @@ def test_unchanged_code_says_what_was_recorded_to_the_last_bit(
         np.testing.assert_array_equal(verdict.new_reward, verdict.old_reward)
 
 
-@pytest.mark.parametrize("num_envs", [1, 3, 5])
-def test_a_doubled_reward_is_the_double_whatever_the_number_of_envs(
-    tmp_path: Path, recorded: Recorded, num_envs: int
-) -> None:
-    for k, verdict in enumerate(rescored(tmp_path, recorded, {REWARD: f"{REWARD} * 2"}, num_envs)):
-        old = recorded.run(k).reward[: STEPS - 3 * k]
-        np.testing.assert_array_equal(verdict.new_reward, 2 * old)
-        assert verdict.returns == pytest.approx((float(old.sum()), float(2 * old.sum())), rel=1e-6)
-        assert verdict.first_difference == 1 and verdict.metres == 0
-        assert verdict.largest == pytest.approx(float(old.max()), rel=1e-6)
-
-
 def test_another_success_is_found_at_the_state_at_which_a_direct_look_finds_it(
     tmp_path: Path, recorded: Recorded
 ) -> None:
@@ -109,24 +96,6 @@ def test_another_success_is_found_at_the_state_at_which_a_direct_look_finds_it(
         assert verdict.success == (None, firsts[-1]) and verdict.has_success
         assert verdict.first_difference is not None or firsts[-1] is None
     assert firsts[0] is not None and firsts[0] > 1
-
-
-def test_with_the_recorded_states_nothing_drifts_where_the_scene_is_another(
-    tmp_path: Path, recorded: Recorded
-) -> None:
-    heavier = {"builder.add_box_collision(half_size=": "builder.add_box_collision(density=8000, half_size="}
-    by_actions = rescored(tmp_path, recorded, heavier)
-    by_states = rescored(tmp_path, recorded, heavier, use_env_states=True)
-    assert max(verdict.metres for verdict in by_states) < 1e-6
-    assert max(verdict.metres for verdict in by_actions) >= max(verdict.metres for verdict in by_states)
-    for verdict in by_states:
-        np.testing.assert_allclose(verdict.new_reward, verdict.old_reward, atol=2e-2)
-
-
-def test_what_was_not_carried_is_in_the_verdict(tmp_path: Path, recorded: Recorded) -> None:
-    for verdict in rescored(tmp_path, recorded, {'name="cube"': 'name="box"'}):
-        assert "none of this name" in verdict.missed["actors/cube"]
-        assert "none of this name" in verdict.missed["actors/box"]
 
 
 def test_what_cannot_be_judged_says_why_and_the_rest_is(tmp_path: Path, recorded: Recorded) -> None:

@@ -32,12 +32,6 @@ def test_the_first_body_that_moves_elsewhere_and_when() -> None:
     assert parts_at(difference(a, b, (0, 0), tolerance=0.1)) == 8
 
 
-def test_nothing_differs_from_itself() -> None:
-    found = difference(made(10), made(10), (0, 0))
-    assert found.bodies is not None and found.bodies.position is None
-    assert all(p.position is None for p in found.numbers)
-
-
 def test_is_compared_as_they_are_aligned() -> None:
     """The same motion, begun three states later: equal once the two are aligned at it."""
     a, b = made(10), made(13)

@@ -7,8 +7,6 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from workbench.jobs.task import TaskOptions
 from workbench.session.tasks.recents import MOST_KEPT, RECENT_FILE, RecentTasks, lasting
@@ -90,14 +88,6 @@ def test_a_broken_file_is_survived_and_written_anew(folder: Path, text: str) -> 
     assert [task.reference for task in recents(folder).list()] == ["PickCube-v1"]
 
 
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.binary(max_size=200))
-def test_no_bytes_break_it(folder: Path, raw: bytes) -> None:
-    folder.mkdir(mode=0o700, exist_ok=True)
-    (folder / RECENT_FILE).write_bytes(raw)
-    assert isinstance(recents(folder).list(), list)
-
-
 def test_a_file_that_others_may_write_is_not_believed(folder: Path) -> None:
     recents(folder).add("PickCube-v1", TaskOptions())
     (folder / RECENT_FILE).chmod(0o666)
@@ -109,9 +99,3 @@ def test_where_nothing_can_be_written_they_last_for_this_run(tmp_path: Path) -> 
     one = RecentTasks(lambda: tmp_path / "file" / "state")
     one.add("PickCube-v1", TaskOptions())
     assert [task.reference for task in one.list()] == ["PickCube-v1"]
-
-
-def test_arguments_that_json_cannot_hold_are_not_kept(folder: Path) -> None:
-    one = recents(folder)
-    one.add("PickCube-v1", TaskOptions(env_kwargs={"a": object()}))
-    assert one.list() == []

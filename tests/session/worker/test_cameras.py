@@ -23,7 +23,6 @@ from workbench.machine.processes.wire import MessageSocket
 from workbench.session.process.heartbeat import HeartbeatReader, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
     CameraRequest,
-    CannotAnswer,
     DrawPast,
     Event,
     LoadFailed,
@@ -32,7 +31,7 @@ from workbench.session.protocol.messages import (
     PlaceCamera,
     Placed,
 )
-from workbench.session.protocol.questions import CaptureMoment, DrawCamera
+from workbench.session.protocol.questions import CaptureMoment
 from workbench.session.worker import cameras as under_test
 from workbench.session.worker.cameras import WorkerCameras
 from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
@@ -134,56 +133,6 @@ def test_sensors_come_first_and_each_kind_as_soon_as_it_is_there(desk: Desk) -> 
     assert desk.first == [False, True] and desk.heartbeat.read().doing == "drawing"
 
 
-def test_after_a_round_there_is_a_pause_in_proportion(desk: Desk) -> None:
-    desk.cameras.watch(0, (SENSOR,))
-    desk.makes()
-    desk.clock.now += 2.0
-    (pictures,) = desk.makes()
-    assert pictures.milliseconds == pytest.approx(2000)
-    desk.cameras.scene_changed()
-    assert desk.wait() == pytest.approx(0.6)
-    assert desk.makes() == [] and desk.wait() == pytest.approx(0.6), "not begun before"
-    desk.clock.now += 0.61
-    desk.makes()
-    assert shown(desk.makes()) == [BASE]
-    desk.cameras.scene_changed()
-    assert desk.wait() == pytest.approx(1 / 15), "nor oftener than 15 times a second"
-    desk.cameras.watch(1, (SENSOR,))
-    assert desk.wait() == 0.0, "somebody waits for these"
-
-
-def test_how_long_a_picture_took_is_not_told_where_steps_took_part_of_the_time(desk: Desk) -> None:
-    """*Fast, rendered in 450 ms* stood below a picture that had taken 4."""
-    desk.cameras.watch(0, (SENSOR,))
-    desk.makes()
-    desk.held.steps.number += 1
-    (pictures,) = desk.makes()
-    assert pictures.milliseconds is None
-    desk.cameras.scene_changed()
-    desk.clock.now += 1.0
-    desk.makes()
-    (pictures,) = desk.makes()
-    assert pictures.milliseconds is not None
-
-
-def test_a_picture_is_fetched_when_it_should_be_ready_by_what_the_last_ones_took(desk: Desk) -> None:
-    desk.cameras.watch(0, (SENSOR,))
-    desk.makes()
-    desk.clock.tick = 0.2  # the renderer is waited for
-    (pictures,) = desk.makes()
-    desk.clock.tick = 0.0
-    for expected in (pictures.milliseconds / 1000, 0.9 * pictures.milliseconds / 1000):
-        desk.cameras.scene_changed()
-        desk.clock.now += 1.0
-        desk.cameras.make(may_block=False)
-        assert desk.wait() == pytest.approx(expected)
-        desk.cameras.make(may_block=False)
-        assert desk.heard() == [], "not while there is something else to do"
-        desk.clock.now += expected + 0.001
-        desk.cameras.make(may_block=False)
-        assert shown(desk.heard()) == [BASE], "and was not waited for: the next is looked for earlier"
-
-
 def test_pictures_are_fast_while_something_moves_and_exact_when_it_stands_still(desk: Desk) -> None:
     def next_picture(*degree: str) -> Any:
         desk.makes()
@@ -211,15 +160,6 @@ def test_pictures_are_fast_while_something_moves_and_exact_when_it_stands_still(
     assert desk.wait() is None, "until something moves again"
 
 
-def test_what_is_watched_already_is_not_begun_again(desk: Desk) -> None:
-    desk.cameras.watch(0, (SENSOR,))
-    desk.makes()
-    desk.cameras.watch(0, (SENSOR,))
-    assert shown(desk.makes()) == [BASE]
-    desk.cameras.watch(0, (SENSOR,))
-    assert desk.wait() is None
-
-
 def test_of_placements_that_wait_the_last_is_made_after_the_picture_and_its_picture_comes_first(
     desk: Desk,
 ) -> None:
@@ -243,19 +183,6 @@ def test_of_placements_that_wait_the_last_is_made_after_the_picture_and_its_pict
     assert desk.wait() != 0.0, "the others when it rests"
     desk.clock.now += 1.0
     assert desk.makes() == [] and shown(desk.makes()) == [BASE]
-
-
-def test_what_waits_is_placed_before_other_cameras_are_watched_and_nothing_without_a_task(desk: Desk) -> None:
-    there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
-    desk.cameras.place(PlaceCamera(BASE, there))
-    desk.cameras.update_watched()
-    assert [event.settings for event in desk.heard()] == [there]
-    desk.cameras.place(PlaceCamera(BASE, None))
-    desk.held.opened = None
-    desk.cameras.watch(0, (SENSOR,))
-    desk.cameras.put_back()
-    desk.cameras.draw_past(DrawPast(np.zeros((0, 7), np.float32), 0, (SENSOR,), 1))
-    assert desk.heard() == [] and desk.wait() is None and desk.makes() == []
 
 
 def test_a_sensor_of_another_size_is_observed_in_it_and_one_that_is_not_there_is_not_placed(
@@ -286,18 +213,6 @@ def test_a_moment_of_the_past_is_drawn_after_what_waits_and_a_failure_is_told(de
     (failed,) = desk.heard()
     assert isinstance(failed, LoadFailed) and "nothing" in failed.problem.message
     assert desk.makes() == [] and shown(desk.makes()) == [BASE], "the one that was left is made anew"
-
-
-def test_a_question_is_answered_as_the_cameras_were_asked_to_stand_or_why_not(desk: Desk) -> None:
-    opened = desk.held.opened
-    assert opened is not None
-    there = desk.placed(BASE, position=(0.4, 0.1, 0.7))
-    desk.cameras.place(PlaceCamera(BASE, there))
-    picture: Any = desk.cameras.answer(opened, DrawCamera(BASE, None, 1), lambda done, total: None)
-    assert np.allclose(picture.pose[:3], there.position, atol=1e-5)
-    with pytest.raises(CannotAnswer, match="env 9"):
-        desk.cameras.answer(opened, DrawCamera(BASE, None, 9), lambda done, total: None)
-    assert desk.heartbeat.read().doing == "idle"
 
 
 def test_a_moment_is_captured_with_pictures_of_the_envs_that_are_named(desk: Desk) -> None:

@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
+from itertools import count
 from typing import Any
 
 import numpy as np
 import pytest
 
 from workbench.authoring.loading.load import load_task
+from workbench.authoring.problem import Interrupted, TaskError
 from workbench.core.env import actions
 from workbench.core.snapshots.snapshot import Snapshot
 from workbench.jobs.open_task import OpenedTask, Opening, build_task
@@ -82,7 +84,6 @@ def lived() -> Iterator[EnvMoment]:
 def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: EnvMoment) -> None:
     did = lived.back(T, dict.fromkeys(range(N), 0))
     assert did.replayed == tuple(range(N)) and not did.not_carried
-    assert did.how == f"{T} steps were replayed, and every body is where it was, to the last bit."
     assert lived.told == [(done, T) for done in range(1, T + 1)]
     assert lived.opened.env.env.elapsed_steps.tolist() == [T] * N
     for after in range(T, 2 * T):
@@ -129,12 +130,36 @@ def test_where_it_does_not_come_out_the_moment_is_put_there(lived: EnvMoment) ->
         did = lived.back(T, dict.fromkeys(range(N), 0))
     finally:
         lived.actions[3] = kept
-    assert did.replayed == (0, 2) and "in 2 of 3 envs" in did.how
+    assert did.replayed == (0, 2)
     wanted, now = lived.packs[T], lived.packed()
     assert [now[0], now[2]] == [wanted[0], wanted[2]]
     np.testing.assert_allclose(
         np.frombuffer(now[1], np.float32), np.frombuffer(wanted[1], np.float32), atol=1e-6
     )
+
+
+def test_an_interrupt_in_the_middle_of_a_replay_ends_it_and_another_failure_on_the_way_does_not(
+    lived: EnvMoment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails_in_the_fifth_step(error: BaseException) -> None:
+        steps = count(1)
+
+        def hook() -> None:
+            if next(steps) == 5:
+                raise error
+
+        monkeypatch.setattr(lived.opened.env.env, "_after_control_step", hook)
+
+    fails_in_the_fifth_step(KeyError("edited"))
+    did = lived.back(T, dict.fromkeys(range(N), 0))
+    assert did.replayed == () and len(lived.told) == 4
+    assert lived.opened.env.env.elapsed_steps.tolist() == [T] * N, "it was put there"
+    fails_in_the_fifth_step(Interrupted("stopped by hand"))
+    with pytest.raises(TaskError) as ended:
+        lived.back(T, dict.fromkeys(range(N), 0))
+    assert isinstance(ended.value.__cause__, Interrupted) and len(lived.told) == 4
+    monkeypatch.undo()
+    assert lived.back(T, dict.fromkeys(range(N), 0)).replayed == tuple(range(N)), "and the next comes out"
 
 
 def test_a_way_that_takes_too_long_is_given_up(lived: EnvMoment, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from workbench.jobs.open_task import OpenedTask, Opening, build_task
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import bodies_of
-from workbench.session.protocol.messages import CannotAnswer, FollowPlan, PlanDropped, PlanWanted, Settings
+from workbench.session.protocol.messages import FollowPlan, PlanDropped, PlanWanted, Settings
 from workbench.session.protocol.questions import PlanActions, PlannedEnv
 from workbench.session.worker.plans import MOST_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
 
@@ -65,46 +65,6 @@ def test_each_env_gets_a_plan_of_its_own_and_what_its_rollouts_earned(
     # They begin where the hand is.
     hand = push.description.geometry.body_names.index("panda/panda_hand_tcp")
     assert np.abs(one.paths[:, 0] - poses[0, hand, :3]).max() < 1e-5
-
-
-def test_a_plan_goes_on_while_its_episode_does_and_begins_anew_with_another(
-    push: OpenedTask, plan: Callable[..., tuple[PlannedEnv, ...]]
-) -> None:
-    push.env.reset(3)
-    (first,) = plan([0])
-    (again,) = plan([0])  # from the same moment: nothing was followed
-    assert np.allclose(first.actions, again.actions, atol=1e-4)
-    push.env.step(np.stack([again.actions[0], np.zeros(7, np.float32)]))
-    (further,) = plan([0])
-    # The plan itself is among the candidates: it is not holding still any more.
-    assert further.returns[further.plan] != further.returns[further.hold]
-
-
-def test_another_number_of_rollouts_and_another_body_count_from_the_next_plan_on(
-    push: OpenedTask, plan: Callable[..., tuple[PlannedEnv, ...]]
-) -> None:
-    push.env.reset(3)
-    (one,) = plan([1], PlanOptions(rollouts=8, horizon=0.2, every=3), "cube")
-    assert len(one.returns) == 8 and one.actions.shape == (3, 7) and one.traced == "cube"
-
-
-def test_a_task_with_other_bodies_in_each_env_has_no_plan_and_says_what_to_do() -> None:
-    opened = opened_with(TASKS / "different_objects.py", 2, render_backend="none")
-    plans = WorkerPlans(lambda: False)
-    question = PlanActions(pickle.dumps(opened.env.snapshot([0])), bodies_in(opened, [0]), SMALL)
-    with pytest.raises(CannotAnswer, match="build the same bodies in each env"):
-        plans.answer(opened, {"render_backend": "none"}, question, lambda done, total: None)
-    plans.close()
-    opened.env.close()
-
-
-def test_a_live_env_with_other_bodies_than_the_rollouts_have_gets_no_plan(push: OpenedTask) -> None:
-    plans = WorkerPlans(lambda: False)
-    (bodies,) = bodies_in(push, [0])
-    question = PlanActions(pickle.dumps(push.env.snapshot([0])), ({**bodies, "cube": b"larger"},), SMALL)
-    with pytest.raises(CannotAnswer, match="^cube: another one"):
-        plans.answer(push, MADE, question, lambda done, total: None)
-    plans.close()
 
 
 def test_a_plan_is_asked_for_once_and_dropped_if_anything_else_moved_the_envs(push: OpenedTask) -> None:
