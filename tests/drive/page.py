@@ -278,4 +278,6 @@ def open_tab(page: Page, name: str) -> None:
 def close_notice(page: Page) -> None:
     """Close viser's notice that the browser draws in software: it lies over what is below it."""
     # By script: one that goes by itself would be waited for.
-    page.evaluate("for (const close of document.querySelectorAll('.mantine-Notification-closeButton')) close.click()")
+    page.evaluate(
+        "for (const close of document.querySelectorAll('.mantine-Notification-closeButton')) close.click()"
+    )

@@ -55,12 +55,6 @@ def test_what_no_robot_can_do_is_refused(tmp_path: Path, value: float) -> None:
         read_actions(tmp_path / "a.npy")
 
 
-def test_an_archive_without_an_array_is_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz")
-    with pytest.raises(ValueError, match="holds no array"):
-        read_actions(tmp_path / "a.npz")
-
-
 def test_a_recording_is_done_again_from_its_seed_and_one_without_actions_is_refused(
     child_process: None, tmp_path: Path
 ) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from workbench.authoring.problem import TaskError
-from workbench.cli.main import main
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import Recorded, record
 from workbench.jobs.task import TaskOptions
@@ -104,10 +103,3 @@ def test_a_task_that_cannot_be_planned_is_refused_with_the_reason(tmp_path: Path
         record(
             replace(PLANNED, task=str(TASKS / "different_objects.py"), out=tmp_path, options=TaskOptions(2))
         )
-
-
-def test_options_of_a_plan_are_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["record", "PushCube-v1", "--actions", "solve", "--rollouts", "2"])
-    assert ended.value.code == 2
-    assert "--rollouts must be at least 4" in capsys.readouterr().err

@@ -37,7 +37,7 @@ from workbench.jobs.rescore.job import Recording, RescoredBy, rescore_recordings
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions
-from workbench.recording.reader.read_episode import read_episode, read_maniskill
+from workbench.recording.reader.read_episode import read_maniskill
 from workbench.recording.reader.reading import find_all_sources
 from workbench.session.clearance import Clearances
 from workbench.session.rescore import verdict_text
@@ -166,25 +166,6 @@ def test_one_steps_into_what_record_episode_wrote(foreign: Path) -> None:
     now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
     assert state_distance(now, run.state(8))[0] < 1e-5
     task.env.close()
-
-
-def test_a_recording_of_ours_is_gone_into_to_the_last_bit(author: Path) -> None:
-    run = run_of(read_episode(sorted((author / "recordings").glob("*.json"))[2]))
-    task = opened(str(author / "push_cube.py"), 2)
-    for state in (0, 5, STEPS):
-        _, replay_result = replay_to(task, run, state, [0])
-        assert (replay_result.way, replay_result.metres, replay_result.missed) == ("re-simulated", 0, {})
-    task.env.close()
-
-
-def test_what_is_no_recording_is_said(author: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="nothing at"):
-        find_all_sources((tmp_path / "gone",))
-    with pytest.raises(UnreadableRecording, match="no recording in"):
-        find_all_sources((tmp_path,))
-    (tmp_path / "x.json").write_text("{}")
-    with pytest.raises(UnreadableRecording, match="no recording in"):
-        find_all_sources((tmp_path / "x.json",))
 
 
 def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, tmp_path: Path) -> None:
@@ -400,16 +381,6 @@ def test_parts_that_are_merged_print_what_the_whole_would(
     assert code == 2 and "is of another job: code is" in err
 
 
-def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recordings = str(author / "recordings")
-    assert run([recordings, "--task", "x.py", "--recorded-source"], capsys)[0] == 2
-    (author / "file").touch()
-    code, _, err = run([recordings, "--csv-file", str(author / "file" / "where.csv")], capsys)
-    assert code == 2 and "cannot be made" in err
-    code, _, err = run([str(author / "nothing")], capsys)
-    assert code == 2 and "There is nothing at" in err
-
-
 # --- for a page ----------------------------------------------------------------------------------------
 
 
@@ -443,20 +414,3 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
         rescored(rescorer, "stopped")
     finally:
         rescorer.rescoring.close()
-
-
-def test_a_recording_with_a_changed_file_is_judged_by_what_is_left_or_says_why(
-    author: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(author / "recordings", tmp_path / "r")
-    one, other, whole = sorted((tmp_path / "r").glob("*.json"))
-    for path in (one.with_suffix(".h5"), other.with_suffix(".h5"), other.with_suffix(".rrd")):
-        content = bytearray(path.read_bytes())
-        content[len(content) // 2] ^= 1
-        path.write_bytes(content)
-    verdicts, _ = rescore_all(RescoreOptions((tmp_path / "r",), task=str(author / "push_cube.py")))
-    by_name = {verdict.of.path.stem: verdict for verdict in verdicts}
-    assert not by_name[one.stem].why_not and not by_name[one.stem].differs
-    assert f"{one.stem}.h5: was cut short or changed" in verdict_text.not_carried(verdicts)[0]
-    assert f"{other.stem}.h5 was cut short or changed" in by_name[other.stem].why_not
-    assert not by_name[whole.stem].why_not and by_name[whole.stem].missed == {}

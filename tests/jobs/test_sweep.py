@@ -19,7 +19,6 @@ from workbench.jobs.record.sweep import (
     Setting,
     SweepOptions,
     SweepReport,
-    collect_sweep,
     recordings_of,
     sweep,
 )
@@ -129,11 +128,6 @@ def test_a_killed_worker_changes_no_number(swept: SweepReport, tmp_path: Path) -
     assert sorted(kept) == sorted(str(file.relative_to(tmp_path)) for file in tmp_path.glob("*/*.rrd"))
 
 
-def test_a_sweep_without_a_part_says_so(tmp_path: Path) -> None:
-    what = options(tmp_path, "MOST=5,1")
-    assert collect_sweep(what, {}).missing == 6
-
-
 # --- what varies ---------------------------------------------------------------------------------------
 
 SEVERAL = """
@@ -232,13 +226,6 @@ def test_a_name_that_cannot_be_set_is_refused_with_what_to_do(several: Path, giv
     with pytest.raises(ValueError, match=".") as refused:
         changed(several, given)
     assert why in str(refused.value)
-
-
-def test_an_id_takes_its_constructors_arguments_alone(tmp_path: Path) -> None:
-    what = replace(options(tmp_path, "robot_uids=panda,fetch"), task="PickCube-v1")
-    assert [one.options.env_kwargs["robot_uids"] for one in recordings_of(what)] == ["panda", "fetch"]
-    with pytest.raises(ValueError, match="workbench new NAME --from PickCube-v1"):
-        recordings_of(replace(options(tmp_path, "robot_uid=panda"), task="PickCube-v1"))
 
 
 @pytest.mark.parametrize(

@@ -92,33 +92,6 @@ def test_other_entries_that_both_have_are_named_and_are_no_difference() -> None:
     assert verdict_text.change_text(found) == "unchanged, except height"
 
 
-def test_what_is_known_of_the_run_is_in_its_verdict() -> None:
-    found = compare(
-        0,
-        said(),
-        said(success=[0] * 5),
-        task="Push-v1",
-        seed=7,
-        start_differs=True,
-        missed={"cube": "gone"},
-    )
-    assert (found.task, found.seed, found.start_differs, found.missed) == (
-        "Push-v1",
-        7,
-        True,
-        {"cube": "gone"},
-    )
-    assert found.has_success and compare(0, said(success=[0] * 5), said()).has_success
-    assert verdict_text.not_carried([found, found]) == ("cube: gone",)
-
-
-def test_one_that_was_not_judged_says_nothing_else() -> None:
-    found = Verdict("it", why_not="it has no step")
-    assert (found.seed, found.length, found.returns, found.largest, found.differing) == (-1, 0, (0, 0), 0, ())
-    assert len(found.old_reward) == len(found.new_reward) == 0 and found.metres is None
-    assert verdict_text.change_text(found) == "not rescored: it has no step"
-
-
 def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_file_says_nothing_of() -> None:
     nan = np.nan
     old = said(a=[nan, 1, 1, 1, 1], b=[1, 1, 1, nan, 1], c=[1, 1, 1, 1, 1], success=[nan, 0, 0, 0, 0])

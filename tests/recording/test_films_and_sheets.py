@@ -25,7 +25,6 @@ from workbench.recording.films import (
     chosen_states,
     contact_sheet,
     default_eye,
-    enlarged,
     frames,
     write_mp4,
 )
@@ -123,14 +122,6 @@ def test_two_cameras_of_one_name_are_told_apart(episode: Episode) -> None:
     human = replace(sensor, info=replace(sensor.info, kind="human"))
     named = cameras_by_name(replace(episode, cameras=[human, sensor]))
     assert named["base_camera"] is sensor and named["base_camera_human"] is human
-
-
-def test_small_pictures_are_enlarged_by_whole_pixels() -> None:
-    picture = np.arange(96 * 128 * 3, dtype=np.uint32).astype(np.uint8).reshape(96, 128, 3)
-    large = enlarged(picture)
-    assert large.shape == (288, 384, 3)
-    assert np.array_equal(large[::3, ::3], picture) and np.array_equal(large[2::3, 2::3], picture)
-    assert enlarged(large) is large
 
 
 def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Episode) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from dataclasses import replace
 
 import pytest
 
@@ -19,7 +17,6 @@ from tests.authoring.camera_source.real_cameras import (
     run_as,
     run_class,
     settings_of,
-    unit,
 )
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
 from workbench.authoring.camera_source.disk import SourceEdit
@@ -99,25 +96,6 @@ def test_what_cannot_be_added_to_is_refused() -> None:
         assert isinstance(plan, RefusedEdit) and "is not a name" in plan.reason
 
 
-@pytest.mark.parametrize("name", ["sapien", "CameraConfig"])
-def test_a_name_that_means_something_else_in_the_file_is_not_imported_over_it(name: str) -> None:
-    source = hook('        return [ManiSkills("cam", pose.Pose([0, 0, 1]), 8, 8, 1.0)]\n')
-    source = source.replace("import sapien\n", "import sapien as pose\n")
-    source = source.replace(
-        "import CameraConfig\n", f"import CameraConfig as ManiSkills\n{name} = 1\n{name} = 2\n"
-    )
-    plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
-    line = source.splitlines().index(f"{name} = 2") + 1
-    assert (
-        isinstance(plan, RefusedEdit)
-        and f"`{name}` means something else in this file (line {line})" in plan.reason
-    )
-    free = source.replace(f"{name} = 1\n{name} = 2\n", "")
-    plan = planned(plan_add, {FILE: free}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
-    assert isinstance(plan, SourceEdit) and len(plan.notes) == 2, plan
-    assert same_cameras(cameras(plan.new_text), cameras(free) | {(SENSOR, "added"): NEW}), plan.diff
-
-
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_copy_stands_beside_its_original(name: str) -> None:
     source = WRITTEN[name]
@@ -170,20 +148,6 @@ def test_what_is_made_in_a_loop_is_refused() -> None:
         assert isinstance(plan, RefusedEdit) and "loop" in plan.reason
 
 
-def test_settings_are_those_that_are_written() -> None:
-    source = WRITTEN["a pose of nothing"]
-    exact = dataclasses.replace(
-        NEW, position=(1 / 3, 0.0, 2 / 3), quaternion=unit((1, 2, 3, 4)), fov=1.23456789
-    )
-    plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "added"), exact, run_as("Task"))
-    assert isinstance(plan, SourceEdit) and plan.settings is not None
-    assert (
-        plan.settings.position == pytest.approx((0.3333, 0.0, 0.6667), abs=1e-7)
-        and plan.settings.fov == 1.2346
-    )
-    assert close(plan.settings, cameras(plan.new_text)[SENSOR, "added"])
-
-
 def hook(body: str) -> str:
     return f"{HEADER}class Task(Base):\n    @property\n    def {SENSOR}(self):\n{body}"
 
@@ -192,26 +156,6 @@ BESIDE_LOOK_AT = """\
         pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])
         return [CameraConfig("cam", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]
 """
-
-
-def test_a_new_camera_is_written_as_its_sibling_is_and_stands_in_a_line_as_that_does() -> None:
-    seen = LookAt((0.51234, 0.3, 0.6), (0.08, 0.0, 0.02))
-    wanted = replace(with_pose(NEW, pose_from_look_at(seen)), distance=math.dist(seen.eye, seen.target))
-    key = ("sensor", "side")
-    plan = planned(plan_add, {FILE: hook(BESIDE_LOOK_AT)}, FILE, "Task", key, wanted, run_as("Task"))
-    assert isinstance(plan, SourceEdit)
-    assert (
-        """\
-        return [
-            CameraConfig("cam", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10),
-            CameraConfig(
-                "side",
-                pose=sapien_utils.look_at(eye=[0.5123, 0.3, 0.6], target=[0.08, 0.0, 0.02]),
-                width=64,
-"""
-        in plan.new_text
-    )
-    assert plan.settings is not None and close(plan.settings, cameras(plan.new_text)[SENSOR, "side"])
 
 
 @pytest.mark.parametrize("forward", [(0, 0, -1), (0, 0, 1)])
@@ -223,63 +167,6 @@ def test_straight_down_and_up_look_at_is_not_used(forward: tuple[float, float, f
     )
     assert isinstance(plan, SourceEdit) and "q=[" in plan.diff
     assert close(wanted, cameras(plan.new_text)[SENSOR, "side"])
-
-
-@pytest.mark.parametrize(
-    "held",
-    [
-        "[CAM, CAM2]",
-        "[CAM, (CAM2),]",
-        "(CAM, CAM2)",
-        "CAM, CAM2",
-        "(CAM,)  # one",
-        "dict(cam=CAM, cam2=CAM2)",
-        '{"cam": CAM , "cam2" : CAM2 ,}',
-    ],
-)
-def test_what_stands_on_one_line_gets_a_line_each(held: str) -> None:
-    for name in ("cam2", "cam"):
-        camera = f'CameraConfig("{name}", sapien.Pose([0, 0, 1]), 8, 8, 1.0)'
-        held = held.replace(name.upper(), camera)
-    source = hook(f"        return {held}\n")
-    plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
-    assert isinstance(plan, SourceEdit), plan
-    assert same_cameras(cameras(plan.new_text), cameras(source) | {(SENSOR, "added"): NEW}), plan.diff
-    indents = [
-        len(line) - len(line.lstrip()) for line in plan.new_text.splitlines() if "CameraConfig(" in line
-    ]
-    assert set(indents) == {12}, plan.diff
-
-
-def test_tidy_text_comes_of_it() -> None:
-    source = HEADER + (
-        "class Task(Base):\n"
-        "    @property\n"
-        "    def _default_sensor_configs(self):\n"
-        '        return CameraConfig("cam", sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0)\n'
-    )
-    plan = planned(plan_add, {FILE: source}, FILE, "Task", ("sensor", "top"), NEW, run_as("Task"))
-    assert isinstance(plan, SourceEdit)
-    assert plan.new_text.endswith(
-        """\
-        return [
-            CameraConfig("cam", sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0),
-            CameraConfig(
-                "top",
-                pose=sapien.Pose(p=[0.1, 0.25, 1.5], q=[0.5, 0.5, 0.5, -0.5]),
-                width=64,
-                height=48,
-                fov=1.25,
-                near=0.02,
-                far=12.0,
-                shader_pack="default",
-            ),
-        ]
-"""
-    )
-    back = planned(plan_remove, {FILE: plan.new_text}, ("sensor", "cam"), run_class)
-    assert isinstance(back, SourceEdit)
-    assert 'return [\n            CameraConfig(\n                "top"' in back.new_text
 
 
 @pytest.mark.parametrize(

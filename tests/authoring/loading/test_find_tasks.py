@@ -96,11 +96,3 @@ def test_no_text_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, raw
     assert found is None or found.path == file
     file.write_bytes(b"class Task(BaseEnv): pass\nx = '''" + raw)
     read_task_file(file)
-
-
-@settings(max_examples=60)
-@given(st.integers(1, 4000))
-def test_no_depth_of_nesting_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, depth: int) -> None:
-    file = tmp_path_factory.getbasetemp() / "deep.py"
-    file.write_text(f"class Task(BaseEnv): pass\nx = {'(' * depth}1{')' * depth}\ny = {'-' * depth}1\n")
-    assert read_task_file(file) is not None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import importlib.metadata
 import inspect
-import linecache
 import os
 import platform
 import sys
@@ -21,11 +20,8 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.authoring.refusal import refused
 from tests.authoring.registered import registered
-from workbench.authoring.loading import registry
 from workbench.authoring.loading.load import (
-    LoadedTask,
     load_task,
-    task_of_class,
     undo_load,
     with_late_imports,
 )
@@ -79,22 +75,6 @@ def test_a_registered_id_gives_the_built_in_class_and_its_source() -> None:
     assert "class PickCubeEnv" in task.source[str(task.file)]
 
 
-def test_a_class_that_a_task_file_imports_is_no_class_of_that_file(write: Write) -> None:
-    built_in = "from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv\n"
-    path = write("child.py", f"{built_in}{PUSH.replace('BaseEnv', 'PickCubeEnv')}", task=True)
-    load_task(str(path))
-    task = load_task("PickCube-v1")
-    assert task.file is not None and task.file.name == "pick_cube.py" and str(path) not in task.source
-
-
-def test_a_class_of_others_that_a_task_file_registers_comes_with_that_file(write: Write) -> None:
-    built_in = "from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv\n"
-    path = write("again.py", f'{built_in}\nregister_env("AuthorPick-v1")(PickCubeEnv)\n', task=True)
-    load_task(str(path))
-    task = task_of_class(REGISTERED_ENVS["AuthorPick-v1"].cls, "AuthorPick-v1")
-    assert (task.file, str(path) in task.source) == (path, True)
-
-
 @pytest.mark.parametrize(
     ("reference", "words"),
     [
@@ -119,37 +99,11 @@ def test_a_wrong_reference_is_refused_in_words(reference: str, words: str) -> No
     assert len(problem.message) <= 500
 
 
-def test_a_misspelt_file_a_folder_and_another_kind_of_file_are_refused(write: Write, folder: Path) -> None:
-    write("push_cube.py", PUSH, task=True)
-    write("notes.txt", "hello")
-    os.mkfifo(folder / "pipe.py")
-    assert "push_cube.py" in refused(folder / "push_cub.py").message
-    assert "push_cube.py" not in refused(folder / "pull_cup.py").message, "a name that is not near"
-    assert "is a folder" in refused(folder).message and "push_cube.py" in refused(folder).message
-    assert "not a .py file" in refused(folder / "notes.txt").message
-    assert "not an ordinary file" in refused(folder / "pipe.py").message
-
-
-def test_an_unreadable_file_is_refused(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write("push.py", PUSH, task=True)
-    if os.geteuid() == 0:
-        # Root reads everything: a file that goes away between the look and the reading instead.
-        monkeypatch.setattr("workbench.authoring.loading.load.check_task_file", Path.unlink)
-    else:
-        path.chmod(0)
-    assert "cannot be read" in refused(path).message
-
-
 @pytest.mark.parametrize("text", ["", "\n\n", "# nothing yet\n", "import torch\n", "class Env:\n    pass\n"])
 def test_a_file_without_a_task_is_refused_with_advice(text: str, write: Write) -> None:
     problem = refused(write("push.py", text))
     assert "BaseEnv" in problem.message
     assert problem.file is not None and problem.file.endswith("push.py")
-
-
-def test_a_class_that_is_only_imported_is_not_taken_for_the_files_own(write: Write) -> None:
-    write("base_task.py", PUSH, task=True)
-    assert "base_task" in refused(write("push.py", "from base_task import PushEnv\n")).message
 
 
 def test_of_several_classes_the_last_registered_one_is_taken_and_the_others_are_named(write: Write) -> None:
@@ -298,13 +252,6 @@ def test_a_helper_of_another_tasks_folder_is_not_taken(write: Write) -> None:
     assert {"AuthorPush-v1", "AuthorPull-v1"} <= set(REGISTERED_ENVS)
 
 
-def test_a_helper_that_imports_the_task_back_gets_the_same_module(write: Write) -> None:
-    write("helper.py", "def radius():\n    import push_back\n    return push_back.PushEnv.goal_radius\n")
-    path = write("push_back.py", "import helper\n" + PUSH + "\nRADIUS = helper.radius()\n", task=True)
-    task = load_task(str(path))
-    assert sys.modules[task.cls.__module__].RADIUS == 0.1
-
-
 def test_a_file_in_a_package_may_import_relatively(write: Write) -> None:
     write("project/__init__.py", "")
     write("project/common.py", "SIZE = 1\n")
@@ -333,15 +280,6 @@ def test_libraries_below_the_tasks_folder_are_left_alone(write: Write) -> None:
     task = load_task(str(path))
     assert sys.modules["author_library"] is library
     assert task.source_files == (path,)
-
-
-def test_the_workbench_itself_below_the_tasks_folder_is_left_alone() -> None:
-    root = Path(registry.__file__).parents[2]
-    path = root / "author_task_in_the_root.py"
-    text = "from mani_skill.envs.sapien_env import BaseEnv\nclass RootEnv(BaseEnv): pass\n"
-    task = load_task(str(path), source={str(path): text})
-    assert task.class_name == "RootEnv"
-    assert sys.modules["workbench.authoring.loading.registry"] is registry
 
 
 def test_a_module_imported_inside_a_hook_is_found_and_followed(write: Write) -> None:
@@ -584,26 +522,6 @@ def test_old_versions_are_let_go(write: Write) -> None:
     assert [version() is None for version in versions] == [True, True, True, False, False]
 
 
-def test_a_library_that_a_failed_load_imported_stays_registered(write: Write, folder: Path) -> None:
-    library = write("site-packages/author_tasks.py", PUSH.replace("AuthorPush", "AuthorLibrary"), task=True)
-    sys.path.append(str(library.parent))
-    path = write("push.py", "import author_tasks\n1 / 0\n")
-    refused(path)
-    assert "author_tasks" in sys.modules
-    assert "AuthorLibrary-v1" in REGISTERED_ENVS
-
-
-def test_a_file_of_mani_skills_own_can_be_opened_by_its_path() -> None:
-    built_in = REGISTERED_ENVS["PushCube-v1"].cls
-    path = inspect.getsourcefile(built_in)
-    task: LoadedTask = load_task(str(path))
-    assert task.class_name == "PushCubeEnv" and task.cls is not built_in
-    assert (
-        sys.modules["mani_skill.envs.tasks.tabletop.pick_cube"].PickCubeEnv
-        is REGISTERED_ENVS["PickCube-v1"].cls
-    )
-
-
 def test_a_failed_save_leaves_an_id_with_the_file_that_took_it_since(write: Write) -> None:
     one = write("one/push.py", PUSH, task=True)
     two = write("two/push.py", PUSH, task=True)
@@ -640,56 +558,3 @@ def test_what_a_failed_load_put_on_the_search_path_is_gone(write: Write, folder:
         refused(path)
         assert (sys.path, sys.meta_path) == (search_path, finders)
     assert REGISTERED_ENVS["AuthorPush-v1"].cls is good.cls
-
-
-def test_a_package_has_the_modules_of_the_good_version_after_a_failed_load(write: Write) -> None:
-    # The name is no other test's: what lies outside of the task's own folder stays imported.
-    write("push_lab/__init__.py", "")
-    write("push_lab/tasks/__init__.py", "")
-    helper = write("push_lab/tasks/helper.py", "SIZE = 1\n")
-    path = write("push_lab/tasks/push.py", "from . import helper\n" + PUSH, task=True)
-    load_task(str(path))
-    good, package = sys.modules["push_lab.tasks"], sys.modules["push_lab"]
-    path.write_text(path.read_text() + "\n1 / 0\n")
-    helper.write_text("SIZE = 2\n")
-    for _ in range(2):
-        refused(path)
-        assert sys.modules["push_lab"] is package
-        assert package.tasks is good is sys.modules["push_lab.tasks"]
-        assert good.helper is sys.modules["push_lab.tasks.helper"] and good.helper.SIZE == 1
-
-
-def test_tracebacks_show_nothing_of_a_version_that_failed(write: Write) -> None:
-    helper = write("helper.py", "SIZE = 1\n")
-    path = write("push.py", "import helper\n1 / 0\n")
-    refused(path)
-    assert not {str(helper), str(path)} & set(linecache.cache)
-
-
-def test_the_tasks_of_one_folder_stay_imported_beside_each_other(write: Write) -> None:
-    one = load_task(str(write("one.py", PUSH, task=True)))
-    module = sys.modules[one.cls.__module__]
-    two = load_task(str(write("two.py", PUSH.replace("AuthorPush", "AuthorTwo"), task=True)))
-    assert sys.modules[one.cls.__module__] is module
-    assert sys.modules[two.cls.__module__] is not module
-
-
-def test_a_file_that_is_called_like_a_library_does_not_take_its_place(write: Write) -> None:
-    sys.modules.pop("antigravity", None)
-    task = load_task(str(write("antigravity.py", PUSH, task=True)))
-    assert task.env_id == "AuthorPush-v1" and "antigravity" not in sys.modules
-
-
-def test_a_null_byte_is_told_at_its_line(write: Write) -> None:
-    problem = refused(write("push.py", "x = 1\ny = 2\nz = '\0'\n"))
-    assert (problem.stage, problem.line) == ("syntax", 3)
-
-
-def test_a_package_itself_may_be_the_task(write: Write) -> None:
-    helper = write("package_that_pushes/shapes.py", "SIZE = 1\n")
-    path = write("package_that_pushes/__init__.py", "from .shapes import SIZE\n" + PUSH, task=True)
-    for size in (1, 2):
-        helper.write_text(f"SIZE = {size}\n")
-        task = load_task(str(path))
-        assert task.source_files == (path, helper)
-        assert sys.modules[task.cls.__module__].SIZE == size

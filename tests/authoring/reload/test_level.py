@@ -130,20 +130,6 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
     assert found.level == "rebuilt" and "EDGE changed" in found.reason
 
 
-def test_methods_of_one_name_are_taken_for_one() -> None:
-    body = """
-    def _load_scene(self, options):
-        maker.reset_all()
-
-    def reset_all(self):
-        return {}
-
-    def evaluate(self):
-        return {{"x": self.reset_all()}}
-    """
-    assert change(task(body.format(1)), task(body.format(2))).level == "rebuilt"
-
-
 @pytest.mark.parametrize(
     ("hooks", "top", "says"),
     [
@@ -289,12 +275,3 @@ def test_cameras_that_depend_on_the_moment_are_rebuilt(hook: str) -> None:
 def test_a_file_that_cannot_be_read_is_no_error() -> None:
     assert change("def (", task("def evaluate(self):\n    return {}\n")).level == "rebuilt"
     assert change(task("x = 1\n"), "class Task(BaseEnv):\n    x = 1\n" + "\0").level == "rebuilt"
-
-
-def test_line_ends_and_layout_are_the_same_code() -> None:
-    body = task("def evaluate(self):\n    return {'a': 1, 'b': 2}\n")
-    assert change(body, body.replace("\n", "\r\n")).level == "same"
-    assert (
-        change(body, body.replace("{'a': 1, 'b': 2}", "{\n        'a': 1,\n        'b': 2,\n    }")).level
-        == "same"
-    )

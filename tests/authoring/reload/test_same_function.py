@@ -60,9 +60,3 @@ def test_a_line_is_followed_where_only_what_is_around_it_changed(words: str, new
 )
 def test_a_function_that_says_something_else_has_no_such_line(words: str, new: str) -> None:
     assert line_in(OLD, new, at(OLD, words)) is None
-
-
-def test_a_line_of_nothing_is_nowhere() -> None:
-    assert line_in(OLD, OLD, 1) is None
-    assert line_in("def (", OLD, 1) is None
-    assert line_in(OLD, OLD, 99) is None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -202,22 +201,6 @@ def test_a_call_that_came_to_have_another_value_is_computed() -> None:
     assert told("note(None)", a=np.zeros(1)) == "`None` is computed when the task runs"
 
 
-def test_arguments_that_are_not_given_are_not_spoken_of() -> None:
-    _, trace = traced("def f():\n    note(b=1.5)\nf()", a=2.5)
-    assert set(trace.parts) == {"b"} and not trace.unknown
-    assert trace.function == "f" and trace.parts["b"].literal
-    project, trace = traced("note(1.5, b=f'{1}')")
-    assert set(trace.parts) == {"a"} and set(trace.unknown) == {"b"}
-    assert project.texts[FILE][trace.at.start : trace.at.end] == "note(1.5, b=f'{1}')"
-    assert trace.function == "<module>"
-
-
-def test_names_defined_by_names_are_followed_forty_deep() -> None:
-    chain = [f"N{i} = N{i - 1}\n" for i in range(1, 41)]
-    assert told(f"N0 = 1.5\n{''.join(chain[:-1])}note(N39)").startswith("1.5 < N39 < N38")
-    assert told(f"N0 = 1.5\n{''.join(chain)}note(N40)") == "`1.5` is defined by itself"
-
-
 TASK = """\
 class Parent:
     eye = 1.5
@@ -360,14 +343,6 @@ assert len(made) == 1
 def test_constants_of_files_beside_it_are_followed_there(text: str, others: str, what: str) -> None:
     more = {"/author/more.py": "X = 1.5"} if "more" in others else {}
     assert told(text, {**more, PLACES: others}) == what
-
-
-def test_an_import_from_the_same_package_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("pack", "pack.places"):
-        monkeypatch.setitem(sys.modules, name, ModuleType(name))
-    text = "import sys, places\nsys.modules['pack.places'] = places\n__package__ = 'pack'\n"
-    assert told(f"{text}from .places import X\nnote(X)", {PLACES: "X = 1.5"}) == "1.5 < X"
-    assert told(f"{text}from pack.places import X\nnote(X)", {PLACES: "X = 1.5"}) == "1.5 < X"
 
 
 def test_of_several_lines_the_one_with_the_running_value_is_meant() -> None:

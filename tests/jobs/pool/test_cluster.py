@@ -19,7 +19,7 @@ from tests.jobs.pool.work import Run, Setup
 from workbench.authoring.problem import TaskError
 from workbench.jobs.pool import cluster as seam
 from workbench.jobs.pool.cluster import Cluster
-from workbench.jobs.pool.connect import NoCluster, connected
+from workbench.jobs.pool.connect import connected
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import JobFile, Kept, job_of
 from workbench.jobs.record.episodes import RecordOptions
@@ -233,25 +233,6 @@ def test_other_versions_are_refused_and_named(
     monkeypatch.setattr(seam, "versions_here", lambda: {**here, "torch": "1.0"})
     with pytest.raises(PoolError, match=re.escape(f"has torch {here['torch']}, and the submitting side 1.0")):
         Run(Setup(folder=tmp_path), range(8)).by(Cluster(address, 1))
-
-
-def test_a_worker_that_fits_on_no_machine_is_refused(address: str, tmp_path: Path) -> None:
-    with pytest.raises(NoCluster, match="no machine of the cluster has 64 CPU for a worker"):
-        Run(Setup(folder=tmp_path), range(8)).by(Cluster(address, cpus_per_worker=64))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("line", ["breakpoint()", "import pdb; pdb.set_trace()"])
-def test_a_line_that_stops_for_a_debugger_is_refused_and_not_waited_at(
-    line: str, address: str, task: Path
-) -> None:
-    task.write_text(TASK.replace("        far = self", f"        {line}\n        far = self"))
-    with pytest.raises(TaskError, match="this line stops for a debugger.*--workers 1 without --cluster"):
-        record(wanted("there"), executor=Cluster(address, 1))
-
-
-def test_a_breakpoint_here_does_what_it_did_before_a_cluster_was_joined(address: str) -> None:
-    assert not os.environ.get("PYTHONBREAKPOINT", "").startswith("ray.")
 
 
 @pytest.mark.slow

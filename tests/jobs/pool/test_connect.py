@@ -30,13 +30,7 @@ with connected("local") as ray:
 _, alive = psutil.wait_procs(family[1:], timeout=20)
 print(len(alive))
 """
-AUTO = """
-from pathlib import Path
-from workbench.jobs.pool.connect import connected
 
-with connected() as ray:
-    print(ray.get_runtime_context().gcs_address.partition(":")[0])
-"""
 TAKES = """
 import os
 from workbench.jobs.pool.connect import connected
@@ -91,14 +85,6 @@ def test_it_can_be_reached_from_this_machine_with_a_token_only_and_ends_with_the
 def test_an_address_where_nothing_answers_is_said(tmp_path: Path, ray_folder: str) -> None:
     (said,) = run(FINDS_NONE, tmp_path, ray_folder)
     assert said.startswith("no Ray cluster answers at 127.0.0.1:1 ") and "`ray start --head`" in said
-
-
-@pytest.mark.slow
-def test_what_a_cluster_that_has_ended_left_is_passed_over(tmp_path: Path, ray_folder: str) -> None:
-    left = Path(ray_folder) / "ray" / "ray_current_cluster"
-    left.parent.mkdir()
-    left.write_text("127.0.0.1:1")
-    assert run(AUTO, tmp_path, ray_folder) == ["127.0.0.1"]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pytest
 
 from workbench.jobs.pool.deal import Deal, ItemQueue, Shard, ThisProcess, Work
 from workbench.jobs.pool.job_file import JobFile, JobFileError, JobKey, Kept, job_of, read_parts, write_whole
-from workbench.jobs.record.episodes import RecordOptions, Written
+from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.task import TaskOptions
 
 WHOLE = Shard()
@@ -119,17 +119,6 @@ def test_what_is_no_job_file_is_refused_and_left_alone(make: Callable[[Path], No
         with pytest.raises((JobFileError, FileNotFoundError), match=r"a\.job"):
             use()
     assert not path.is_file() or path.read_bytes() == before
-
-
-def test_a_result_of_another_type_is_refused(tmp_path: Path) -> None:
-    run(tmp_path / "a.job")
-    with pytest.raises(JobFileError, match="a result cannot be read"):
-        read_parts([tmp_path / "a.job"]).results(Written)
-
-
-def test_a_missing_folder_is_made(tmp_path: Path) -> None:
-    JobFile(tmp_path / "new" / "a.job", JOB).close()
-    assert (tmp_path / "new" / "a.job").is_file()
 
 
 # --- which job it is -------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.waiting import until
-from tests.jobs.pool import work
 from tests.jobs.pool.work import BEGUN, PROBLEM, Run, Setup, Squared
 from workbench.authoring.problem import Problem, TaskError
 from workbench.jobs.pool.deal import (
@@ -62,18 +61,6 @@ def test_each_item_is_done_once_with_the_same_result_whoever_does_it(
     pids = {result.pid for result in done.results.values()}
     assert pids == {os.getpid()} if isinstance(executor, ThisProcess) else os.getpid() not in pids
     assert not any(map(psutil.pid_exists, pids - {os.getpid()}))
-
-
-@child_process
-def test_cores_are_shared_out_and_no_process_is_started_for_nothing(tmp_path: Path) -> None:
-    cores = sorted(os.sched_getaffinity(0))
-    given = [
-        line.rpartition(" ")[2].split(",")
-        for line in Run(Setup(folder=tmp_path), range(4)).by(Processes(2)).updates
-    ]
-    together = sorted(int(core) for one in given for core in one)
-    assert together == (cores if len(cores) > 1 else 2 * cores)
-    assert len(Run(Setup(folder=tmp_path), range(4), chunk=4).by(Processes(2)).updates) == 1
 
 
 @child_process
@@ -189,13 +176,6 @@ def test_a_task_that_cannot_be_loaded_is_said_once(executor: Executor, tmp_path:
     with pytest.raises(TaskError, match="it broke") as raised:
         run.by(executor)
     assert raised.value.problem == PROBLEM and not run.results
-
-
-@child_process
-def test_a_process_that_forgets_an_item_is_a_failure(tmp_path: Path) -> None:
-    run = Run(Setup(folder=tmp_path), range(8), run=work.forget)
-    with pytest.raises(PoolError, match="ended before it was done"):
-        run.by(Processes(1))
 
 
 @child_process

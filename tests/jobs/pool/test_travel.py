@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from workbench.jobs.actions import needed_by
-from workbench.jobs.pool import travel
-from workbench.jobs.pool.travel import TooMuch, files_below, pack_baggage, relocated
+from workbench.jobs.pool.travel import files_below, pack_baggage, relocated
 
 
 @pytest.fixture
@@ -47,13 +46,6 @@ def test_what_is_named_from_the_current_folder_is_found_there_too(
     assert Path("mine/assets/cup/cup.urdf").read_text() == "assets/cup/cup.urdf"
     assert Path("demo.npy").read_bytes() == b"123"
     assert Path(places[str(place)], "task.py").samefile("mine/task.py")
-
-
-def test_too_much_is_refused_with_what_is_large(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(travel, "MOST_BYTES", 2 << 20)
-    (place / "huge.bin").write_bytes(bytes(5 << 20))
-    with pytest.raises(TooMuch, match=r"are 5 MB, and up to 2 MB travel.*huge\.bin \(5 MB\)"):
-        pack_baggage([place])
 
 
 @dataclass(frozen=True)

@@ -85,14 +85,6 @@ def test_of_a_changed_file_the_others_are_read(episode: Made, tmp_path: Path, su
     np.testing.assert_array_equal(found.action, episode.action)
 
 
-def test_where_both_are_changed_there_is_no_recording(episode: Made, tmp_path: Path) -> None:
-    files = episode.write(tmp_path)
-    flip(files.rrd, 3000)
-    flip(files.h5, 3000)
-    with pytest.raises(UnreadableRecording, match=r"\.rrd was cut short or changed .*\.h5 was cut short"):
-        read_episode(files.json)
-
-
 def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, tmp_path: Path) -> None:
     files = episode.write(tmp_path)
     write_into_description(files.json, ("good",), "a note")

@@ -117,11 +117,6 @@ def test_numbers_texts_and_both_come_back(child_process: None, make_episode: Mak
     ]
 
 
-def test_an_episode_without_such_entries_has_no_place_for_them(make_episode: Maker, tmp_path: Path) -> None:
-    path = make_episode(2, evaluate={"success": np.zeros(3, bool)}).write(tmp_path).rrd
-    assert not [name for name in read_rrd(path) if name.startswith(("/batch", "/logs/evaluate"))]
-
-
 def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Path) -> None:
     write(make_episode(3), tmp_path, [{"phase": said(f"{state // 2}")} for state in range(4)], finish=False)
     (files,) = recover(tmp_path)
@@ -133,13 +128,6 @@ def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Pat
         ("1",),
         ("1",),
     ]
-
-
-def test_the_json_that_a_library_reads_stays_small(make_episode: Maker, tmp_path: Path) -> None:
-    steps = 1500
-    made = make_episode(steps)
-    files = write(made, tmp_path, [{"clock": said(f"{state:060}")} for state in range(steps + 1)])
-    assert files is not None and files.json.stat().st_size < 3 * MOST_BYTES
 
 
 @settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])

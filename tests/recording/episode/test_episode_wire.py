@@ -224,18 +224,3 @@ def test_a_picture_that_is_none_is_said(picture: NDArray | None) -> None:
         pictures[0]
     with pytest.raises(OSError, match="no picture"):
         pictures.blob(0)
-
-
-@pytest.mark.parametrize(
-    ("modality", "picture"), [("depth", numbers(4, 6)), ("segmentation", numbers(4, 6, kind="i4"))]
-)
-def test_pictures_of_one_number_a_pixel_come_as_they_are(modality: Modality, picture: NDArray) -> None:
-    read = of_first("cameras", pictures={modality: T + 1})(pack_episode(an_episode(), None, 1, SentShapes()))
-    (track,) = unpack_episode(crossed(read), lambda *_: PictureRead(picture), 1, SharedShapes(), {}).cameras
-    np.testing.assert_array_equal(getattr(track, modality)[T], picture, strict=True)
-
-
-def test_a_camera_may_be_a_pixel_wide() -> None:
-    read = pack_episode(an_episode(), None, 1, SentShapes())
-    lens = msgspec.structs.replace(read.cameras[0].camera, width=1, height=1)
-    assert here(of_first("cameras", camera=lens)(read)).cameras[0].info.width == 1

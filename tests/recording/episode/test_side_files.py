@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.episodes import Made, made, write
+from tests.drive.episodes import Made
 from workbench.recording.episode.side_files import side_file_path, side_files, side_files_text
 from workbench.recording.reader.read_episode import read_episode
 
@@ -97,12 +97,6 @@ def test_a_file_that_changed_within_its_second_is_another(task: Path) -> None:
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
     assert path.stat().st_size == before.st_size
     assert "notes.txt has changed since" in side_files_text(str(task), recorded)
-
-
-def test_a_recording_says_them(tmp_path: Path) -> None:
-    json = write(tmp_path, made(3, side_files={"meshes/part.obj": "0123456789ab"}), pictures=False)
-    assert read_episode(json).info.side_files == {"meshes/part.obj": "0123456789ab"}
-    assert read_episode(json.with_suffix(".rrd")).info.side_files == {"meshes/part.obj": "0123456789ab"}
 
 
 def test_a_recording_that_was_copied_elsewhere_finds_its_task_where_one_looks_from(

@@ -20,7 +20,7 @@ from workbench.recording.lerobot.format import Choice, frames_of
 from workbench.recording.lerobot.read import lerobot_rows, read_lerobot
 from workbench.recording.library.library import Library, LibraryError
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import find_all_sources, read_recording
+from workbench.recording.reader.reading import read_recording
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -196,17 +196,6 @@ def test_a_broken_dataset_is_said(episode: Episode, tmp_path: Path) -> None:
     (folder / "meta/info.json").write_text("{")
     with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
         lerobot_rows(folder)
-
-
-def test_a_broken_dataset_hides_nothing_beside_it(episode: Episode, tmp_path: Path) -> None:
-    for name in ("broken", "whole"):
-        export(tmp_path / name, episode)
-    (tmp_path / "broken/meta/info.json").write_text("{")
-    broken, whole = find_all_sources([tmp_path])
-    assert (broken.name, whole.name) == ("broken#0", "whole#0")
-    with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
-        read_recording(broken)
-    np.testing.assert_array_equal(read_recording(whole).action, episode.action)
 
 
 def test_a_dataset_is_in_the_library_an_episode_a_row(

@@ -19,7 +19,6 @@ import mani_skill.envs  # noqa: F401  (registers the tasks)
 import msgspec
 import numpy as np
 import pytest
-import rerun as rr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mani_skill.utils.wrappers.record import RecordEpisode
@@ -157,17 +156,6 @@ def test_a_trajectory_with_pictures_has_a_thumbnail(
     assert red > 250 and green < 5
 
 
-def test_a_lone_rrd_is_a_row_with_its_properties(tmp_path: Path) -> None:
-    recording = rr.RecordingStream("workbench Old-v1")
-    memory = recording.memory_recording()
-    recording.send_property(
-        "episode", rr.AnyValues(task="Old-v1", seed=4, length=6, success=True, fail=False)
-    )
-    (tmp_path / "old.rrd").write_bytes(memory.drain_as_bytes())
-    (row,) = read(tmp_path)
-    assert (row.kind, row.task, row.seed, row.length, row.success) == ("rrd only", "Old-v1", 4, 6, True)
-
-
 @pytest.mark.parametrize(
     ("files", "said"),
     [
@@ -191,15 +179,6 @@ def test_files_that_are_broken_are_rows_that_say_so(
         (tmp_path / name).write_bytes(content)
     (row,) = read(tmp_path)
     assert row.problem is not None and said in row.problem
-
-
-def test_an_h5_alone_is_a_row_once_it_is_clear_that_nothing_comes_to_it(tmp_path: Path) -> None:
-    path = tmp_path / "x.h5"
-    path.write_bytes(b"HDF")
-    assert read(tmp_path) == []
-    os.utime(path, (1e9, 1e9))
-    (row,) = read(tmp_path)
-    assert row.problem is not None and "needs x.json beside it" in row.problem
 
 
 def test_what_is_no_recording_is_no_row(tmp_path: Path) -> None:
@@ -267,27 +246,6 @@ def test_whatever_a_description_says_there_is_one_row_that_the_index_can_hold(fi
     assert picture is None or picture[:2] == b"\xff\xd8"
 
 
-def test_a_wrong_field_is_named_by_its_path_and_the_others_are_shown(tmp_path: Path, maniskill: Path) -> None:
-    describe(tmp_path, "ours", task="Push-v1", seed="seven", scene={"body_names": [], "body_kinds": []})
-    for suffix in (".json", ".h5"):
-        shutil.copy(maniskill / f"demo{suffix}", tmp_path)
-    said = json.loads((tmp_path / "demo.json").read_text())
-    said["episodes"][1]["elapsed_steps"] = "two"
-    (tmp_path / "demo.json").write_text(json.dumps(said))
-    good, wrong, ours = read(tmp_path)
-    assert (good.name, good.length, good.problem) == ("demo#traj_0", 3, None)
-    assert wrong.problem is not None and wrong.problem.endswith("at $.episodes[1].elapsed_steps.")
-    assert (ours.task, ours.seed, ours.length) == ("Push-v1", None, 12)
-    assert ours.problem == (
-        "ours.json is not as a recording is described: expected `int | null`, got `str` at $.workbench.seed."
-    )
-    describe(tmp_path, "ours", scene={"body_names": [], "body_kinds": []})
-    assert read(tmp_path)[2].problem == (
-        "ours.json is not as a recording is described: "
-        "object missing required field `body_hidden` at $.workbench.scene."
-    )
-
-
 def test_a_copy_of_a_recording_is_another_row(tmp_path: Path) -> None:
     describe(tmp_path, "a", id="ab12")
     shutil.copytree(tmp_path, tmp_path / "copy", ignore=shutil.ignore_patterns("copy"))
@@ -328,16 +286,6 @@ def test_only_what_changed_is_read_again(
     assert read_keys == []  # from the index
 
 
-def test_a_folder_that_comes_later_is_looked_into_and_has_its_thumbnails(tmp_path: Path) -> None:
-    library = Library(tmp_path / "later")
-    library.refresh()
-    assert library.view().rows == ()
-    describe(tmp_path / "later", "a", id="ab12")
-    library.refresh()
-    assert library.thumbnails(["ab12"]) == {"ab12": jpeg()}
-    library.close()
-
-
 @pytest.mark.parametrize(
     "damage", ["deleted", "garbage", "cut", "another program's", "rows of another version"]
 )
@@ -366,18 +314,6 @@ def test_an_index_that_is_wrong_is_made_anew(tmp_path: Path, damage: str) -> Non
     library.refresh()
     assert len(library.thumbnails([row.id for row in good])) == 30
     library.close()
-
-
-def test_a_page_of_garbage_within_the_index_costs_no_more_than_reading_again(tmp_path: Path) -> None:
-    for k in range(120):
-        describe(tmp_path, f"r{k:03}", seed=k)
-    good = read(tmp_path)
-    index = index_path(tmp_path)
-    content = bytearray(index.read_bytes())
-    for page in range(1, len(content) // 4096):
-        content[page * 4096 : page * 4096 + 200] = os.urandom(200)
-    index.write_bytes(content)
-    assert read(tmp_path) == good
 
 
 def test_an_index_that_came_with_the_folder_is_left_alone(tmp_path: Path) -> None:
@@ -471,40 +407,6 @@ def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
         library.close()
 
 
-def test_rows_are_shown_while_others_are_read_and_from_the_index_before_anything_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("workbench.recording.library.library.PUBLISH_SECONDS", 0.0)
-    for k in range(5):
-        describe(tmp_path, f"r{k}")
-        os.utime(tmp_path / f"r{k}.json", ns=(10**18 + k, 10**18 + k))
-    for suffix in (".h5", ".rrd"):
-        for path in tmp_path.glob(f"*{suffix}"):
-            os.utime(path, ns=(10**18, 10**18))
-    seen: list[tuple[int, object]] = []
-
-    def follow(library: Library) -> None:
-        real = library._publish
-
-        def publish(*arguments: Any, **changes: Any) -> None:
-            real(*arguments, **changes)
-            seen.append((len(library.view().rows), library.view().reading))
-
-        library._publish = publish  # type: ignore[method-assign]
-
-    library = Library(tmp_path)
-    follow(library)
-    library.refresh()
-    library.close()
-    assert seen == [*((k, (k, 5)) for k in range(1, 6)), (5, None)]
-    seen.clear()
-    library = Library(tmp_path)
-    follow(library)
-    library.refresh()
-    library.close()
-    assert seen == [(5, (0, 0)), (5, None)]
-
-
 # --- tags and notes ---------------------------------------------------------------------------------------
 
 
@@ -585,21 +487,6 @@ def test_deleting_takes_all_files_and_can_be_taken_back(tmp_path: Path, library:
         library.undo_delete()
 
 
-def test_what_stands_there_now_is_not_written_over_when_a_deletion_is_taken_back(
-    tmp_path: Path, library: Library
-) -> None:
-    describe(tmp_path, "a", id="aaaa")
-    library.refresh()
-    library.delete(["aaaa"])
-    describe(tmp_path, "a", id="bbbb")
-    before = tree(tmp_path)
-    with pytest.raises(LibraryError, match="there is a file of that name already"):
-        library.undo_delete()
-    assert tree(tmp_path) == before
-    library.empty_trash()
-    assert not (tmp_path / ".trash").exists() and library.view().trash.files == 0
-
-
 def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
     tmp_path: Path, maniskill: Path, library: Library
 ) -> None:
@@ -614,32 +501,3 @@ def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
     library.set_note([first.id], "x")
     library.delete([first.id, second.id])
     assert library.view().rows == () and library.view().trash.files == 3
-
-
-def test_a_deletion_that_fails_leaves_the_recording_whole(tmp_path: Path, library: Library) -> None:
-    describe(tmp_path, "a", id="aaaa")
-    (tmp_path / ".trash").write_text("a file where the folder should be")
-    before = tree(tmp_path)
-    library.refresh()
-    with pytest.raises(LibraryError, match="Not everything was deleted"):
-        library.delete(["aaaa"])
-    assert tree(tmp_path) == before and [row.id for row in library.view().rows] == ["aaaa"]
-
-
-def test_a_trash_that_is_a_link_is_nobodys_trash(tmp_path: Path) -> None:
-    folder, other = tmp_path / "recordings", tmp_path / "other"
-    describe(folder, "a")
-    (other / "2026").mkdir(parents=True)
-    (other / "2026" / "precious.txt").write_text("mine")
-    (folder / ".trash").symlink_to(other)
-    library = Library(folder)
-    library.refresh()
-    try:
-        assert library.view().trash.files == 0
-        with pytest.raises(LibraryError, match="is a link"):
-            library.delete([row.id for row in library.view().rows])
-        with pytest.raises(LibraryError):
-            library.empty_trash()
-        assert (folder / "a.json").exists() and (other / "2026" / "precious.txt").exists()
-    finally:
-        library.close()

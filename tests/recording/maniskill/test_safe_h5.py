@@ -15,7 +15,7 @@ import pytest
 
 from tests.recording.foreign_h5 import write
 from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.maniskill.safe_h5 import DEEPEST, RefusedH5, open_h5
+from workbench.recording.maniskill.safe_h5 import DEEPEST
 from workbench.recording.reader.read_episode import read_maniskill
 from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.scan import scan_folder
@@ -160,23 +160,6 @@ def test_one_dataset_under_many_names_is_not_read_for_ever(
 
     with pytest.raises(UnreadableRecording, match="GB of numbers"):
         read_maniskill(write(tmp_path, spoil), "traj_0")
-
-
-def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.h5")
-    (tmp_path / "zero.h5").symlink_to("/dev/zero")
-    for name in ("pipe.h5", "zero.h5"):
-        with pytest.raises(OSError, match="not a regular file"), open_h5(tmp_path / name):
-            pass
-
-
-def test_a_group_of_no_such_name_is_missing_and_not_refused(tmp_path: Path) -> None:
-    with open_h5(write(tmp_path)) as file:
-        assert file.get("traj_0/nothing/below") is None and "traj_1" not in file
-        with pytest.raises(KeyError):
-            file["traj_1"]
-    with open_h5(write(tmp_path, external_link)) as other, pytest.raises(RefusedH5):
-        other["traj_0/obs"]
 
 
 PLUGINS = """

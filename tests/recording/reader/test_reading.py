@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -184,15 +183,6 @@ def test_a_link_out_of_the_folder_is_followed_to_that_file_alone(tmp_path: Path)
     assert rows(folder)["b"].problem is None and rows(folder)["b"].seed == 3
 
 
-def test_a_folder_that_is_made_anew_is_read_again(tmp_path: Path) -> None:
-    folder = tmp_path / "recordings"
-    describe(folder, "a")
-    assert rows(folder)["a"].problem is None
-    folder.rename(tmp_path / "old")
-    describe(folder, "b")
-    assert rows(folder)["b"].problem is None
-
-
 def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
     describe(tmp_path, "a")
     program = (
@@ -216,14 +206,6 @@ def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
     process.stdout.close()
     _, alive = psutil.wait_procs(family, timeout=10)
     assert not alive
-
-
-def test_serving_recordings_needs_none_of_what_reads_them() -> None:
-    program = "import sys\nimport workbench.recording.library.library, workbench.session.review.review\nprint(*sys.modules)"
-    said = subprocess.run(
-        python_command("-c", program), env=child_environment(), check=True, capture_output=True, text=True
-    ).stdout.split()
-    assert not {"h5py", "rerun", "imageio_ffmpeg", "pyarrow.parquet"} & set(said)
 
 
 def test_an_episode_that_claims_more_memory_than_there_may_be_is_refused(
@@ -277,11 +259,3 @@ print(tried(lambda: subprocess.run(["/bin/true"], check=True)), tried(lambda: op
         "did", no, no, no, no, no, "Operation not permitted", "no memory", "did", no
     ], said.stderr  # fmt: skip
     assert (folder / "inside").read_text() == "inside"
-
-
-def test_the_nursery_has_one_thread(tmp_path: Path) -> None:
-    describe(tmp_path, "a")
-    rows(tmp_path)
-    fork_server = psutil.Process(reader_of(tmp_path, episodes=False)).parent()
-    assert fork_server is not None and fork_server.num_threads() == 1
-    assert sys.executable == fork_server.exe() or fork_server.cmdline()[0] == sys.executable

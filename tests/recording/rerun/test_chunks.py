@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from workbench.recording.rerun.chunks import TimedChunks, changed_rows, property_chunk
+from workbench.recording.rerun.chunks import TimedChunks
 
 STEPS = np.arange(5, dtype=np.int64)
 
@@ -56,31 +56,3 @@ def test_numbers(shape: tuple[int, ...], place: Callable[[NDArray], NDArray]) ->
     width = int(np.prod(shape))
     columns = rr.Scalars.columns(scalars=values.reshape(-1)).partition([width] * 5)
     assert data_of(ours) == data_of(Chunk.from_columns("/evaluate/offset", times(), columns))
-
-
-def test_texts() -> None:
-    steps = np.array([0, 3, 3], dtype=np.int64)
-    lines = [(0, "INFO", "reset"), (3, "WARN", "fail"), (3, "INFO", "")]
-    ours = TimedChunks(0.05).texts("/logs/events", lines)
-    columns = rr.TextLog.columns(text=["reset", "fail", ""], level=["INFO", "WARN", "INFO"])
-    nanoseconds = (steps * 50_000_000).astype("timedelta64[ns]")
-    index = [rr.TimeColumn("step", sequence=steps), rr.TimeColumn("sim_time", duration=nanoseconds)]
-    assert data_of(ours) == data_of(Chunk.from_columns("/logs/events", index, columns))
-
-
-def test_rows_between_two_equal_ones_are_left_out() -> None:
-    values = np.array([0, 0, 0, 1, 1, 1, 0.0])
-    assert [
-        None if rows is None else rows.tolist()
-        for rows in changed_rows(np.stack([values, np.arange(7)])[..., None])
-    ] == [[0, 2, 3, 5, 6], None]
-    chunk = TimedChunks(0.05).scalars("/reward", np.arange(7, dtype=np.int64), values)
-    batch = chunk.to_record_batch()
-    assert batch.column("step").to_pylist() == [0, 2, 3, 5, 6]
-
-
-def test_properties() -> None:
-    values = {"task": "PickCube-v1", "seed": 3, "return": 1.5, "success": True, "files": ["a", "b"]}
-    ours = property_chunk("episode", {**values, "reset": None})
-    assert ours.entity_path == "/__properties/episode"
-    assert data_of(ours) == data_of(Chunk.from_property("episode", rr.AnyValues(**values)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from tests.recording.refused_calls import descriptors
 from workbench.core.scene.shapes import SharedShapes
 from workbench.recording.episode.episode import CameraTrack, Episode
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun import layout, read
+from workbench.recording.rerun import read
 from workbench.recording.rerun.chunks import STEP
 from workbench.recording.rerun.private_api import IndexedChunk, decode_chunk, index_of
 from workbench.recording.rerun.read import RerunTable
@@ -94,21 +93,6 @@ def test_a_picture_here_and_there_is_of_the_state_that_it_was_taken_at(tmp_path:
     assert [brightness(episode, i) for i in range(4)] == pytest.approx([0, 60, 120, 180], abs=3)
 
 
-def test_what_is_kept_of_pictures_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = read._ChunkCache()
-    monkeypatch.setattr(read, "_chunk_cache", kept)
-    monkeypatch.setattr(read, "KEPT_BYTES", 4000)
-    episodes = [read_episode(write(tmp_path, made(9, seed=s)).with_suffix(".rrd")) for s in range(6)]
-    for _ in range(2):
-        for episode in episodes:
-            assert brightness(episode, 3) == pytest.approx(60, abs=3)
-            assert 0 < kept._bytes == sum(rows.nbytes for _, rows in kept._chunks.values())
-    assert len(kept._chunks) < 6
-    monkeypatch.setattr(read, "KEPT_BYTES", 0)
-    brightness(episodes[0], 3)
-    assert len(kept._chunks) == 1, "the newest, however large"
-
-
 def test_its_file_is_closed_when_a_recording_is_let_go_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -140,21 +124,3 @@ def test_meshes_of_one_scene_are_read_once(tmp_path: Path) -> None:
         np.testing.assert_array_equal(b.mesh.vertices, c.mesh.vertices)
         np.testing.assert_array_equal(b.mesh.faces, c.mesh.faces)
         assert b.material.base_color == c.material.base_color
-
-
-def test_the_same_scene_written_by_another_process_is_shared_as_well(
-    child_process: None, tmp_path: Path, fresh_chunks: Callable[[], None]
-) -> None:
-    shapes = SharedShapes()
-    found = []
-    for seed in (1, 2):
-        fresh_chunks()
-        found.append(read_episode(write(tmp_path, made(3, seed=seed)).with_suffix(".rrd"), shapes))
-    one, two = (episode.geometry for episode in found)
-    assert one is not None and two is not None
-    assert all(a.mesh is b.mesh for a, b in zip(one.visuals, two.visuals, strict=True))
-
-
-@pytest.fixture
-def fresh_chunks() -> Callable[[], None]:
-    return layout._made.clear

@@ -18,7 +18,6 @@ from tests.recording.verify_rrd import verify_rrd
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.rerun.chunks import static_chunk
-from workbench.recording.rerun.private_api import index_of
 from workbench.recording.rerun.read import RerunTable
 
 Maker = Callable[..., Made]
@@ -53,11 +52,6 @@ def test_every_file_holds_the_same(written: list[Path]) -> None:
         assert episode.info.seed == seed and not episode.broken_files
 
 
-def test_no_file_is_larger_for_it(written: list[Path]) -> None:
-    whole, *_, joined = (path.stat().st_size for path in written)
-    assert joined < 1.01 * whole
-
-
 def test_rerun_finds_nothing_wrong(child_process: None, written: list[Path]) -> None:
     for path in (written[0], written[-1]):
         assert verify_rrd(path) is None
@@ -72,21 +66,6 @@ def test_rerun_finds_nothing_wrong(child_process: None, written: list[Path]) -> 
             chunk.id for chunk in reader.store().stream() if chunk.entity_path.startswith("/world")
         )
         assert found == streamed
-
-
-def test_the_index_has_the_rows_that_rerun_writes(written: list[Path]) -> None:
-    rows = []
-    for path in written:
-        index = index_of(RrdReader(path).store(), "step")
-        assert all(later.begin >= earlier.end for earlier, later in zip(index, index[1:]))
-        assert index[0].entity == "/__properties", "what a list of recordings reads comes first"
-        rows.append(
-            [
-                (one.entity, one.rows, one.static, one.components, one.steps)
-                for one in sorted(index, key=lambda one: (one.entity, one.static))
-            ]
-        )
-    assert rows == rows[:1] * EPISODES
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rerun as rr
-from rerun.chunk import Chunk, LazyChunkStream, RrdReader
+from rerun.chunk import RrdReader
 
 from tests.drive.episodes import Made, header_of, journal_of
 from tests.drive.rows import append
@@ -92,15 +91,6 @@ def test_whoever_has_turned_rerun_off_still_gets_the_whole_recording(
     files = episode.write(tmp_path)
     assert len(RrdReader(files.rrd).blueprints()) == 1
     assert os.environ["RERUN"] == "off"
-
-
-def test_options_of_a_reset_that_json_has_no_words_for_are_said_as_text(
-    child_process: None, make_episode: Maker, tmp_path: Path
-) -> None:
-    episode = make_episode()
-    episode.info = dataclasses.replace(episode.info, reset_options={"at": Path("/there")})
-    files = episode.write(tmp_path)
-    assert read_episode(files.json).info.reset_options == {"at": "/there"}
 
 
 @pytest.mark.slow
@@ -196,10 +186,3 @@ def test_a_blueprint_can_be_shown_before_the_recording(make_episode: Maker, tmp_
     again = RrdReader(alone)
     assert [entry.recording_id for entry in again.blueprints()] == [inside.recording_id]
     assert again.recordings() == []
-
-
-def test_a_file_of_another_writer_has_no_blueprint_to_show_before(tmp_path: Path) -> None:
-    path = tmp_path / "other.rrd"
-    chunk = Chunk.from_columns("/reward", [], rr.Scalars.columns(scalars=[1.0]))
-    LazyChunkStream.from_iter([chunk]).write_rrd(path, application_id="other", recording_id="one")
-    assert blueprint_stream(path) is None

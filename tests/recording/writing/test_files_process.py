@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.episodes import appended, geometry_of, header_of, journal_of, made
+from tests.drive.episodes import appended, header_of, journal_of, made
 from tests.drive.waiting import until
 from tests.recording.read_rrd import read_rrd
 from workbench.jobs.record.gather import EpisodeFinisher, GatheredEpisode
@@ -27,7 +27,7 @@ from workbench.recording.writing.episode_writer import EpisodeFiles, EpisodeWrit
 from workbench.recording.writing.files_process import FilesProcess
 from workbench.recording.writing.finish import make_files
 from workbench.recording.writing.from_journal import Header
-from workbench.recording.writing.journal import FOLDER, SCENE_SUFFIX, Journal, claim
+from workbench.recording.writing.journal import FOLDER, Journal, claim
 from workbench.recording.writing.publish import RecordingError
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -114,21 +114,6 @@ def test_what_cannot_be_written_is_said_as_on_a_thread(tmp_path: Path, process: 
         said.append(str(error.value))
     assert said[0] == said[1] and "here" in said[0]
     assert appended(tmp_path, made(3), pictures=False).finish(process).json.is_file()  # it goes on
-
-
-@pytest.mark.parametrize("spoilt", ["gone", "cut"])
-def test_without_the_scenes_file_the_meshes_are_there(
-    tmp_path: Path, process: FilesProcess, spoilt: str
-) -> None:
-    """They are in memory too, and the process says that it has not found them."""
-    writer = appended(tmp_path, made(3), pictures=False)
-    (scene,) = (tmp_path / FOLDER).glob(f"*{SCENE_SUFFIX}")
-    if spoilt == "gone":
-        scene.unlink()
-    else:
-        os.truncate(scene, scene.stat().st_size // 2)
-    geometry = read_episode(writer.finish(process).rrd).geometry
-    assert geometry is not None and len(geometry.visuals) == len(geometry_of(made(3)).visuals) > 0
 
 
 def test_a_relative_folder_is_the_one_of_now(

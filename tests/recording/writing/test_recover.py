@@ -236,21 +236,6 @@ def test_a_strangers_file_under_the_name_is_left_alone(
     assert len(list(tmp_path.iterdir())) == 4
 
 
-@pytest.mark.parametrize("text", ["no JSON", "{}", "[]", '{"workbench": 3}', '{"workbench": {"id": "9"}}'])
-def test_a_strangers_json_under_the_name_is_left_alone(
-    make_episode: Maker, tmp_path: Path, text: str
-) -> None:
-    left(make_episode(2), tmp_path, id="0", written_at="2026-11-21T12:00:00+00:00")
-    (files,) = recover(tmp_path)
-    files.h5.unlink()
-    files.rrd.unlink()
-    files.json.write_text(text)
-    left(make_episode(4), tmp_path, id="1", written_at="2026-11-21T12:00:00+00:00")
-    (others,) = recover(tmp_path)
-    assert others.json.stem == f"{files.json.stem}_2" and read_episode(others.json).length == 4
-    assert files.json.read_text() == text and len(list(tmp_path.iterdir())) == 4
-
-
 @pytest.mark.parametrize("named", [[".h5"], [".h5", ".rrd"]])
 def test_of_a_writer_that_died_between_two_names_only_what_it_named_itself_is_taken_back(
     make_episode: Maker, tmp_path: Path, named: list[str]
@@ -358,26 +343,3 @@ def test_one_that_cannot_be_an_episode_is_told_and_kept_and_the_others_are_made(
         assert read_episode(path).length == 4
         assert sorted(path.name for path in (tmp_path / FOLDER).iterdir()) == ["0.arrow", "0.scene"]
     assert descriptors() == before
-
-
-def test_one_that_may_not_be_opened_is_told_and_kept_and_the_others_are_made(
-    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In a folder that two users record to."""
-    others, opened = left(make_episode(), tmp_path, id="0"), os.open
-    left(make_episode(4), tmp_path, id="1")
-
-    def refuse(path: Path, *args: int, **kwargs: int) -> int:
-        if path == others:
-            raise PermissionError(errno.EACCES, "Permission denied")
-        return opened(path, *args, **kwargs)
-
-    monkeypatch.setattr(os, "open", refuse)
-    for _ in range(2):
-        with pytest.raises(RecordingError, match="may not be written to"):
-            recover(tmp_path)
-        (path,) = tmp_path.glob("*.json")
-        assert read_episode(path).length == 4 and others.exists()
-    monkeypatch.undo()
-    recover(tmp_path)
-    assert lengths(tmp_path) == {"0": 3, "1": 4}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -131,9 +130,3 @@ def test_only_the_episode_with_that_id_is_removed(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_said_before(address: str, says: str) -> None:
     with pytest.raises(RecordingError, match=says):
         require_place(address)
-
-
-def test_a_place_that_can_be_written_is_left_as_it_was() -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        require_place(f"file://{folder}")
-        assert list(Path(folder).iterdir()) == []
