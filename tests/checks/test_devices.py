@@ -16,11 +16,6 @@ def in_evaluate(checked: Checked, rule: str, *lines: str) -> RuleResult:
     return checked(rule, (AT, AT + "".join(f"        {line}\n" for line in lines)))
 
 
-@pytest.mark.parametrize("rule", ("loop-over-envs", "device-copies", "foreign-device"))
-def test_the_example_keeps_it(rule: str, checked: Checked) -> None:
-    assert checked(rule).state == "kept"
-
-
 @pytest.mark.parametrize(
     "line",
     (

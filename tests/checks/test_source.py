@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import gymnasium
-import pytest
-
-from tests.checks.checked import EXAMPLE, Checked, check_rule, the_finding
-from workbench.authoring.loading.load import load_task, undo_load
+from tests.checks.checked import Checked, the_finding
 
 REGISTERED = '@register_env("WorkbenchPushCube-v1", max_episode_steps=50)'
 RESET = "            b = len(env_idx)\n"
@@ -16,39 +12,10 @@ EVALUATE = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
 BUILT = '        self.cube = builder.build(name="cube")\n'
 
 
-@pytest.mark.parametrize(
-    "rule",
-    (
-        "registered", "versioned-id", "time-limit", "id-taken", "supported-robots", "reward-modes", "unknown-name",
-        "unseeded-random", "backend-only-call", "missing-file", "undeclared-assets",
-    ),
-)  # fmt: skip
-def test_the_example_keeps_it(rule: str, checked: Checked) -> None:
-    assert checked(rule).state == "kept"
-
-
 def test_a_class_without_an_id(checked: Checked) -> None:
     finding = the_finding(checked("registered", (REGISTERED, "")))
     assert finding.code.startswith("class PushCubeEnv") and '@register_env("PushCube-v1"' in finding.message
     assert checked("versioned-id", (REGISTERED, "")).state == "not_applicable"
-
-
-def test_an_id_of_gymnasium_alone(checked: Checked) -> None:
-    """As gym.make takes it, with its limit."""
-    register = (
-        "import gymnasium\n"
-        'gymnasium.register("AtGymnasium-v1", entry_point=f"{__name__}:PushCubeEnv", max_episode_steps=30)\n'
-    )
-    text = EXAMPLE.read_text().replace(REGISTERED, "") + register
-    try:
-        finding = the_finding(checked("registered", text=text))
-        file = str(finding.file)
-        loaded = load_task(file)
-    finally:
-        gymnasium.registry.pop("AtGymnasium-v1", None)
-    assert '@register_env("AtGymnasium-v1", max_episode_steps=30)' in finding.message
-    assert (loaded.env_id, loaded.max_episode_steps) == ("AtGymnasium-v1", 30)
-    undo_load(loaded)
 
 
 def test_an_id_without_a_version(checked: Checked) -> None:
@@ -91,11 +58,6 @@ def test_a_typo_on_a_builder(checked: Checked) -> None:
     )
     finding = the_finding(checked("unknown-name", typo))
     assert finding.code.startswith("builder.inital_pose") and "Write 'initial_pose'." in finding.message
-
-
-def test_an_attribute_of_a_builder_that_the_task_reads_is_no_typo(checked: Checked) -> None:
-    own = f"        builder.colour = 3\n{BUILT}        self.colour = builder.colour\n"
-    assert checked("unknown-name", (BUILT, own)).state == "kept"
 
 
 def test_methods_that_do_not_exist(checked: Checked) -> None:
@@ -199,8 +161,3 @@ def test_a_download_that_is_not_declared(checked: Checked) -> None:
     assert checked("undeclared-assets", imports, named, declared).state == "kept"
     optional = f'{BUILT}        if self.num_envs > 99:\n            self.models = "ycb:024_bowl"\n'
     assert checked("undeclared-assets", (BUILT, optional)).state == "kept"
-
-
-def test_the_built_in_task_keeps_them() -> None:
-    for rule in ("registered", "id-taken", "unknown-name", "backend-only-call"):
-        assert check_rule(rule, "PushCube-v1", num_envs=1, seeds=1).state == "kept"
