@@ -141,30 +141,6 @@ def test_a_task_that_cannot_be_imported_is_an_error_in_every_report_at_its_line(
     assert error is not None and "ModuleNotFoundError" in error.get("message", "")
 
 
-def test_what_is_ignored_is_in_the_summary_and_in_each_report(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rules = (
-        "--select",
-        "entry-name,reward-rows,success-and-fail",
-        "--ignore",
-        "success-and-fail,reward-rows",
-    )
-    files = ("--junit", "a.xml", "--sarif", "a.sarif", "--json-file", "a.json")
-    ended = run(capsys, "bad.py", *rules, *files, *FEW)
-    assert ended.code == 0 and "2 ignored: reward-rows, success-and-fail" in ended.out
-    assert "1 rule kept, 0 broken, 2 ignored." in ended.out
-    ignored = ["reward-rows", "success-and-fail"]
-    assert json.loads((place / "a.json").read_text())["ignored"] == ignored
-    cases = {case.get("name"): case for case in ElementTree.parse(place / "a.xml").getroot()[0]}
-    assert [name for name, case in cases.items() if case.find("skipped") is not None] == ignored
-    (made,) = json.loads((place / "a.sarif").read_text())["runs"]
-    off = made["invocations"][0]["ruleConfigurationOverrides"]
-    assert [each["descriptor"]["id"] for each in off] == ignored
-    rules_of = made["tool"]["driver"]["rules"]
-    assert all(rules_of[each["descriptor"]["index"]]["id"] == each["descriptor"]["id"] for each in off)
-
-
 def test_as_many_seeds_as_were_asked_for_are_tried(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of three, with two envs: the fourth is not counted."""
     few = ("--num-envs", "2", "--seeds", "3", "--workers", "1", "--env", "render_backend=none")
@@ -250,18 +226,6 @@ def test_a_task_that_needs_a_renderer_gets_one(place: Path, child_process: None)
     ]
     ended = in_a_process(*words)
     assert ended.returncode == 0, ended.stdout + ended.stderr
-
-
-def test_pictures_are_not_asked_of_a_task_that_is_made_without_a_renderer(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ended = run(capsys, "good.py", "--select", "ground-truth,camera-sees,runs", "--json", *FEW)
-    states = {one["rule"]: one["state"] for one in json.loads(ended.out)["rules"]}
-    assert ended.code == 0 and states == {
-        "runs": "kept",
-        "ground-truth": "not_known",
-        "camera-sees": "not_known",
-    }
 
 
 def test_json_is_all_that_is_printed_and_equals_the_file(

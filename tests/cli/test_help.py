@@ -38,12 +38,7 @@ def test_a_topic_is_shown(topic: Topic, capsys: pytest.CaptureFixture[str]) -> N
     ("name", "advice"),
     [
         ("camera", "Did you mean 'cameras'?"),
-        ("gizmo", "architecture"),
         ("try reward", "These mention it: solve"),
-        ("test my reward", ", solve,"),
-        ("Reward  hacking", "These mention it: solve"),
-        ("reward planner", "These mention it: solve"),
-        ("the", "no topic"),
         ("zzz", "no topic mentions it"),
         ("\x1b[2J", "no topic"),
     ],

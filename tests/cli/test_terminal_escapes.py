@@ -219,14 +219,6 @@ def test_a_loggers_record_is_one_line_and_its_traceback_is_text(monkeypatch: pyt
     assert "Traceback" in said and "ValueError" in said and "\x1b[31mred\x1b[0m" in said
 
 
-def test_what_ends_a_command_is_printed_as_text(child_process: None, tmp_path: Path) -> None:
-    program = (
-        f"from workbench.machine.text import guard_terminal\nguard_terminal()\nraise ValueError({EVIL!r})"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
-    assert harmful(done.stderr) == set() and "ValueError" in done.stderr and "\\x1b" in done.stderr
-
-
 def test_bars_still_move_and_what_they_say_is_text() -> None:
     said = io.StringIO()
     console = SafeConsole(file=said, force_terminal=True, width=100)

@@ -86,26 +86,6 @@ def test_a_rule_of_gpu_simulation_is_looked_at_where_no_other_is(tmp_path: Path)
     assert states(check(options(task_of(tmp_path, keeps), "rows-lost"))) == {"rows-lost": "kept"}
 
 
-@pytest.mark.slow
-def test_a_finding_of_gpu_simulation_that_a_comment_silences_is_listed(
-    tmp_path: Path, child_process: None
-) -> None:
-    old, loses = LOSES_ROWS
-    why = "one target for each reset"
-    silenced = old, loses.rstrip("\n") + f"  # workbench: off[rows-lost] {why}\n"
-    for workers in (1, 2):
-        rules = ("rows-lost", "entry-name")[:workers]
-        report = check(options(task_of(tmp_path, silenced), *rules, workers=workers))
-        (result,) = report.of_state("silenced")
-        (one,) = result.silenced
-        assert (result.rule, one.reason, one.finding.degree) == ("rows-lost", why, "stop")
-        assert one.finding.code.startswith("self.drawn") and not report.fails("warn")
-    further = old, silenced[1] + loses.removeprefix(old).replace("drawn", "other")
-    result = check(options(task_of(tmp_path, further), "rows-lost")).results[0]
-    assert result.state == "broken" and len(result.silenced) == 1
-    assert [finding.code for finding in result.findings] == ["self.other = torch.rand((b, 2))"]
-
-
 def test_a_task_that_raises_breaks_one_rule_and_leaves_the_others_undecided(tmp_path: Path) -> None:
     task = task_of(tmp_path, RAISES)
     report = check(options(task, "runs", "reward-finite", "success-at-reset", "rows-lost"))
@@ -118,19 +98,6 @@ def test_a_task_that_raises_breaks_one_rule_and_leaves_the_others_undecided(tmp_
         and finding.rule == "runs"
         and "gone" in report.of_state("not_known")[0].why
     )
-
-
-def test_what_raises_when_an_env_is_closed_ends_no_check(tmp_path: Path) -> None:
-    raises = (
-        "    def evaluate(self)",
-        "    def close(self):\n        raise ValueError('closed')\n\n    def evaluate(self)",
-    )
-    report = check(options(task_of(tmp_path, raises), "runs", "success-at-reset", "state-restores"))
-    assert states(report) == {
-        "runs": "broken", "success-at-reset": "kept", "state-restores": "not_known"
-    }  # fmt: skip
-    (finding,) = report.findings
-    assert finding.code == "raise ValueError('closed')"
 
 
 def test_a_rule_that_is_not_decided_is_no_success(tmp_path: Path) -> None:
@@ -315,17 +282,6 @@ def test_what_is_wrong_in_given_episodes_alone_is_found(tmp_path: Path) -> None:
     what = replace(options(task, "success-and-fail"), actions=str(tmp_path / "one.npy"))
     (finding,) = check(what).findings
     assert "in 4 of 4 given episodes" in finding.message
-
-
-def test_actions_of_another_robot_leave_the_rules_of_success_undecided_and_blame_no_line(
-    tmp_path: Path,
-) -> None:
-    np.save(tmp_path / "wide.npy", np.zeros((5, 9), np.float32))
-    task = task_of(tmp_path)
-    what = replace(options(task, "success-stays-possible", "runs"), actions=str(tmp_path / "wide.npy"))
-    report = check(what)
-    assert states(report) == {"runs": "kept", "success-stays-possible": "not_known"}
-    assert "9 dimensions" in report.of_state("not_known")[0].why and report.fails("stop")
 
 
 def test_a_task_that_only_one_env_can_run_is_checked_with_one(tmp_path: Path) -> None:

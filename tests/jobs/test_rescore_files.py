@@ -19,25 +19,20 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.drive.episodes import made, write
 from tests.drive.session import rescored
-from tests.session.recorded_runs import opened
 from workbench.authoring.problem import TaskError
 from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.cli.main import main
 from workbench.cli.share import export_in_terminal
 from workbench.cli.terminal.arguments import JobArguments
-from workbench.core.capture.recorded_state import read_states, state_distance
 from workbench.jobs.actions import read_actions
-from workbench.jobs.from_recording import run_of
 from workbench.jobs.pool.deal import Deal, ThisProcess, Work
 from workbench.jobs.pool.travel import pack_baggage, relocated
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
-from workbench.jobs.replay import replay_to
 from workbench.jobs.rescore.job import Recording, RescoredBy, rescore_recordings, setup_of
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions
-from workbench.recording.reader.read_episode import read_maniskill
 from workbench.recording.reader.reading import find_all_sources
 from workbench.session.clearance import Clearances
 from workbench.session.rescore import verdict_text
@@ -133,13 +128,6 @@ def test_an_edited_reward_differs_by_what_was_edited_and_the_recorded_text_does_
     assert set(Path("/tmp").glob("workbench-recorded-*")) <= before
 
 
-def test_another_file_can_be_judged_with(author: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other.py"
-    other.write_text(TEXT.replace(REWARD, f"{REWARD} * 0"))
-    verdicts, _ = rescore_all(RescoreOptions((author / "recordings",), task=str(other), use_env_states=True))
-    assert all(not verdict.new_reward.any() for verdict in verdicts) and len(verdicts) == EPISODES
-
-
 def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: Path) -> None:
     found = find_all_sources((foreign,))
     assert [source.part for source in found] == ["traj_0", "traj_1"]
@@ -151,21 +139,6 @@ def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: P
             assert verdict.why_not == "" and verdict.metres is not None and verdict.metres < 1e-4
             assert verdict.success == (None, None) and not verdict.drifted
             np.testing.assert_allclose(verdict.new_reward, verdict.old_reward, atol=1e-3)
-
-
-def test_one_steps_into_what_record_episode_wrote(foreign: Path) -> None:
-    run = run_of(read_maniskill(foreign, "traj_1"))
-    task = opened("PickCube-v1", 2, reward_mode="dense")
-    step, replay_result = replay_to(task, run, 8, [1])
-    assert (
-        replay_result.way == "re-simulated"
-        and replay_result.metres is not None
-        and replay_result.metres < 1e-5
-    )
-    assert step.elapsed_steps.tolist()[1] == 8 and replay_result.missed == {}
-    now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
-    assert state_distance(now, run.state(8))[0] < 1e-5
-    task.env.close()
 
 
 def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, tmp_path: Path) -> None:
@@ -346,14 +319,6 @@ def test_a_broken_task_is_told_with_its_line(author: Path, capsys: pytest.Captur
     assert code == 1 and f"push_cube.py:{line}" in err and "nonsense" in err
     with pytest.raises(TaskError):
         rescore_all(RescoreOptions((author / "recordings",)))
-
-
-def test_a_broken_task_among_others_is_told_at_its_episodes(author: Path, foreign: Path) -> None:
-    edit(author, REWARD, "return self.nonsense(obs)")
-    verdicts, _ = rescore_all(RescoreOptions((author / "recordings", foreign)))
-    broken = [verdict for verdict in verdicts if "nonsense" in verdict.why_not]
-    rescored = [verdict for verdict in verdicts if not verdict.why_not]
-    assert (len(broken), len(rescored)) == (EPISODES, 2)
 
 
 @pytest.mark.slow

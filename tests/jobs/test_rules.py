@@ -294,12 +294,6 @@ def test_a_version_that_is_not_taken_changes_no_row(desk: Desk) -> None:
     assert desk.rows() == before
 
 
-def test_a_scene_that_is_built_anew_has_its_own_rows(desk: Desk) -> None:
-    built = "\n    def _load_scene(self, options):\n        super()._load_scene(options)\n        self.extra = 1\n"
-    assert desk.save(built + REWRITTEN) == "rebuilt"
-    assert rule_ids(desk) == ["rows-rewritten"]
-
-
 # --- the page ------------------------------------------------------------------------------------------
 
 

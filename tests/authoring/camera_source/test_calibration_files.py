@@ -133,15 +133,11 @@ def test_many_ways_to_write_one_pose_are_read(text: str) -> None:
     ("text", "says"),
     [
         ("", "nothing to read"),
-        ("1 2 3", "here are 3"),
         ('{"a": ', "begins like JSON"),
-        ("hello", "no matrix of bare numbers"),
         ("!!python/object/apply:os.system ['true']", "no YAML"),
         ('{"camera_matrix": [[1,0,0],[0,1,0],[0,0,1]]}', "no pose is in it"),
-        ("projection_matrix:\n  rows: 3\n  cols: 4\n  data: [1,0,0,0,0,1,0,0,0,0,1,0]", "no pose is in it"),
         ("a: " + "[" * 5000, "no YAML"),
         ("a: &a [*a]", "alias"),
-        ('{"a": ' + "[" * 900 + "]" * 900 + "}", "no pose|nested too deeply|none"),
         ("9" * 300_000, "characters"),
     ],
 )

@@ -51,19 +51,6 @@ def edited_line(plan: SourceEdit | RefusedEdit) -> int:
     return line
 
 
-def test_kind_tells_a_sensor_from_a_camera_for_people() -> None:
-    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    assert (
-        edited_line(planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), run_class))
-        == LINE
-    )
-    people = real_settings({FILE: TWO}, "cam", "_default_human_render_camera_configs")
-    assert (
-        edited_line(planned(plan_edit, {FILE: TWO}, ("human", "cam"), people, higher(people), run_class))
-        == LINE + 4
-    )
-
-
 def test_two_of_one_name_and_value_are_told_apart_by_the_place() -> None:
     source = TWO.replace("512, 512", "128, 128").replace('f"{name}"', '"cam"')
     before = real_settings({FILE: source}, "cam", "_default_sensor_configs")
@@ -72,12 +59,6 @@ def test_two_of_one_name_and_value_are_told_apart_by_the_place() -> None:
             plan_edit, {FILE: source}, ("sensor", "cam"), before, higher(before), run_as(class_name)
         )
         assert edited_line(plan) == line
-
-
-def test_a_computed_name_is_found_by_its_place() -> None:
-    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = planned(plan_edit, {FILE: TWO}, ("sensor", "cam"), before, higher(before), run_as("Other"))
-    assert edited_line(plan) == LINE + 11
 
 
 @pytest.mark.parametrize(

@@ -64,39 +64,6 @@ def test_imports_ids_and_its_own_place_are_said_otherwise_and_nothing_else(insta
     assert ids == (("Näh-Task-v1", "MyNäh-Task2-v1"), ("Other", "MyOther2"))
 
 
-@pytest.mark.parametrize(
-    ("text", "copied"),
-    [
-        ("FOLDER = __file__\nimport os\n", "{}FOLDER = installed_task.__file__\nimport os\n"),
-        ('"""A task."""\n\nFOLDER = __file__\n', '"""A task."""\n\n{}FOLDER = installed_task.__file__\n'),
-        (
-            "#!/bin/python\n@at(__file__)\nclass A: ...\n",
-            "#!/bin/python\n{}@at(installed_task.__file__)\nclass A: ...\n",
-        ),
-        (
-            "from  .  import(x)\nfrom . \\\n deep import y",
-            "from pack.sub.inner import(x)\nfrom pack.sub.inner.deep import y",
-        ),
-    ],
-)
-def test_what_stands_before_all_else_stays_there(installed: Path, text: str, copied: str) -> None:
-    added = "import pack.sub.inner.task as installed_task  # its files are there\n"
-    assert copied_text(installed, text) == (copied.format(added), ())
-
-
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("from ....base import x", "beyond its package"),
-        ("@register_env(ENV_ID)\nclass Task: pass", "line 1 registers an id that is computed"),
-        ("class Task(:", "not valid Python"),
-    ],
-)
-def test_what_cannot_be_said_otherwise_is_refused(installed: Path, text: str, why: str) -> None:
-    with pytest.raises(CannotCopy, match=why):
-        copied_text(installed, text)
-
-
 def test_a_copy_is_never_written_over_another_file(installed: Path, tmp_path: Path) -> None:
     installed.write_text(TEXT)
     folder = tmp_path / "mine"

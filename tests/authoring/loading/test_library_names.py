@@ -50,17 +50,6 @@ def test_a_librarys_name_is_the_librarys_wherever_it_is_imported_late(
     assert task.source_files == (path, helper)
 
 
-def test_the_author_is_told_of_such_files_and_of_no_others(write: Write) -> None:
-    plant(write, "numpy", "random", "winreg_of_mine", "example")
-    write("torch/__init__.py", "")
-    write("scipy/notes.txt", "")
-    path = write("sapien.py", TASK, task=True)
-    task = load_task(str(path))
-    assert [file.name for file in task.named_like_libraries] == ["numpy.py", "random.py", "torch"]
-    assert f"{path.parent / 'numpy.py'} has the name of a library" in task.notices[0]
-    assert "import numpy" in task.notices[0] and "Rename" in task.notices[0]
-
-
 @pytest.mark.parametrize("name", ["sapien", "torch", "numpy", "random", "sympy", "mani_skill", "workbench"])
 def test_a_task_may_itself_be_called_like_a_library(write: Write, name: str) -> None:
     library = sys.modules.get(name)
@@ -71,20 +60,6 @@ def test_a_task_may_itself_be_called_like_a_library(write: Write, name: str) -> 
     assert seen is not sys.modules[task.cls.__module__] and (library is None or seen is library)
     path.write_text(path.read_text() + "\nNEXT = 1\n")
     assert sys.modules[load_task(str(path)).cls.__module__].NEXT == 1
-
-
-def test_what_a_task_wanted_from_such_a_file_is_said(write: Write) -> None:
-    write("statistics.py", "def spread(values): return 0\n")
-    path = write("push.py", "from statistics import spread\n" + TASK, task=True)
-    with pytest.raises(
-        TaskError, match=r"cannot import name 'spread'.*statistics\.py has the name of a library"
-    ):
-        load_task(str(path))
-    path.write_text("import random.helpers\n")
-    write("random/__init__.py", "")
-    write("random/helpers.py", "")
-    with pytest.raises(TaskError, match=r"random has the name of a library"):
-        load_task(str(path))
 
 
 def test_a_first_load_that_fails_leaves_no_folder_and_no_finder_behind(write: Write) -> None:

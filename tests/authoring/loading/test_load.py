@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import importlib.metadata
 import inspect
 import os
 import platform
@@ -79,16 +78,11 @@ def test_a_registered_id_gives_the_built_in_class_and_its_source() -> None:
     ("reference", "words"),
     [
         ("PikCube-v1", "PickCube-v1"),
-        ("pickcube-v1", "PickCube-v1"),
         ("CartPole-v1", "gymnasium"),
         ("", "no task named"),
-        ("   ", "no task named"),
         ("nowhere/push.py", "nor does its folder"),
         ("push.py:", "after the colon"),
-        ("push.py:1st", "after the colon"),
         ("bad\0name.py", "not a path"),
-        ("~nobody-of-that-name/push.py", "not a path"),
-        ("x" * 5000 + ".py", "cannot look at the file"),
         (os.devnull, "not an ordinary file"),
     ],
 )
@@ -97,13 +91,6 @@ def test_a_wrong_reference_is_refused_in_words(reference: str, words: str) -> No
     assert words in problem.message
     assert (problem.stage, problem.line) == ("import", None)
     assert len(problem.message) <= 500
-
-
-@pytest.mark.parametrize("text", ["", "\n\n", "# nothing yet\n", "import torch\n", "class Env:\n    pass\n"])
-def test_a_file_without_a_task_is_refused_with_advice(text: str, write: Write) -> None:
-    problem = refused(write("push.py", text))
-    assert "BaseEnv" in problem.message
-    assert problem.file is not None and problem.file.endswith("push.py")
 
 
 def test_of_several_classes_the_last_registered_one_is_taken_and_the_others_are_named(write: Write) -> None:
@@ -271,17 +258,6 @@ def test_a_file_in_a_package_may_import_relatively(write: Write) -> None:
     assert task.source_files[0] == path and helper in task.source_files
 
 
-def test_libraries_below_the_tasks_folder_are_left_alone(write: Write) -> None:
-    write(".venv/lib/site-packages/author_library.py", "COUNT = 0\n")
-    path = write("push.py", PUSH, task=True)
-    sys.path.append(str(path.parent / ".venv/lib/site-packages"))
-    library = importlib.import_module("author_library")
-    path.write_text("import author_library\n" + path.read_text())
-    task = load_task(str(path))
-    assert sys.modules["author_library"] is library
-    assert task.source_files == (path,)
-
-
 def test_a_module_imported_inside_a_hook_is_found_and_followed(write: Write) -> None:
     helper = write("late.py", "SIZE = 1\n")
     body = "    @staticmethod\n    def size():\n        import late\n        return late.SIZE\n"
@@ -315,15 +291,6 @@ def test_given_texts_come_in_place_of_files_on_disk_even_of_missing_ones(write: 
     assert load_task(str(path), source=good.source).env_id == "AuthorPush-v1"
 
 
-def test_the_hash_is_of_the_content_and_not_of_the_place(write: Write) -> None:
-    hashes = set()
-    for name in ("one", "two"):
-        write(f"{name}/helper.py", "SIZE = 1\n")
-        path = write(f"{name}/push.py", "import helper\n" + PUSH, task=True)
-        hashes.add(load_task(str(path)).source_hash)
-    assert len(hashes) == 1
-
-
 def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_reads_them(
     write: Write,
 ) -> None:
@@ -347,11 +314,8 @@ def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_r
     ("text", "stage", "message", "code"),
     [
         ("def f(:\n    pass\n", "syntax", "SyntaxError", "def f(:"),
-        ("x = 'open\n", "syntax", "unterminated string", "x = 'open"),
-        ("if True:\npass\n", "syntax", "IndentationError", "pass"),
         ("x = 1\n\n1 / 0\n", "import", "ZeroDivisionError: division by zero", "1 / 0"),
         ("def f():\n    raise ValueError\nf()\n", "import", "ValueError", "raise ValueError"),
-        ("assert 1 == 2\n", "import", "AssertionError: assert 1 == 2", "assert 1 == 2"),
         (
             "import no_such_module_anywhere\n",
             "import",
@@ -359,33 +323,14 @@ def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_r
             "import no_such_module_anywhere",
         ),
         ("import healper\n", "import", "there is helper.py in the file's folder", "import healper"),
-        ("from helper import NOTHING\n", "import", "ImportError", "from helper import NOTHING"),
         (
             "from typing import gone\n",
             "import",
             f"Python {platform.python_version()}",
             "from typing import gone",
         ),
-        (
-            "from mani_skill.utils import gone\n",
-            "import",
-            f"mani_skill {importlib.metadata.version('mani_skill')}",
-            "from mani_skill.utils import gone",
-        ),
         ("exit()\n", "import", "__main__", "exit()"),
-        (
-            "import sys; sys.exit('no display')\n",
-            "import",
-            "no display",
-            "import sys; sys.exit('no display')",
-        ),
         ("def f(): f()\nf()\n", "import", "RecursionError", "def f(): f()"),
-        (
-            "import torch\ntorch.zeros(2) @ torch.zeros(3)\n",
-            "import",
-            "RuntimeError",
-            "torch.zeros(2) @ torch.zeros(3)",
-        ),
         ("import ast\nast.parse('1 +')\n", "import", "SyntaxError", "ast.parse('1 +')"),
         ("x = '\0'\n", "syntax", "null byte", None),
     ],
@@ -405,18 +350,6 @@ def test_what_is_wrong_in_the_file_is_told_at_its_line(
         "workbench_task", ""
     )
     assert len(problem.traceback.splitlines()) < 250
-
-
-def test_a_wrong_encoding_is_told_at_its_line(write: Write) -> None:
-    path = write("push.py", PUSH, task=True)
-    path.write_bytes(b"# one\n# W\xfcrfel\n")
-    problem = refused(path)
-    assert (problem.stage, problem.line) == ("syntax", 2)
-    assert "UTF-8" in problem.message and problem.code == "# W\N{REPLACEMENT CHARACTER}rfel"
-    path.write_bytes(b"# coding: klingon\n")
-    problem = refused(path)
-    assert (problem.stage, problem.line) == ("syntax", 1)
-    assert "klingon" in problem.message
 
 
 def test_what_is_wrong_in_a_helper_is_told_at_the_helpers_line(write: Write) -> None:

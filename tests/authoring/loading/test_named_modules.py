@@ -15,7 +15,6 @@ from workbench.authoring.loading import library_names
 from workbench.authoring.loading.load import class_of_module, import_modules, load_task, undo_load
 from workbench.authoring.loading.reference import (
     RecordedTask,
-    find_module,
     followed_folder,
     named_file,
     reference_to_class,
@@ -71,19 +70,6 @@ def test_it_is_found_without_being_imported(lab: Path) -> None:
     why = why_missing("lab_of_yours.tasks:MinimalEnv")
     assert why is not None and "there is no module lab_of_yours.tasks" in why and str(lab.parent) in why
     assert named_file("lab_of_mine.tasks.nowhere:MinimalEnv") is None
-
-
-def test_a_path_is_never_taken_for_a_module(lab: Path) -> None:
-    """A recording names its file by an absolute path."""
-    assert find_module("lab_of_mine.tasks") is not None
-    for reference in (
-        f"{lab.parent}/lab_of_mine.tasks:MinimalEnv",
-        "./lab_of_mine.tasks:MinimalEnv",
-        "lab_of_mine.py:A",
-    ):
-        assert followed_folder(reference) is None or reference.endswith(".py:A")
-        assert refused(reference).stage == "import"
-    assert not [name for name in sys.modules if name.startswith("lab_of_mine")]
 
 
 def test_its_class_opens_and_is_followed_with_the_whole_package(lab: Path) -> None:

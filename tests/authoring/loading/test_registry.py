@@ -111,19 +111,3 @@ def test_a_name_that_one_load_takes_twice_is_refused_with_both_places() -> None:
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is second
     registrations.undo()
     assert registered() == before
-
-
-def test_a_name_is_somebody_elses_in_any_table_but_that_of_downloads() -> None:
-    assets.DATA_GROUPS["AuthorDownloads-v1"] = []
-    registrations = registry.Registrations()
-    with registry.registering(lambda file: file == THIS_FILE, registrations):
-        for name in ("AuthorDownloads-v1", "CartPole-v1"):
-            env_registration.register_env(name)(type("Task", (BaseEnv,), {}))
-
-        @agents.register_agent()
-        class Robot(Panda):
-            uid = "fetch"
-
-    assert [one.name for one in registrations.replaced()] == ["CartPole-v1", "fetch"]
-    registrations.undo()
-    assert registry.is_other_gymnasium_id("CartPole-v1") and assets.DATA_GROUPS["AuthorDownloads-v1"] == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 from pathlib import Path
 
@@ -43,15 +42,6 @@ def test_once_is_until_the_program_ends(store: Path) -> None:
     assert kept.trusts(content("one")) and not kept.follows(content("one"))
     assert kept.follows(content("two")) and not kept.follows(content("two", "/other/push.py"))
     assert not TrustStore().trusts(content("one")) and not store.exists()
-
-
-def test_the_text_that_was_trusted_last_is_compared_with(store: Path) -> None:
-    for text in ("one", "two", "one"):  # the one that was said again is the last
-        TrustStore().trust(content(text))
-    assert len(json.loads(store.read_text())["trusted"]) == 2
-    assert TrustStore().trusted_before(content("three")) == content("one").file_sums
-    assert TrustStore().trusted_before(content("one")) == content("two").file_sums
-    assert TrustStore().trusted_before(content("one", "/other/push.py")) is None
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])

@@ -102,16 +102,6 @@ def test_every_way_of_saving_is_seen_again_and_again(
     assert calls.nothing_before(last)
 
 
-def test_a_burst_of_saves_is_few_calls_and_the_last_content_wins(
-    file: Path, last: Path, calls: Calls
-) -> None:
-    for number in range(1, 11):
-        file.write_text(f"a = {number}\n")
-        time.sleep(0.005)  # as a burst comes
-    assert calls.until({"task.py": "a = 10\n"}) <= 3
-    assert calls.nothing_before(last)
-
-
 def test_only_new_content_of_followed_files_counts(file: Path, last: Path, calls: Calls) -> None:
     os.utime(file)
     file.with_name("other.py").write_text("b = 1\n")
@@ -223,12 +213,6 @@ def many(watcher: SourceWatcher, tmp_path: Path, calls: Calls, monkeypatch: pyte
         return files
 
     return follow
-
-
-def test_of_many_files_each_comes_to_its_turn(many: Many, calls: Calls) -> None:
-    for number, file in enumerate(many(0, 5)):
-        file.write_text(f"a = 2{number}\n")
-        assert calls.next() == {file.name: f"a = 2{number}\n"}
 
 
 def test_a_call_that_raises_is_logged_and_the_next_save_is_seen(

@@ -143,17 +143,11 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
             "",
             "may keep",
         ),
-        ("def evaluate(self):\n    self.w = self.w or {n}\n    return {{'w': self.w}}\n", "", "may keep"),
         ("def evaluate(self):\n    return {{'w': self.kept.setdefault('w', {n})}}\n", "", "setdefault"),
         (
             "@functools.lru_cache\ndef table(self):\n    return {n}\ndef evaluate(self):\n    return {{'w': self.table()}}\n",
             "",
             "lru_cache",
-        ),
-        (
-            "@functools.cached_property\ndef table(self):\n    return {n}\ndef evaluate(self):\n    return {{'w': self.table}}\n",
-            "",
-            "cached",
         ),
         ("def evaluate(self, kept={{}}):\n    kept['w'] = {n}\n    return kept\n", "", "default"),
         (
@@ -162,17 +156,7 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
             "W may be changed",
         ),
         (
-            "def evaluate(self):\n    SEEN['w'] = {n}\n    return SEEN\n",
-            "SEEN = {{}}\n",
-            "SEEN may be changed",
-        ),
-        (
             "def evaluate(self):\n    SEEN.append({n})\n    return {{}}\n",
-            "SEEN = [1]\n",
-            "SEEN may be changed",
-        ),
-        (
-            "def evaluate(self):\n    mine = SEEN\n    mine[0] = {n}\n    return {{}}\n",
             "SEEN = [1]\n",
             "SEEN may be changed",
         ),
@@ -182,16 +166,10 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
             "RNG may be changed",
         ),
         ("def evaluate(self):\n    return {{'w': getattr(self, 'com' + 'pute')({n})}}\n", "", "getattr"),
-        ("def evaluate(self):\n    return eval('{n}')\n", "", "eval"),
         (
             "def evaluate(self):\n    return {{'w': isinstance(self.x, Mode) + {n}}}\n",
             "class Mode:\n    A = 1\n",
             "the class Mode",
-        ),
-        (
-            "def __init__(self):\n    super().__init__()\n    self.w = self.first\ndef evaluate(self):\n    self.first = {n}\n    return {{}}\n",
-            "",
-            "super().__init__()",
         ),
         (
             "def __getattr__(self, name):\n    return 1\ndef evaluate(self):\n    return {{'w': self.x + {n}}}\n",
@@ -237,12 +215,6 @@ def test_a_robot_of_the_file_is_what_the_env_was_built_of_though_nobody_names_it
     assert (
         change(task(body, top.format(1)), task(body.replace("'r'", "'s'"), top.format(1))).level == "patched"
     )
-
-
-def test_another_task_of_the_file_may_change_as_it_likes() -> None:
-    other = "\n\nclass Other(BaseEnv):\n    def _load_scene(self, options):\n        self.thing = {}\n"
-    mine = task("def evaluate(self):\n    return {'x': 1}\n")
-    assert change(mine + other.format(1), mine + other.format(2)).level == "patched"
 
 
 def test_a_helper_beside_the_task_is_compared_too() -> None:

@@ -16,7 +16,6 @@ import psutil
 import pytest
 
 from tests.jobs.pool.work import Run, Setup
-from workbench.authoring.problem import TaskError
 from workbench.jobs.pool import cluster as seam
 from workbench.jobs.pool.cluster import Cluster
 from workbench.jobs.pool.connect import connected
@@ -207,23 +206,6 @@ def test_items_are_done_once_also_where_a_worker_dies(address: str, tmp_path: Pa
     pids = {result.pid for result in run.results.values()}
     # What the dead one had done may have died with it.
     assert os.getpid() not in pids and pids - {int((tmp_path / "killed").read_text())}
-
-
-@pytest.mark.parametrize(
-    ("how", "says", "error"),
-    [("value", "not such a number", PoolError), ("cannot be loaded", "it broke", TaskError)],
-)
-def test_what_ends_a_job_here_ends_it_there(
-    how: str, says: str, error: type[Exception], address: str, tmp_path: Path
-) -> None:
-    with pytest.raises(error, match=says):
-        Run(Setup(how, 3, folder=tmp_path), range(8), tries=3, goes_on=True).by(Cluster(address, 1))
-
-
-def test_stopping_ends_the_job_with_what_is_done(address: str, tmp_path: Path) -> None:
-    run = Run(Setup(folder=tmp_path), range(10**6), stop=lambda: len(run.results) > 5)
-    run.by(Cluster(address, 2))
-    assert 5 < len(run.results) < 10**5
 
 
 def test_other_versions_are_refused_and_named(

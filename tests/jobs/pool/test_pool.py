@@ -79,16 +79,6 @@ def test_what_is_not_wanted_any_more_is_left_out_and_all_before_it_is_done(
 
 
 @child_process
-def test_an_item_that_waits_for_others_is_dropped_when_it_is_not_wanted(tmp_path: Path) -> None:
-    def enough(run: Run, number: int) -> None:
-        if (tmp_path / "waits").exists():
-            run.deal.lower(4)
-
-    done = Run(Setup("waits", 4, folder=tmp_path), range(10**6), on_result=enough).by(Processes(2))
-    assert set(range(4)) <= set(done.results)
-
-
-@child_process
 @pytest.mark.parametrize("executor", EXECUTORS)
 def test_what_was_stopped_is_resumed_with_what_is_left(executor: Executor, tmp_path: Path) -> None:
     asked = False
@@ -119,15 +109,11 @@ def fails(how: str, says: str, error: type[Exception] = PoolError) -> Any:
     ("how", "says", "error"),
     [
         fails("killed", "a process that squares was killed by SIGKILL"),
-        fails("left", "a process that squares ended with exit code 0"),
         fails("bug", "a process that squares ended with exit code 1"),
         fails("task", "it broke", TaskError),
-        fails("value", "not such a number"),
         fails("no UTF-8", r"there is no .*caf\\udce9"),
         fails("garbage", "a process that squares sent what cannot be read"),
-        fails("endless", "a process that squares sent what cannot be read"),
         fails("another type", "a process that squares sent what cannot be read"),
-        fails("no path", "a process that squares sent what cannot be read"),
         fails("another's", "a process that squares sent the result of an item that it does not have"),
     ],
 )
@@ -289,14 +275,6 @@ def test_failures_at_different_places_or_between_results_do_not() -> None:
             assert chunk is not None
             told.deal.result(number, chunk.numbers[0], 0)
     assert told.deal.count_left(99) == 100 - (2 * FIRST_ALIKE - 2) - 3 * LATER_ALIKE
-
-
-def test_a_job_without_a_result_is_a_failure() -> None:
-    told = Told(range(1))
-    told.deal.next("a")
-    told.deal.failed("a", problem(3))
-    with pytest.raises(TaskError, match="it broke at 3"):
-        told.deal.require_results()
 
 
 @given(total=st.integers(1, 200), count=st.integers(1, 40), chunk=st.integers(1, 9))

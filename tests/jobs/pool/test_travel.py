@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,17 +73,3 @@ def test_a_job_needs_the_folder_of_its_task_and_what_acts(place: Path) -> None:
         needed_by("PushCube-v1", "random") == needed_by("PushCube-v1")
         and not needed_by("PushCube-v1").folders
     )
-
-
-def test_a_package_of_the_current_folder_is_needed_from_its_top_and_an_installed_one_is_not(
-    place: Path,
-) -> None:
-    package = place.parent / "lab" / "tasks"
-    package.mkdir(parents=True)
-    for folder in (package, package.parent):
-        (folder / "__init__.py").touch()
-    (package / "cups.py").touch()
-    assert needed_by("lab.tasks.cups:Cups").folders == (package.parent,)
-    assert needed_by("PushCube-v1", imports=["lab.tasks"]).folders == (package.parent,)
-    assert needed_by("mani_skill.envs.tasks.tabletop.push_cube:PushCubeEnv").folders == ()
-    assert os.path.isdir("lab")

@@ -57,20 +57,6 @@ def test_a_call_that_fails_leaves_the_old_content_or_the_new(
         assert then or sorted(os.listdir(path.parent)) == beside, call
 
 
-@KINDS
-def test_a_link_stays_one_and_the_file_keeps_who_may_read_it(
-    tmp_path: Path, begin: Callable[[Path], tuple[Path, Callable[[], None]]]
-) -> None:
-    path, write = begin(tmp_path / "a")
-    aside = path.rename(tmp_path / f"aside{path.suffix}")
-    path.symlink_to(aside)
-    aside.chmod(0o640)
-    write()
-    assert path.is_symlink() and b"typed now" in aside.read_bytes()
-    assert aside.stat().st_mode & 0o777 == 0o640
-    assert sorted(os.listdir(tmp_path)) == ["a", aside.name]
-
-
 def test_notes_of_one_trajectory_leave_those_of_the_others(tmp_path: Path) -> None:
     path = tmp_path / "demo.notes"
     for number in range(3):

@@ -171,16 +171,6 @@ def test_episodes_that_do_not_fit_together_are_said_and_nothing_is_left(
     assert len(read_lerobot(tmp_path / "rest", 1).reward) == episode.length
 
 
-def test_a_folder_with_something_in_it_is_not_written_to(episode: Episode, tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="something at"):
-        export(tmp_path, episode)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match="Cannot write the dataset"):
-        export(tmp_path / "file" / "set", episode)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "mine.txt"]
-
-
 def test_a_broken_dataset_is_said(episode: Episode, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     export(folder, episode)

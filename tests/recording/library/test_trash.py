@@ -37,26 +37,6 @@ def recording(folder: Path, name: str, suffixes: tuple[str, ...] = (".json", ".h
     return paths
 
 
-@pytest.mark.parametrize("at", [1, 2, 3])
-def test_a_move_that_fails_leaves_every_file_of_the_recording_where_it_was(tmp_path: Path, at: int) -> None:
-    paths = recording(tmp_path, "sub/a")
-    before = files(tmp_path)
-    with refused(at, ("rename",)):
-        with pytest.raises(
-            TrashError, match=f"{paths[at - 1].name} was left where it is: Input/output error"
-        ):
-            move_to_trash(tmp_path, [paths])
-    assert files(tmp_path) == before
-    batch = move_to_trash(tmp_path, [paths])
-    assert batch is not None and outside(tmp_path) == {}
-    with refused(at, ("rename",)):
-        with pytest.raises(TrashError, match="was left where it is: Input/output error"):
-            restore_from_trash(tmp_path, batch)
-    assert outside(tmp_path) == {} and read_trash(tmp_path).files == 3
-    assert sorted(restore_from_trash(tmp_path, batch)) == sorted(before)
-    assert files(tmp_path) == before
-
-
 def test_what_lies_in_the_trash_is_counted_by_deletion_file_and_byte(tmp_path: Path) -> None:
     assert read_trash(tmp_path) == Trash()
     recordings = [recording(tmp_path, name) for name in ("a", "sub/b")]
@@ -104,18 +84,6 @@ def test_a_trash_that_leads_elsewhere_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(TrashError, match="could not be emptied"):
         empty_trash(folder)
     assert files(elsewhere) == before and all(path.exists() for path in paths)
-
-
-def test_emptying_deletes_all_of_it_and_an_empty_one_needs_none(tmp_path: Path) -> None:
-    empty_trash(tmp_path)
-    move_to_trash(tmp_path, [recording(tmp_path, "a")])
-    kept = recording(tmp_path, "b")
-    empty_trash(tmp_path)
-    assert not (tmp_path / TRASH).exists() and all(path.exists() for path in kept)
-    (tmp_path / TRASH).write_text("no folder")
-    assert read_trash(tmp_path) == Trash()
-    with pytest.raises(TrashError, match="could not be emptied: Not a directory"):
-        empty_trash(tmp_path)
 
 
 @pytest.mark.parametrize("then", [0, errno.EROFS])

@@ -21,7 +21,7 @@ from workbench.cli.main import main
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
-from workbench.recording.reader.read_episode import read_episode, read_maniskill
+from workbench.recording.reader.read_episode import read_episode
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -59,19 +59,6 @@ def test_maniskills_dataset_class_loads_what_was_recorded(recordings: list[Path]
     obs, _ = stock.reset(seed=ours[0].info.seed)
     np.testing.assert_allclose(data.obs[0], obs[0].numpy(), atol=1e-5)
     stock.close()
-
-
-def test_each_episode_is_numbered_in_both_files(recordings: list[Path], tmp_path: Path) -> None:
-    file = tmp_path / "new" / "demos.h5"
-    assert export(recordings[0].parent, "--maniskill", file) == 0
-    entries = json.loads(file.with_suffix(".json").read_text())["episodes"]
-    assert [entry["episode_id"] for entry in entries] == [0, 1, 2, 3]
-    with h5py.File(file) as written:
-        assert sorted(written) == ["traj_0", "traj_1", "traj_2", "traj_3"]
-        actions: list[Any] = [written[f"traj_{k}/actions"] for k in range(4)]
-        assert [len(each) for each in actions] == [one["elapsed_steps"] for one in entries]
-    assert {path.name for path in file.parent.iterdir()} == {"demos.h5", "demos.json"}
-    assert sorted(read_maniskill(file, f"traj_{k}").info.seed for k in range(4)) == [1, 1, 2, 3]
 
 
 @pytest.mark.slow

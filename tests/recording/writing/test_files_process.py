@@ -23,11 +23,10 @@ from tests.recording.read_rrd import read_rrd
 from workbench.jobs.record.gather import EpisodeFinisher, GatheredEpisode
 from workbench.recording.episode.made_here import MadeHere, made_here
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing.episode_writer import EpisodeFiles, EpisodeWriter
+from workbench.recording.writing.episode_writer import EpisodeWriter
 from workbench.recording.writing.files_process import FilesProcess
 from workbench.recording.writing.finish import make_files
-from workbench.recording.writing.from_journal import Header
-from workbench.recording.writing.journal import FOLDER, Journal, claim
+from workbench.recording.writing.journal import claim
 from workbench.recording.writing.publish import RecordingError
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -116,15 +115,6 @@ def test_what_cannot_be_written_is_said_as_on_a_thread(tmp_path: Path, process: 
     assert appended(tmp_path, made(3), pictures=False).finish(process).json.is_file()  # it goes on
 
 
-def test_a_relative_folder_is_the_one_of_now(
-    tmp_path: Path, process: FilesProcess, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "below").mkdir()
-    monkeypatch.chdir(tmp_path / "below")
-    files = appended(Path("kept"), made(3), pictures=False).finish(process)
-    assert files.rrd.parent == Path("kept") and (tmp_path / "below" / files.json).is_file()
-
-
 def test_killed_at_any_moment_the_episode_is_made_once(tmp_path: Path) -> None:
     for wait in (0, 0.005, 0.02, 0.04):
         folder, process = tmp_path / str(wait), started()
@@ -168,38 +158,6 @@ def test_nobody_recovers_what_it_works_on(tmp_path: Path, process: FilesProcess)
     os.kill(pid_of(process), signal.SIGCONT)
     assert future.result(30).json.is_file()
     waiting.close()
-
-
-def test_those_that_wait_at_the_end_are_made_here_and_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    there = counted(monkeypatch)
-    writers = [appended(tmp_path, made(3, seed=seed), pictures=False) for seed in range(12)]
-    finisher = EpisodeFinisher(in_process=True)
-    process = finisher._process
-    assert process is not None
-    until(lambda: process.is_ready, "it has done its imports")
-    futures = [finisher.finish(GatheredEpisode(writer, env=0, seed=0)) for writer in writers]
-    finisher.close()
-    assert not any(isinstance(future.result(), str) for future in futures)
-    assert len(list(tmp_path.glob("*.json"))) == 12 and not (tmp_path / FOLDER).exists()
-    assert (finisher.finished.count, finisher.waiting) == (12, 0)
-    assert 0 < len(there) < 12
-    assert not Path(f"/proc/{pid_of(process)}").exists()
-
-
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """The journals that any process has made files of, from now on."""
-    there: list[Path] = []
-    make = FilesProcess.make
-
-    def counting(self: FilesProcess, journal: Journal, header: Header, states: int) -> EpisodeFiles | None:
-        if (files := make(self, journal, header, states)) is not None:
-            there.append(journal.path)
-        return files
-
-    monkeypatch.setattr(FilesProcess, "make", counting)
-    return there
 
 
 def test_where_no_process_can_be_started_the_thread_makes_them(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -41,23 +40,6 @@ def rows(path: Path) -> list[bytes]:
 
 def numbers(*values: int) -> list[bytes]:
     return [bytes([value]) for value in values]
-
-
-@pytest.mark.parametrize("removed", ["folder", "file"])
-def test_a_folder_that_vanished_is_told_at_the_next_row(
-    tmp_path: Path, journal: Journal, removed: str
-) -> None:
-    journal.append(JournalEntry("row", 0, b"0"))
-    journal.sync()
-    journal.append(JournalEntry("row", 0, b"1"))
-    if removed == "folder":
-        shutil.rmtree(tmp_path / "folder")
-    else:
-        journal.path.unlink()
-    journal.sync()
-    for tell in (lambda: journal.append(JournalEntry("row", 0, b"2")), journal.append, journal.finish):
-        with pytest.raises(FileNotFoundError, match="was removed during the recording"):
-            tell()
 
 
 def test_an_error_of_the_disk_is_told_at_the_next_row_and_the_next_sync_makes_no_good_of_it(
@@ -99,29 +81,6 @@ def test_what_could_not_be_written_is_written_once_there_is_room(
     journal.finish()
     assert rows(journal.path) == [b"0", b"".join(value * 3000 for value in numbers(1, 2))]
     assert journal.size == journal.path.stat().st_size
-
-
-@pytest.mark.parametrize("alone", [True, False])
-def test_a_row_that_was_taken_is_kept_and_one_that_was_refused_is_not(
-    journal: Journal, monkeypatch: pytest.MonkeyPatch, alone: bool
-) -> None:
-    """Also a row so large that whoever brings it writes it."""
-    monkeypatch.setattr(journals, "_BATCH_BYTES", 100)
-
-    def bring(value: bytes) -> bool:
-        try:
-            journal.append(
-                *([] if alone else [JournalEntry("camera/0", 0, value)]), JournalEntry("row", 0, value)
-            )
-        except OSError:
-            return False
-        return True
-
-    with refused(2, ("pwrite",), errno.ENOSPC, then=errno.ENOSPC):
-        taken = [value * 200 for value in numbers(1, 2, 3) if bring(value * 200)]
-    assert len(taken) < 3
-    journal.finish()
-    assert b"".join(rows(journal.path)) == b"".join(taken)
 
 
 def test_a_picture_that_could_not_be_made_is_told_and_costs_its_own_state_alone(journal: Journal) -> None:

@@ -16,13 +16,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.drive.episodes import Made, entries_of, header_of, journal_of
+from tests.drive.episodes import Made, entries_of, journal_of
 from tests.drive.rows import append
 from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
 from workbench.core.scene.shapes import Mesh
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing import finish as making
 from workbench.recording.writing.finish import episode_stem, recover
 from workbench.recording.writing.journal import FOLDER, Journal, JournalEntry
 from workbench.recording.writing.publish import RecordingError
@@ -69,21 +68,6 @@ def test_a_journal_may_end_anywhere(make_episode: Maker, tmp_path: Path) -> None
         assert rows == sum(one <= end for one in ends)
 
 
-def test_garbage_at_the_end_is_left_out(make_episode: Maker, tmp_path: Path) -> None:
-    """After a power cut a file may be as long as it was meant to be, and hold something else."""
-    episode = make_episode(4)
-    writer = episode.writer(tmp_path)
-    for row in episode.rows():
-        append(writer, row)
-    journal_of(writer).write()
-    writer.close()
-    journal = next((tmp_path / FOLDER).glob("*.arrow"))
-    with journal.open("ab") as file:
-        file.write(bytes(1000) + os.urandom(5000))
-    (files,) = recover(tmp_path)
-    assert read_episode(files.rrd).length == 4
-
-
 SCHEMA = 200
 """Bytes with which a journal begins and that hold no data."""
 
@@ -120,47 +104,6 @@ def test_a_damaged_journal_is_never_deleted_with_steps_in_it(
         # All of it is there, or all but what stands last and cannot be told from what was being written.
         (length,) = lengths(folder).values()
         assert length == 6 or (length == 5 and place is not None and place >= SCHEMA)
-
-
-@pytest.mark.parametrize("linked", [0, 1, 2, 3])
-def test_a_writer_that_died_between_two_names(
-    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, linked: int
-) -> None:
-    episode = make_episode()
-    writer = episode.writer(tmp_path)
-    for row in episode.rows():
-        append(writer, row)
-    link = os.link
-    done: list[str] = []
-
-    class Death(BaseException):
-        pass
-
-    def dying(source: str, target: str) -> None:
-        if len(done) == linked:
-            raise Death
-        link(source, target)
-        done.append(target)
-
-    # Death takes no time to clean up.
-    monkeypatch.setattr(os, "link", dying)
-    monkeypatch.setattr("workbench.recording.writing.publish._remove", lambda paths: None)
-    monkeypatch.setattr(Path, "unlink", lambda self, missing_ok=False: None)
-    if linked == 3:
-        monkeypatch.setattr(
-            "workbench.recording.writing.publish.sync_folder", lambda folder: (_ for _ in ()).throw(Death())
-        )
-    with pytest.raises(Death):
-        journal_of(writer).finish()
-        making.make_files(journal_of(writer).path, header_of(journal_of(writer).path), tmp_path)
-    monkeypatch.undo()
-    writer.close()
-    assert len([path for path in tmp_path.iterdir() if path.is_file()]) == linked
-    recovered = recover(tmp_path)
-    assert len(recovered) == (0 if linked == 3 else 1)
-    (path,) = tmp_path.glob("*.json")
-    assert read_episode(path).info.id == episode.info.id
-    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_a_journal_without_a_step_is_cleared_away(make_episode: Maker, tmp_path: Path) -> None:
@@ -249,13 +192,6 @@ def test_of_a_writer_that_died_between_two_names_only_what_it_named_itself_is_ta
         os.link(journal.with_suffix(suffix), tmp_path / f"{first.json.stem}_2{suffix}")
     (second,) = recover(tmp_path)
     assert second.json.stem == f"{first.json.stem}_2"
-    assert lengths(tmp_path) == {"0": 2, "1": 4}
-
-
-def test_two_of_one_name_become_two(make_episode: Maker, tmp_path: Path) -> None:
-    for number, steps in enumerate((2, 4)):
-        left(make_episode(steps), tmp_path, id=f"{number}", written_at="2026-11-21T12:00:00+00:00")
-    assert [files.json.stem[-5:] for files in recover(tmp_path)] == ["00-00", "-00_2"]
     assert lengths(tmp_path) == {"0": 2, "1": 4}
 
 

@@ -19,7 +19,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.writing.finish import EpisodeFiles
 from workbench.recording.writing.publish import RecordingError
-from workbench.recording.writing.upload import remove_uploaded_id, require_place, upload_episode
+from workbench.recording.writing.upload import remove_uploaded_id, upload_episode
 
 
 @pytest.fixture(scope="module")
@@ -118,15 +118,3 @@ def test_only_the_episode_with_that_id_is_removed(tmp_path: Path) -> None:
     assert len(names(place)) == 3
     remove_uploaded_id(place, "Task", 1, "mine")
     assert names(place) == []
-
-
-@pytest.mark.parametrize(
-    ("address", "says"),
-    [
-        ("nonsense://place", "Protocol not known: nonsense"),
-        ("file:///proc/nowhere", "Cannot record to file:///proc"),
-    ],
-)
-def test_a_place_that_cannot_be_written_is_said_before(address: str, says: str) -> None:
-    with pytest.raises(RecordingError, match=says):
-        require_place(address)
