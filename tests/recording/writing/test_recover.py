@@ -6,10 +6,10 @@ import dataclasses
 import errno
 import json
 import os
-import random
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,62 +48,61 @@ def test_a_killed_writer_was_given_time_to_lose_nothing(make_episode: Maker, tmp
     assert found.length == 5
 
 
-def test_a_journal_may_end_anywhere(make_episode: Maker, tmp_path: Path) -> None:
-    episode = make_episode(4)
-    writer = episode.writer(tmp_path)
+SCHEMA = 200
+"""Bytes with which a journal begins and that hold no data."""
+DAMAGE = st.one_of(
+    st.tuples(st.just("cut"), st.floats(0, 1)),
+    st.tuples(st.just("flip"), st.floats(0, 0.03) | st.floats(0, 0.999)),
+    st.tuples(st.just("more"), st.binary(min_size=1, max_size=300)),
+)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(damage=DAMAGE, bit=st.integers(0, 7))
+def test_a_journal_that_is_cut_or_changed_anywhere_gives_its_whole_states_or_stays(
+    make_episode: Maker, tmp_path: Path, damage: tuple[str, Any], bit: int
+) -> None:
+    """A killed process cuts it, and after a power cut a file may be as long as it was meant to be, and hold something else."""
+    folder = Path(tempfile.mkdtemp(dir=tmp_path))
+    episode = make_episode(6)
+    writer = episode.writer(folder)
     ends = []
     for row in episode.rows():
         append(writer, row)
         journal_of(writer).write()
         ends.append(journal_of(writer).size)
-    journal_of(writer).write()
-    journal = next((tmp_path / FOLDER).glob("*.arrow"))
-    whole = journal.read_bytes()
-    writer.discard()
-    chance = random.Random(0)
-    cut = tmp_path / "cut.arrow"
-    for end in [*ends, *(chance.randrange(len(whole)) for _ in range(40))]:
-        cut.write_bytes(whole[:end])
-        rows = sum(entry.kind == "row" for entry in entries_of(cut))
-        assert rows == sum(one <= end for one in ends)
-
-
-SCHEMA = 200
-"""Bytes with which a journal begins and that hold no data."""
-
-
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data())
-def test_a_damaged_journal_is_never_deleted_with_steps_in_it(
-    make_episode: Maker, tmp_path: Path, data: st.DataObject
-) -> None:
-    folder = Path(tempfile.mkdtemp(dir=tmp_path))
-    episode = make_episode(6)
-    writer = episode.writer(folder)
-    for row in episode.rows():
-        append(writer, row)
-        journal_of(writer).write()
     writer.close()
     path = folder / FOLDER / f"{episode.info.id}.arrow"
     content = bytearray(path.read_bytes())
-    beginning = st.integers(0, SCHEMA - 1)
-    place = data.draw(st.none() | beginning | st.integers(0, len(content) - 1), "byte")
-    if place is not None:
-        content[place] ^= 1 << data.draw(st.integers(0, 7), "bit")
+    (kind, where), whole = damage, len(ends)
+    place = int(where * len(content)) if kind != "more" else 0
+    if kind == "cut":
+        # At the end of a state, as often as in one.
+        place = ends[place % len(ends)] if bit % 2 else place
+        del content[place:]
+        whole = sum(end <= place for end in ends)
+    elif kind == "flip":
+        content[place] ^= 1 << bit
+    else:
+        content += bytes(1000) + where
     path.write_bytes(content)
     try:
         recover(folder)
     except RecordingError:
-        assert place is not None and place >= SCHEMA
+        assert kind == "flip" and place >= SCHEMA
         left_over = [one for one in (folder / FOLDER).iterdir() if one.suffix in (".arrow", ".damaged")]
         assert [one.read_bytes() for one in left_over] == [bytes(content)]
         if left_over[0].suffix == ".damaged":
             recover(folder)  # it was said once
             assert left_over[0].exists()
-    else:
-        # All of it is there, or all but what stands last and cannot be told from what was being written.
-        (length,) = lengths(folder).values()
-        assert length == 6 or (length == 5 and place is not None and place >= SCHEMA)
+        return
+    found = [read_episode(path) for path in folder.glob("*.json")]
+    states = [len(one.poses) for one in found if one.poses is not None]
+    # All of it is there, or all but what stands last and cannot be told from what was being written.
+    assert states == ([whole] if whole > 1 else []) or (kind == "flip" and states == [6] and place >= SCHEMA)
+    for one in found:
+        np.testing.assert_array_equal(one.poses, episode.poses[: states[0]])
+        np.testing.assert_array_equal(one.action, episode.action[: states[0] - 1])
 
 
 def test_a_journal_without_a_step_is_cleared_away(make_episode: Maker, tmp_path: Path) -> None:
