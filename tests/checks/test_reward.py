@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from tests.checks.checked import Checked, the_finding
+from tests.checks.checked import EXAMPLE, Checked, check_rules, the_finding
 
 
 def test_a_reward_that_is_nan(checked: Checked) -> None:
@@ -104,3 +106,20 @@ def test_the_largest_reward_without_success(checked: Checked) -> None:
     near = "reward[info['cube_to_goal'] < 0.25] = 3"
     finding = the_finding(checked("reward-needs-success", ('reward[info["success"]] = 3', near)))
     assert "without success" in finding.message
+
+
+IN_TIME = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005)', '"success": self.elapsed_steps == 7'
+
+
+def test_a_reward_is_compared_with_the_success_of_its_own_step(tmp_path: Path) -> None:
+    """Success for one step, and the largest reward at that step, or at the one before it or after it."""
+    rules, most = ("reward-needs-success", "reward-order"), 'reward[info["success"]] = 3'
+    for step in (6, 7, 8):
+        paid = f"{most[:-1]}1\n        reward[self.elapsed_steps == {step}] = 3"
+        text = EXAMPLE.read_text().replace(*IN_TIME).replace(most, paid)
+        assert text.count("elapsed_steps ==") == 2
+        (tmp_path / "task.py").write_text(text)
+        results = check_rules(rules, str(tmp_path / "task.py"), num_envs=4, seeds=4, render_backend="none")
+        for rule in rules:
+            told = [finding.message for finding in results[rule].findings]
+            assert len(told) == (step != 7) and all(f"(step {step} of seed " in one for one in told), told

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drive.session import TASKS
@@ -92,6 +92,7 @@ def test_after_each_save_the_env_does_what_a_new_one_of_that_text_does(seed: int
     assert seed or len(set(levels)) > 1, "not each save builds the scene again"
 
 
+@settings(max_examples=15)
 @given(st.lists(st.integers(0, TEXT.count("\n") - 1), min_size=1, max_size=5))
 def test_lines_between_statements_are_no_change(places: list[int]) -> None:
     lines = TEXT.splitlines(keepends=True)
