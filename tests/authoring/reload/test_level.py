@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.reload.level import Change, Inherited, find_change
+from workbench.authoring.reload.level import Change, Inherited, find_change, removed_effects
 
 FILE = "/author/task.py"
 PUSH_CUBE = (Path(__file__).parents[3] / "tasks" / "push_cube.py").read_text()
@@ -143,11 +143,17 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
             "",
             "may keep",
         ),
+        ("def evaluate(self):\n    self.w = self.w or {n}\n    return {{'w': self.w}}\n", "", "may keep"),
         ("def evaluate(self):\n    return {{'w': self.kept.setdefault('w', {n})}}\n", "", "setdefault"),
         (
             "@functools.lru_cache\ndef table(self):\n    return {n}\ndef evaluate(self):\n    return {{'w': self.table()}}\n",
             "",
             "lru_cache",
+        ),
+        (
+            "@functools.cached_property\ndef table(self):\n    return {n}\ndef evaluate(self):\n    return {{'w': self.table}}\n",
+            "",
+            "cached",
         ),
         ("def evaluate(self, kept={{}}):\n    kept['w'] = {n}\n    return kept\n", "", "default"),
         (
@@ -156,7 +162,17 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
             "W may be changed",
         ),
         (
+            "def evaluate(self):\n    SEEN['w'] = {n}\n    return SEEN\n",
+            "SEEN = {{}}\n",
+            "SEEN may be changed",
+        ),
+        (
             "def evaluate(self):\n    SEEN.append({n})\n    return {{}}\n",
+            "SEEN = [1]\n",
+            "SEEN may be changed",
+        ),
+        (
+            "def evaluate(self):\n    mine = SEEN\n    mine[0] = {n}\n    return {{}}\n",
             "SEEN = [1]\n",
             "SEEN may be changed",
         ),
@@ -166,10 +182,16 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
             "RNG may be changed",
         ),
         ("def evaluate(self):\n    return {{'w': getattr(self, 'com' + 'pute')({n})}}\n", "", "getattr"),
+        ("def evaluate(self):\n    return eval('{n}')\n", "", "eval"),
         (
             "def evaluate(self):\n    return {{'w': isinstance(self.x, Mode) + {n}}}\n",
             "class Mode:\n    A = 1\n",
             "the class Mode",
+        ),
+        (
+            "def __init__(self):\n    super().__init__()\n    self.w = self.first\ndef evaluate(self):\n    self.first = {n}\n    return {{}}\n",
+            "",
+            "super().__init__()",
         ),
         (
             "def __getattr__(self, name):\n    return 1\ndef evaluate(self):\n    return {{'w': self.x + {n}}}\n",
@@ -247,3 +269,27 @@ def test_cameras_that_depend_on_the_moment_are_rebuilt(hook: str) -> None:
 def test_a_file_that_cannot_be_read_is_no_error() -> None:
     assert change("def (", task("def evaluate(self):\n    return {}\n")).level == "rebuilt"
     assert change(task("x = 1\n"), "class Task(BaseEnv):\n    x = 1\n" + "\0").level == "rebuilt"
+
+
+@pytest.mark.parametrize(
+    ("statement", "has_one"),
+    [
+        ("torch.set_num_threads(8)", True),
+        ("torch.backends.flag = True", True),
+        ("np.seterr_of['all'] += 1", True),
+        ("if SIZE:\n    torch.set_num_threads(8)", True),
+        ("SIZE = max(1, 2)", False),
+        ("import math", False),
+    ],
+)
+def test_what_an_import_did_and_a_new_version_does_not_is_told_at_its_line(
+    statement: str, has_one: bool
+) -> None:
+    def removed(old: str, new: str) -> str:
+        return removed_effects({FILE: old}, {FILE: new})
+
+    base = task("x = 1\n", "SIZE = 1\n")
+    old = f"{base}\n{statement}\n"
+    line = base.count("\n") + 2
+    assert removed(old, base) == (f"task.py:{line} ({statement.splitlines()[0]})" if has_one else "")
+    assert removed(base, old) == removed(old, f"import re\n{old}") == removed(old, old) == ""

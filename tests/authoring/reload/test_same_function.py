@@ -60,3 +60,10 @@ def test_a_line_is_followed_where_only_what_is_around_it_changed(words: str, new
 )
 def test_a_function_that_says_something_else_has_no_such_line(words: str, new: str) -> None:
     assert line_in(OLD, new, at(OLD, words)) is None
+
+
+def test_of_equal_lines_the_one_at_the_same_place_is_meant() -> None:
+    old = OLD.replace("self.up = 2  # twice", "self.up = 1")
+    new = "import torch\n\n\n" + old.replace("class Task", "# the task\nclass Task")
+    for line in (i for i, text in enumerate(old.splitlines(), 1) if "self.up = 1" in text):
+        assert line_in(old, new, line) == line + 4
