@@ -135,12 +135,6 @@ def test_the_place_is_the_innermost_line_of_the_authors_and_the_stage_is_the_hoo
     assert problem.message.partition(":")[0].split(" ")[0] in problem.traceback or method == "unprintable"
 
 
-def test_a_property_that_says_what_cameras_there_are_belongs_to_the_build(task: LoadedTask) -> None:
-    env = task.cls()
-    problem = caught(lambda: env._default_sensor_configs, task.source_files, "step")
-    assert (problem.stage, problem.code) == ("build", "return unknown_name")
-
-
 def test_an_error_of_a_librarys_that_comes_from_the_authors_has_the_authors_line(task: LoadedTask) -> None:
     env = task.cls()
 

@@ -106,13 +106,6 @@ def test_a_rule_that_is_not_decided_is_no_success(tmp_path: Path) -> None:
     assert report.findings == () and report.fails("stop")
 
 
-def test_a_finding_below_the_degree_that_fails_is_told_and_passes(tmp_path: Path) -> None:
-    both = AT_ONCE, ("height < -0.1", "height < 1")
-    report = check(options(task_of(tmp_path, *both), "success-and-fail"))
-    assert [finding.degree for finding in report.findings] == ["warn"]
-    assert report.fails("warn") and not report.fails("stop")
-
-
 def test_a_job_that_is_stopped_gives_what_it_has(tmp_path: Path) -> None:
     seen: list[RuleResult] = []
     rules = "success-at-reset", "reward-finite"

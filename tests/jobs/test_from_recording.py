@@ -21,14 +21,8 @@ from workbench.jobs.from_recording import (
     recorded_source,
     reference_of,
 )
-from workbench.jobs.open_task import open_task
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record as record_episodes
-from workbench.jobs.rescore.run import rescore
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.episode.row import Source
-from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 
@@ -219,25 +213,3 @@ def test_its_env_is_made_with_its_own_robot_and_modes() -> None:
         "control_mode": "pd_joint_delta_pos",
     }
     assert (options.num_envs, options.seed) == (2, 5)
-
-
-TWO_MODES = "{'panda-0': 'pd_joint_pos', 'panda-1': 'pd_joint_delta_pos'}"
-
-
-def test_two_robots_are_made_again_with_the_mode_that_both_have(
-    renderer: None, child_process: None, tmp_path: Path
-) -> None:
-    options = TaskOptions(
-        num_envs=1, env_kwargs={"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
-    )
-    what = RecordOptions("TwoRobotPickCube-v1", tmp_path, 1, pictures=False, max_steps=2, options=options)
-    (written,) = record_episodes(what).written
-    info = read_episode(written.path).info
-    assert info.control_mode == info.env_kwargs["control_mode"] == "pd_ee_delta_pose"
-    again = open_task("TwoRobotPickCube-v1", options_of(info, 1, TaskOptions()))
-    (verdict,) = rescore(again, [Source(written.path)])
-    again.env.close()
-    assert not verdict.why_not and not verdict.differs
-    # As recordings of last week have it.
-    older = replace(info, control_mode=TWO_MODES, env_kwargs={})
-    assert "control_mode" not in options_of(older, 1).env_kwargs

@@ -100,19 +100,6 @@ def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_f
     )
 
 
-def test_without_recorded_rewards_there_is_nothing_to_compare_them_with() -> None:
-    found = compare(0, said([], success=[0] * 5), said(success=[0, 0, 0, 0, 1]))
-    assert found.differing == ("success",) and found.largest == 0
-    assert np.isnan(found.old_reward).all() and len(found.old_reward) == 4
-    assert verdict_text.returns_text(found) == "no reward → 6"
-
-
-def test_it_is_compared_as_far_as_it_is_said_now() -> None:
-    old = said(success=[0, 0, 0, 0, 1], height=[0, 0, 0, 0, 7.0], short=[0.0, 0])
-    found = compare(0, old, said([0.0, 1.0], success=[0, 0, 0], height=[0.0, 0, 0], short=[0.0, 9, 9]))
-    assert found.length == 2 and not found.differing and found.returns == (1, 1)
-
-
 def test_drift_is_that_of_the_state_that_is_furthest() -> None:
     drift = np.array([[0, 0], [2e-3, 1e-4], [1e-3, 0.02], [0, 0], [0, 0]])
     found = compare(0, said(), said(), drift, begin=7)

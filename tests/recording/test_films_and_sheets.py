@@ -18,10 +18,8 @@ from numpy.typing import NDArray
 from workbench.recording.episode.encoded_pictures import EncodedPictures, encode_jpeg
 from workbench.recording.episode.episode import Episode
 from workbench.recording.films import (
-    Encoding,
     FilmEye,
     camera_of,
-    cameras_by_name,
     chosen_states,
     contact_sheet,
     default_eye,
@@ -59,14 +57,6 @@ def test_a_film_holds_every_frame_in_order_at_its_rate(tmp_path: Path) -> None:
         assert abs(float(frame.mean()) - 20 * index) < 3
 
 
-@pytest.mark.parametrize("exact, size", [(False, (64, 34)), (True, (63, 33))])
-def test_an_odd_size_is_padded_for_people_and_kept_for_data(
-    tmp_path: Path, exact: bool, size: tuple[int, int]
-) -> None:
-    write_mp4(tmp_path / "odd.mp4", shades(3, 33, 63), 10, Encoding(exact_size=exact))
-    assert film(tmp_path / "odd.mp4")[0]["size"] == size
-
-
 def test_a_full_disk_ends_a_film_with_a_sentence_and_leaves_nothing(tmp_path: Path) -> None:
     # In a process of its own: the limit on the size of files cannot be taken back by everybody.
     noise = (
@@ -92,13 +82,6 @@ def test_a_state_without_a_picture_shows_the_one_before(episode: Episode) -> Non
     every_third = replace(camera, frame=np.array([0, 3, 6]), pose=camera.pose[:3], rgb=_pictures(shades(3)))
     seen = [round(float(picture.mean()) / 20) for picture in frames(episode, every_third)]
     assert seen == [0, 0, 0, 1, 1, 1, 2, 2, 2]
-
-
-def test_two_cameras_of_one_name_are_told_apart(episode: Episode) -> None:
-    sensor = camera_of(episode, "base_camera")
-    human = replace(sensor, info=replace(sensor.info, kind="human"))
-    named = cameras_by_name(replace(episode, cameras=[human, sensor]))
-    assert named["base_camera"] is sensor and named["base_camera_human"] is human
 
 
 def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Episode) -> None:

@@ -109,15 +109,6 @@ def test_only_new_content_of_followed_files_counts(file: Path, last: Path, calls
     assert calls.nothing_before(last)
 
 
-def test_line_ends_alone_are_no_change_and_a_crlf_file_is_followed(
-    file: Path, last: Path, calls: Calls
-) -> None:
-    file.write_bytes(b"a = 0\r\n")
-    assert calls.nothing_before(last)
-    file.write_bytes(b"a = 1\r\n")
-    assert calls.next() == {"task.py": "a = 1\n"}
-
-
 def test_a_file_that_stays_away_is_told_once_and_so_is_its_return(
     file: Path, last: Path, calls: Calls
 ) -> None:

@@ -195,20 +195,6 @@ def test_attributes_are_those_of_the_running_object(call: str, what: str) -> Non
     assert told(TASK.format(call)) == what
 
 
-@pytest.mark.parametrize(
-    ("call", "places"),
-    [
-        ("self.own = 4.5; note(self.own)", ["task.py:17 in Task.__init__", "task.py:19 in Task.hook"]),
-        ("self.far = 4.5; note(self.far)", ["task.py:11 in Parent", "task.py:19 in Task.hook"]),
-    ],
-)
-def test_an_attribute_that_is_set_twice_is_refused_with_each_file_line_and_class(
-    call: str, places: list[str]
-) -> None:
-    refused = told(TASK.format(call))
-    assert all(place in refused for place in places), refused
-
-
 OTHER = """
 class Other:
     def __init__(self):

@@ -171,23 +171,6 @@ def test_episodes_that_do_not_fit_together_are_said_and_nothing_is_left(
     assert len(read_lerobot(tmp_path / "rest", 1).reward) == episode.length
 
 
-def test_a_broken_dataset_is_said(episode: Episode, tmp_path: Path) -> None:
-    folder = tmp_path / "set"
-    export(folder, episode)
-    with pytest.raises(UnreadableRecording, match="no episode 7"):
-        read_lerobot(folder, 7)
-    info = json.loads((folder / "meta/info.json").read_text())
-    (folder / "meta/info.json").write_text(json.dumps({**info, "data_path": "../../secret.parquet"}))
-    with pytest.raises(UnreadableRecording, match="outside of it"):
-        read_lerobot(folder, 0)
-    (folder / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v2.1"}))
-    with pytest.raises(UnreadableRecording, match="version v2.1; version 3 can be read"):
-        lerobot_rows(folder)
-    (folder / "meta/info.json").write_text("{")
-    with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
-        lerobot_rows(folder)
-
-
 def test_a_dataset_is_in_the_library_an_episode_a_row(
     episode: Episode, succeeding: Episode, tmp_path: Path
 ) -> None:

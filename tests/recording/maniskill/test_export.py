@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 import sys
@@ -71,22 +70,6 @@ def test_replay_trajectory_takes_them(recordings: list[Path], tmp_path: Path) ->
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert "3/3=100.00% demos saved" in done.stdout
-
-
-def test_an_episode_of_another_kind_is_refused_or_left_out(
-    recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other = TaskOptions(num_envs=1, env_kwargs={**PUSHED, "control_mode": "pd_joint_delta_pos"})
-    (joint,) = record(
-        RecordOptions("PushCube-v1", tmp_path / "r", 1, pictures=False, max_steps=2, options=other)
-    ).written
-    both = (recordings[0], joint.path)
-    assert export(*both, "--maniskill", tmp_path / "demos.h5") == 2
-    said = capsys.readouterr().err
-    assert "control mode" in said and "pd_joint_delta_pos" in said
-    assert not (tmp_path / "demos.h5").exists()
-    assert export(*both, "--maniskill", tmp_path / "demos.h5", "--only-fitting") == 0
-    assert len(json.loads((tmp_path / "demos.json").read_text())["episodes"]) == 1
 
 
 def test_nothing_that_is_there_is_written_over(

@@ -166,29 +166,6 @@ def test_what_stays_as_it_was_is_not_written_again(make_episode: Callable[..., M
     np.testing.assert_array_equal(moved, [0, 1, 2, 3, 7, 8, 9])
 
 
-def test_observations_and_parts_of_the_reward_have_places_of_their_own(
-    written: tuple[Made, Path, Entities], make_episode: Callable[..., Made], tmp_path: Path
-) -> None:
-    episode, _, entities = written
-    assert episode.obs.keys() == {
-        "agent/qpos",
-        "agent/qvel",
-        "extra/is_grasped",
-        "extra/tcp_pose",
-        "extra/goal_pos",
-    }
-    steps, values = scalars(entities, "/observation/state")
-    np.testing.assert_array_equal(steps, np.arange(len(episode.poses)))
-    expected = np.concatenate([one.reshape(len(one), -1) for one in episode.obs.values()], axis=1)
-    np.testing.assert_array_equal(values, expected)
-    names = entities["/observation/state"]["SeriesLines:names"].values[0]
-    assert names[:2] == ["agent/qpos[0]", "agent/qpos[1]"] and len(names) == expected.shape[1]
-    terms = make_episode(evaluate={"reward_terms/reach": np.arange(4.0), "success": np.zeros(4, bool)})
-    entities = read_rrd(terms.write(tmp_path).rrd)
-    np.testing.assert_array_equal(scalars(entities, "/reward/reach")[1][:, 0], np.arange(4.0))
-    assert entities["/reward/reach"]["SeriesLines:names"].values[0] == ["reach"]
-
-
 def test_an_rrd_that_somebody_was_sent_holds_all_but_the_states(
     written: tuple[Made, Path, Entities], tmp_path: Path
 ) -> None:

@@ -15,15 +15,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.episodes import Made, Track, journal_of
 from tests.drive.rows import EpisodeRow, append
-from tests.recording.verify_rrd import verify_rrd
 from workbench.core.camera_data import CameraInfo, Picture
-from workbench.core.scene.shapes import Mesh
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.rerun.read import read_properties
@@ -171,32 +168,6 @@ def test_a_disk_without_room_leaves_the_journal_or_nothing(
     assert [read_episode(files.rrd).length for files in recovered] == ([1] if room == 40_000 else [])
     assert len(left(tmp_path)) == 3 * len(recovered)
     assert read_episode(episode.write(tmp_path).rrd).length == 3
-
-
-def test_finishing_again_helps_once_there_is_room(
-    child_process: None, make_episode: Maker, tmp_path: Path
-) -> None:
-    episode = wide(make_episode)
-    writer = episode.writer(tmp_path)
-    for row in episode.rows():
-        append(writer, row)
-    with little_room(30_000):
-        with pytest.raises(RecordingError):
-            writer.finish()
-    assert verify_rrd(writer.finish().rrd) is None
-    assert len(left(tmp_path)) == 3
-
-
-def test_what_rerun_refuses_is_an_error_out_of_strict_mode_too(make_episode: Maker, tmp_path: Path) -> None:
-    rr.set_strict_mode(False)
-    episode = make_episode()
-    (visual,) = episode.geometry.visuals
-    flat = Mesh(np.zeros((3, 2), dtype=np.float32), visual.mesh.faces)  # vertices without z
-    broken = (dataclasses.replace(visual, mesh=flat),)
-    episode.geometry = dataclasses.replace(episode.geometry, visuals=broken)
-    with pytest.raises(ValueError):
-        episode.write(tmp_path)
-    assert {Path(name).suffix for name in left(tmp_path)} == {".arrow", ".scene"}
 
 
 def test_writing_many_leaves_no_threads(make_episode: Maker, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
 from workbench.core.scene.shapes import Mesh
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing.finish import episode_stem, recover
+from workbench.recording.writing.finish import recover
 from workbench.recording.writing.journal import FOLDER, Journal, JournalEntry
 from workbench.recording.writing.publish import RecordingError
 
@@ -161,21 +161,6 @@ def lengths(folder: Path) -> dict[str, int]:
     found = {episode.info.id: episode.length for episode in map(read_episode, folder.glob("*.json"))}
     assert len(list(folder.iterdir())) == 3 * len(found), sorted(path.name for path in folder.iterdir())
     return found
-
-
-@pytest.mark.parametrize("suffix", [".rrd", ".h5"])
-def test_a_strangers_file_under_the_name_is_left_alone(
-    make_episode: Maker, tmp_path: Path, suffix: str
-) -> None:
-    """Also where the writer died with a file of that ending half made."""
-    journal = left(make_episode(), tmp_path, written_at="2026-11-21T12:00:00+00:00")
-    stem = episode_stem(dataclasses.replace(make_episode().info, written_at="2026-11-21T12:00:00+00:00"))
-    journal.with_suffix(suffix).write_text("half made")
-    (tmp_path / f"{stem}{suffix}").write_text("of a stranger")
-    (files,) = recover(tmp_path)
-    assert files.json.name == f"{stem}_2.json"
-    assert (tmp_path / f"{stem}{suffix}").read_text() == "of a stranger"
-    assert len(list(tmp_path.iterdir())) == 4
 
 
 @pytest.mark.parametrize("named", [[".h5"], [".h5", ".rrd"]])
