@@ -99,7 +99,9 @@ OBSERVED = "PickCube-v1", 7
 """Task and seed."""
 
 
-@pytest.mark.parametrize("obs_mode", ["rgb+depth+segmentation", "state+rgb"])
+@pytest.mark.parametrize(
+    "obs_mode", ["rgb+depth+segmentation", pytest.param("state+rgb", marks=pytest.mark.slow)]
+)
 def test_pictures_that_were_observed_are_as_maniskills_recorder_writes_them(
     renderer: None, tmp_path: Path, obs_mode: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
