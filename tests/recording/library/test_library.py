@@ -400,3 +400,33 @@ def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
     library.set_note([first.id], "x")
     library.delete([first.id, second.id])
     assert library.view().rows == () and library.view().trash.files == 3
+
+
+def test_a_note_that_cannot_be_kept_is_an_error_and_nothing_is_half_written(
+    tmp_path: Path, library: Library
+) -> None:
+    describe(tmp_path, "a", id="a1")
+    library.refresh()
+    (tmp_path / "a.json").write_text("{}")
+    before = tree(tmp_path)
+    with pytest.raises(LibraryError, match="a could not be kept .*is not a recording"):
+        library.set_note(["a1"], "x")
+    assert tree(tmp_path) == before
+    with pytest.raises(LibraryError, match="not in the library any more"):
+        library.set_tags(["a1", "zz"], add=["x"])
+
+
+def test_a_scan_that_is_asked_for_is_made_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not when its time comes, which here is in an hour."""
+    for name in ("SCAN_SECONDS", "LONGEST_PAUSE"):
+        monkeypatch.setattr(f"workbench.recording.library.library.{name}", 3600.0)
+    library = Library(tmp_path)
+    library.watch()
+    try:
+        until(lambda: library.view().reading is None, "the first look", seen=library.view)
+        for count in (1, 2):
+            describe(tmp_path, f"r{count}")
+            library.request_scan()
+            until(lambda count=count: len(library.view().rows) == count, "the row", seen=library.view)
+    finally:
+        library.close()

@@ -159,3 +159,17 @@ def test_threads_write_all_journals_and_end_with_the_last(
         journal.close()
     thread.join(20)
     assert not thread.is_alive()
+
+
+def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
+    begin = journal.size
+    made: Future[list[JournalEntry]] = Future()
+    journal.append(JournalEntry("row", 0, b"0" * 100))
+    journal.append(made, JournalEntry("row", 0, b"1" * 100))
+    waiting = journal.size
+    assert begin + 200 < waiting < begin + 300
+    made.set_result([JournalEntry("picture/0/rgb", 1, b"p" * 1000)])
+    assert journal.size > waiting + 1000
+    for _ in range(2):
+        journal.write()
+        assert journal.size == journal.path.stat().st_size
