@@ -63,13 +63,27 @@ def export(folder: Path, *episodes: Episode, options: ExportOptions | None = Non
     return export_lerobot(sources, folder, options or ExportOptions())
 
 
-def test_what_was_exported_is_read_back(episode: Episode, tmp_path: Path) -> None:
-    made = export(tmp_path / "set", shorter(episode, 5), episode)
-    assert (made.episodes, made.frames) == (2, 5 + episode.length)
-    first, second = lerobot_rows(tmp_path / "set")
-    assert (first.length, second.length, second.seed) == (5, episode.length, episode.info.seed)
-    assert second.total_reward == pytest.approx(float(episode.reward.sum()), rel=1e-5)
-    read = read_lerobot(tmp_path / "set", 1)
+@pytest.mark.parametrize(
+    "limits", [{}, {"DATA_MB": 0, "VIDEO_MB": 0, "CHUNK_SIZE": 2}], ids=["one", "many files"]
+)
+def test_what_was_exported_is_read_back(
+    episode: Episode, limits: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, limit in limits.items():
+        monkeypatch.setattr(f"workbench.recording.lerobot.format.{name}", limit)
+    made = export(tmp_path / "set", shorter(episode, 5), shorter(episode, 4), episode)
+    assert (made.episodes, made.frames) == (3, 9 + episode.length)
+    files = [
+        path.relative_to(tmp_path / "set/data").as_posix()
+        for path in (tmp_path / "set/data").rglob("*.parquet")
+    ]
+    expected = ["chunk-000/file-000.parquet", "chunk-000/file-001.parquet", "chunk-001/file-000.parquet"]
+    assert sorted(files) == expected[: 3 if limits else 1]
+    first, second, third = lerobot_rows(tmp_path / "set")
+    assert (first.length, second.length, third.length) == (5, 4, episode.length)
+    assert third.seed == episode.info.seed
+    assert third.total_reward == pytest.approx(float(episode.reward.sum()), rel=1e-5)
+    read = read_lerobot(tmp_path / "set", 2)
     assert read.geometry is None and read.info.control_dt == pytest.approx(episode.info.control_dt)
     assert read.action_names == tuple(name.replace("/", ".") for name in episode.action_names)
     np.testing.assert_array_equal(read.action, episode.action)

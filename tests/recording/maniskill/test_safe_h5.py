@@ -134,7 +134,12 @@ def test_what_stands_in_its_own_file_is_read_also_by_soft_links_and_packed(tmp_p
         group["obs/word"] = np.bytes_(b"what is no number is left out")
         group.create_dataset("obs/empty", shape=(4, 0), dtype=np.float32)
 
-    read = read_maniskill(write(tmp_path, spoil), "traj_0")
+    path = write(tmp_path, spoil)
+    described = path.with_suffix(".json")
+    kwargs = '"env_kwargs": {"sim_config": {"control_freq": 50}}, "env_id"'
+    described.write_text(described.read_text().replace('"env_id"', kwargs))
+    read = read_maniskill(path, "traj_0")
+    assert read.info.control_dt == 0.02
     assert {name: values.shape for name, values in read.obs.items()} == {
         "empty": (4, 0),
         "fast": (4, 3000),
