@@ -80,6 +80,11 @@ def test_success_that_pays_less_is_found_though_no_episode_succeeds(checked: Che
     edit = 'reward[info["success"]] = 3', 'reward[info["success"]] = 0.5'
     finding = the_finding(checked("reward-order", OUT_OF_REACH, edit))
     assert 'is 0.1667 wherever info["success"] is true' in finding.message
+    more = 'reward[info["success"]] = 3', 'reward[info["success"]] = 5'
+    assert (
+        "to 1.67 in states with success"
+        in the_finding(checked("reward-normalized", OUT_OF_REACH, more)).message
+    )
 
 
 @pytest.mark.parametrize("rule", ["reward-order", "reward-needs-success", "success-flickers"])
