@@ -49,7 +49,13 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def swept(out: Path) -> SweepReport:
-    return sweep(options(out, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix"))
+    seen: list[RecordProgress] = []
+    report = sweep(options(out, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix"), on_progress=seen.append)
+    over = [progress.over for progress in seen if progress.over is not None]
+    assert sorted(written.seed for _, written in over if written is not None) == [5, 5, 6, 6, 7, 7], (
+        "told as they come"
+    )
+    return report
 
 
 def test_each_seed_is_recorded_once_for_each_point(swept: SweepReport, out: Path) -> None:

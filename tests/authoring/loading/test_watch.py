@@ -266,3 +266,12 @@ def test_what_is_no_file_any_more_counts_as_gone_and_is_followed_on(tmp_path: Pa
     other.replace(file)
     assert seen.get(timeout=PATIENCE) == {file}
     watcher.stop()
+
+
+@pytest.mark.parametrize("save", [rename_over, delete_and_create])
+def test_of_many_files_one_that_was_renamed_or_made_is_seen_by_its_folder(
+    save: Callable[[Path, str], None], many: Many, calls: Calls
+) -> None:
+    for number, file in enumerate(many(0, 0)):
+        save(file, f"a = 2{number}\n")
+        assert calls.next() == {file.name: f"a = 2{number}\n"}

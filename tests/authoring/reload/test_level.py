@@ -239,6 +239,16 @@ def test_a_robot_of_the_file_is_what_the_env_was_built_of_though_nobody_names_it
     )
 
 
+def test_another_order_of_an_enums_members_is_rebuilt() -> None:
+    members = "    A = enum.auto()\n", "    B = enum.auto()\n"
+    body, head = (
+        "def evaluate(self):\n    return {'m': Mode.A.value}\n",
+        "import enum\n\n\nclass Mode(enum.Enum):\n",
+    )
+    found = change(task(body, head + "".join(members)), task(body, head + "".join(members[::-1])))
+    assert found.level == "rebuilt" and "Mode" in found.reason
+
+
 def test_a_helper_beside_the_task_is_compared_too() -> None:
     texts = [
         {

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from workbench.jobs.actions import needed_by
-from workbench.jobs.pool.travel import files_below, pack_baggage, relocated
+from workbench.jobs.pool import travel
+from workbench.jobs.pool.travel import TooMuch, files_below, pack_baggage, relocated
 
 
 @pytest.fixture
@@ -73,3 +74,10 @@ def test_a_job_needs_the_folder_of_its_task_and_what_acts(place: Path) -> None:
         needed_by("PushCube-v1", "random") == needed_by("PushCube-v1")
         and not needed_by("PushCube-v1").folders
     )
+
+
+def test_too_much_is_refused_with_what_is_large(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(travel, "MOST_BYTES", 2 << 20)
+    (place / "huge.bin").write_bytes(bytes(5 << 20))
+    with pytest.raises(TooMuch, match=r"are 5 MB, and up to 2 MB travel.*huge\.bin \(5 MB\)"):
+        pack_baggage([place])
