@@ -158,7 +158,7 @@ def test_a_broken_recording_is_a_row_and_the_others_are_judged(author: Path, tmp
     broken, cut, _ = sorted(tmp_path.glob("*.rrd"))
     for file in (broken, broken.with_suffix(".h5"), cut):
         file.write_bytes(file.read_bytes()[:1000])
-    verdicts, _ = rescore_all(RescoreOptions((tmp_path,)))
+    verdicts, _ = rescore_all(RescoreOptions((tmp_path,), task=str(author / "push_cube.py")))
     # Of the second what there is to judge by is whole.
     assert [bool(verdict.why_not) for verdict in verdicts] == [True, False, False]
     assert broken.stem in verdicts[0].why_not

@@ -26,7 +26,7 @@ from workbench.jobs.record.run import Recorded, record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
 
-pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240), pytest.mark.slow]
 PLAIN = {"render_backend": "none"}
 TASK = """
 from pathlib import Path
@@ -114,7 +114,6 @@ def workers_of_ray() -> list[psutil.Process]:
     ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_episodes_have_the_same_bits_as_in_this_process_and_name_the_files_here(
     workers: int, address: str, task: Path
@@ -130,7 +129,6 @@ def test_episodes_have_the_same_bits_as_in_this_process_and_name_the_files_here(
     assert len(list(Path("there").iterdir())) == 24
 
 
-@pytest.mark.slow
 def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(
     address: str, task: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -153,7 +151,6 @@ def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(
     assert not capfd.readouterr().out
 
 
-@pytest.mark.slow
 def test_a_job_that_was_stopped_leaves_whole_episodes_and_goes_on(address: str, task: Path) -> None:
     here, asked = bits(record(wanted("here"))), wanted("there")
     over = threading.Event()
@@ -183,7 +180,6 @@ def test_a_job_that_was_stopped_leaves_whole_episodes_and_goes_on(address: str, 
     assert bits(second) == here and len(list(Path("there").glob("*.json"))) == 8
 
 
-@pytest.mark.slow
 def test_seeds_that_fail_are_told_with_the_line_here_and_the_others_are_kept(
     address: str, task: Path
 ) -> None:
@@ -217,7 +213,6 @@ def test_other_versions_are_refused_and_named(
         Run(Setup(folder=tmp_path), range(8)).by(Cluster(address, 1))
 
 
-@pytest.mark.slow
 def test_a_folder_that_a_machine_does_not_see_is_refused(
     address: str, task: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
