@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from workbench.authoring.loading.load import LoadedTask, load_task
-from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
+from workbench.authoring.problem import Problem, problem_from_exception, shorten
 
 Write = Callable[..., Path]
 
@@ -136,12 +135,6 @@ def test_the_place_is_the_innermost_line_of_the_authors_and_the_stage_is_the_hoo
     assert problem.message.partition(":")[0].split(" ")[0] in problem.traceback or method == "unprintable"
 
 
-def test_a_property_that_says_what_cameras_there_are_belongs_to_the_build(task: LoadedTask) -> None:
-    env = task.cls()
-    problem = caught(lambda: env._default_sensor_configs, task.source_files, "step")
-    assert (problem.stage, problem.code) == ("build", "return unknown_name")
-
-
 def test_an_error_of_a_librarys_that_comes_from_the_authors_has_the_authors_line(task: LoadedTask) -> None:
     env = task.cls()
 
@@ -179,31 +172,6 @@ def test_endless_recursion_and_endless_messages_are_bounded(task: LoadedTask) ->
     assert deep.traceback.splitlines()[-1].startswith("RecursionError")
 
 
-def test_a_name_that_is_nearly_right_is_suggested(write: Write) -> None:
-    file = write(
-        "names.py",
-        "import torch\ncube_size = 1\ndef a(): cube_sise\ndef b(): torch.zeross\ndef c(): nothing_like_it\n",
-    )
-    names: dict[str, Callable[[], object]] = {}
-    exec(compile(file.read_text(), str(file), "exec"), names)
-    messages = [caught(names[name], (file,)).message for name in "abc"]
-    assert messages[0].endswith("Did you mean 'cube_size'?") and messages[1].endswith("Did you mean 'zeros'?")
-    assert "Did you mean" not in messages[2]
-
-
-def test_chains_that_bite_their_tail_end() -> None:
-    one, two = ValueError("one"), ValueError("two")
-    one.__context__, two.__context__ = two, one
-    assert problem_from_exception(one, "step", ()).message.endswith("ValueError: one")
-
-
-def test_problems_and_their_errors_cross_a_pipe() -> None:
-    problem = Problem("import", "m", "f.py", 3, "x", "t")
-    error = pickle.loads(pickle.dumps(TaskError(problem)))
-    assert error.problem == problem
-    assert str(error) == "f.py:3: m"
-
-
 @given(st.text(), st.integers(min_value=1, max_value=80))
 def test_a_shortened_text_is_one_line_of_bounded_length(text: str, limit: int) -> None:
     short = shorten(text, limit)
@@ -211,16 +179,3 @@ def test_a_shortened_text_is_one_line_of_bounded_length(text: str, limit: int) -
     assert len(short.splitlines()) <= 1
     if len(text) <= limit and text == " ".join(text.split()):
         assert short == text
-
-
-def test_a_prompt_that_nobody_answers_says_what_to_do(write: Write) -> None:
-    text = "import io, pdb\n\ndef stop():\n    pdb.Pdb(stdin=io.StringIO(''), stdout=io.StringIO()).set_trace()\n    return 1\n"
-    file = write("prompts.py", text)
-    names: dict = {}
-    exec(compile(text, str(file), "exec"), names)
-    problem = caught(names["stop"], (file,))
-    assert (problem.file, problem.line) == (str(file), 5)
-    assert (
-        problem.message.startswith("BdbQuit: ")
-        and "just before this line: remove the call" in problem.message
-    )

@@ -52,14 +52,10 @@ def check(task: LoadedTask, evaluate: object, reward: object = None, num_envs: i
     ("evaluate", "reward"),
     [
         ({}, None),
-        ({}, torch.zeros(N)),
-        ({"success": YES}, torch.zeros(N, dtype=torch.float64)),
         ({"success": YES, "fail": ~YES, "distance": torch.rand(N, 3)}, torch.ones(N)),
         ({"success": YES}, YES.clone()),  # ManiSkill's own sparse reward
         # Told by a rule, and no reason not to show it.
         ({"success": YES.float(), "fail": YES.int()}, torch.zeros(N)),
-        ({"success": YES}, ~YES),
-        ({}, torch.ones(N, dtype=torch.int64)),
         ({"parts": {"arm": torch.zeros(N, 2)}, "instruction": "push"}, None),
         # Only success and fail are asked for a row for each env.
         ({"best": None, "stage": 2, "distance": 0.5, "progress": torch.tensor(0.5)}, None),
@@ -76,14 +72,8 @@ def test_what_upstream_takes_is_let_through(evaluate: dict, reward: object, task
     [
         (None, "returned None; it must return a dict"),
         (YES, "bool tensor of shape (4,); it must return a dict"),
-        ([("success", YES)], "list"),
         ({"success": True}, "'success' as bool (True)"),
-        ({"success": np.ones(N, dtype=bool)}, "numpy bool array of shape (4,)"),
-        ({"success": torch.tensor(True)}, "shape ()"),
-        ({"success": YES[:, None]}, "shape (4, 1)"),
         ({"success": YES[:3]}, "shape (3,); expected a bool tensor of shape (4,)"),
-        ({"success": [True] * N}, "list"),
-        ({"success": {"all": YES}}, "'success' as dict"),
         ({"note": "x", "fail": None}, "'fail' as None"),
         ({"fail": Mute()}, "'fail' as Mute (<Mute, whose repr raises ValueError>)"),
     ],
@@ -114,28 +104,10 @@ def test_a_wrong_reward_is_told_at_its_def(reward: object, words: str, task: Loa
     assert problem.message.startswith("compute_dense_reward() returned ")
 
 
-def test_a_number_that_is_none_is_a_value_and_no_wrong_shape(task: LoadedTask) -> None:
-    assert check(task, {"success": YES}, torch.tensor([0, float("nan"), float("inf"), 0])) is None
-
-
-def test_a_hook_that_is_inherited_has_no_place_of_the_authors(task: LoadedTask) -> None:
-    cls = load_task("PickCube-v1").cls
-    problem = check_step_returns(cls, N, None, None, task.source_files)
-    assert problem is not None and (problem.file, problem.line, problem.code) == (None, None, None)
-
-
 def test_a_class_put_in_front_of_the_tasks_hides_nothing(task: LoadedTask) -> None:
     batched = type("Batched", (task.cls,), {})
     problem = check_step_returns(batched, N, None, None, task.source_files)
     assert problem is not None and problem.code == "def evaluate(self):"
-
-
-def test_other_devices_are_only_asked(task: LoadedTask) -> None:
-    device = torch.device("meta")
-    evaluate = {"success": torch.zeros(N, dtype=torch.bool, device=device)}
-    assert check(task, evaluate) is None
-    problem = check(task, evaluate, torch.zeros(N, 1, device=device))
-    assert problem is not None and "shape (4, 1)" in problem.message
 
 
 shapes = st.lists(st.integers(0, 5), max_size=3).map(tuple)

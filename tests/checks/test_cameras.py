@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.checks.checked import Checked, check_rule, the_finding
+from tests.checks.checked import Checked, the_finding
 
 EYE = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])"
 HUMAN_EYE = "pose = sapien_utils.look_at(eye=[0.7, 0.7, 0.6], target=[0.0, 0.0, 0.2])"
@@ -17,7 +17,6 @@ def test_a_camera_that_looks_past_the_objects(checked: Checked, renderer: None) 
     assert [finding.message.partition(" ")[0] for finding in result.findings] == ["cube", "goal"]
     assert "8 of 8 pictures" in result.findings[0].message
     assert result.findings[0].code.startswith("return [CameraConfig")
-    assert checked("camera-sees").state == "kept"
 
 
 def test_an_object_needs_one_camera_of_several_and_a_fixed_camera_an_object(
@@ -32,26 +31,16 @@ def test_an_object_needs_one_camera_of_several_and_a_fixed_camera_an_object(
     )
 
 
-def test_a_body_that_only_carries_a_camera_need_not_be_seen(renderer: None) -> None:
-    assert check_rule("camera-sees", "MS-AntWalk-v1", num_envs=4, seeds=4).state == "not_applicable"
-
-
-def test_the_planar_worlds_of_maniskill_are_measured(renderer: None) -> None:
-    assert check_rule("camera-sees", "MS-HopperHop-v1", num_envs=4, seeds=4).state == "not_applicable"
-
-
 def test_a_camera_that_looks_at_the_sky(checked: Checked, renderer: None) -> None:
     up = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 1.5])"
     finding = the_finding(checked("camera-background", (EYE, up)))
     assert "'base_camera'" in finding.message and finding.function == "_default_sensor_configs"
-    assert checked("camera-background").state == "kept"
 
 
 def test_a_camera_that_looks_straight_down(checked: Checked) -> None:
     down = "pose = sapien_utils.look_at(eye=[0.1, 0, 0.6], target=[0.1, 0, 0])"
     finding = the_finding(checked("camera-pose", (EYE, down)))
     assert "length 0.707" in finding.message and finding.code.startswith("return [CameraConfig")
-    assert checked("camera-pose").state == "kept"
     finding = the_finding(checked("camera-pose", (HUMAN_EYE, down)))
     assert finding.function == "_default_human_render_camera_configs"
 
@@ -70,4 +59,3 @@ def test_a_camera_with_too_many_pixels(checked: Checked) -> None:
     large = CAMERA.replace("width=128, height=128", "width=1920, height=1080")
     finding = the_finding(checked("camera-size", (CAMERA, large)))
     assert "1920 x 1080" in finding.message
-    assert checked("camera-size").state == "kept"

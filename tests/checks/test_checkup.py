@@ -42,40 +42,6 @@ def test_a_task_that_raises_with_a_renderer_too_is_told_once(renderer: None, tmp
     assert {result.state for result in results if result.rule != "runs"} == {"not_known"}
 
 
-def test_what_fails_for_want_of_a_renderer_is_no_cause_of_what_fails_with_one(
-    renderer: None, tmp_path: Path
-) -> None:
-    file, built = tmp_path / "task.py", 'self.cube = builder.build(name="cube")\n'
-    looks = "self.cube._objs[0].find_component_by_type(sapien.render.RenderBodyComponent).compute_global_aabb_tight()"
-    text = EXAMPLE.read_text()
-    assert built in text
-    file.write_text(text.replace(built, f"{built}        {looks}\n        raise ValueError('mine')\n"))
-    loaded = load_task(str(file))
-    checkup = Checkup(loaded, num_envs=2, seeds=2)
-    try:
-        (result,) = [
-            one
-            for one in results_of(checkup, dict.fromkeys(RULES, "off") | {"runs": "warn"})
-            if one.rule == "runs"
-        ]
-    finally:
-        checkup.close()
-        undo_load(loaded)
-    assert (
-        "ValueError: mine" in the_finding(result).message
-        and "AttributeError" not in the_finding(result).message
-    )
-
-
-def test_a_loop_in_the_source_is_told_where_the_task_cannot_be_built(checked: Checked) -> None:
-    at = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
-    loop = "        for i in range(self.num_envs): pass\n"
-    edits = (at, at + loop), ('name="goal"', "name=self.gone")
-    result = checked("loop-over-envs", *edits, render_backend="none")
-    assert result.state == "broken" and "gone" in result.why
-    assert [finding.code for finding in result.findings] == [loop.strip()]
-
-
 ONE_ENV = "        super().__init__(*args, robot_uids=robot_uids, **kwargs)\n"
 ONLY = "        if kwargs.get('num_envs', 1) != 1: raise ValueError('one env only')\n"
 
@@ -118,26 +84,3 @@ def test_a_task_that_is_written_for_one_env_is_told_so_at_its_line(
     if rule == "runs":
         assert finding.code == line
     assert checked(rule, edit, num_envs=1).findings == ()
-
-
-def test_what_a_robot_of_the_author_raises_is_theirs(checked: Checked) -> None:
-    """The reach is measured by its property, which no hook of the task calls here."""
-    robot = (
-        "@register_agent()\nclass Odd(Panda):\n    uid = 'odd_arm'\n\n    @property\n    def tcp(self):\n"
-        "        raise ValueError('no tcp yet')\n\n    @tcp.setter\n    def tcp(self, value):\n        self.kept = value\n\n\n"
-    )
-    imports = "from mani_skill.agents.registration import register_agent\nfrom mani_skill.agents.robots import Panda\n"
-    above = '@register_env("WorkbenchPushCube-v1"'
-    edits = (
-        ("import numpy as np\n", f"import numpy as np\n{imports}"),
-        (above, robot + above),
-        ("self.agent.tcp.pose", "self.agent.kept.pose"),
-    )
-    result = checked("outside-reach", *edits, robot_uids="odd_arm")
-    assert result.state == "not_known" and result.problem is not None
-    assert result.problem.code == "raise ValueError('no tcp yet')"
-
-
-def test_what_one_env_raises_too_gets_no_advice_to_take_one(checked: Checked) -> None:
-    edit = '"cube_height": height,', '"cube_height": height / self.gone,'
-    assert "--num-envs" not in the_finding(checked("runs", edit)).message

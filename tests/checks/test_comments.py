@@ -64,8 +64,3 @@ def test_a_rule_that_was_not_decided_says_nothing_of_a_comment() -> None:
     for state in ("failed", "not_known", "not_applicable"):
         assert told(RuleResult("reward-finite", state)) == []
     assert told() == []
-
-
-def test_a_file_that_cannot_be_read_has_no_comment_to_tell() -> None:
-    broken = "def f(:  # workbench: off[reward-rows]\n"
-    assert comments_without_effect({"a.py": broken, FILE: TASKS}, (), "Mine") == []

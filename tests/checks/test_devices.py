@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from tests.checks.checked import Checked, the_finding
 from workbench.checks.by_hook.run import RuleResult
 
@@ -16,32 +14,24 @@ def in_evaluate(checked: Checked, rule: str, *lines: str) -> RuleResult:
     return checked(rule, (AT, AT + "".join(f"        {line}\n" for line in lines)))
 
 
-@pytest.mark.parametrize("rule", ("loop-over-envs", "device-copies", "foreign-device"))
-def test_the_example_keeps_it(rule: str, checked: Checked) -> None:
-    assert checked(rule).state == "kept"
-
-
-@pytest.mark.parametrize(
-    "line",
-    (
-        "[i for i in range(self.num_envs)]",
-        "for row in self.cube.pose.p: row + 1",
-        "for i in range(len(self.cube._objs)): pass",
-        "n = self.num_envs; [i for i in range(n)]",
-        "torch.stack([p * 2 for p, q in zip(self.cube.pose.p, self.cube.pose.q)])",
-    ),
+LOOPS = (
+    "[i for i in range(self.num_envs)]",
+    "for row in self.cube.pose.p: row + 1",
+    "for i in range(len(self.cube._objs)): pass",
+    "n = self.num_envs; [i for i in range(n)]",
+    "torch.stack([p * 2 for p, q in zip(self.cube.pose.p, self.cube.pose.q)])",
 )
-def test_a_loop_over_envs(line: str, checked: Checked) -> None:
-    finding = the_finding(in_evaluate(checked, "loop-over-envs", line))
-    assert finding.code == line and finding.function == "evaluate"
 
 
-def test_a_loop_in_what_evaluate_calls(checked: Checked) -> None:
-    method = "    def count(self):\n        return [i for i in range(self.num_envs)]\n\n    def evaluate("
-    finding = the_finding(
-        checked("loop-over-envs", ("    def evaluate(", method), (AT, f"{AT}        self.count()\n"))
-    )
-    assert finding.function == "count"
+def test_loops_over_envs_in_evaluate_and_in_what_it_calls(checked: Checked) -> None:
+    method = "    def count(self):\n        return [i for i in range(self.num_envs)]  # called\n\n    def evaluate("
+    calls = AT + "".join(f"        {line}\n" for line in (*LOOPS, "self.count()"))
+    result = checked("loop-over-envs", ("    def evaluate(", method), (AT, calls))
+    told = {finding.code: finding.function for finding in result.findings}
+    assert told == {
+        **dict.fromkeys(LOOPS, "evaluate"),
+        "return [i for i in range(self.num_envs)]  # called": "count",
+    }
 
 
 def test_other_loops_are_none_over_envs(checked: Checked) -> None:
@@ -54,28 +44,24 @@ def test_other_loops_are_none_over_envs(checked: Checked) -> None:
     assert in_evaluate(checked, "loop-over-envs", *lines).state == "kept"
 
 
-@pytest.mark.parametrize(
-    ("line", "written"),
-    (
-        ("float(distance[0])", "float(tensor)"),
-        ("distance.max().item()", ".item()"),
-        ("distance.cpu()", ".cpu()"),
-        ("distance.tolist()", ".tolist()"),
-        ("1 if (distance < 0.1).any() else 2", "if tensor:"),
-        ("self.cube.pose[0].sp", ".cpu()"),
-    ),
-)
-def test_a_copy_to_the_host(line: str, written: str, checked: Checked) -> None:
-    finding = the_finding(in_evaluate(checked, "device-copies", line))
-    assert written in finding.message and finding.code == line and " once in each step" in finding.message
-    assert finding.count == 1, "the message says how often"
+COPIES = {
+    "float(distance[0])": "float(tensor)",
+    "distance.max().item()": ".item()",
+    "distance.cpu()": ".cpu()",
+    "distance.tolist()": ".tolist()",
+    "1 if (distance < 0.1).any() else 2": "if tensor:",
+    "self.cube.pose[0].sp": ".cpu()",
+    "torch.tensor([d.item() for d in distance])": "once for each env in each step",
+}
 
 
-def test_a_copy_for_each_env(checked: Checked) -> None:
-    line = "torch.tensor([d.item() for d in distance])"
-    assert (
-        "once for each env in each step" in the_finding(in_evaluate(checked, "device-copies", line)).message
-    )
+def test_copies_to_the_host(checked: Checked) -> None:
+    result = in_evaluate(checked, "device-copies", *COPIES)
+    told = {finding.code: finding for finding in result.findings}
+    assert told.keys() == COPIES.keys()
+    for line, written in COPIES.items():
+        assert written in told[line].message and told[line].count == 1, "the message says how often"
+    assert " once in each step" in told["distance.cpu()"].message
 
 
 def test_copies_that_only_some_steps_make(checked: Checked) -> None:
@@ -94,24 +80,24 @@ def test_copies_of_host_tensors_and_at_resets_are_none(checked: Checked) -> None
     assert checked("device-copies", *edits).state == "kept"
 
 
-@pytest.mark.parametrize(
-    "lines",
-    (
-        ("distance + torch.zeros(self.num_envs)",),
-        ("torch.where(distance < 1, torch.ones(1).expand(self.num_envs), distance)",),
-        ("x = torch.zeros(self.num_envs)", "x = x * 2", "torch.stack([x, distance])"),
-        ("x = torch.zeros(self.num_envs)", "x[distance < 1]"),
-        ("distance.clone()[distance < 1] = torch.zeros(self.num_envs)[distance.cpu() < 1]",),
-        ("distance.cpu() + distance",),
-        ("distance + torch.from_numpy(np.zeros(self.num_envs))",),
-        ("distance + torch.zeros(self.num_envs, device='cpu')",),
-        ("x = torch.zeros(self.num_envs)", "torch.zeros(self.num_envs, device=x.device) + distance"),
-        ("Pose.create_from_pq(torch.zeros((self.num_envs, 3))).p + self.cube.pose.p",),
-    ),
+MEET = (
+    "distance + torch.zeros(self.num_envs)",
+    "torch.where(distance < 1, torch.ones(1).expand(self.num_envs), distance)",
+    "x = torch.zeros(self.num_envs) * 2; torch.stack([x, distance])",
+    "x[distance < 1]",
+    "distance.clone()[distance < 1] = torch.zeros(self.num_envs)[distance.cpu() < 1]",
+    "distance.cpu() + distance",
+    "distance + torch.from_numpy(np.zeros(self.num_envs))",
+    "distance + torch.zeros(self.num_envs, device='cpu')",
+    "torch.zeros(self.num_envs, device=x.device) + distance",
+    "Pose.create_from_pq(torch.zeros((self.num_envs, 3))).p + self.cube.pose.p",
 )
-def test_a_host_tensor_meets_one_of_the_device(lines: tuple[str, ...], checked: Checked) -> None:
-    finding = the_finding(in_evaluate(checked, "foreign-device", *lines))
-    assert finding.code == lines[-1] and finding.function == "evaluate"
+
+
+def test_host_tensors_meet_those_of_the_device(checked: Checked) -> None:
+    result = in_evaluate(checked, "foreign-device", *MEET)
+    assert {finding.code for finding in result.findings} == set(MEET)
+    assert {finding.function for finding in result.findings} == {"evaluate"}
 
 
 def test_what_a_gpu_takes(checked: Checked) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Literal
 
 import pytest
@@ -67,17 +66,6 @@ def test_the_worst_of_all_parts_is_told() -> None:
     # What is held at one seed may slip at all.
     held = result("falls-at-reset", Seen(("wanted", "cube")), loose, Seen(tried=32))
     assert over_seeds([*parts, held], "warn").state == "not_known"
-
-
-def test_a_rope_that_falls_is_one_finding() -> None:
-    def link(number: int, metres: float, *seeds: int) -> Seen:
-        name = ("body", f"rope/link_{number}", "rope")
-        return Seen(name, PLACE, seeds=seeds, size=metres, texts=(f"falls {metres:.2f} m",))
-
-    rows = Seen(("loose", "rope")), Seen(tried=32), link(0, 0.1, 1, 2), link(1, 0.3, 2), link(2, 0.2, 5)
-    (finding,) = over_seeds([result("falls-at-reset", *rows)], "warn").findings
-    assert finding.message.startswith("rope/link_1 falls 0.30 m") and "1 of 32 seeds" in finding.message
-    assert finding.count == 3 and "2 more links of rope" in finding.message
 
 
 def test_what_changes_between_parts_is_not_constant() -> None:
@@ -151,13 +139,6 @@ def test_a_part_that_raises_leaves_the_rule_undecided_unless_another_breaks_it(
     assert (whole.state, whole.why, whole.problem) == (state, "it raised", problem)
     assert over_seeds([raised, broken], "stop").state == "broken"
     assert over_seeds([raised, raised], "stop").state == state
-
-
-def test_a_rule_that_says_nothing_in_any_part_is_not_applicable() -> None:
-    none = RuleResult(
-        "success-at-reset", "not_applicable", why="evaluate() has no entry success", seconds=1.0
-    )
-    assert over_seeds([none, none], "stop") == replace(none, seconds=2.0)
 
 
 @pytest.mark.parametrize("rule", RULES_OVER_SEEDS)

@@ -12,47 +12,15 @@ CUBE_POSE = "self.cube.set_pose(Pose.create_from_pq(p=cube, q=[1, 0, 0, 0]))"
 HEIGHT = "cube[:, 2] = CUBE_HALF_SIZE\n"
 
 
-@pytest.mark.parametrize(
-    "rule",
-    [
-        "overlap-at-reset",
-        "falls-at-reset",
-        "batch-of-reset",
-        "quaternion-order",
-        "unit-quaternion",
-        "robot-holds",
-        "outside-reach",
-        "bodies-stay",
-    ],
-)
-def test_the_example_keeps_each(checked: Checked, rule: str) -> None:
-    assert checked(rule, seeds=4).state == "kept"
-
-
 def test_a_cube_in_the_table(checked: Checked) -> None:
     finding = the_finding(checked("overlap-at-reset", (HEIGHT, "cube[:, 2] = 0.005\n")))
     assert "cube and table-workspace are 15 mm" in finding.message and finding.count == 8
     assert finding.code == CUBE_POSE and finding.function == "_initialize_episode"
 
 
-def test_a_robot_in_the_table_is_what_is_to_be_moved(checked: Checked) -> None:
-    low = f"{CUBE_POSE}\n            self.agent.robot.set_pose(sapien.Pose([-0.615, 0, -0.2]))"
-    result = checked("overlap-at-reset", (CUBE_POSE, low), seeds=4)
-    (message,) = (one.message for one in result.findings if "table-workspace are" in one.message)
-    assert message.startswith("panda/") and "reset it to joint positions" in message
-
-
 def test_a_cube_above_the_table(checked: Checked) -> None:
     finding = the_finding(checked("falls-at-reset", (HEIGHT, "cube[:, 2] = 0.08\n")))
     assert "cube falls 0.06 m" in finding.message and finding.code == CUBE_POSE
-
-
-def test_a_cube_that_is_thrown_may_fly(checked: Checked) -> None:
-    thrown = (
-        f"{CUBE_POSE}\n            self.cube.set_linear_velocity(torch.tensor([[0.5, 0, 0]]).repeat(b, 1))"
-    )
-    result = checked("falls-at-reset", (CUBE_POSE, thrown))
-    assert result.state == "not_known" and "cube" in result.why
 
 
 def test_a_whole_batch_in_a_partial_reset(checked: Checked) -> None:
@@ -89,21 +57,6 @@ def test_a_buffer_of_all_envs_is_not_to_blame_for_another_mistake(
     assert result.state == "not_known" and result.findings == () and result.problem is not None
 
 
-def test_another_task_of_the_file_is_not_looked_at(checked: Checked) -> None:
-    other = (
-        '@register_env("Other-v1", max_episode_steps=5)\nclass Other(BaseEnv):\n'
-        "    def _initialize_episode(self, env_idx, options):\n"
-        "        p = torch.zeros((self.num_envs, 3)) + np.random.rand()\n"
-        "        self.cube.set_pose(Pose.create_from_pq(p))\n\n"
-        "    def evaluate(self):\n        return {'success': [x for x in range(self.num_envs)]}\n\n\n"
-    )
-    above = '@register_env("WorkbenchPushCube-v1"'
-    # A rule that is broken in the same hook of the task that is checked.
-    breaks = (HEIGHT, f"{HEIGHT}            self.drawn = torch.rand((b, 2))\n")
-    for rule in ("batch-of-reset", "unseeded-random", "loop-over-envs"):
-        assert checked(rule, (above, other + above), breaks).state == "kept"
-
-
 TURNED = """half = torch.rand(b) * 3
             zero = torch.zeros(b)
             q = torch.stack([{}], dim=1)
@@ -116,11 +69,6 @@ def test_quaternions_with_w_last(checked: Checked) -> None:
     assert "x, y, z, w" in finding.message and finding.code.startswith("self.cube.set_pose")
     right = TURNED.format("half.cos(), zero, zero, half.sin()")
     assert checked("quaternion-order", (CUBE_POSE, right)).state == "kept"
-
-
-def test_half_a_turn_is_noted_only(checked: Checked) -> None:
-    result = checked("quaternion-order", (CUBE_POSE, CUBE_POSE.replace("[1, 0, 0, 0]", "[0, 0, 0, 1]")))
-    assert result.state == "kept" and "cube is turned by half a turn" in result.notes[0]
 
 
 def test_quaternions_of_scipy(checked: Checked) -> None:

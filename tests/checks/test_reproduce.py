@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
-
 from tests.checks.checked import Checked, the_finding
 
 DRAWN = "torch.rand((b, 2))"
 GOAL_POSE = "self.goal.set_pose(Pose.create_from_pq(p=goal, q=[1, 0, 0, 0]))"
 SIZE = "builder.add_box_collision(half_size=[CUBE_HALF_SIZE] * 3)"
-
-
-@pytest.mark.parametrize(
-    "rule", ["runs", "same-seed", "state-restores", "actions-replay", "same-for-any-batch"]
-)
-def test_the_example_keeps_each(checked: Checked, rule: str) -> None:
-    assert checked(rule, seeds=4).state == "kept"
 
 
 def test_a_partial_reset_that_fails(checked: Checked) -> None:
@@ -29,16 +20,6 @@ def test_unseeded_numbers(checked: Checked) -> None:
     )
     assert finding.degree == "stop" and "np.random.rand() is not seeded" in finding.message
     assert "actors/cube" in finding.message and "np.random.rand" in finding.code
-
-
-def test_unseeded_numbers_that_a_helper_draws_are_told_at_their_call(checked: Checked) -> None:
-    helper = (
-        "def drawn(b):\n    low = 0\n    return torch.tensor(np.random.uniform(low, 1, (b, 2))).float()\n\n\n"
-    )
-    edits = (DRAWN, "drawn(b)"), ("@register_env(", f"{helper}@register_env(")
-    finding = the_finding(checked("same-seed", *edits, seeds=4))
-    assert finding.code.startswith("return torch.tensor(np.random.uniform") and finding.function == "drawn"
-    assert "np.random.uniform() is not seeded" in finding.message
 
 
 def test_numbers_that_another_hook_draws_are_told_there(checked: Checked) -> None:

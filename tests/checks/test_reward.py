@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from tests.checks.checked import Checked, the_finding
+from tests.checks.checked import EXAMPLE, Checked, check_rules, the_finding
 
 
 def test_a_reward_that_is_nan(checked: Checked) -> None:
     edit = "reward = reach + push\n", "reward = reach + push + torch.sqrt(0.7 - reach) * 0\n"
     finding = the_finding(checked("reward-finite", edit))
     assert "nan" in finding.message and finding.function == "compute_dense_reward"
-    assert checked("reward-finite").state == "kept"
 
 
 def test_a_reward_that_never_changes(checked: Checked) -> None:
     edit = "reward = reach + push\n", "reward = torch.ones_like(reach)\n"
     assert "at each of" in the_finding(checked("reward-changes", edit)).message
-    assert checked("reward-changes").state == "kept"
 
 
 def test_a_normalized_reward_above_one(checked: Checked) -> None:
@@ -27,7 +27,6 @@ def test_a_normalized_reward_above_one(checked: Checked) -> None:
     )
     finding = the_finding(checked("reward-normalized", edit))
     assert finding.function == "compute_normalized_dense_reward" and finding.count > 1
-    assert checked("reward-normalized").state == "kept"
 
 
 def test_a_sparse_reward_above_one(checked: Checked) -> None:
@@ -56,7 +55,6 @@ def test_a_normalized_reward_that_is_another_reward(checked: Checked) -> None:
     )
     finding = the_finding(checked("reward-ratio", edit))
     assert "no single constant" in finding.message and finding.function == "compute_normalized_dense_reward"
-    assert checked("reward-ratio").state == "kept"
 
 
 def test_a_normalized_reward_with_an_offset_is_noted(checked: Checked) -> None:
@@ -68,17 +66,11 @@ def test_a_normalized_reward_with_an_offset_is_noted(checked: Checked) -> None:
     assert result.state == "kept" and "times 0.1667 plus 0.5" in result.notes[0]
 
 
-def test_a_reward_without_a_normalized_one_has_no_ratio(checked: Checked) -> None:
-    edit = 'SUPPORTED_REWARD_MODES = ("normalized_dense", "dense"', 'SUPPORTED_REWARD_MODES = ("dense"'
-    assert checked("reward-ratio", edit).state == "not_applicable"
-
-
 @pytest.mark.parametrize("paid", ["0", "0.5"])
 def test_success_that_earns_less_than_the_way_to_it(checked: Checked, paid: str) -> None:
     edit = 'reward[info["success"]] = 3', f'reward[info["success"]] = {paid}'
     finding = the_finding(checked("reward-order", edit))
     assert f"{float(paid) / 3:.4g} " in finding.message and finding.function == "compute_dense_reward"
-    assert checked("reward-order").state == "kept"
 
 
 OUT_OF_REACH = '"success": (distance < GOAL_RADIUS)', '"success": (self.elapsed_steps > 1000)'
@@ -88,6 +80,11 @@ def test_success_that_pays_less_is_found_though_no_episode_succeeds(checked: Che
     edit = 'reward[info["success"]] = 3', 'reward[info["success"]] = 0.5'
     finding = the_finding(checked("reward-order", OUT_OF_REACH, edit))
     assert 'is 0.1667 wherever info["success"] is true' in finding.message
+    more = 'reward[info["success"]] = 3', 'reward[info["success"]] = 5'
+    assert (
+        "to 1.67 in states with success"
+        in the_finding(checked("reward-normalized", OUT_OF_REACH, more)).message
+    )
 
 
 @pytest.mark.parametrize("rule", ["reward-order", "reward-needs-success", "success-flickers"])
@@ -114,4 +111,20 @@ def test_the_largest_reward_without_success(checked: Checked) -> None:
     near = "reward[info['cube_to_goal'] < 0.25] = 3"
     finding = the_finding(checked("reward-needs-success", ('reward[info["success"]] = 3', near)))
     assert "without success" in finding.message
-    assert checked("reward-needs-success").state == "kept"
+
+
+IN_TIME = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005)', '"success": self.elapsed_steps == 7'
+
+
+def test_a_reward_is_compared_with_the_success_of_its_own_step(tmp_path: Path) -> None:
+    """Success for one step, and the largest reward at that step, or at the one before it or after it."""
+    rules, most = ("reward-needs-success", "reward-order"), 'reward[info["success"]] = 3'
+    for step in (6, 7, 8):
+        paid = f"{most[:-1]}1\n        reward[self.elapsed_steps == {step}] = 3"
+        text = EXAMPLE.read_text().replace(*IN_TIME).replace(most, paid)
+        assert text.count("elapsed_steps ==") == 2
+        (tmp_path / "task.py").write_text(text)
+        results = check_rules(rules, str(tmp_path / "task.py"), num_envs=4, seeds=4, render_backend="none")
+        for rule in rules:
+            told = [finding.message for finding in results[rule].findings]
+            assert len(told) == (step != 7) and all(f"(step {step} of seed " in one for one in told), told

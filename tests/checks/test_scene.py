@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import trimesh
 
 from tests.checks.checked import Checked, the_finding
-from workbench.checks.by_hook.scene import CHECKS
 
 CUBE = 'self.cube = builder.build(name="cube")\n'
 CUBE_AT = "builder.initial_pose = sapien.Pose(p=[0, 0, CUBE_HALF_SIZE])"
@@ -37,13 +35,6 @@ def boxes(merge: str, size: str = "0.02") -> tuple[str, str]:
     return added(PER_ENV.format(size=size, merge=merge))
 
 
-@pytest.mark.parametrize("rule", CHECKS)
-def test_the_example_breaks_none(checked: Checked, rule: str) -> None:
-    nothing_such = "hull-fills-hollow", "heavy-mesh", "reconfigures", "hidden-objects"
-    expected = "not_applicable" if rule in nothing_such else "kept"
-    assert checked(rule, seeds=4).state == expected
-
-
 def test_a_robot_at_the_origin(checked: Checked) -> None:
     edit = "super()._load_agent(options, sapien.Pose(p=[-0.615, 0, 0]))", "super()._load_agent(options)"
     finding = the_finding(checked("robot-pose", edit, seeds=4))
@@ -67,21 +58,6 @@ def test_a_body_that_stays_at_the_origin_needs_no_pose(checked: Checked) -> None
             assert checked(rule, away, seeds=4).state == "kept"
 
 
-TABLE = """table = self.scene.create_articulation_builder()
-        top = table.create_link_builder(None)
-        top.set_name("top")
-        top.add_box_collision(half_size=[0.3, 0.3, 0.01])
-        {pose}
-        table.build(name="top_table", fix_root_link=True)"""
-
-
-def test_an_articulation_that_cannot_move_and_stays_at_the_origin_needs_no_pose(checked: Checked) -> None:
-    """It overlaps the ground and the table, which do not move either."""
-    for rule in ("initial-pose", "overlap-at-load"):
-        cube_away = CUBE_AT, "builder.initial_pose = sapien.Pose(p=[0, 0, 0.1])"
-        assert checked(rule, cube_away, added(TABLE.format(pose="")), seeds=4).state == "kept"
-
-
 def test_a_body_at_the_origin_that_is_inside_another_is_told(checked: Checked) -> None:
     built = FIXED.format(x=0, build="build_kinematic").replace("fixed.build", "self.fixed = fixed.build")
     kinematic = added(built)
@@ -91,11 +67,6 @@ def test_a_body_at_the_origin_that_is_inside_another_is_told(checked: Checked) -
     static = added(FIXED.format(x=0, build="build_static"))
     assert checked("initial-pose", static, seeds=4).state == "kept"
     assert "cube and fixed are built" in the_finding(checked("overlap-at-load", static, seeds=4)).message
-
-
-def test_a_mark_without_collision_may_be_built_anywhere(checked: Checked) -> None:
-    goal_at = "builder.initial_pose = sapien.Pose(p=[0.2, 0, GOAL_HEIGHT])"
-    assert checked("initial-pose", (goal_at, ""), seeds=4).state == "kept"
 
 
 def test_a_cube_that_is_built_in_the_table(checked: Checked) -> None:
@@ -109,12 +80,6 @@ def test_a_cube_that_is_built_in_the_table(checked: Checked) -> None:
 def test_a_goal_that_never_moves(checked: Checked) -> None:
     finding = the_finding(checked("kinematic-never-moved", (GOAL_POSE, "pass"), seeds=4))
     assert "build_static(name='goal')" in finding.message and "build_kinematic" in finding.code
-
-
-def test_a_goal_that_a_step_may_move_is_left_alone(checked: Checked) -> None:
-    moves = f"    def _after_control_step(self):\n        if self.push > 9:\n            {GOAL_POSE}\n\n"
-    edits = (GOAL_POSE, "self.push = 0"), ("    def evaluate(self)", f"{moves}    def evaluate(self)")
-    assert checked("kinematic-never-moved", *edits, seeds=4).state == "not_known"
 
 
 def test_bodies_merged_under_one_name(checked: Checked) -> None:
@@ -191,12 +156,6 @@ def test_parts_that_stay_in_the_state(checked: Checked) -> None:
     assert checked("merged-actors", boxes(f"{merge}\n        {REGISTERED}"), seeds=4).state == "kept"
 
 
-def test_a_merged_body_that_is_in_no_state(checked: Checked) -> None:
-    merge = "from mani_skill.utils.structs import Actor\n        self.merged = Actor.merge(parts, name='box')"
-    removed = f"{merge}\n        {REGISTERED}".rsplit("\n", 1)[0]
-    assert "is not in the state" in the_finding(checked("merged-actors", boxes(removed), seeds=4)).message
-
-
 MARKERS = """markers = []
         for i in range(self.num_envs):
             each = self.scene.create_actor_builder()
@@ -235,12 +194,6 @@ def test_what_cannot_be_hidden(checked: Checked) -> None:
         (added(HIDE.format("self.agent.robot")), HIDE.format("self.agent.robot")),
     ):
         assert the_finding(checked("hidden-objects", edit, seeds=4)).code == line
-
-
-def test_a_merged_actor_that_is_hidden_as_advised(checked: Checked) -> None:
-    advised = f"{NO_COLLISION}\n        {HIDE.format('self.marker')}"
-    assert checked("hidden-objects", markers(after=advised), seeds=4).state == "kept"
-    assert checked("hidden-objects", seeds=4).state == "not_applicable"
 
 
 def test_one_env_with_the_same_objects_for_ever(checked: Checked) -> None:

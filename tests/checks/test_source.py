@@ -1,206 +1,168 @@
-"""Rules of the class, its registration and its source, each with a task that breaks it and one that keeps it."""
+"""Rules of the class, its registration and its source, each with mistakes that break it and what only looks like one."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import gymnasium
 import pytest
 
-from tests.checks.checked import EXAMPLE, Checked, check_rule, the_finding
-from workbench.authoring.loading.load import load_task, undo_load
+from tests.checks.checked import EXAMPLE, Checked, check_rules, the_finding
+from workbench.checks.results import RuleResult
+from workbench.core.rules import Finding
 
 REGISTERED = '@register_env("WorkbenchPushCube-v1", max_episode_steps=50)'
 RESET = "            b = len(env_idx)\n"
 EVALUATE = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
 BUILT = '        self.cube = builder.build(name="cube")\n'
-
-
-@pytest.mark.parametrize(
-    "rule",
+IMPORTS = (
+    "import numpy as np\n",
     (
-        "registered", "versioned-id", "time-limit", "id-taken", "supported-robots", "reward-modes", "unknown-name",
-        "unseeded-random", "backend-only-call", "missing-file", "undeclared-assets",
+        "import os\nimport random\nfrom pathlib import Path\n\nimport numpy as np\nfrom mani_skill import ASSET_DIR\n\n"
+        'MESH = "bowl"\n'
     ),
-)  # fmt: skip
-def test_the_example_keeps_it(rule: str, checked: Checked) -> None:
-    assert checked(rule).state == "kept"
+)
+NEVER = "if self.num_envs > 99: "
+"""What is read only, and does not run."""
 
 
-def test_a_class_without_an_id(checked: Checked) -> None:
+def source_results(folder: Path, *edits: tuple[str, str]) -> dict[str, RuleResult]:
+    """Those of all rules of the source, of one text with all of these edits."""
+    rules = ("versioned-id", "time-limit", "supported-robots", "reward-modes", "unknown-name", "unseeded-random",
+             "backend-only-call", "missing-file", "undeclared-assets")  # fmt: skip
+    text = EXAMPLE.read_text()
+    for old, new in edits:
+        assert old in text, old
+        text = text.replace(old, new)
+    (folder / "task.py").write_text(text)
+    return check_rules(rules, str(folder / "task.py"), num_envs=2, seeds=1, render_backend="none")
+
+
+def lines(place: str, *statements: str) -> tuple[str, str]:
+    """An edit that adds statements below this line."""
+    indent = place[: len(place) - len(place.lstrip())]
+    return place, place + "".join(f"{indent}{statement}\n" for statement in statements)
+
+
+def test_each_mistake_is_found_at_its_line(tmp_path: Path) -> None:
+    results = source_results(
+        tmp_path,
+        IMPORTS,
+        (REGISTERED, '@register_env("WorkbenchPushCube")'),
+        ('SUPPORTED_ROBOTS = ["panda", "fetch"]', 'SUPPORTED_ROBOTS = ["fetch"]'),
+        ('"normalized_dense", ', '"normalised_dense", '),
+        lines(
+            RESET, "x = np.random.rand()", "x = np.random.default_rng().random()", "x = random.uniform(0, 1)"
+        ),
+        lines(
+            BUILT,
+            "builder.inital_pose = 3",
+            "self.size = np.random.rand()",
+            f'{NEVER}builder.add_visual_from_file("cup.glb")',
+            'x = str(Path(__file__).parent / "mug.glb")',
+            'x = os.path.join(os.path.dirname(__file__), f"{MESH}.obj")',
+            'self.models = ASSET_DIR / "assets/mani_skill2_ycb/info_pick_v0.json"',
+        ),
+        lines(
+            EVALUATE,
+            f"{NEVER}self.get_pairwise_contact_forces(self.cube, self.goal)",
+            f"{NEVER}self.evalute()",
+            f"{NEVER}self.scene.create_actor_bulder()",
+            f"{NEVER}self.scene._gpu_apply_all()",
+            f"{NEVER}self.scene.px.gpu_fetch_rigid_dynamic_data()",
+            f"{NEVER}self.scene.get_contacts()",
+            "self.cube._objs[0].pose",
+        ),
+    )
+
+    def told(rule: str) -> dict[str, Finding]:
+        assert results[rule].state == "broken", results[rule]
+        return {finding.code.removeprefix(NEVER): finding for finding in results[rule].findings}
+
+    (code,) = told("versioned-id")
+    assert code.startswith("@register_env") and "'WorkbenchPushCube-v1'" in told("versioned-id")[code].message
+    assert [*told("time-limit")] == ['@register_env("WorkbenchPushCube")']
+    assert "'panda'" in told("supported-robots")['SUPPORTED_ROBOTS = ["fetch"]'].message
+    assert "'normalised_dense'" in next(iter(told("reward-modes").values())).message
+    for code, named in {
+        "builder.inital_pose = 3": "initial_pose",
+        "self.get_pairwise_contact_forces(self.cube, self.goal)": "self.scene.get_pairwise_contact_forces()",
+        "self.evalute()": "self.evaluate()",
+        "self.scene.create_actor_bulder()": "self.scene.create_actor_builder()",
+    }.items():
+        assert named in told("unknown-name")[code].message
+    drawn = told("unseeded-random")
+    assert drawn.keys() == {
+        *("x = np.random.rand()", "x = np.random.default_rng().random()", "x = random.uniform(0, 1)"),
+        "self.size = np.random.rand()",
+    }
+    assert "torch.rand" in drawn["x = np.random.rand()"].message
+    assert "_batched_episode_rng" in drawn["self.size = np.random.rand()"].message
+    backends = {
+        code: "GPU" in finding.message.split("simulation only")[0]
+        for code, finding in told("backend-only-call").items()
+    }
+    assert backends == {
+        "self.scene._gpu_apply_all()": True,
+        "self.scene.px.gpu_fetch_rigid_dynamic_data()": True,
+        "self.scene.get_contacts()": False,
+        "self.cube._objs[0].pose": False,
+    }
+    missing = [finding.message for finding in results["missing-file"].findings]
+    assert all(any(name in one for one in missing) for name in ("cup.glb", "/mug.glb", "/bowl.obj")), missing
+    assert {finding.degree for finding in results["missing-file"].findings} == {"stop"}
+    assert "asset_download_ids=['ycb']" in next(iter(told("undeclared-assets").values())).message
+
+
+def test_what_only_looks_like_one_is_none(tmp_path: Path) -> None:
+    (tmp_path / "cup.glb").write_bytes(b"")
+    results = source_results(
+        tmp_path,
+        IMPORTS,
+        ("max_episode_steps=50)", "max_episode_steps=50, asset_download_ids=['ycb'])"),
+        lines(
+            RESET,
+            "self.draw_goal = lambda: None",
+            "self.draw_goal()",
+            "if hasattr(self, 'draw_more'): self.draw_more()",
+            "x = np.random.RandomState(3).rand() + self._batched_episode_rng[0].rand()",
+        ),
+        lines(
+            BUILT,
+            "builder.colour = 3",
+            "self.colour = builder.colour",
+            "self.first = self.cube._objs[0].pose",
+            'x = Path(__file__).parent / "cup.glb"',
+            f'{NEVER}open("log.csv", "w")',
+            'self.models = ASSET_DIR / "assets/mani_skill2_ycb/info_pick_v0.json"',
+        ),
+        lines(
+            EVALUATE,
+            "if self.gpu_sim_enabled: self.scene._gpu_apply_all()",
+        ),
+        ("\n\n@register_env", "\ndef try_out():\n    return np.random.rand()\n\n\n@register_env"),
+    )
+    assert {rule: result.findings for rule, result in results.items() if result.findings} == {}
+
+
+def test_a_class_without_an_id_and_one_with_that_of_another_task(checked: Checked) -> None:
     finding = the_finding(checked("registered", (REGISTERED, "")))
     assert finding.code.startswith("class PushCubeEnv") and '@register_env("PushCube-v1"' in finding.message
-    assert checked("versioned-id", (REGISTERED, "")).state == "not_applicable"
-
-
-def test_an_id_of_gymnasium_alone(checked: Checked) -> None:
-    """As gym.make takes it, with its limit."""
-    register = (
-        "import gymnasium\n"
-        'gymnasium.register("AtGymnasium-v1", entry_point=f"{__name__}:PushCubeEnv", max_episode_steps=30)\n'
-    )
-    text = EXAMPLE.read_text().replace(REGISTERED, "") + register
-    try:
-        finding = the_finding(checked("registered", text=text))
-        file = str(finding.file)
-        loaded = load_task(file)
-    finally:
-        gymnasium.registry.pop("AtGymnasium-v1", None)
-    assert '@register_env("AtGymnasium-v1", max_episode_steps=30)' in finding.message
-    assert (loaded.env_id, loaded.max_episode_steps) == ("AtGymnasium-v1", 30)
-    undo_load(loaded)
-
-
-def test_an_id_without_a_version(checked: Checked) -> None:
-    finding = the_finding(checked("versioned-id", ("WorkbenchPushCube-v1", "WorkbenchPushCube")))
-    assert finding.code.startswith("@register_env") and "'WorkbenchPushCube-v1'" in finding.message
-
-
-def test_no_time_limit(checked: Checked) -> None:
-    finding = the_finding(checked("time-limit", (", max_episode_steps=50", "")))
-    assert finding.code == '@register_env("WorkbenchPushCube-v1")'
-
-
-def test_the_id_of_another_task(checked: Checked) -> None:
     finding = the_finding(checked("id-taken", ("WorkbenchPushCube-v1", "PushCube-v1")))
     assert "'PushCube-v1'" in finding.message
 
 
-def test_robots_that_are_not_said(checked: Checked) -> None:
-    line = 'SUPPORTED_ROBOTS = ["panda", "fetch"]'
-    finding = the_finding(checked("supported-robots", (line, "")))
-    assert "SUPPORTED_ROBOTS = ['panda']" in finding.message
-    finding = the_finding(checked("supported-robots", (line, 'SUPPORTED_ROBOTS = ["fetch"]')))
-    assert finding.code == 'SUPPORTED_ROBOTS = ["fetch"]' and "'panda'" in finding.message
-
-
-def test_a_reward_mode_without_its_method(checked: Checked) -> None:
-    finding = the_finding(
-        checked("reward-modes", ("def compute_normalized_dense_reward", "def compute_norm_dense_reward"))
-    )
-    assert finding.code.startswith("SUPPORTED_REWARD_MODES")
-    assert "('dense', 'sparse', 'none')" in finding.message
-    finding = the_finding(checked("reward-modes", ('"normalized_dense", ', '"normalised_dense", ')))
-    assert "'normalised_dense'" in finding.message
-
-
-def test_a_typo_on_a_builder(checked: Checked) -> None:
-    typo = (
-        "builder.initial_pose = sapien.Pose(p=[0, 0, CUBE",
-        "builder.inital_pose = sapien.Pose(p=[0, 0, CUBE",
-    )
-    finding = the_finding(checked("unknown-name", typo))
-    assert finding.code.startswith("builder.inital_pose") and "Write 'initial_pose'." in finding.message
-
-
-def test_an_attribute_of_a_builder_that_the_task_reads_is_no_typo(checked: Checked) -> None:
-    own = f"        builder.colour = 3\n{BUILT}        self.colour = builder.colour\n"
-    assert checked("unknown-name", (BUILT, own)).state == "kept"
-
-
-def test_methods_that_do_not_exist(checked: Checked) -> None:
-    calls = "        if self.num_envs > 99:\n            self.{}\n"
-    for call, write in (
+@pytest.mark.parametrize(
+    ("edit", "named"),
+    [
+        (('SUPPORTED_ROBOTS = ["panda", "fetch"]', ""), "SUPPORTED_ROBOTS = ['panda']"),
         (
-            "get_pairwise_contact_forces(self.cube, self.goal)",
-            "Write self.scene.get_pairwise_contact_forces().",
+            ("def compute_normalized_dense_reward", "def compute_norm_dense_reward"),
+            "('dense', 'sparse', 'none')",
         ),
-        ("evalute()", "Write self.evaluate()."),
-        ("scene.create_actor_bulder()", "Write self.scene.create_actor_builder()."),
-    ):
-        finding = the_finding(checked("unknown-name", (EVALUATE, EVALUATE + calls.format(call))))
-        assert write in finding.message and finding.function == "evaluate"
-
-
-def test_names_that_are_set_somewhere_or_asked_for_exist(checked: Checked) -> None:
-    set_later = f"{RESET}            self.draw_goal = lambda: None\n            self.draw_goal()\n"
-    asked = f"{RESET}            if hasattr(self, 'draw_goal'):\n                self.draw_goal()\n"
-    for text in (set_later, asked):
-        assert checked("unknown-name", (RESET, text)).state == "kept"
-
-
-def test_random_numbers_that_no_seed_reaches(checked: Checked) -> None:
-    for line, drawn in (
-        ("x = np.random.rand()", "np.random.rand()"),
-        ("x = np.random.default_rng().random()", "np.random.default_rng()"),
-        ("import random; x = random.uniform(0, 1)", "random.uniform()"),
-    ):
-        finding = the_finding(checked("unseeded-random", (RESET, f"{RESET}            {line}\n")))
-        assert finding.message.startswith(drawn) and "torch.rand" in finding.message
-        assert finding.function == "_initialize_episode"
-    finding = the_finding(
-        checked("unseeded-random", (BUILT, f"{BUILT}        self.size = np.random.rand()\n"))
-    )
-    assert "_batched_episode_rng" in finding.message
-
-
-def test_random_numbers_that_are_seeded_or_drawn_elsewhere(checked: Checked) -> None:
-    seeded = f"{RESET}            x = np.random.RandomState(3).rand() + self._batched_episode_rng[0].rand()\n"
-    assert checked("unseeded-random", (RESET, seeded)).state == "kept"
-    script = "\ndef try_out():\n    return np.random.rand()\n"
-    assert checked("unseeded-random", ("\n\n@register_env", f"{script}\n\n@register_env")).state == "kept"
-
-
-def test_calls_of_one_backend(checked: Checked) -> None:
-    for call, of in (
-        ("self.scene._gpu_apply_all()", "GPU simulation only"),
-        ("self.scene.px.gpu_fetch_rigid_dynamic_data()", "GPU simulation only"),
-        ("self.scene.get_contacts()", "CPU simulation only"),
-        ("self.cube._objs[0].pose", "CPU simulation only"),
-    ):
-        finding = the_finding(checked("backend-only-call", (EVALUATE, f"{EVALUATE}        {call}\n")))
-        assert of in finding.message and finding.code == call
-
-
-def test_calls_of_one_backend_behind_its_condition(checked: Checked) -> None:
-    below = "        if self.gpu_sim_enabled:\n            self.scene._gpu_apply_all()\n"
-    after = (
-        "        if not self.gpu_sim_enabled:\n            return {}\n        self.scene._gpu_fetch_all()\n"
-    )
-    at_load = "        self.first = self.cube._objs[0].pose\n"
-    edits = (EVALUATE, EVALUATE + below + after), (BUILT, BUILT + at_load)
-    assert checked("backend-only-call", *edits).state == "kept"
-
-
-def test_a_file_that_is_missing(checked: Checked) -> None:
-    at = "        builder.add_box_collision("
-    for written, named in (
-        ('builder.add_visual_from_file("cup.glb")', "cup.glb"),
-        ('builder.add_visual_from_file(filename=str(Path(__file__).parent / "cup.glb"))', "/cup.glb"),
-        ('folder = os.path.dirname(__file__); x = os.path.join(folder, f"{MESH}.obj")', "/bowl.obj"),
-    ):
-        imports = (
-            "import numpy as np",
-            'import os\nfrom pathlib import Path\nimport numpy as np\nMESH = "bowl"',
-        )
-        finding = the_finding(checked("missing-file", imports, (at, f"        {written}\n{at}")))
-        assert named in finding.message and finding.degree == "stop" and finding.function == "_load_scene"
-
-
-def test_files_that_exist_or_are_made(checked: Checked, tmp_path: Path) -> None:
-    (tmp_path / "cup.glb").write_bytes(b"")
-    at = "        builder.add_box_collision("
-    imports = "import numpy as np", "from pathlib import Path\nimport numpy as np"
-    found = 'x = Path(__file__).parent / "cup.glb"'
-    assert checked("missing-file", imports, (at, f"        {found}\n{at}")).state == "kept"
-    made = 'if self.num_envs > 99:\n            open("log.csv", "w")\n        np.savez("made.npz")'
-    assert checked("missing-file", imports, (at, f"        {made}\n{at}")).state == "kept"
-    relative = 'if self.num_envs > 99:\n            builder.add_visual_from_file("cup.glb")'
-    finding = the_finding(checked("missing-file", imports, (at, f"        {relative}\n{at}")))
-    assert "a process starts anywhere" in finding.message
-
-
-def test_a_download_that_is_not_declared(checked: Checked) -> None:
-    imports = "import numpy as np", "from mani_skill import ASSET_DIR\nimport numpy as np"
-    named = BUILT, f'{BUILT}        self.models = ASSET_DIR / "assets/mani_skill2_ycb/info_pick_v0.json"\n'
-    finding = the_finding(checked("undeclared-assets", imports, named))
-    assert "asset_download_ids=['ycb']" in finding.message and finding.code.startswith("self.models")
-    declared = "max_episode_steps=50)", "max_episode_steps=50, asset_download_ids=['ycb'])"
-    assert checked("undeclared-assets", imports, named, declared).state == "kept"
-    optional = f'{BUILT}        if self.num_envs > 99:\n            self.models = "ycb:024_bowl"\n'
-    assert checked("undeclared-assets", (BUILT, optional)).state == "kept"
-
-
-def test_the_built_in_task_keeps_them() -> None:
-    for rule in ("registered", "id-taken", "unknown-name", "backend-only-call"):
-        assert check_rule(rule, "PushCube-v1", num_envs=1, seeds=1).state == "kept"
+    ],
+)
+def test_what_is_missing_is_named_with_what_to_write(
+    checked: Checked, edit: tuple[str, str], named: str
+) -> None:
+    rule = "supported-robots" if "ROBOTS" in edit[0] else "reward-modes"
+    assert named in the_finding(checked(rule, edit)).message

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from workbench.cli import main
-from workbench.cli.terminal.arguments import EnvArguments, Rules, history_bytes
+from workbench.cli.terminal.arguments import EnvArguments, history_bytes
 
 
 @pytest.mark.parametrize(
@@ -17,11 +17,6 @@ from workbench.cli.terminal.arguments import EnvArguments, Rules, history_bytes
 )
 def test_a_size_is_read_as_people_write_it(text: str, size: int) -> None:
     assert history_bytes(text) == size
-
-
-@pytest.mark.parametrize("rules", ["stop", "warn", "off", None])
-def test_the_degree_of_the_rules_is_an_option_of_the_task(rules: Rules) -> None:
-    assert EnvArguments(4, "cpu", rules).options().rules == rules
 
 
 @pytest.mark.parametrize("text", ["", "0", "many", "-3MB", "12XB", "1e9MB", "10", "nan GB", "9" * 400 + "GB"])
@@ -44,13 +39,6 @@ def test_the_limits_themselves_are_taken_and_what_is_past_them_is_not(
     else:
         with pytest.raises(ValueError, match=named):
             EnvArguments(num_envs, seed=seed).options()
-
-
-def test_the_smallest_and_the_largest_history_are_taken() -> None:
-    assert (history_bytes("1MB"), history_bytes("1048576MB")) == (2**20, 2**40)
-    for text in (str(2**20 - 1), str(2**40 + 2**20)):
-        with pytest.raises(ValueError, match="--history"):
-            history_bytes(text)
 
 
 def test_an_argument_of_the_env_is_json_or_else_a_string() -> None:
@@ -77,13 +65,6 @@ def test_a_package_that_is_older_than_the_range_is_named_with_the_command(
     first, second = capsys.readouterr().err.splitlines()
     assert ended.value.code == 2
     assert first.startswith("viser>=99 is wanted, ") and second.endswith(" 'viser>=99'")
-
-
-@pytest.mark.parametrize("command", ["open", "check", "record", "rescore", "solve", "sweep"])
-def test_how_many_envs_run_at_once_has_one_name(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main.main([command, "--help"])
-    assert "--num-envs INT" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("given", [["--envs-per-worker", "0"], ["--envs_per_worker=0"]])

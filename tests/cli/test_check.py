@@ -141,48 +141,6 @@ def test_a_task_that_cannot_be_imported_is_an_error_in_every_report_at_its_line(
     assert error is not None and "ModuleNotFoundError" in error.get("message", "")
 
 
-def test_a_task_that_is_not_there_is_an_error_in_a_report(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ended = run(capsys, "nowhere.py", "--json", *FEW)
-    assert ended.code == 2 and "nowhere.py" in json.loads(ended.out)["error"]["message"]
-
-
-def test_folders_of_reports_are_made_before_anything_runs(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (place / "file").write_text("")
-    ended = run(capsys, "good.py", "--json-file", "file/in/report.json", *FEW)
-    assert ended.code == 2 and "file/in/report.json cannot be written" in ended.err
-    assert "is a folder" in run(capsys, "good.py", "--sarif", str(place), *FEW).err
-    ended = run(capsys, "good.py", "--select", "entry-name", "--junit", "reports/today/a.xml", *FEW)
-    assert ended.code == 0 and (place / "reports" / "today" / "a.xml").is_file()
-
-
-def test_what_is_ignored_is_in_the_summary_and_in_each_report(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    rules = (
-        "--select",
-        "entry-name,reward-rows,success-and-fail",
-        "--ignore",
-        "success-and-fail,reward-rows",
-    )
-    files = ("--junit", "a.xml", "--sarif", "a.sarif", "--json-file", "a.json")
-    ended = run(capsys, "bad.py", *rules, *files, *FEW)
-    assert ended.code == 0 and "2 ignored: reward-rows, success-and-fail" in ended.out
-    assert "1 rule kept, 0 broken, 2 ignored." in ended.out
-    ignored = ["reward-rows", "success-and-fail"]
-    assert json.loads((place / "a.json").read_text())["ignored"] == ignored
-    cases = {case.get("name"): case for case in ElementTree.parse(place / "a.xml").getroot()[0]}
-    assert [name for name, case in cases.items() if case.find("skipped") is not None] == ignored
-    (made,) = json.loads((place / "a.sarif").read_text())["runs"]
-    off = made["invocations"][0]["ruleConfigurationOverrides"]
-    assert [each["descriptor"]["id"] for each in off] == ignored
-    rules_of = made["tool"]["driver"]["rules"]
-    assert all(rules_of[each["descriptor"]["index"]]["id"] == each["descriptor"]["id"] for each in off)
-
-
 def test_as_many_seeds_as_were_asked_for_are_tried(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Of three, with two envs: the fourth is not counted."""
     few = ("--num-envs", "2", "--seeds", "3", "--workers", "1", "--env", "render_backend=none")
@@ -192,21 +150,6 @@ def test_as_many_seeds_as_were_asked_for_are_tried(place: Path, capsys: pytest.C
     assert finding["count"] == 3 and "3 of 3 seeds (seed 0, 1, 2)" in finding["message"]
     (noted,) = (one["notes"] for one in said["rules"] if one["rule"] == "success-stays-possible")
     assert noted == ["success in 3 of 3 random episodes"]
-
-
-def test_rules_that_one_error_leaves_undecided_stand_below_it(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = (place / "good.py").read_text()
-    (place / "raises.py").write_text(text.replace('name="goal"', "name=self.gone"))
-    rules = "reward-finite,reward-changes,success-at-reset,success-and-fail,entry-name"
-    ended = run(capsys, "raises.py", "--select", rules, *FEW)
-    why = ended.out.index("not known ")
-    assert "'gone'" in ended.out[why:].split("\n")[0]
-    # Where its lines break is the terminal's matter.
-    words = " ".join(ended.out[why:].split())
-    assert " 5 rules: success-at-reset, success-and-fail, entry-name, reward-finite, reward-changes " in words
-    assert ended.err.count("not known") == 1
 
 
 def test_a_comment_that_silences_nothing_any_more_is_told(
@@ -283,18 +226,6 @@ def test_a_task_that_needs_a_renderer_gets_one(place: Path, child_process: None)
     ]
     ended = in_a_process(*words)
     assert ended.returncode == 0, ended.stdout + ended.stderr
-
-
-def test_pictures_are_not_asked_of_a_task_that_is_made_without_a_renderer(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ended = run(capsys, "good.py", "--select", "ground-truth,camera-sees,runs", "--json", *FEW)
-    states = {one["rule"]: one["state"] for one in json.loads(ended.out)["rules"]}
-    assert ended.code == 0 and states == {
-        "runs": "kept",
-        "ground-truth": "not_known",
-        "camera-sees": "not_known",
-    }
 
 
 def test_json_is_all_that_is_printed_and_equals_the_file(
@@ -459,30 +390,6 @@ def test_a_rule_that_ends_its_process_fails_and_no_other(place: Path, child_proc
     assert states == {"success-at-reset": "kept", "info-rows": "kept", "time-limit": "kept"}
     (why,) = (one["why"] for one in said["rules"] if one["state"] == "failed")
     assert "SIGKILL" in why
-
-
-def test_what_is_not_known_is_told_with_its_reason_and_fails_nothing(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    files = ("--json-file", "a.json", "--sarif", "a.sarif")
-    ended = run(capsys, "good.py", "--select", "success-flickers,camera-names", *files, *FEW)
-    said = json.loads((place / "a.json").read_text())
-    assert ended.code == 0 and said["counts"] == {"not_known": 1, "kept": 1}
-    assert "not known success-flickers: no random episode succeeds" in ended.out
-    (invocation,) = json.loads((place / "a.sarif").read_text())["runs"][0]["invocations"]
-    (note,) = invocation["toolExecutionNotifications"]
-    assert (note["level"], note["associatedRule"]["id"]) == ("note", "success-flickers")
-    assert invocation["executionSuccessful"] is True
-
-
-def test_other_tasks_of_the_file_are_named(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    more = (
-        '\n\n@register_env("WorkbenchSecond-v1", max_episode_steps=5)\nclass Second(PushCubeEnv):\n    pass\n'
-    )
-    (place / "good.py").write_text(TEXT + more)
-    ended = run(capsys, "good.py:PushCubeEnv", "--select", "entry-name", *FEW)
-    assert ended.code == 0 and "WorkbenchPushCube-v1: 1 rule kept" in ended.out
-    assert "Not checked, as one task is checked at a time: good.py:Second" in ended.err
 
 
 @pytest.mark.slow

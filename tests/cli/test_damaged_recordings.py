@@ -74,8 +74,12 @@ def run(*arguments: object) -> int:
 
 
 CASES = [
-    *[(f"ours{suffix}", kind) for suffix in (".h5", ".rrd", ".json") for kind in DAMAGES],
-    *[(f"theirs{suffix}", kind) for suffix in (".h5", ".json") for kind in DAMAGES],
+    *[("ours.h5", kind) for kind in DAMAGES],
+    *[
+        (name, kind)
+        for name in ("ours.rrd", "ours.json", "theirs.h5", "theirs.json")
+        for kind in ("cut", "gone")
+    ],
     ("set/meta/info.json", "cut"),
     ("set/data", "cut"),
 ]

@@ -178,12 +178,6 @@ def test_a_module_of_another_folder_that_cannot_be_imported_is_named_with_its_li
     assert (told["file"], told["line"]) == (f"{lab}/{where}", line_of(tmp_path / lab / where, words)), told
 
 
-def test_an_error_without_a_line_of_the_authors_has_none(tmp_path: Path, check: Check) -> None:
-    (tmp_path / "task.py").write_bytes(b"x = 1" * 10_000_000)
-    told = check("task.py")
-    assert (told["file"], told["line"]) == ("task.py", None), told
-
-
 ROBOT = """
 from pathlib import Path
 import numpy as np
@@ -232,7 +226,6 @@ MJCF = """<mujoco model="stick">
 """
 MISTAKES = {
     "an inertia": (URDF, 'ixx="0.001"', 'ixx="-0.001"', '<link name="arm"', "arm"),
-    "no number": (URDF, "0.03 0.03 0.3", "0.03 wide 0.3", "0.03 wide 0.3", "arm"),
     "a link twice": (
         URDF,
         '<link name="arm"',
@@ -241,14 +234,6 @@ MISTAKES = {
         "base",
     ),
     "no parent": (URDF, '<parent link="base"/>', '<parent link="bse"/>', '<joint name="hinge"', "hinge"),
-    "no limit": (
-        URDF,
-        '    <limit lower="-1.5" upper="1.5" effort="10" velocity="3"/>\n',
-        "",
-        '<joint name="hinge"',
-        "hinge",
-    ),
-    "a joint's type": (URDF, "revolute", "hinge", '<joint name="hinge"', "hinge"),
     "not closed": (URDF, "</robot>\n", "", None, ""),
     "an element of MJCF": (
         MJCF,
@@ -257,7 +242,6 @@ MISTAKES = {
         "thin",
         "arm",
     ),
-    "MJCF not closed": (MJCF, "</worldbody>", "", "</mujoco>", ""),
 }
 
 
@@ -304,18 +288,3 @@ def test_a_mesh_that_is_not_there_is_told_with_the_link_that_names_it(
     assert f"{robot}:{line_of(robot, 'urdf_path')}" in said, said
     assert f"{described}:{line_of(described, visual)}" in said and "'arm'" in said
     assert str(tmp_path / "meshes" / "arm.stl") in said
-
-
-def test_a_file_that_the_task_loads_itself_is_told_with_the_line_that_loads_it(
-    tmp_path: Path, check: Check
-) -> None:
-    described = tmp_path / "door.xml"
-    described.write_text(URDF.replace('ixx="0.001"', 'ixx="-0.001"'))
-    loads = f"loader = self.scene.create_urdf_loader()\n        loader.parse({str(described)!r})\n        "
-    file = edited(
-        tmp_path, ("build_ground(self.scene)\n", f"build_ground(self.scene)\n        {loads}pass\n")
-    )
-    told = check("task.py")
-    assert told["line"] == line_of(file, "loader.parse")
-    link = line_of(described, '<link name="arm"')
-    assert f"{described}:{link}" in told["message"]

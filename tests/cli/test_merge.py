@@ -80,11 +80,6 @@ def test_an_episode_that_was_deleted_is_made_again(place: Path, capsys: pytest.C
     assert (place / "demos" / f"{again.stem}.h5").read_bytes() == before["seed0003"]
 
 
-def test_a_part_that_is_empty_says_so(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert record("--shard", "1/4", "--out", "demos") == 0
-    assert "part 1/4 has nothing to do: the job has 3 batches" in capsys.readouterr().err
-
-
 def test_a_part_of_another_job_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert record("--shard", "1/3", "--out", "demos") == 0
     assert record("--shard", "2/3", "--out", "demos", "--seed", "5") == 0

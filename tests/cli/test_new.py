@@ -56,23 +56,6 @@ def test_the_first_template_is_taken_where_none_is_named_and_a_second_time_it_is
     assert (place / "first.py").read_text() == text
 
 
-def test_a_class_that_the_file_does_not_open_with_is_named(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    _, out, _ = run(capsys, "new", "lift_it", "--from", "PickCube-v1")
-    assert out.splitlines()[-1] == "Open it:  workbench open lift_it.py:LiftItEnv"
-
-
-def test_without_a_name_and_a_terminal_it_says_what_to_type(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, out, err = run(capsys, "new", "--from", "tabletop")
-    assert (code, out) == (2, "") and err.startswith(
-        "Type a name, as in: workbench new stack_two --from minimal"
-    )
-    assert list(place.iterdir()) == []
-
-
 class Terminal:
     """``workbench new`` at a terminal of its own."""
 

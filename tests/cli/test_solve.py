@@ -17,17 +17,14 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from rich.progress import Progress
 
 from tests.drive.waiting import until
 from workbench.checks.results import RuleResult
-from workbench.cli.jobs.record import RecordBar
-from workbench.cli.jobs.solve import SolveOutput, as_csv, as_json, as_junit
+from workbench.cli.jobs.solve import SolveOutput, as_junit
 from workbench.cli.main import main
 from workbench.core.rules import FailOn, Finding
 from workbench.jobs.check.plan import CheckedTask
 from workbench.jobs.check.run import CheckReport
-from workbench.jobs.record.episodes import Written
 from workbench.jobs.record.run import RecordProgress
 from workbench.jobs.record.solve import SolveOptions, solve
 from workbench.jobs.task import TaskOptions
@@ -146,26 +143,6 @@ def test_the_exit_code_has_the_degrees_of_the_checks(fail_on: FailOn, found: boo
     assert suite.get("failures") == str(int(found))
 
 
-def test_each_row_names_the_rules_that_it_is_an_example_of() -> None:
-    rows = list(csv.DictReader(io.StringIO(as_csv(FOUND, SolveOptions("x"), SolveOutput()))))
-    assert [row["rules"] for row in rows] == ["", "reward-exploited"]
-    told = json.loads(as_json(FOUND, SolveOptions("x"), SolveOutput()))
-    assert [row["rules"] for row in told["seeds"]] == [[], ["reward-exploited"]]
-    assert told["verdicts"][0]["message"] == "1 of 2 episodes earned more" and told["notes"]
-
-
-def test_the_bar_moves_within_a_seed_and_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines: list[str] = []
-    monkeypatch.setattr("workbench.cli.jobs.record.err.print", lambda line, **how: lines.append(line))
-    bar = Progress()
-    shown = RecordBar(bar, 4, "solving", first_seed=2)
-    written = Written(0, Path("2.rrd"), 2, 13, 9.25, True)
-    shown.show(RecordProgress(0, 12, None, {0: 12}, 50, 0.24))
-    assert (bar.tasks[0].description, bar.tasks[0].completed) == ("solving, seed 2 at step 12 of 50", 0.24)
-    shown.show(RecordProgress(1, 13, (0, written), {}, 50, 1.0))
-    assert lines == ["seed 2: 13 steps, return 9.250, success, 1 of 4 kept"]
-
-
 @pytest.mark.slow
 def test_the_report_is_the_same_with_several_processes(lift: Path) -> None:
     def same(report: SolveReport) -> list[tuple[int, int, int, float]]:
@@ -251,21 +228,3 @@ def test_the_command_prints_and_writes_reports(lift: Path, capsys: pytest.Captur
     )
     suite = ElementTree.fromstring(files["xml"].read_text())
     assert (suite.get("tests"), suite.get("failures")) == ("2", "0")
-
-
-@pytest.mark.parametrize(
-    ("given", "says"),
-    [
-        ("--seeds 0", "--seeds must be at least 1"),
-        ("--rollouts 1", "--rollouts must be at least 4"),
-        ("--horizon -1", "--horizon is a time in seconds"),
-        ("--seconds-per-seed 0", "--seconds-per-seed must be above 0"),
-        ("--json --csv", "both print the result"),
-        ("--junit .", "is a folder"),
-    ],
-)
-def test_a_wrong_option_is_refused_by_name(given: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["solve", "PushCube-v1", *given.split()])
-    assert ended.value.code == 2
-    assert says in capsys.readouterr().err

@@ -74,21 +74,6 @@ def test_a_sweep_prints_its_points_and_writes_its_results(
     assert "holds the results of another sweep" in capsys.readouterr().err
 
 
-def test_parts_are_merged_to_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert sweep("--set", "MOST=5,1", "--out", "whole") == 0
-    for part in ("1/2", "2/2"):
-        assert sweep("--set", "MOST=5,1", "--out", f"part{part[0]}", "--shard", part) == 0
-        assert not (tmp_path / f"part{part[0]}" / RESULTS).exists()
-    assert (
-        run("merge", "sweep-1-of-2.job", "sweep-2-of-2.job", "--out", "merged", "--json-file", "m.json") == 0
-    )
-    assert numbers(tmp_path / "merged") == numbers(tmp_path / "whole")
-    for row in read_results(tmp_path / "merged" / RESULTS).episodes:
-        assert (tmp_path / "merged" / row.recording).is_file()
-    assert len(json.loads((tmp_path / "m.json").read_text())["points"]) == 2
-
-
 def test_a_job_goes_on_after_what_is_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -24,7 +24,6 @@ from urllib.parse import urlsplit
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.style import Style
 from rich.table import Table
@@ -34,9 +33,8 @@ from tests.drive.episodes import made, write
 from tests.drive.waiting import until
 from tests.ui.tabs import handshake
 from workbench.authoring.problem import Problem
-from workbench.cli.terminal import output as terminal
 from workbench.cli.terminal.output import SafeConsole, print_line, print_problem, print_text, refuse, warn
-from workbench.machine.text import SafeStream, guard_terminal
+from workbench.machine.text import guard_terminal
 from workbench.recording.library.library import Library
 from workbench.session.process.captured_output import PrintedLine, Run
 from workbench.ui.library.rows import cells
@@ -221,14 +219,6 @@ def test_a_loggers_record_is_one_line_and_its_traceback_is_text(monkeypatch: pyt
     assert "Traceback" in said and "ValueError" in said and "\x1b[31mred\x1b[0m" in said
 
 
-def test_what_ends_a_command_is_printed_as_text(child_process: None, tmp_path: Path) -> None:
-    program = (
-        f"from workbench.machine.text import guard_terminal\nguard_terminal()\nraise ValueError({EVIL!r})"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
-    assert harmful(done.stderr) == set() and "ValueError" in done.stderr and "\\x1b" in done.stderr
-
-
 def test_bars_still_move_and_what_they_say_is_text() -> None:
     said = io.StringIO()
     console = SafeConsole(file=said, force_terminal=True, width=100)
@@ -261,13 +251,3 @@ def test_no_renderable_brings_a_control_through_our_console(parts: list[str]) ->
     console.print(Text.from_ansi(text))
     console.print(text.replace("[/", "(/"))
     assert harmful(said.getvalue()) == set()
-
-
-def test_guarding_twice_is_guarding_once() -> None:
-    with both_streams() as streams:
-        guard_terminal()
-        guard_terminal()
-        assert isinstance(sys.stdout, SafeStream) and sys.stdout.raw is streams
-        assert terminal.out.file is streams, "bars of ours go past the guard"
-        Console().print("[bold]kept[/]")
-    assert "kept" in streams.getvalue()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
-import pytest
 import tyro
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -40,25 +39,6 @@ def test_what_is_shown_gives_the_same_options(
 ) -> None:
     options = TaskOptions(num_envs, seed=seed, env_kwargs=kwargs, rules=rules)
     assert typed(command_line(f"/tmp/{name}.py", options)) == (f"/tmp/{name}.py", options)
-
-
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        (TaskOptions(), "workbench open push.py"),
-        (
-            TaskOptions(4, env_kwargs={"robot_uids": "fetch"}),
-            "workbench open push.py --num-envs 4 --env robot_uids=fetch",
-        ),
-        (TaskOptions(env_kwargs={"a": "1", "b": 1}), "workbench open push.py --env 'a=\"1\"' --env b=1"),
-        (
-            TaskOptions(env_kwargs={"a": "$(rm -rf ~); `x`"}),
-            "workbench open push.py --env 'a=$(rm -rf ~); `x`'",
-        ),
-    ],
-)
-def test_it_is_short_and_quoted_for_a_shell(options: TaskOptions, line: str) -> None:
-    assert command_line("push.py", options) == line
 
 
 def test_which_options_differ_is_told_by_their_names() -> None:

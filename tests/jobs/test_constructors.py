@@ -8,6 +8,7 @@ import pytest
 
 import workbench
 from workbench.authoring.problem import TaskError
+from workbench.core.broken_rule import RuleWarning
 from workbench.jobs.open_task import open_task
 from workbench.jobs.task import TaskOptions
 
@@ -89,7 +90,8 @@ def test_it_is_told_at_its_def(text: str, words: str, rules: str, tmp_path: Path
 def test_one_that_does_not_hand_num_envs_on_is_opened_with_one_env_and_says_so(tmp_path: Path) -> None:
     file = tmp_path / "task.py"
     file.write_text(HEADER + LOST)
-    opened = open_task(str(file), TaskOptions(3, "cpu", env_kwargs={"render_backend": "none"}))
+    with pytest.warns(RuleWarning, match="num_envs"):
+        opened = open_task(str(file), TaskOptions(3, "cpu", env_kwargs={"render_backend": "none"}))
     line = (HEADER + LOST)[: (HEADER + LOST).index("# the fault")].count("\n") + 1
     assert opened.env.num_envs == 1
     assert any(f"{file}:{line}" in notice for notice in opened.description.notices)

@@ -23,17 +23,3 @@ def test_why_one_could_not_be_written_is_not_lost_to_the_next(tmp_path: Path) ->
     lost, kept = (future.result() for future in futures)
     assert isinstance(lost, str) and "env 0" in lost and "gone" in lost
     assert isinstance(kept, EpisodeFiles) and kept.rrd.is_file()
-
-
-def test_those_that_wait_at_the_end_are_all_made(tmp_path: Path) -> None:
-    """On two threads then."""
-    episodes = [
-        GatheredEpisode(appended(tmp_path, made(3), pictures=False), env=env, seed=0) for env in range(8)
-    ]
-    changes: list[int] = []
-    finisher = EpisodeFinisher(lambda: changes.append(finisher.waiting))
-    futures = [finisher.finish(episode) for episode in episodes]
-    finisher.close()
-    files = [future.result() for future in futures]
-    assert len({made.rrd for made in files if isinstance(made, EpisodeFiles) and made.rrd.is_file()}) == 8
-    assert (finisher.waiting, finisher.finished.count, len(changes)) == (0, 8, 8)

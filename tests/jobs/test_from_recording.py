@@ -20,16 +20,9 @@ from workbench.jobs.from_recording import (
     options_of,
     recorded_source,
     reference_of,
-    why_not_enter,
 )
-from workbench.jobs.open_task import open_task
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record as record_episodes
-from workbench.jobs.rescore.run import rescore
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.episode.row import Source
-from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 
@@ -127,18 +120,6 @@ def test_code_that_raises_on_the_way_leaves_the_envs_where_they_were(live: Sessi
     assert np.nanmax(np.abs(moved - stood)[..., :3]) < 0.02
 
 
-def test_what_changed_since_it_was_recorded_is_told_on_arrival(live: Session, run: RecordedRun) -> None:
-    text = (TASKS / "push_cube.py").read_text()
-    then = text.replace("GOAL_RADIUS = 0.1", "GOAL_RADIUS = 0.2").replace(
-        "tanh(5 * distance)", "tanh(distance)"
-    )
-    assert then != text
-    number = live.enter_recording(run.until(3), source_file="push_cube.py", source={"push_cube.py": then})
-    view = wait_until(live, lambda v: v.timeline.entered == number, "the state")
-    told = "an episode, step 3 (changed since: GOAL_RADIUS, compute_dense_reward): its actions were replayed"
-    assert view.timeline.arrived.startswith(told)
-
-
 def test_a_renamed_actor_is_told_and_the_robot_is_where_it_was(live: Session, run: RecordedRun) -> None:
     view = live.view()
     file = Path(view.task.file or "")
@@ -232,32 +213,3 @@ def test_its_env_is_made_with_its_own_robot_and_modes() -> None:
         "control_mode": "pd_joint_delta_pos",
     }
     assert (options.num_envs, options.seed) == (2, 5)
-
-
-def test_another_task_than_the_open_one_is_named(live: Session) -> None:
-    task = live.view().task
-    assert task is not None
-    assert why_not_enter(task, info(None)) == ""
-    assert "PickCube-v1" in why_not_enter(task, info(None, "PickCube-v1"))
-
-
-TWO_MODES = "{'panda-0': 'pd_joint_pos', 'panda-1': 'pd_joint_delta_pos'}"
-
-
-def test_two_robots_are_made_again_with_the_mode_that_both_have(
-    renderer: None, child_process: None, tmp_path: Path
-) -> None:
-    options = TaskOptions(
-        num_envs=1, env_kwargs={"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
-    )
-    what = RecordOptions("TwoRobotPickCube-v1", tmp_path, 1, pictures=False, max_steps=2, options=options)
-    (written,) = record_episodes(what).written
-    info = read_episode(written.path).info
-    assert info.control_mode == info.env_kwargs["control_mode"] == "pd_ee_delta_pose"
-    again = open_task("TwoRobotPickCube-v1", options_of(info, 1, TaskOptions()))
-    (verdict,) = rescore(again, [Source(written.path)])
-    again.env.close()
-    assert not verdict.why_not and not verdict.differs
-    # As recordings of last week have it.
-    older = replace(info, control_mode=TWO_MODES, env_kwargs={})
-    assert "control_mode" not in options_of(older, 1).env_kwargs

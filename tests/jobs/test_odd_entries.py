@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ import pytest
 import workbench
 from tests.drive.session import live_session, wait_until
 from tests.recording.verify_rrd import verify_rrd
-from tests.session.odd_entries import TEXT, write_task
+from tests.session.odd_entries import write_task
 from tests.session.recorded_runs import opened
 from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.core.env.step_result import OtherEntry, StepResult
@@ -24,8 +22,6 @@ from workbench.jobs.replay import replay_to
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
-from workbench.session.review.view import curves
-from workbench.ui.review.curves import step_of
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -98,43 +94,6 @@ def test_it_is_recorded_and_read_back(recordings: Path) -> None:
         assert episode.broken_files == ()
 
 
-def test_an_rrd_alone_says_the_same(recordings: Path, tmp_path: Path) -> None:
-    first = sorted(recordings.glob("*.rrd"))[0]
-    episode = read_episode(Path(shutil.copy(first, tmp_path)))
-    check_recorded(episode, episode.info.env_index)
-
-
-def test_a_recording_from_before_has_no_such_entries(recordings: Path, tmp_path: Path) -> None:
-    path = sorted(recordings.glob("*.json"))[0]
-    for suffix in (".rrd", ".h5"):
-        shutil.copy(path.with_suffix(suffix), tmp_path)
-    said = json.loads(path.read_text()) | {"workbench_checksum": None}
-    del said["workbench"]["batch"], said["workbench"]["texts"]
-    (tmp_path / path.name).write_text(json.dumps(said))
-    episode = read_episode(tmp_path / path.name)
-    assert episode.batch == {} and episode.texts == {} and "away" in episode.evaluate
-
-
-@pytest.mark.parametrize("texts", [3, {"a": 5}, {"a": [[0, "short"]]}, {"a": [["x", None]]}])
-def test_texts_that_are_none_are_a_broken_recording(recordings: Path, tmp_path: Path, texts: Any) -> None:
-    path = sorted(recordings.glob("*.json"))[0]
-    said = json.loads(path.read_text()) | {"workbench_checksum": None}
-    said["workbench"]["texts"] = texts
-    (tmp_path / path.name).write_text(json.dumps(said))
-    for suffix in (".rrd", ".h5"):
-        shutil.copy(path.with_suffix(suffix), tmp_path)
-    with pytest.raises(ValueError, match="broken"):
-        read_episode(tmp_path / path.name)
-
-
-def test_a_review_shows_and_draws_it(recordings: Path) -> None:
-    episode = read_episode(sorted(recordings.glob("*.json"))[0])
-    assert text(step_of(episode, 2).others["phase"]) == "push"
-    drawn = curves(episode)
-    assert "progress (not per env)" in drawn and "away" in drawn
-    assert list(drawn["goal (not per env)"]) == ["goal (not per env)[0]", "goal (not per env)[1]"]
-
-
 def test_what_is_not_per_env_is_no_difference_when_it_is_rescored(recordings: Path, file: Path) -> None:
     verdicts, _ = rescore_all(RescoreOptions((recordings,), num_envs=2))
     assert len(verdicts) == N
@@ -173,18 +132,3 @@ def test_the_page_plays_and_records_it(session: Session, file: Path) -> None:
     read = [read_episode(path) for path in sorted((file.parent / "of_the_page").glob("*.json"))]
     assert all(text(episode.other_entries_at(2)["phase"]) == "push" for episode in read)
     assert "progress" in read[0].batch
-
-
-def test_a_save_that_returns_none_is_told_at_its_line_and_the_page_stays(
-    session: Session, file: Path
-) -> None:
-    file.write_text(TEXT.replace("        return entries\n", "        return None\n"))
-    view = wait_until(session, lambda view: view.problem is not None, "the failure")
-    line = TEXT[: TEXT.index("    def evaluate")].count("\n") + 1
-    assert "evaluate() returned None; it must return a dict" in view.problem.message
-    assert (view.problem.line, view.task is not None) == (line, True)
-    file.write_text(TEXT.replace('"success": away < 0.05', '"success": (away < 0.05).any()'))
-    view = wait_until(session, lambda view: "'success' as a bool" in str(view.problem), "the other failure")
-    assert view.problem.line == line
-    file.write_text(TEXT)
-    wait_until(session, lambda view: view.problem is None, "the mended file")

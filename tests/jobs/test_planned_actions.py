@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 
 from workbench.authoring.problem import TaskError
-from workbench.cli.main import main
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import Recorded, record
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
-from workbench.planning.rollouts import NotAlike
 from workbench.recording.reader.read_episode import read_episode
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
-TASKS = Path(__file__).parents[2] / "tasks"
+
 PLANNED = RecordOptions(
     "PushCube-v1",
     episodes=3,
@@ -97,17 +95,3 @@ def test_a_mistake_in_a_rollout_is_told_at_its_line(tmp_path: Path) -> None:
     with pytest.raises(TaskError, match="no reward") as raised:
         record(replace(PLANNED, task=str(wrong), out=tmp_path / "out"))
     assert (raised.value.problem.file, raised.value.problem.line) == (str(wrong), 9)
-
-
-def test_a_task_that_cannot_be_planned_is_refused_with_the_reason(tmp_path: Path) -> None:
-    with pytest.raises(NotAlike, match="object"):
-        record(
-            replace(PLANNED, task=str(TASKS / "different_objects.py"), out=tmp_path, options=TaskOptions(2))
-        )
-
-
-def test_options_of_a_plan_are_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["record", "PushCube-v1", "--actions", "solve", "--rollouts", "2"])
-    assert ended.value.code == 2
-    assert "--rollouts must be at least 4" in capsys.readouterr().err

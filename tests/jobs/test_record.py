@@ -22,12 +22,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.drive.page import open_workbench
 from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 from workbench.authoring.problem import TaskError
 from workbench.cli.jobs.record import record_in_terminal
-from workbench.cli.main import main
 from workbench.jobs.from_recording import options_of
 from workbench.jobs.pool.deal import Deal, Executor, Work
 from workbench.jobs.pool.processes import Processes
@@ -42,8 +40,7 @@ pytestmark = pytest.mark.usefixtures("child_process")
 TASKS = Path(__file__).parents[2] / "tasks"
 PUSHER = Path(__file__).parents[1] / "browser" / "pusher.py"
 PLAIN = {"render_backend": "none"}
-ONE_ENV = ("record", "PickCube-v1", "--workers", "1", "--num-envs", "1")
-"""Without a renderer, for whose shaders each process takes some seconds."""
+
 PUSHED = {"control_mode": "pd_ee_delta_pos", **PLAIN}
 
 
@@ -254,22 +251,6 @@ def test_successes_are_kept_and_nothing_else(tmp_path: Path) -> None:
     assert len(list((tmp_path / "out").iterdir())) == 12
 
 
-def test_successes_that_do_not_come_are_given_up(tmp_path: Path) -> None:
-    what = RecordOptions(
-        "PushCube-v1",
-        tmp_path,
-        successes=1,
-        tries=2,
-        actions="hold",
-        pictures=False,
-        max_steps=2,
-        options=TaskOptions(num_envs=2, env_kwargs=PLAIN),
-    )
-    done = record(what)
-    assert (done.written, done.tried) == ((), 2)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_actions_come_from_a_file_and_are_done_to_its_end(recorded: Recorded, tmp_path: Path) -> None:
     actions = [episode.action for episode in read_all(recorded)]
     np.savez(tmp_path / "actions.npz", *actions)
@@ -306,49 +287,6 @@ def test_demonstrations_are_replayed_from_their_own_seeds(
     assert begins == 0 and demonstration.name in source
 
 
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        (np.zeros((4, 3), np.float32), "3 dimensions"),
-        (np.zeros(4), "shape"),
-        (np.full((4, 8), np.nan), "NaN"),
-        (b"no array", "cannot be read"),
-        (None, "there is no file"),
-    ],
-)
-def test_a_file_of_actions_that_does_not_fit_is_refused_in_a_sentence(
-    content: Any, says: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "actions.npy"
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    elif content is not None:
-        np.save(path, content)
-    what = RecordOptions(
-        "PushCube-v1",
-        tmp_path / "out",
-        actions=str(path),
-        pictures=False,
-        options=TaskOptions(num_envs=1, env_kwargs=PLAIN),
-    )
-    with pytest.raises((ValueError, FileNotFoundError), match=says):
-        record(what)
-    assert not list((tmp_path / "out").glob("*"))
-
-
-@pytest.mark.parametrize(
-    ("asked", "says"),
-    [
-        ({"episodes": 2, "successes": 1}, "name one"),
-        ({"workers": 0}, "--workers"),
-        ({"use_env_states": True}, "--use-env-states needs"),
-    ],
-)
-def test_what_makes_no_sense_is_refused(asked: dict[str, Any], says: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=says):
-        record(RecordOptions("PushCube-v1", tmp_path, **asked))
-
-
 def test_pictures_of_every_camera_are_recorded(renderer: None, tmp_path: Path) -> None:
     what = RecordOptions(
         str(TASKS / "push_cube.py"), tmp_path, 1, max_steps=2, options=TaskOptions(num_envs=1)
@@ -359,26 +297,6 @@ def test_pictures_of_every_camera_are_recorded(renderer: None, tmp_path: Path) -
     assert len(cameras["base_camera"].frame) == 3
     depth = cameras["base_camera"].depth
     assert depth is not None and depth[0].shape == (128, 128)
-
-
-def test_an_episode_of_a_robot_alone_ends_by_itself(tmp_path: Path) -> None:
-    robot = f"{TASKS / 'own_robot.py'}:PenArm"
-    (episode,) = read_all(record(RecordOptions(robot, tmp_path, 1, options=TaskOptions(1, env_kwargs=PLAIN))))
-    assert 1 < len(episode.action) <= 1000
-
-
-def test_a_material_of_the_files_own_module_takes_no_pictures_from_its_recordings(tmp_path: Path) -> None:
-    text = (TASKS / "push_cube.py").read_text()
-    (tmp_path / "own.py").write_text(
-        f"{text}\n\nimport sapien.render\nBLUE = sapien.render.RenderMaterial()\n"
-    )
-    asked = ("record", "own.py", "--episodes", "1", "--max-steps", "1", "--num-envs", "1")
-    # In a process of its own: SAPIEN refuses the renderer only where the material is there first.
-    subprocess.run(
-        [sys.executable, "-m", "workbench.cli.main", *asked], cwd=tmp_path, check=True, timeout=120
-    )
-    (recorded,) = (tmp_path / "recordings").glob("*.rrd")
-    assert read_episode(recorded).cameras
 
 
 def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
@@ -412,22 +330,6 @@ def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.C
     assert "Look at them with: workbench review" in said.out
 
 
-def test_a_task_that_goes_to_another_folder_changes_nothing_about_where_files_go(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = (TASKS / "minimal.py").read_text()
-    (tmp_path / "goes.py").write_text(f"import os\n\nos.chdir('/')\n{text}")
-    (tmp_path / "act.py").write_text("def still(obs):\n    return obs.new_zeros(len(obs), 8)\n")
-    monkeypatch.chdir(tmp_path)
-    options = TaskOptions(num_envs=1, env_kwargs=PLAIN)
-    what = RecordOptions(
-        "goes.py", Path("out"), 1, actions="act.py:still", pictures=False, max_steps=2, options=options
-    )
-    (written,) = record(what).written
-    assert written.path.parent == Path("out") and (tmp_path / written.path).is_file()
-    assert Path.cwd() == tmp_path
-
-
 DRAWS = """
 import torch
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
@@ -455,12 +357,6 @@ def test_a_rule_that_the_task_breaks_is_told_once_by_however_many_processes(
     assert [(finding.rule, finding.line) for finding in found] == [("rows-rewritten", 9)]
     off = replace(what, options=replace(options, rules="off"))
     assert len(record(off, on_finding=found.append).written) == 4 and len(found) == 1
-
-
-def test_a_keyword_that_the_task_does_not_take_is_named(tmp_path: Path) -> None:
-    options = TaskOptions(num_envs=1, env_kwargs={"colour": "red"})
-    with pytest.raises(TaskError, match="'colour'"):
-        record(RecordOptions("PickCube-v1", tmp_path / "out", options=options))
 
 
 @pytest.mark.slow
@@ -520,80 +416,3 @@ def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
     assert [int(kept) for _, kept in told] == list(range(1, len(written) + 1)), "a line for each, in a pipe"
     assert not (tmp_path / ".writing").exists()
     assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["record", "nothing_here.py"], "nothing_here.py"),
-        (["open", "nothing_here.py", "--port", "0"], "nothing_here.py"),
-        (["view", "nothing_here.rrd"], "nothing_here.rrd"),
-        (["open", "PickCube-v1", "--host", "0.0.0.0", "--no-token"], "token"),
-        (["open", "PickCube-v1", "--env", "robot"], "name=value"),
-    ],
-)
-def test_arguments_are_refused_with_a_sentence(
-    arguments: list[str],
-    says: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == 2 and says in capsys.readouterr().err
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["record", "PickCub-v1"], "PickCube-v1"),
-        (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
-        (["record", "PickCube-v1", "--actions", "demo.h5"], "demo.h5"),
-        (["record", "PickCube-v1", "--actions", "gone.py:act"], "there is no file"),
-        (["record", "PickCube-v1", "--actions", "randomly"], "module:function"),
-        ([*ONE_ENV, "--actions", "gone:act"], "no module gone"),
-        ([*ONE_ENV, "--actions", "json:act"], "json has no function act"),
-        (["record", "PickCube-v1", "--out", sys.executable], "is not a folder"),
-    ],
-)
-def test_a_recording_that_cannot_be_made_ends_with_a_sentence(
-    arguments: list[str],
-    says: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    said = capsys.readouterr().err
-    assert ended.value.code not in (0, None) and says in said and "Traceback" not in said
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_a_page_that_cannot_be_opened_ends_with_a_sentence(tmp_path: Path) -> None:
-    """As a process: the door is open by then, and a worker is there."""
-    done = subprocess.run(
-        [sys.executable, "-m", "workbench.cli.main", "open", "PickCub-v1", "--port", "0"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=tmp_path,
-        stdin=subprocess.DEVNULL,
-    )
-    assert done.returncode != 0 and "PickCube-v1" in done.stderr
-    assert "PickCub-v1" in done.stdout and "http" not in done.stdout
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_a_page_of_an_id_says_where_it_is_once() -> None:
-    with open_workbench(
-        "PickCube-v1", "--num-envs", "1", "--no-spare", "--env", "render_backend=none"
-    ) as opened:
-        opened.wait_for_line("loaded PickCube-v1")
-        assert sum("page  " in line for line in opened.lines) == 1

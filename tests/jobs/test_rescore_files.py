@@ -19,25 +19,20 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.drive.episodes import made, write
 from tests.drive.session import rescored
-from tests.session.recorded_runs import opened
 from workbench.authoring.problem import TaskError
 from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.cli.main import main
 from workbench.cli.share import export_in_terminal
 from workbench.cli.terminal.arguments import JobArguments
-from workbench.core.capture.recorded_state import read_states, state_distance
 from workbench.jobs.actions import read_actions
-from workbench.jobs.from_recording import run_of
 from workbench.jobs.pool.deal import Deal, ThisProcess, Work
 from workbench.jobs.pool.travel import pack_baggage, relocated
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
-from workbench.jobs.replay import replay_to
 from workbench.jobs.rescore.job import Recording, RescoredBy, rescore_recordings, setup_of
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions
-from workbench.recording.reader.read_episode import read_episode, read_maniskill
 from workbench.recording.reader.reading import find_all_sources
 from workbench.session.clearance import Clearances
 from workbench.session.rescore import verdict_text
@@ -133,13 +128,6 @@ def test_an_edited_reward_differs_by_what_was_edited_and_the_recorded_text_does_
     assert set(Path("/tmp").glob("workbench-recorded-*")) <= before
 
 
-def test_another_file_can_be_judged_with(author: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other.py"
-    other.write_text(TEXT.replace(REWARD, f"{REWARD} * 0"))
-    verdicts, _ = rescore_all(RescoreOptions((author / "recordings",), task=str(other), use_env_states=True))
-    assert all(not verdict.new_reward.any() for verdict in verdicts) and len(verdicts) == EPISODES
-
-
 def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: Path) -> None:
     found = find_all_sources((foreign,))
     assert [source.part for source in found] == ["traj_0", "traj_1"]
@@ -151,40 +139,6 @@ def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: P
             assert verdict.why_not == "" and verdict.metres is not None and verdict.metres < 1e-4
             assert verdict.success == (None, None) and not verdict.drifted
             np.testing.assert_allclose(verdict.new_reward, verdict.old_reward, atol=1e-3)
-
-
-def test_one_steps_into_what_record_episode_wrote(foreign: Path) -> None:
-    run = run_of(read_maniskill(foreign, "traj_1"))
-    task = opened("PickCube-v1", 2, reward_mode="dense")
-    step, replay_result = replay_to(task, run, 8, [1])
-    assert (
-        replay_result.way == "re-simulated"
-        and replay_result.metres is not None
-        and replay_result.metres < 1e-5
-    )
-    assert step.elapsed_steps.tolist()[1] == 8 and replay_result.missed == {}
-    now = {name: rows[1] for name, rows in read_states(task.env.env).items()}
-    assert state_distance(now, run.state(8))[0] < 1e-5
-    task.env.close()
-
-
-def test_a_recording_of_ours_is_gone_into_to_the_last_bit(author: Path) -> None:
-    run = run_of(read_episode(sorted((author / "recordings").glob("*.json"))[2]))
-    task = opened(str(author / "push_cube.py"), 2)
-    for state in (0, 5, STEPS):
-        _, replay_result = replay_to(task, run, state, [0])
-        assert (replay_result.way, replay_result.metres, replay_result.missed) == ("re-simulated", 0, {})
-    task.env.close()
-
-
-def test_what_is_no_recording_is_said(author: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="nothing at"):
-        find_all_sources((tmp_path / "gone",))
-    with pytest.raises(UnreadableRecording, match="no recording in"):
-        find_all_sources((tmp_path,))
-    (tmp_path / "x.json").write_text("{}")
-    with pytest.raises(UnreadableRecording, match="no recording in"):
-        find_all_sources((tmp_path / "x.json",))
 
 
 def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, tmp_path: Path) -> None:
@@ -204,7 +158,7 @@ def test_a_broken_recording_is_a_row_and_the_others_are_judged(author: Path, tmp
     broken, cut, _ = sorted(tmp_path.glob("*.rrd"))
     for file in (broken, broken.with_suffix(".h5"), cut):
         file.write_bytes(file.read_bytes()[:1000])
-    verdicts, _ = rescore_all(RescoreOptions((tmp_path,)))
+    verdicts, _ = rescore_all(RescoreOptions((tmp_path,), task=str(author / "push_cube.py")))
     # Of the second what there is to judge by is whole.
     assert [bool(verdict.why_not) for verdict in verdicts] == [True, False, False]
     assert broken.stem in verdicts[0].why_not
@@ -367,14 +321,6 @@ def test_a_broken_task_is_told_with_its_line(author: Path, capsys: pytest.Captur
         rescore_all(RescoreOptions((author / "recordings",)))
 
 
-def test_a_broken_task_among_others_is_told_at_its_episodes(author: Path, foreign: Path) -> None:
-    edit(author, REWARD, "return self.nonsense(obs)")
-    verdicts, _ = rescore_all(RescoreOptions((author / "recordings", foreign)))
-    broken = [verdict for verdict in verdicts if "nonsense" in verdict.why_not]
-    rescored = [verdict for verdict in verdicts if not verdict.why_not]
-    assert (len(broken), len(rescored)) == (EPISODES, 2)
-
-
 @pytest.mark.slow
 def test_parts_that_are_merged_print_what_the_whole_would(
     author: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -398,16 +344,6 @@ def test_parts_that_are_merged_print_what_the_whole_would(
     edit(author, REWARD, f"{REWARD} + 0.5")
     code, _, err = run([*few, "--shard", "1/2"], capsys)
     assert code == 2 and "is of another job: code is" in err
-
-
-def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recordings = str(author / "recordings")
-    assert run([recordings, "--task", "x.py", "--recorded-source"], capsys)[0] == 2
-    (author / "file").touch()
-    code, _, err = run([recordings, "--csv-file", str(author / "file" / "where.csv")], capsys)
-    assert code == 2 and "cannot be made" in err
-    code, _, err = run([str(author / "nothing")], capsys)
-    assert code == 2 and "There is nothing at" in err
 
 
 # --- for a page ----------------------------------------------------------------------------------------
@@ -443,20 +379,3 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
         rescored(rescorer, "stopped")
     finally:
         rescorer.rescoring.close()
-
-
-def test_a_recording_with_a_changed_file_is_judged_by_what_is_left_or_says_why(
-    author: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(author / "recordings", tmp_path / "r")
-    one, other, whole = sorted((tmp_path / "r").glob("*.json"))
-    for path in (one.with_suffix(".h5"), other.with_suffix(".h5"), other.with_suffix(".rrd")):
-        content = bytearray(path.read_bytes())
-        content[len(content) // 2] ^= 1
-        path.write_bytes(content)
-    verdicts, _ = rescore_all(RescoreOptions((tmp_path / "r",), task=str(author / "push_cube.py")))
-    by_name = {verdict.of.path.stem: verdict for verdict in verdicts}
-    assert not by_name[one.stem].why_not and not by_name[one.stem].differs
-    assert f"{one.stem}.h5: was cut short or changed" in verdict_text.not_carried(verdicts)[0]
-    assert f"{other.stem}.h5 was cut short or changed" in by_name[other.stem].why_not
-    assert not by_name[whole.stem].why_not and by_name[whole.stem].missed == {}

@@ -195,22 +195,6 @@ def test_rules_that_are_to_stop_stop_at_the_line(body: str, tmp_path: Path) -> N
     assert "# the fault" in (problem.code or "") and "--rules warn" in problem.message
 
 
-@pytest.mark.parametrize("body", [NEIGHBOURS_BEHIND, STEPPED, SHRUNK])
-def test_rules_that_are_to_warn_let_the_task_open(body: str, tmp_path: Path) -> None:
-    for task in opened(write(body, tmp_path), rules="warn"):
-        assert task.env.broken_rules is not None
-        rows = task.env.broken_rules.rows
-        assert rows and all("# the fault" in row.code for row in rows)
-
-
-@pytest.mark.parametrize("body", [NEIGHBOURS_BEHIND, REWRITTEN])
-def test_without_rules_nothing_is_told(body: str, tmp_path: Path) -> None:
-    told: list[Finding] = []
-    for task in opened(write(body, tmp_path), rules="off", found=told):
-        assert task.env.broken_rules is None
-    assert told == []
-
-
 def test_an_installed_task_is_told_of_and_never_stopped_unless_that_is_asked_for() -> None:
     @register_env("InstalledTaskOfATest-v1", override=True)
     class Lost(PickCubeEnv):
@@ -308,12 +292,6 @@ def test_a_version_that_is_not_taken_changes_no_row(desk: Desk) -> None:
     with pytest.raises(TaskError):
         desk.save(LOST + REWRITTEN + "\n    def evaluate(self):\n        return nothing_of_this_name\n")
     assert desk.rows() == before
-
-
-def test_a_scene_that_is_built_anew_has_its_own_rows(desk: Desk) -> None:
-    built = "\n    def _load_scene(self, options):\n        super()._load_scene(options)\n        self.extra = 1\n"
-    assert desk.save(built + REWRITTEN) == "rebuilt"
-    assert rule_ids(desk) == ["rows-rewritten"]
 
 
 # --- the page ------------------------------------------------------------------------------------------

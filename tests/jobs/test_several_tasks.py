@@ -68,13 +68,6 @@ def test_where_a_certain_task_is_wanted_the_others_are_named_and_none_is_opened(
         open_task(str(file), OPTIONS)
 
 
-def test_a_base_class_is_not_opened_in_place_of_its_tasks(file: Path) -> None:
-    file.write_text(tasks("OneEnv", "TwoEnv", broken=("OneEnv", "TwoEnv")))
-    with pytest.raises(TaskError) as caught:
-        load_version(Load(str(file), OPTIONS, any_task=True), None)
-    assert caught.value.classes[0] == "TwoEnv"
-
-
 @pytest.mark.slow
 def test_the_chooser_stays_while_the_one_that_was_tried_fails(
     child_process: None, file: Path, tmp_path: Path

@@ -10,7 +10,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from workbench.authoring.problem import TaskError
 from workbench.cli.jobs.sweep import parse_settings
 from workbench.jobs.pool.deal import Executor
 from workbench.jobs.pool.processes import Processes
@@ -19,7 +18,6 @@ from workbench.jobs.record.sweep import (
     Setting,
     SweepOptions,
     SweepReport,
-    collect_sweep,
     recordings_of,
     sweep,
 )
@@ -51,7 +49,13 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def swept(out: Path) -> SweepReport:
-    return sweep(options(out, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix"))
+    seen: list[RecordProgress] = []
+    report = sweep(options(out, "MOST=5,1", "control_mode=pd_ee_delta_pos,nix"), on_progress=seen.append)
+    over = [progress.over for progress in seen if progress.over is not None]
+    assert sorted(written.seed for _, written in over if written is not None) == [5, 5, 6, 6, 7, 7], (
+        "told as they come"
+    )
+    return report
 
 
 def test_each_seed_is_recorded_once_for_each_point(swept: SweepReport, out: Path) -> None:
@@ -88,11 +92,6 @@ def test_a_point_that_cannot_be_built_is_told_in_its_rows_and_the_others_go_on(s
     assert (last.episodes, last.failed, last.rate) == (0, 3, None)
 
 
-def test_points_that_all_fail_end_the_sweep(tmp_path: Path) -> None:
-    with pytest.raises(TaskError, match="nix"):
-        sweep(options(tmp_path, "control_mode=nix,nox", seeds=1))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("executor", [Processes(2), Processes(4)])
 def test_the_numbers_are_the_same_on_any_number_of_workers(
@@ -127,11 +126,6 @@ def test_a_killed_worker_changes_no_number(swept: SweepReport, tmp_path: Path) -
     assert killer.done and numbers(again) == numbers(swept)
     kept = [row.recording for row in again.results.episodes if row.recording]
     assert sorted(kept) == sorted(str(file.relative_to(tmp_path)) for file in tmp_path.glob("*/*.rrd"))
-
-
-def test_a_sweep_without_a_part_says_so(tmp_path: Path) -> None:
-    what = options(tmp_path, "MOST=5,1")
-    assert collect_sweep(what, {}).missing == 6
 
 
 # --- what varies ---------------------------------------------------------------------------------------
@@ -212,33 +206,19 @@ def test_an_argument_of_the_constructor_is_given_to_it(several: Path) -> None:
     [
         ("SCALE=4", "SCALE of several.py may be Base.SCALE or several.SCALE: name one of them so"),
         ("weight=4", "weight of several.py may be Swept.__init__.weight or several.weight: name one"),
-        ("GAIN=4", "may be Other.GAIN or Swept.GAIN"),
         ("talll=true", "did you mean tall?"),
-        ("gian=1", "no constructor argument gian; did you mean GAIN?"),
-        ("NAM=1", "no constructor argument NAM; did you mean NAME?"),
-        ("several.NAM=1", "no constructor argument several.NAM; did you mean several.NAME"),
         ("parts.HERE=1", "only constants of this file can be set, not those of modules that it imports"),
-        ("num_envs=2", "no constructor argument num_envs"),
         ("ANGLE=1", "ANGLE (line 9 of several.py) is computed, `math.pi / 2`"),
         ("TWICE=3", "several.TWICE is set in several lines of several.py: 11, 13"),
         ("REACH=1", "several.REACH (line 5 of several.py) is imported"),
         ("LIMITS=3", "several.LIMITS is a list (line 8); got 3"),
-        ("NAME=3", "several.NAME is a text (line 10); got 3"),
         ("several.SCALE=true", "several.SCALE is a number (line 7); got True"),
-        ("math=1", "is imported"),
     ],
 )
 def test_a_name_that_cannot_be_set_is_refused_with_what_to_do(several: Path, given: str, why: str) -> None:
     with pytest.raises(ValueError, match=".") as refused:
         changed(several, given)
     assert why in str(refused.value)
-
-
-def test_an_id_takes_its_constructors_arguments_alone(tmp_path: Path) -> None:
-    what = replace(options(tmp_path, "robot_uids=panda,fetch"), task="PickCube-v1")
-    assert [one.options.env_kwargs["robot_uids"] for one in recordings_of(what)] == ["panda", "fetch"]
-    with pytest.raises(ValueError, match="workbench new NAME --from PickCube-v1"):
-        recordings_of(replace(options(tmp_path, "robot_uid=panda"), task="PickCube-v1"))
 
 
 @pytest.mark.parametrize(
@@ -256,14 +236,6 @@ def test_an_id_takes_its_constructors_arguments_alone(tmp_path: Path) -> None:
 def test_values_are_json_or_text(text: str, values: tuple[object, ...]) -> None:
     (setting,) = parse_settings([text])
     assert setting.values == values
-
-
-@pytest.mark.parametrize(
-    "given", [[], ["a"], ["a="], ["a=1,"], ["1a=2"], ["a=1,1.0"], ["a=1", "a=2"], ["a=x,x"], ["=1"]]
-)
-def test_settings_that_make_no_sense_are_refused(given: list[str]) -> None:
-    with pytest.raises(ValueError, match="--set"):
-        parse_settings(given)
 
 
 def test_how_the_episodes_are_cut_does_not_hang_on_the_workers(tmp_path: Path) -> None:

@@ -47,14 +47,6 @@ def test_a_reward_is_another_from_a_share_of_the_largest_on(share: float, differ
     assert found.first_difference == (3 if differs else None) and found.differing == ("reward",) * differs
 
 
-@pytest.mark.parametrize(("change", "differs"), [(0.9e-7, False), (1.1e-7, True)])
-def test_where_all_is_zero_a_number_is_another_from_a_hair_on(change: float, differs: bool) -> None:
-    zero = np.zeros(4)
-    assert compare(0, said(zero), said(zero + change)).differs == differs
-    found = compare(0, said(height=np.zeros(5)), said(height=np.full(5, change)))
-    assert found.differing == ("height",) * differs and not found.differs
-
-
 def test_the_reward_differs_first_and_most_at_steps_of_the_episode() -> None:
     found = compare(0, said(), said([0.0, 1.5, 4.0, 3.5]), begin=10)
     assert (found.first_difference, found.look_at, found.largest) == (12, 13, 2)
@@ -92,33 +84,6 @@ def test_other_entries_that_both_have_are_named_and_are_no_difference() -> None:
     assert verdict_text.change_text(found) == "unchanged, except height"
 
 
-def test_what_is_known_of_the_run_is_in_its_verdict() -> None:
-    found = compare(
-        0,
-        said(),
-        said(success=[0] * 5),
-        task="Push-v1",
-        seed=7,
-        start_differs=True,
-        missed={"cube": "gone"},
-    )
-    assert (found.task, found.seed, found.start_differs, found.missed) == (
-        "Push-v1",
-        7,
-        True,
-        {"cube": "gone"},
-    )
-    assert found.has_success and compare(0, said(success=[0] * 5), said()).has_success
-    assert verdict_text.not_carried([found, found]) == ("cube: gone",)
-
-
-def test_one_that_was_not_judged_says_nothing_else() -> None:
-    found = Verdict("it", why_not="it has no step")
-    assert (found.seed, found.length, found.returns, found.largest, found.differing) == (-1, 0, (0, 0), 0, ())
-    assert len(found.old_reward) == len(found.new_reward) == 0 and found.metres is None
-    assert verdict_text.change_text(found) == "not rescored: it has no step"
-
-
 def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_file_says_nothing_of() -> None:
     nan = np.nan
     old = said(a=[nan, 1, 1, 1, 1], b=[1, 1, 1, nan, 1], c=[1, 1, 1, 1, 1], success=[nan, 0, 0, 0, 0])
@@ -133,25 +98,6 @@ def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_f
         lost.look_at == lost.first_difference == 2
         and verdict_text.change_text(lost) == "reward NaN now, from step 2"
     )
-
-
-def test_without_recorded_rewards_there_is_nothing_to_compare_them_with() -> None:
-    found = compare(0, said([], success=[0] * 5), said(success=[0, 0, 0, 0, 1]))
-    assert found.differing == ("success",) and found.largest == 0
-    assert np.isnan(found.old_reward).all() and len(found.old_reward) == 4
-    assert verdict_text.returns_text(found) == "no reward → 6"
-
-
-def test_it_is_compared_as_far_as_it_is_said_now() -> None:
-    old = said(success=[0, 0, 0, 0, 1], height=[0, 0, 0, 0, 7.0], short=[0.0, 0])
-    found = compare(0, old, said([0.0, 1.0], success=[0, 0, 0], height=[0.0, 0, 0], short=[0.0, 9, 9]))
-    assert found.length == 2 and not found.differing and found.returns == (1, 1)
-
-
-def test_each_entry_has_a_scale_of_its_own() -> None:
-    old = said(large=[1e6] * 5, small=[1.0] * 5, lost=[np.inf] * 5)
-    now = said(large=[1e6 + 1] * 5, small=[1.0, 1.0, 1.5, 1.0, 1.0], lost=[np.inf] * 4 + [-np.inf])
-    assert compare(0, old, now).differing == ("small", "lost")
 
 
 def test_drift_is_that_of_the_state_that_is_furthest() -> None:

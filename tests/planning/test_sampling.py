@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from hypothesis import given
@@ -58,14 +56,6 @@ def test_knots_of_one_value_are_a_plan_of_that_value_before_and_after_a_shift(
     sampler.candidates(torch.full((3,), value))
     sampler.shift(shift)
     torch.testing.assert_close(sampler.sequences(sampler.plan[None]), torch.full((1, steps, 3), value))
-
-
-@given(knots=st.integers(2, 9), steps=st.integers(2, 40), seed=st.integers(0, 100))
-def test_a_shift_by_no_step_changes_nothing(knots: int, steps: int, seed: int) -> None:
-    sampler = sampler_of(PlanOptions(rollouts=8, knots=knots), steps, seed)
-    before = improved(sampler, 1, torch.tensor([0.3, -0.8, 1.0])).clone()
-    sampler.shift(0)
-    assert torch.equal(sampler.plan, before)
 
 
 def test_a_shift_brings_forward_what_was_planned_for_later() -> None:
@@ -177,10 +167,3 @@ def test_the_seed_alone_decides_what_is_drawn() -> None:
 def test_options_out_of_range_are_refused_by_name(wrong: dict, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         PlanOptions(**wrong)
-
-
-def test_the_usual_horizon_is_half_a_second_within_bounds() -> None:
-    assert [USUAL.steps(dt) for dt in (0.05, 0.02, 0.01, 0.5)] == [10, 20, 20, 8]
-    assert [USUAL.steps(dt, has_success=False) for dt in (0.1, 0.05, 0.02)] == [10, 20, 20], "a whole second"
-    assert replace(USUAL, horizon=1.0).steps(0.05) == 20
-    assert replace(USUAL, horizon=0.1, every=4).steps(0.05) == 4

@@ -18,14 +18,11 @@ from numpy.typing import NDArray
 from workbench.recording.episode.encoded_pictures import EncodedPictures, encode_jpeg
 from workbench.recording.episode.episode import Episode
 from workbench.recording.films import (
-    Encoding,
     FilmEye,
     camera_of,
-    cameras_by_name,
     chosen_states,
     contact_sheet,
     default_eye,
-    enlarged,
     frames,
     write_mp4,
 )
@@ -60,30 +57,6 @@ def test_a_film_holds_every_frame_in_order_at_its_rate(tmp_path: Path) -> None:
         assert abs(float(frame.mean()) - 20 * index) < 3
 
 
-@pytest.mark.parametrize("exact, size", [(False, (64, 34)), (True, (63, 33))])
-def test_an_odd_size_is_padded_for_people_and_kept_for_data(
-    tmp_path: Path, exact: bool, size: tuple[int, int]
-) -> None:
-    write_mp4(tmp_path / "odd.mp4", shades(3, 33, 63), 10, Encoding(exact_size=exact))
-    assert film(tmp_path / "odd.mp4")[0]["size"] == size
-
-
-def test_a_film_is_never_written_over_another_file_and_nothing_half_written_stays(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    path.write_bytes(b"mine")
-    with pytest.raises(FileExistsError, match="not written over"):
-        write_mp4(path, shades(2), 10)
-    assert path.read_bytes() == b"mine"
-    with pytest.raises(ValueError, match="no picture"):
-        write_mp4(tmp_path / "none.mp4", [], 10)
-    with pytest.raises(ValueError, match="shape"):
-        write_mp4(tmp_path / "mixed.mp4", [*shades(2), *shades(1, 10, 10)], 10)
-    with pytest.raises(OSError, match="folder is none"):
-        (tmp_path / "folder is none").write_text("")
-        write_mp4(tmp_path / "folder is none" / "a.mp4", shades(2), 10)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.mp4", "folder is none"]
-
-
 def test_a_full_disk_ends_a_film_with_a_sentence_and_leaves_nothing(tmp_path: Path) -> None:
     # In a process of its own: the limit on the size of files cannot be taken back by everybody.
     noise = (
@@ -109,28 +82,6 @@ def test_a_state_without_a_picture_shows_the_one_before(episode: Episode) -> Non
     every_third = replace(camera, frame=np.array([0, 3, 6]), pose=camera.pose[:3], rgb=_pictures(shades(3)))
     seen = [round(float(picture.mean()) / 20) for picture in frames(episode, every_third)]
     assert seen == [0, 0, 0, 1, 1, 1, 2, 2, 2]
-
-
-def test_a_camera_that_is_not_there_is_said_with_those_that_are(episode: Episode) -> None:
-    with pytest.raises(ValueError, match="no camera 'nobody': it has base_camera, hand_camera"):
-        camera_of(episode, "nobody")
-    with pytest.raises(ValueError, match="without pictures"):
-        camera_of(replace(episode, cameras=[]), "base_camera")
-
-
-def test_two_cameras_of_one_name_are_told_apart(episode: Episode) -> None:
-    sensor = camera_of(episode, "base_camera")
-    human = replace(sensor, info=replace(sensor.info, kind="human"))
-    named = cameras_by_name(replace(episode, cameras=[human, sensor]))
-    assert named["base_camera"] is sensor and named["base_camera_human"] is human
-
-
-def test_small_pictures_are_enlarged_by_whole_pixels() -> None:
-    picture = np.arange(96 * 128 * 3, dtype=np.uint32).astype(np.uint8).reshape(96, 128, 3)
-    large = enlarged(picture)
-    assert large.shape == (288, 384, 3)
-    assert np.array_equal(large[::3, ::3], picture) and np.array_equal(large[2::3, 2::3], picture)
-    assert enlarged(large) is large
 
 
 def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Episode) -> None:

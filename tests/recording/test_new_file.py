@@ -52,20 +52,6 @@ def test_whatever_call_fails_it_is_whole_or_not_there(
         assert then or call.startswith("unlink") or set(left) <= {path}, call
 
 
-def test_what_was_written_is_on_the_disk_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fsync, lasting = os.fsync, []
-
-    def sync(descriptor: int) -> None:
-        lasting.append((Path(f"/proc/self/fd/{descriptor}").read_bytes(), (tmp_path / "a.png").exists()))
-        fsync(descriptor)
-
-    monkeypatch.setattr(os, "fsync", sync)
-    write(tmp_path / "a.png")
-    assert lasting == [(b"whole", False)]
-
-
 @pytest.mark.parametrize("links", [True, False])
 def test_a_file_that_came_meanwhile_is_not_written_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
@@ -81,22 +67,3 @@ def test_a_file_that_came_meanwhile_is_not_written_over(
     with pytest.raises(FileExistsError, match="is not written over"):
         write(path)
     assert there(tmp_path) == {"a.mp4": b"of another"}
-
-
-def test_what_raises_meanwhile_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(KeyError):
-        with new_file(tmp_path / "a.mp4") as temporary:
-            temporary.write_bytes(b"half")
-            raise KeyError
-    assert there(tmp_path) == {}
-
-
-def test_a_file_in_place_of_the_folder_is_said(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"mine")
-    for path in (tmp_path / "file" / "a.mp4", tmp_path / "file" / "b" / "a.mp4"):
-        with pytest.raises(OSError) as told:
-            write(path)
-        assert told.value.strerror == f"Cannot write {path}: Not a directory."
-        with pytest.raises(OSError, match="Not a directory"), new_file(path):
-            pytest.fail("it is said before anything is made")
-    assert there(tmp_path) == {"file": b"mine"}

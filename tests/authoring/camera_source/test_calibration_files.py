@@ -9,14 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from workbench.authoring.camera_source.calibration_files import (
     CameraToExport,
-    camera_as_ros_yaml,
     camera_pose,
     cameras_as_json,
     cameras_as_opencv_yaml,
@@ -79,31 +77,6 @@ def test_opencv_reads_its_yaml(tmp_path: Path) -> None:
     )
 
 
-def test_ros_camera_info_is_of_the_form_that_its_parsers_read() -> None:
-    text = camera_as_ros_yaml(RIDING)
-    info = yaml.safe_load(text)
-    assert (info["image_width"], info["image_height"], info["camera_name"]) == (320, 240, "base: camera 1")
-    sizes = {
-        "camera_matrix": (3, 3),
-        "distortion_coefficients": (1, 5),
-        "rectification_matrix": (3, 3),
-        "projection_matrix": (3, 4),
-    }
-    for name, (rows, columns) in sizes.items():
-        assert (info[name]["rows"], info[name]["cols"], len(info[name]["data"])) == (
-            rows,
-            columns,
-            rows * columns,
-        )
-        assert all(isinstance(number, float) for number in info[name]["data"])
-    assert_allclose(np.reshape(info["camera_matrix"]["data"], (3, 3)), frames.intrinsic_of(RIDING.settings))
-    assert info["distortion_model"] == "plumb_bob"
-    words = text.splitlines()[0].split("--")[1:]
-    told = {word.split()[0]: float(word.split()[1]) for word in words}
-    r = frames.rotation_matrix([told["qw"], told["qx"], told["qy"], told["qz"]])
-    assert_allclose(r, frames.matrix_of(RIDING.pose_in_env, "opencv", "camera_to_world")[:3, :3], atol=1e-9)
-
-
 @pytest.mark.parametrize("suffix", ["yaml", "json"])
 def test_what_opencv_wrote_is_read(tmp_path: Path, suffix: str) -> None:
     extrinsic = frames.matrix_of(POSE, "opencv", "world_to_camera")
@@ -160,15 +133,11 @@ def test_many_ways_to_write_one_pose_are_read(text: str) -> None:
     ("text", "says"),
     [
         ("", "nothing to read"),
-        ("1 2 3", "here are 3"),
         ('{"a": ', "begins like JSON"),
-        ("hello", "no matrix of bare numbers"),
         ("!!python/object/apply:os.system ['true']", "no YAML"),
         ('{"camera_matrix": [[1,0,0],[0,1,0],[0,0,1]]}', "no pose is in it"),
-        ("projection_matrix:\n  rows: 3\n  cols: 4\n  data: [1,0,0,0,0,1,0,0,0,0,1,0]", "no pose is in it"),
         ("a: " + "[" * 5000, "no YAML"),
         ("a: &a [*a]", "alias"),
-        ('{"a": ' + "[" * 900 + "]" * 900 + "}", "no pose|nested too deeply|none"),
         ("9" * 300_000, "characters"),
     ],
 )
@@ -183,11 +152,6 @@ def test_a_matrix_that_is_no_rotation_is_refused_in_words() -> None:
         camera_pose(mirrored, "opencv", "world_to_camera")
     with pytest.raises(ValueError, match="positive number of metres"):
         camera_pose(mirrored, "opencv", "world_to_camera", metres_per_unit=0)
-
-
-def test_a_mounted_camera_says_where_it_is_only_when_its_mount_does() -> None:
-    with pytest.raises(ValueError, match="mounted on panda/panda_hand"):
-        cameras_as_json([CameraToExport(("sensor", "hand"), PLAIN, mount="panda/panda_hand")])
 
 
 @given(st.text(max_size=300) | st.text('0123456789.,:-[]{}!%&*\n eE"RtvecTrows', max_size=300))

@@ -13,7 +13,7 @@ from transforms3d.euler import euler2quat
 from transforms3d.quaternions import quat2mat
 
 from workbench.authoring.camera_source.write_pose import look_at, to_euler
-from workbench.authoring.source.changes import quaternion_texts, same_side
+from workbench.authoring.source.changes import quaternion_texts
 from workbench.core.cameras.conventions import angle_between
 
 turns = st.floats(-2 * math.pi, 2 * math.pi)
@@ -72,17 +72,6 @@ def test_look_at_is_maniskills(
     wanted = sapien_utils.look_at(eye, target, up).raw_pose[0, 3:].tolist()
     found = look_at(eye, target, up)
     assert found is not None and angle_between(found, wanted) < 1e-4
-
-
-def test_of_two_quaternions_the_one_on_the_side_of_the_old_one_is_taken() -> None:
-    assert same_side((0.6, 0, 0, 0.8), (-1, 0, 0, 0)) == pytest.approx([-0.6, 0, 0, -0.8])
-    assert same_side((-0.6, 0, 0, -0.8), (1, 0, 0, 0)) == pytest.approx([0.6, 0, 0, 0.8])
-    assert same_side((0, 0, 0, 1), (1, 0, 0, 0)) == [0, 0, 0, 1], "neither of them resembles it"
-
-
-def test_along_up_there_is_no_look_at() -> None:
-    for target in ((1.0, 2.0, 9.0), (1.0, 2.0, -9.0), (1.0, 2.0, 3.0)):
-        assert look_at((1.0, 2.0, 3.0), target) is None
 
 
 def test_a_quaternion_without_direction_is_refused() -> None:

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workbench.authoring.loading import find_tasks
 from workbench.authoring.loading.find_tasks import find_task_files, is_below, read_task_file
 
 REGISTERED = (
@@ -58,23 +57,6 @@ def test_hidden_folders_environments_packages_and_links_are_left_out(tmp_path: P
     assert is_below(mine, work) and not is_below(work / "link.py", work)
 
 
-def test_a_search_is_bounded_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for number in range(6):
-        task(tmp_path / f"t{number}.py")
-    task(tmp_path / "/".join("abcdefgh") / "deep.py")
-    task(tmp_path / "a/large.py", "class T(BaseEnv): pass\n" + "#" * find_tasks.LARGEST)
-    assert len(names(tmp_path)) == 6 and find_task_files(tmp_path).left_out == ""
-    monkeypatch.setattr(find_tasks, "MOST_FOUND", 4)
-    cut = find_task_files(tmp_path)
-    assert len(cut.files) == 4 and "first 4 task files" in cut.left_out
-    monkeypatch.setattr(find_tasks, "MOST_LOOKED_AT", 2)
-    assert "first 2 Python files" in find_task_files(tmp_path).left_out
-    stopped = find_task_files(tmp_path, lambda: True)
-    assert stopped.files == () and "ended" in stopped.left_out
-    monkeypatch.setattr(find_tasks, "LONGEST", -1.0)
-    assert find_task_files(tmp_path).left_out
-
-
 def test_a_file_that_does_not_parse_is_listed_if_it_is_a_task_that_somebody_is_writing(
     tmp_path: Path,
 ) -> None:
@@ -96,11 +78,3 @@ def test_no_text_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, raw
     assert found is None or found.path == file
     file.write_bytes(b"class Task(BaseEnv): pass\nx = '''" + raw)
     read_task_file(file)
-
-
-@settings(max_examples=60)
-@given(st.integers(1, 4000))
-def test_no_depth_of_nesting_breaks_the_search(tmp_path_factory: pytest.TempPathFactory, depth: int) -> None:
-    file = tmp_path_factory.getbasetemp() / "deep.py"
-    file.write_text(f"class Task(BaseEnv): pass\nx = {'(' * depth}1{')' * depth}\ny = {'-' * depth}1\n")
-    assert read_task_file(file) is not None

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import importlib
 import sys
-from pathlib import Path
 
 import pytest
 
 from tests.authoring.conftest import Write
-from workbench.authoring.loading.library_names import LibraryFinder, is_library, searched_first
 from workbench.authoring.loading.load import load_task
 from workbench.authoring.problem import TaskError
 from workbench.jobs.policy import load_policy
@@ -52,17 +50,6 @@ def test_a_librarys_name_is_the_librarys_wherever_it_is_imported_late(
     assert task.source_files == (path, helper)
 
 
-def test_the_author_is_told_of_such_files_and_of_no_others(write: Write) -> None:
-    plant(write, "numpy", "random", "winreg_of_mine", "example")
-    write("torch/__init__.py", "")
-    write("scipy/notes.txt", "")
-    path = write("sapien.py", TASK, task=True)
-    task = load_task(str(path))
-    assert [file.name for file in task.named_like_libraries] == ["numpy.py", "random.py", "torch"]
-    assert f"{path.parent / 'numpy.py'} has the name of a library" in task.notices[0]
-    assert "import numpy" in task.notices[0] and "Rename" in task.notices[0]
-
-
 @pytest.mark.parametrize("name", ["sapien", "torch", "numpy", "random", "sympy", "mani_skill", "workbench"])
 def test_a_task_may_itself_be_called_like_a_library(write: Write, name: str) -> None:
     library = sys.modules.get(name)
@@ -73,32 +60,6 @@ def test_a_task_may_itself_be_called_like_a_library(write: Write, name: str) -> 
     assert seen is not sys.modules[task.cls.__module__] and (library is None or seen is library)
     path.write_text(path.read_text() + "\nNEXT = 1\n")
     assert sys.modules[load_task(str(path)).cls.__module__].NEXT == 1
-
-
-def test_what_a_task_wanted_from_such_a_file_is_said(write: Write) -> None:
-    write("statistics.py", "def spread(values): return 0\n")
-    path = write("push.py", "from statistics import spread\n" + TASK, task=True)
-    with pytest.raises(
-        TaskError, match=r"cannot import name 'spread'.*statistics\.py has the name of a library"
-    ):
-        load_task(str(path))
-    path.write_text("import random.helpers\n")
-    write("random/__init__.py", "")
-    write("random/helpers.py", "")
-    with pytest.raises(TaskError, match=r"random has the name of a library"):
-        load_task(str(path))
-
-
-def test_names_that_no_library_needs_are_the_authors(write: Write) -> None:
-    for name in ("example", "utils", "mine"):
-        write(f"{name}.py", "OWN = True\n")
-        assert not is_library(name)
-    path = write("push.py", "import example, utils, mine\n" + TASK, task=True)
-    assert [file.name for file in load_task(str(path)).source_files][1:] == [
-        "example.py",
-        "utils.py",
-        "mine.py",
-    ]
 
 
 def test_a_first_load_that_fails_leaves_no_folder_and_no_finder_behind(write: Write) -> None:
@@ -119,17 +80,6 @@ def test_a_first_load_that_fails_leaves_no_folder_and_no_finder_behind(write: Wr
     assert (sys.path, sys.meta_path) == before
 
 
-def test_the_file_itself_is_found_again_after_a_rename(write: Write, late: tuple[str, ...]) -> None:
-    wrong = write(f"{late[0]}.py", "SIZE = 2\n")
-    path = write("push.py", "from palette import SIZE\n" + TASK, task=True)
-    with pytest.raises(TaskError, match="palette"):
-        load_task(str(path))
-    wrong.rename(wrong.with_name("palette.py"))
-    task = load_task(str(path))
-    assert task.named_like_libraries == ()
-    assert [file.name for file in task.source_files] == ["push.py", "palette.py"]
-
-
 def test_a_policy_imports_what_lies_beside_it_but_no_library(
     write: Write, late: tuple[str, ...], capsys: pytest.CaptureFixture
 ) -> None:
@@ -145,39 +95,3 @@ def test_a_policy_imports_what_lies_beside_it_but_no_library(
     load_policy(f"{policy}:act")
     assert "colorsys" not in capsys.readouterr().err, "told once"
     del sys.modules["gains"]
-
-
-def test_a_policy_by_its_modules_name_is_found_where_the_command_was_started(
-    write: Write, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write("a_policy_here.py", "def act(obs): return 1\n")
-    write("random.py", "def act(obs): return 1\n")
-    monkeypatch.chdir(folder)
-    before = list(sys.path), list(sys.meta_path)
-    assert load_policy("a_policy_here:act")(None) == 1
-    assert (sys.path, sys.meta_path) == before
-    with pytest.raises(
-        ValueError, match=r"random has no function act, it is a library's; name the file: .*random.py:act"
-    ):
-        load_policy("random:act")
-    del sys.modules["a_policy_here"]
-
-
-def test_after_a_file_of_an_installed_package_names_are_the_libraries_as_before(write: Write) -> None:
-    installed = importlib.import_module("mani_skill.envs.tasks.tabletop.push_cube").__file__
-    load_task(str(installed))
-    assert is_library("sympy") and is_library("numpy")
-    plant(write, "sympy")
-    task = load_task(str(write("push.py", TASK, task=True)))
-    assert [file.name for file in task.named_like_libraries] == ["sympy.py"]
-
-
-def test_a_folder_is_searched_first_for_a_while(write: Write, folder: Path, late: tuple[str, ...]) -> None:
-    plant(write, *late)
-    before, finders = list(sys.path), list(sys.meta_path)
-    with searched_first(folder):
-        assert sys.path[0] == str(folder)
-        assert any(isinstance(finder, LibraryFinder) for finder in sys.meta_path)
-        sys.path.append("/added/meanwhile")
-        importlib.import_module(late[0])
-    assert sys.path == ["/added/meanwhile", *before] and sys.meta_path == finders

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import gc
-import importlib.metadata
 import inspect
-import linecache
 import os
 import platform
 import sys
@@ -21,11 +19,8 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.authoring.refusal import refused
 from tests.authoring.registered import registered
-from workbench.authoring.loading import registry
 from workbench.authoring.loading.load import (
-    LoadedTask,
     load_task,
-    task_of_class,
     undo_load,
     with_late_imports,
 )
@@ -55,22 +50,6 @@ def test_a_file_gives_its_class_with_what_it_was_registered_with(write: Write) -
     assert sys.modules[task.cls.__module__].__file__ == str(path)
 
 
-@pytest.mark.parametrize("form", ["absolute", "relative", "home", "with class"])
-def test_every_form_of_a_path_names_the_same_file(
-    form: str, write: Write, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write("push.py", PUSH, task=True)
-    monkeypatch.chdir(folder)
-    monkeypatch.setenv("HOME", str(folder))
-    reference = {
-        "absolute": str(path),
-        "relative": "push.py",
-        "home": "~/push.py",
-        "with class": "push.py:PushEnv",
-    }[form]
-    assert load_task(reference).file == path
-
-
 def test_a_registered_id_gives_the_built_in_class_and_its_source() -> None:
     task = load_task("PickCube-v1")
     assert task.cls is REGISTERED_ENVS["PickCube-v1"].cls
@@ -79,36 +58,15 @@ def test_a_registered_id_gives_the_built_in_class_and_its_source() -> None:
     assert "class PickCubeEnv" in task.source[str(task.file)]
 
 
-def test_a_class_that_a_task_file_imports_is_no_class_of_that_file(write: Write) -> None:
-    built_in = "from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv\n"
-    path = write("child.py", f"{built_in}{PUSH.replace('BaseEnv', 'PickCubeEnv')}", task=True)
-    load_task(str(path))
-    task = load_task("PickCube-v1")
-    assert task.file is not None and task.file.name == "pick_cube.py" and str(path) not in task.source
-
-
-def test_a_class_of_others_that_a_task_file_registers_comes_with_that_file(write: Write) -> None:
-    built_in = "from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv\n"
-    path = write("again.py", f'{built_in}\nregister_env("AuthorPick-v1")(PickCubeEnv)\n', task=True)
-    load_task(str(path))
-    task = task_of_class(REGISTERED_ENVS["AuthorPick-v1"].cls, "AuthorPick-v1")
-    assert (task.file, str(path) in task.source) == (path, True)
-
-
 @pytest.mark.parametrize(
     ("reference", "words"),
     [
         ("PikCube-v1", "PickCube-v1"),
-        ("pickcube-v1", "PickCube-v1"),
         ("CartPole-v1", "gymnasium"),
         ("", "no task named"),
-        ("   ", "no task named"),
         ("nowhere/push.py", "nor does its folder"),
         ("push.py:", "after the colon"),
-        ("push.py:1st", "after the colon"),
         ("bad\0name.py", "not a path"),
-        ("~nobody-of-that-name/push.py", "not a path"),
-        ("x" * 5000 + ".py", "cannot look at the file"),
         (os.devnull, "not an ordinary file"),
     ],
 )
@@ -117,39 +75,6 @@ def test_a_wrong_reference_is_refused_in_words(reference: str, words: str) -> No
     assert words in problem.message
     assert (problem.stage, problem.line) == ("import", None)
     assert len(problem.message) <= 500
-
-
-def test_a_misspelt_file_a_folder_and_another_kind_of_file_are_refused(write: Write, folder: Path) -> None:
-    write("push_cube.py", PUSH, task=True)
-    write("notes.txt", "hello")
-    os.mkfifo(folder / "pipe.py")
-    assert "push_cube.py" in refused(folder / "push_cub.py").message
-    assert "push_cube.py" not in refused(folder / "pull_cup.py").message, "a name that is not near"
-    assert "is a folder" in refused(folder).message and "push_cube.py" in refused(folder).message
-    assert "not a .py file" in refused(folder / "notes.txt").message
-    assert "not an ordinary file" in refused(folder / "pipe.py").message
-
-
-def test_an_unreadable_file_is_refused(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write("push.py", PUSH, task=True)
-    if os.geteuid() == 0:
-        # Root reads everything: a file that goes away between the look and the reading instead.
-        monkeypatch.setattr("workbench.authoring.loading.load.check_task_file", Path.unlink)
-    else:
-        path.chmod(0)
-    assert "cannot be read" in refused(path).message
-
-
-@pytest.mark.parametrize("text", ["", "\n\n", "# nothing yet\n", "import torch\n", "class Env:\n    pass\n"])
-def test_a_file_without_a_task_is_refused_with_advice(text: str, write: Write) -> None:
-    problem = refused(write("push.py", text))
-    assert "BaseEnv" in problem.message
-    assert problem.file is not None and problem.file.endswith("push.py")
-
-
-def test_a_class_that_is_only_imported_is_not_taken_for_the_files_own(write: Write) -> None:
-    write("base_task.py", PUSH, task=True)
-    assert "base_task" in refused(write("push.py", "from base_task import PushEnv\n")).message
 
 
 def test_of_several_classes_the_last_registered_one_is_taken_and_the_others_are_named(write: Write) -> None:
@@ -236,14 +161,6 @@ def test_a_built_in_id_is_taken_over_and_given_back(write: Write) -> None:
     assert gym.spec("PickCube-v1").max_episode_steps == 50
 
 
-def test_names_deleted_from_a_file_are_gone(write: Write) -> None:
-    path = write("push.py", "OLD = 1\n" + PUSH, task=True)
-    load_task(str(path))
-    path.write_text(path.read_text().replace("OLD = 1\n", "").replace("0.1", "OLD"))
-    problem = refused(path)
-    assert "NameError" in problem.message and problem.code == "goal_radius = OLD"
-
-
 def test_an_agent_in_the_file_is_the_new_one_after_a_save(write: Write) -> None:
     robot = """
     from mani_skill.agents.registration import register_agent
@@ -298,13 +215,6 @@ def test_a_helper_of_another_tasks_folder_is_not_taken(write: Write) -> None:
     assert {"AuthorPush-v1", "AuthorPull-v1"} <= set(REGISTERED_ENVS)
 
 
-def test_a_helper_that_imports_the_task_back_gets_the_same_module(write: Write) -> None:
-    write("helper.py", "def radius():\n    import push_back\n    return push_back.PushEnv.goal_radius\n")
-    path = write("push_back.py", "import helper\n" + PUSH + "\nRADIUS = helper.radius()\n", task=True)
-    task = load_task(str(path))
-    assert sys.modules[task.cls.__module__].RADIUS == 0.1
-
-
 def test_a_file_in_a_package_may_import_relatively(write: Write) -> None:
     write("project/__init__.py", "")
     write("project/common.py", "SIZE = 1\n")
@@ -322,26 +232,6 @@ def test_a_file_in_a_package_may_import_relatively(write: Write) -> None:
     assert sys.modules["project.tasks.push"].OWN == 2
     assert sys.modules["project.tasks"].PushEnv is task.cls
     assert task.source_files[0] == path and helper in task.source_files
-
-
-def test_libraries_below_the_tasks_folder_are_left_alone(write: Write) -> None:
-    write(".venv/lib/site-packages/author_library.py", "COUNT = 0\n")
-    path = write("push.py", PUSH, task=True)
-    sys.path.append(str(path.parent / ".venv/lib/site-packages"))
-    library = importlib.import_module("author_library")
-    path.write_text("import author_library\n" + path.read_text())
-    task = load_task(str(path))
-    assert sys.modules["author_library"] is library
-    assert task.source_files == (path,)
-
-
-def test_the_workbench_itself_below_the_tasks_folder_is_left_alone() -> None:
-    root = Path(registry.__file__).parents[2]
-    path = root / "author_task_in_the_root.py"
-    text = "from mani_skill.envs.sapien_env import BaseEnv\nclass RootEnv(BaseEnv): pass\n"
-    task = load_task(str(path), source={str(path): text})
-    assert task.class_name == "RootEnv"
-    assert sys.modules["workbench.authoring.loading.registry"] is registry
 
 
 def test_a_module_imported_inside_a_hook_is_found_and_followed(write: Write) -> None:
@@ -377,15 +267,6 @@ def test_given_texts_come_in_place_of_files_on_disk_even_of_missing_ones(write: 
     assert load_task(str(path), source=good.source).env_id == "AuthorPush-v1"
 
 
-def test_the_hash_is_of_the_content_and_not_of_the_place(write: Write) -> None:
-    hashes = set()
-    for name in ("one", "two"):
-        write(f"{name}/helper.py", "SIZE = 1\n")
-        path = write(f"{name}/push.py", "import helper\n" + PUSH, task=True)
-        hashes.add(load_task(str(path)).source_hash)
-    assert len(hashes) == 1
-
-
 def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_reads_them(
     write: Write,
 ) -> None:
@@ -409,11 +290,8 @@ def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_r
     ("text", "stage", "message", "code"),
     [
         ("def f(:\n    pass\n", "syntax", "SyntaxError", "def f(:"),
-        ("x = 'open\n", "syntax", "unterminated string", "x = 'open"),
-        ("if True:\npass\n", "syntax", "IndentationError", "pass"),
         ("x = 1\n\n1 / 0\n", "import", "ZeroDivisionError: division by zero", "1 / 0"),
         ("def f():\n    raise ValueError\nf()\n", "import", "ValueError", "raise ValueError"),
-        ("assert 1 == 2\n", "import", "AssertionError: assert 1 == 2", "assert 1 == 2"),
         (
             "import no_such_module_anywhere\n",
             "import",
@@ -421,33 +299,14 @@ def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_r
             "import no_such_module_anywhere",
         ),
         ("import healper\n", "import", "there is helper.py in the file's folder", "import healper"),
-        ("from helper import NOTHING\n", "import", "ImportError", "from helper import NOTHING"),
         (
             "from typing import gone\n",
             "import",
             f"Python {platform.python_version()}",
             "from typing import gone",
         ),
-        (
-            "from mani_skill.utils import gone\n",
-            "import",
-            f"mani_skill {importlib.metadata.version('mani_skill')}",
-            "from mani_skill.utils import gone",
-        ),
         ("exit()\n", "import", "__main__", "exit()"),
-        (
-            "import sys; sys.exit('no display')\n",
-            "import",
-            "no display",
-            "import sys; sys.exit('no display')",
-        ),
         ("def f(): f()\nf()\n", "import", "RecursionError", "def f(): f()"),
-        (
-            "import torch\ntorch.zeros(2) @ torch.zeros(3)\n",
-            "import",
-            "RuntimeError",
-            "torch.zeros(2) @ torch.zeros(3)",
-        ),
         ("import ast\nast.parse('1 +')\n", "import", "SyntaxError", "ast.parse('1 +')"),
         ("x = '\0'\n", "syntax", "null byte", None),
     ],
@@ -467,18 +326,6 @@ def test_what_is_wrong_in_the_file_is_told_at_its_line(
         "workbench_task", ""
     )
     assert len(problem.traceback.splitlines()) < 250
-
-
-def test_a_wrong_encoding_is_told_at_its_line(write: Write) -> None:
-    path = write("push.py", PUSH, task=True)
-    path.write_bytes(b"# one\n# W\xfcrfel\n")
-    problem = refused(path)
-    assert (problem.stage, problem.line) == ("syntax", 2)
-    assert "UTF-8" in problem.message and problem.code == "# W\N{REPLACEMENT CHARACTER}rfel"
-    path.write_bytes(b"# coding: klingon\n")
-    problem = refused(path)
-    assert (problem.stage, problem.line) == ("syntax", 1)
-    assert "klingon" in problem.message
 
 
 def test_what_is_wrong_in_a_helper_is_told_at_the_helpers_line(write: Write) -> None:
@@ -584,26 +431,6 @@ def test_old_versions_are_let_go(write: Write) -> None:
     assert [version() is None for version in versions] == [True, True, True, False, False]
 
 
-def test_a_library_that_a_failed_load_imported_stays_registered(write: Write, folder: Path) -> None:
-    library = write("site-packages/author_tasks.py", PUSH.replace("AuthorPush", "AuthorLibrary"), task=True)
-    sys.path.append(str(library.parent))
-    path = write("push.py", "import author_tasks\n1 / 0\n")
-    refused(path)
-    assert "author_tasks" in sys.modules
-    assert "AuthorLibrary-v1" in REGISTERED_ENVS
-
-
-def test_a_file_of_mani_skills_own_can_be_opened_by_its_path() -> None:
-    built_in = REGISTERED_ENVS["PushCube-v1"].cls
-    path = inspect.getsourcefile(built_in)
-    task: LoadedTask = load_task(str(path))
-    assert task.class_name == "PushCubeEnv" and task.cls is not built_in
-    assert (
-        sys.modules["mani_skill.envs.tasks.tabletop.pick_cube"].PickCubeEnv
-        is REGISTERED_ENVS["PickCube-v1"].cls
-    )
-
-
 def test_a_failed_save_leaves_an_id_with_the_file_that_took_it_since(write: Write) -> None:
     one = write("one/push.py", PUSH, task=True)
     two = write("two/push.py", PUSH, task=True)
@@ -640,56 +467,3 @@ def test_what_a_failed_load_put_on_the_search_path_is_gone(write: Write, folder:
         refused(path)
         assert (sys.path, sys.meta_path) == (search_path, finders)
     assert REGISTERED_ENVS["AuthorPush-v1"].cls is good.cls
-
-
-def test_a_package_has_the_modules_of_the_good_version_after_a_failed_load(write: Write) -> None:
-    # The name is no other test's: what lies outside of the task's own folder stays imported.
-    write("push_lab/__init__.py", "")
-    write("push_lab/tasks/__init__.py", "")
-    helper = write("push_lab/tasks/helper.py", "SIZE = 1\n")
-    path = write("push_lab/tasks/push.py", "from . import helper\n" + PUSH, task=True)
-    load_task(str(path))
-    good, package = sys.modules["push_lab.tasks"], sys.modules["push_lab"]
-    path.write_text(path.read_text() + "\n1 / 0\n")
-    helper.write_text("SIZE = 2\n")
-    for _ in range(2):
-        refused(path)
-        assert sys.modules["push_lab"] is package
-        assert package.tasks is good is sys.modules["push_lab.tasks"]
-        assert good.helper is sys.modules["push_lab.tasks.helper"] and good.helper.SIZE == 1
-
-
-def test_tracebacks_show_nothing_of_a_version_that_failed(write: Write) -> None:
-    helper = write("helper.py", "SIZE = 1\n")
-    path = write("push.py", "import helper\n1 / 0\n")
-    refused(path)
-    assert not {str(helper), str(path)} & set(linecache.cache)
-
-
-def test_the_tasks_of_one_folder_stay_imported_beside_each_other(write: Write) -> None:
-    one = load_task(str(write("one.py", PUSH, task=True)))
-    module = sys.modules[one.cls.__module__]
-    two = load_task(str(write("two.py", PUSH.replace("AuthorPush", "AuthorTwo"), task=True)))
-    assert sys.modules[one.cls.__module__] is module
-    assert sys.modules[two.cls.__module__] is not module
-
-
-def test_a_file_that_is_called_like_a_library_does_not_take_its_place(write: Write) -> None:
-    sys.modules.pop("antigravity", None)
-    task = load_task(str(write("antigravity.py", PUSH, task=True)))
-    assert task.env_id == "AuthorPush-v1" and "antigravity" not in sys.modules
-
-
-def test_a_null_byte_is_told_at_its_line(write: Write) -> None:
-    problem = refused(write("push.py", "x = 1\ny = 2\nz = '\0'\n"))
-    assert (problem.stage, problem.line) == ("syntax", 3)
-
-
-def test_a_package_itself_may_be_the_task(write: Write) -> None:
-    helper = write("package_that_pushes/shapes.py", "SIZE = 1\n")
-    path = write("package_that_pushes/__init__.py", "from .shapes import SIZE\n" + PUSH, task=True)
-    for size in (1, 2):
-        helper.write_text(f"SIZE = {size}\n")
-        task = load_task(str(path))
-        assert task.source_files == (path, helper)
-        assert sys.modules[task.cls.__module__].SIZE == size

@@ -15,7 +15,6 @@ from workbench.authoring.loading import library_names
 from workbench.authoring.loading.load import class_of_module, import_modules, load_task, undo_load
 from workbench.authoring.loading.reference import (
     RecordedTask,
-    find_module,
     followed_folder,
     named_file,
     reference_to_class,
@@ -73,19 +72,6 @@ def test_it_is_found_without_being_imported(lab: Path) -> None:
     assert named_file("lab_of_mine.tasks.nowhere:MinimalEnv") is None
 
 
-def test_a_path_is_never_taken_for_a_module(lab: Path) -> None:
-    """A recording names its file by an absolute path."""
-    assert find_module("lab_of_mine.tasks") is not None
-    for reference in (
-        f"{lab.parent}/lab_of_mine.tasks:MinimalEnv",
-        "./lab_of_mine.tasks:MinimalEnv",
-        "lab_of_mine.py:A",
-    ):
-        assert followed_folder(reference) is None or reference.endswith(".py:A")
-        assert refused(reference).stage == "import"
-    assert not [name for name in sys.modules if name.startswith("lab_of_mine")]
-
-
 def test_its_class_opens_and_is_followed_with_the_whole_package(lab: Path) -> None:
     task = load_task(REFERENCE)
     minimal, arm = lab / "tasks" / "minimal.py", lab / "robots" / "arm.py"
@@ -105,14 +91,6 @@ def test_its_class_opens_and_is_followed_with_the_whole_package(lab: Path) -> No
     assert REGISTERED_ENVS["LabOfMine-v1"].cls is again.cls
     assert sys.modules["lab_of_mine.tasks.minimal"] is sys.modules[again.cls.__module__]
     assert undo_load(again)
-
-
-def test_a_librarys_module_is_imported_as_it_is() -> None:
-    task = load_task("mani_skill.envs.tasks.tabletop.pick_cube:PickCubeEnv")
-    assert task.cls is REGISTERED_ENVS["PickCube-v1"].cls
-    assert (task.env_id, task.max_episode_steps, task.followed) == ("PickCube-v1", 50, False)
-    assert "PickCubeEnv" in refused("mani_skill.envs.tasks.tabletop.pick_cube:PickCubEnv").message
-    assert "not a class that inherits BaseEnv" in refused("json.decoder:JSONDecoder").message
 
 
 def test_the_current_folder_goes_ahead_of_no_library(
@@ -139,28 +117,6 @@ def test_an_import_gives_the_ids_that_the_package_registers(lab: Path) -> None:
     import_modules(("lab_of_mine.tasks",))
     task = load_task("LabOfMine-v1")
     assert (task.class_name, task.file, task.followed) == ("MinimalEnv", lab / "tasks" / "minimal.py", False)
-
-
-def test_what_is_wrong_with_an_import_is_said_at_its_line(lab: Path) -> None:
-    with pytest.raises(TaskError, match="there is no module lab_of_yours"):
-        import_modules(("lab_of_yours",))
-    arm = lab / "robots" / "arm.py"
-    for text, words, line in (
-        ("\nREACH = 1 / 0\n", "ZeroDivisionError", 2),
-        ("\n\nREACH = (\n", "never closed", 3),
-        ("raise SystemExit(3)\n", "SystemExit", 1),
-    ):
-        arm.write_text(text)
-        with pytest.raises(TaskError) as caught:
-            import_modules(("lab_of_mine.tasks",))
-        problem = caught.value.problem
-        assert words in problem.message
-        assert (problem.file, problem.line) == (str(arm), line)
-
-
-def test_a_module_without_a_class_says_what_is_missing(lab: Path) -> None:
-    message = refused("lab_of_mine.tasks").message
-    assert "lab_of_mine.tasks is a module" in message and "lab_of_mine.tasks:" in message
 
 
 def test_a_recording_brings_no_import(lab: Path) -> None:

@@ -40,22 +40,6 @@ def test_it_opens_in_an_empty_scene_and_says_so(write: Write) -> None:
     assert not undo_load(task) and undo_load(other)
 
 
-def test_an_agent_that_is_not_registered_is_named(write: Write) -> None:
-    file = write("arms.py", ROBOTS.replace("@register_agent()", ""))
-    assert "SmallPanda is an agent that is not registered: put @register_agent()" in refused(file).message
-    assert (
-        "there is no class Smallpanda in arms.py; did you mean SmallPanda?"
-        in refused(f"{write('arms.py', ROBOTS)}:Smallpanda").message
-    )
-
-
-def test_a_task_goes_before_the_robots_of_its_file(write: Write) -> None:
-    file = write("arms.py", ROBOTS + "\nclass PushEnv(BaseEnv):\n    pass\n", task=True)
-    task = load_task(str(file))
-    assert (task.class_name, task.robot, task.others, task.notices) == ("PushEnv", None, (), ())
-    assert load_task(f"{file}:TallPanda").env_id == "Empty-v1"
-
-
 @pytest.mark.parametrize("text", ["raise SystemExit\n", "1 / 0\n"])
 def test_a_version_that_fails_leaves_the_robot_that_was(write: Write, text: str) -> None:
     from mani_skill.agents.registration import REGISTERED_AGENTS

@@ -79,16 +79,6 @@ def test_where_names_are_computed_all_that_lies_beside_counts_and_that_is_said(
     assert any("task.py:" in what and "further code" in what for what in content.unseen)
 
 
-def test_a_compiled_module_is_said_and_is_not_loaded(tmp_path: Path) -> None:
-    file = lay(tmp_path, task=f"{TASK}import fast")
-    (tmp_path / "fast.cpython-311-x86_64-linux-gnu.so").write_bytes(b"\x7fELF")
-    assert read_content(file).unseen == (
-        "fast.cpython-311-x86_64-linux-gnu.so is compiled and is not loaded.",
-    )
-    with pytest.raises(TaskError, match="No module named 'fast'"):
-        load_task(recorded(file))
-
-
 def test_the_hash_is_of_what_the_texts_say_wherever_they_lie(tmp_path: Path) -> None:
     here = lay(tmp_path / "here", task="import alone")
     (tmp_path / "here" / "alone.py").write_text("A = 1\n")
@@ -143,16 +133,6 @@ def test_what_nobody_agreed_to_does_not_run_however_it_is_imported(tmp_path: Pat
     finally:
         sys.path.remove(str(tmp_path))
     assert "other" not in ran(tmp_path)
-
-
-def test_a_file_in_a_package_runs_with_the_packages_above_it(tmp_path: Path) -> None:
-    (tmp_path / "pack").mkdir()
-    (tmp_path / "pack" / "__init__.py").write_text("FROM_PACKAGE = 1\n")
-    (tmp_path / "pack" / "size.py").write_text("SIZE = 2\n")
-    file = tmp_path / "pack" / "task.py"
-    file.write_text(f"from . import FROM_PACKAGE\nfrom .size import SIZE\n{TASK}")
-    assert read_content(file).modules == ("__init__.py", "size.py")
-    assert load_task(recorded(file)).class_name == "Lift"
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 from pathlib import Path
 
@@ -43,28 +42,6 @@ def test_once_is_until_the_program_ends(store: Path) -> None:
     assert kept.trusts(content("one")) and not kept.follows(content("one"))
     assert kept.follows(content("two")) and not kept.follows(content("two", "/other/push.py"))
     assert not TrustStore().trusts(content("one")) and not store.exists()
-
-
-def test_the_text_that_was_trusted_last_is_compared_with(store: Path) -> None:
-    for text in ("one", "two", "one"):  # the one that was said again is the last
-        TrustStore().trust(content(text))
-    assert len(json.loads(store.read_text())["trusted"]) == 2
-    assert TrustStore().trusted_before(content("three")) == content("one").file_sums
-    assert TrustStore().trusted_before(content("one")) == content("two").file_sums
-    assert TrustStore().trusted_before(content("one", "/other/push.py")) is None
-
-
-def test_the_oldest_answers_go_first_and_only_the_newest_name_their_files(
-    store: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(trust, "MOST_KEPT", 4)
-    monkeypatch.setattr(trust, "MOST_WITH_FILES", 2)
-    texts = [str(number) for number in range(6)]
-    for text in texts:
-        TrustStore().trust(content(text))
-    assert [TrustStore().trusts(content(text)) for text in texts] == [False, False, True, True, True, True]
-    kept = json.loads(store.read_text())["trusted"]
-    assert [one["files"] for one in kept] == [{}, {}, *(content(text).file_sums for text in "45")]
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
@@ -108,22 +85,3 @@ def test_a_store_that_cannot_be_read_just_now_is_not_written_over(
         assert kept.trusts(content("two"))
     assert store.read_bytes() == before and TrustStore().trusts(content("one"))
     assert "not known" in caplog.text and "cannot be kept" in caplog.text
-
-
-def test_a_broken_store_that_cannot_be_set_aside_stays(
-    store: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    store.parent.mkdir()
-    store.write_text("{")
-    kept = TrustStore()
-
-    def fail(*_: object) -> None:
-        raise OSError(errno.EACCES, os.strerror(errno.EACCES))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", fail)
-        kept.trust(content("one"))
-    assert store.read_text() == "{" and kept.trusts(content("one"))
-    assert "cannot be kept" in caplog.text
-    kept.trust(content("two"))
-    assert TrustStore().trusts(content("two")) and not TrustStore().trusts(content("one"))

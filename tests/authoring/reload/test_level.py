@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.reload.level import Change, Inherited, find_change
+from workbench.authoring.reload.level import Change, Inherited, find_change, removed_effects
 
 FILE = "/author/task.py"
 PUSH_CUBE = (Path(__file__).parents[3] / "tasks" / "push_cube.py").read_text()
@@ -130,20 +130,6 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
     assert found.level == "rebuilt" and "EDGE changed" in found.reason
 
 
-def test_methods_of_one_name_are_taken_for_one() -> None:
-    body = """
-    def _load_scene(self, options):
-        maker.reset_all()
-
-    def reset_all(self):
-        return {}
-
-    def evaluate(self):
-        return {{"x": self.reset_all()}}
-    """
-    assert change(task(body.format(1)), task(body.format(2))).level == "rebuilt"
-
-
 @pytest.mark.parametrize(
     ("hooks", "top", "says"),
     [
@@ -253,10 +239,14 @@ def test_a_robot_of_the_file_is_what_the_env_was_built_of_though_nobody_names_it
     )
 
 
-def test_another_task_of_the_file_may_change_as_it_likes() -> None:
-    other = "\n\nclass Other(BaseEnv):\n    def _load_scene(self, options):\n        self.thing = {}\n"
-    mine = task("def evaluate(self):\n    return {'x': 1}\n")
-    assert change(mine + other.format(1), mine + other.format(2)).level == "patched"
+def test_another_order_of_an_enums_members_is_rebuilt() -> None:
+    members = "    A = enum.auto()\n", "    B = enum.auto()\n"
+    body, head = (
+        "def evaluate(self):\n    return {'m': Mode.A.value}\n",
+        "import enum\n\n\nclass Mode(enum.Enum):\n",
+    )
+    found = change(task(body, head + "".join(members)), task(body, head + "".join(members[::-1])))
+    assert found.level == "rebuilt" and "Mode" in found.reason
 
 
 def test_a_helper_beside_the_task_is_compared_too() -> None:
@@ -291,10 +281,25 @@ def test_a_file_that_cannot_be_read_is_no_error() -> None:
     assert change(task("x = 1\n"), "class Task(BaseEnv):\n    x = 1\n" + "\0").level == "rebuilt"
 
 
-def test_line_ends_and_layout_are_the_same_code() -> None:
-    body = task("def evaluate(self):\n    return {'a': 1, 'b': 2}\n")
-    assert change(body, body.replace("\n", "\r\n")).level == "same"
-    assert (
-        change(body, body.replace("{'a': 1, 'b': 2}", "{\n        'a': 1,\n        'b': 2,\n    }")).level
-        == "same"
-    )
+@pytest.mark.parametrize(
+    ("statement", "has_one"),
+    [
+        ("torch.set_num_threads(8)", True),
+        ("torch.backends.flag = True", True),
+        ("np.seterr_of['all'] += 1", True),
+        ("if SIZE:\n    torch.set_num_threads(8)", True),
+        ("SIZE = max(1, 2)", False),
+        ("import math", False),
+    ],
+)
+def test_what_an_import_did_and_a_new_version_does_not_is_told_at_its_line(
+    statement: str, has_one: bool
+) -> None:
+    def removed(old: str, new: str) -> str:
+        return removed_effects({FILE: old}, {FILE: new})
+
+    base = task("x = 1\n", "SIZE = 1\n")
+    old = f"{base}\n{statement}\n"
+    line = base.count("\n") + 2
+    assert removed(old, base) == (f"task.py:{line} ({statement.splitlines()[0]})" if has_one else "")
+    assert removed(base, old) == removed(old, f"import re\n{old}") == removed(old, old) == ""

@@ -62,7 +62,8 @@ def test_a_function_that_says_something_else_has_no_such_line(words: str, new: s
     assert line_in(OLD, new, at(OLD, words)) is None
 
 
-def test_a_line_of_nothing_is_nowhere() -> None:
-    assert line_in(OLD, OLD, 1) is None
-    assert line_in("def (", OLD, 1) is None
-    assert line_in(OLD, OLD, 99) is None
+def test_of_equal_lines_the_one_at_the_same_place_is_meant() -> None:
+    old = OLD.replace("self.up = 2  # twice", "self.up = 1")
+    new = "import torch\n\n\n" + old.replace("class Task", "# the task\nclass Task")
+    for line in (i for i, text in enumerate(old.splitlines(), 1) if "self.up = 1" in text):
+        assert line_in(old, new, line) == line + 4

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -73,44 +72,24 @@ def said(project: Project, part: TracedValue) -> str:
     ("text", "what"),
     [
         ("note(1.5)", "1.5"),
-        ("note(-2)", "-2"),
-        ("note((.5))", ".5"),
-        ("note('minimal')", "'minimal'"),
         ("note(None)", "None"),
         ("X = 1.5\nnote(X)", "1.5 < X"),
         ("X: float = 1.5\nY = X\nnote(a=Y)", "1.5 < Y < X"),
         ("X, (Y, Z) = 1.5, (2.5, 3.5)\nnote(Y)", "2.5 < Y"),
-        ("note([1, (2)])", "[1, (2)] {1, 2}"),
         ("X = 2\nnote((1, X))", "(1, X) {1, 2 < X}"),
         ("X = 2\nnote(Y := X)", "`Y := X` is computed when the task runs"),
         # Numbers within an expression.
         ("note(60 * np.pi / 180)", "60 * np.pi / 180 {60 times degrees plus 0}"),
-        ("note(np.pi / 180 * 60 + 1)", "np.pi / 180 * 60 + 1 {60 times degrees plus 1}"),
         ("note(math.radians(30))", "math.radians(30) {30 times degrees plus 0}"),
         ("A = 30\nnote(np.deg2rad(A))", "np.deg2rad(A) {30 < A times degrees plus 0}"),
         ("H = 0.2\nnote(H + 0.25)", "H + 0.25 {0.25 times 1 plus 0.2}"),
         ("H = 0.2\nnote(0.5 - H)", "0.5 - H {0.5 times 1 plus -0.2}"),
-        ("H = 0.2\nnote(H - 0.5)", "H - 0.5 {0.5 times -1 plus 0.2}"),
         ("H = 0.2\nnote(H - 0.5 + 0.25)", "H - 0.5 + 0.25 {0.25 times 1 plus -0.3}"),
-        ("H = 0.2\nnote(1 + H * np.pi / 180)", "1 + H * np.pi / 180 {1 times 1 plus 0.00349}"),
         ("H = 0.2\nnote(2 * H)", "2 * H"),
-        ("note(1.0 + 0.5)", "1.0 + 0.5"),
-        ("note(2 ** 3)", "2 ** 3"),
-        ("note(np.pi)", "np.pi"),
-        ("note(np.pi / 2)", "np.pi / 2"),
-        ("note(2 * np.arctan(0.5))", "2 * np.arctan(0.5)"),
-        ("note(np.sqrt(0.5))", "np.sqrt(0.5)"),
-        *(
-            (f"note(math.{name}(0.5))", f"math.{name}(0.5)")
-            for name in ("atan", "asin", "acos", "tan", "sqrt")
-        ),
-        *((f"note(np.arc{name}(0.5))", f"np.arc{name}(0.5)") for name in ("tan", "sin", "cos")),
         ("V = np.array([1, 2])\nnote(V + [0, 1])", "V + [0, 1]"),
         # Functions that only hold what they are given.
         ("note(float(2))", "2"),
-        ("note(float())", "float()"),
         ("note(np.array([1, 2]))", "[1, 2] {1, 2}"),
-        ("V = [1, 2]\nnote(np.array(object=V))", "np.array(object=V) {1 < V, 2 < V}"),
         ("V = [1, 2]\nnote(torch.tensor(V))", "torch.tensor(V) {1 < V, 2 < V}"),
         ("note(Pose.create(sapien.Pose([1, 2, 3])))", "posesapien.Pose([1, 2, 3]) {[1, 2, 3] {1, 2, 3}}"),
         (
@@ -120,18 +99,14 @@ def said(project: Project, part: TracedValue) -> str:
         ("note(euler2quat(0, 0, ak=1))", "eulereuler2quat(0, 0, ak=1) {0, 0, 1}"),
         # Choices.
         ("F = True\nnote(1.5 if F else 2.5)", "1.5"),
-        ("F, K = False, 'b'\nnote(1.5 if F or not K == 'b' else 2.5)", "2.5"),
         ("F, K = False, 'b'\nX = 2.5 if not F and K != 'a' else 1.5\nnote(X)", "2.5 < X"),
         # Elements.
         ('D = {"x": 1, "eye": [1, 2]}\nnote(D["eye"])', '[1, 2] {1 < D["eye"], 2 < D["eye"]} < D["eye"]'),
         ('D = dict(x=1, eye=2)\nnote(D["eye"])', '2 < D["eye"]'),
-        ('D = dict(x=1, eye=2)\nnote(D["eye"])\nD["x"]', '2 < D["eye"]'),
         ('D = dict(x=1, eye=2)\nnote(D["eye"])\nD["eye"]', '2 < D["eye"] (line 11)'),
         ("L = [[1, 2], [3, 4]]\nnote(L[1][0])", "3 < L[1][0]"),
         ("L = (1, 2)\nM = L\nnote(M[-1])", "2 < M[-1]"),
-        ("L = (1, 2)\nnote(L[-2])", "1 < L[-2]"),
         ("L, I = (1, 2), 1\nnote(L[I])", "2 < L[I]"),
-        ("note((1, 2)[0])", "1 < (1, 2)[0]"),
     ],
 )
 def test_a_value_is_followed_to_where_it_is_written(text: str, what: str) -> None:
@@ -142,46 +117,22 @@ def test_a_value_is_followed_to_where_it_is_written(text: str, what: str) -> Non
     ("text", "why"),
     [
         ("note(True)", "`True` is computed when the task runs"),
-        ("note(b'1')", "`b'1'` is computed when the task runs"),
-        ("note(-True)", "`True` is computed when the task runs"),
-        ("note(~1)", "`~1` is computed when the task runs"),
         ("note(f'{1}')", "`f'{1}'` is computed when the task runs"),
-        ("note([1, max(2, 3)])", "`max(2, 3)` is computed when the task runs"),
         ("note(np.sqrt(max(2, 3)))", "`max(2, 3)` is computed when the task runs"),
-        ("note(1 + max(2, 3))", "`max(2, 3)` is computed when the task runs"),
-        ("note([max][0](2, 3))", "`[max][0](2, 3)` is computed when the task runs"),
         ("note(np.sqrt(*[2]))", "`np.sqrt(*[2])` is computed when the task runs"),
-        (
-            "note(euler2quat(0, 0, 0, 'sxyz', **{}))",
-            "`euler2quat(0, 0, 0, 'sxyz', **{})` is computed when the task runs",
-        ),
         ("note(1.5 if max(1, 2) else 2)", "`max(1, 2)` is computed when the task runs"),
         ("note(*[1])", "`a` is given by * or **"),
-        ("note(**dict(a=1))", "`a` is given by * or **"),
         ("import places\nnote(places)", "`places` comes from places, which is not one of your files"),
         ("def f(x):\n    note(x)\nf(1)", "`x` cannot be read in the file: it is a parameter of f"),
-        ("(lambda x: note(x))(1)", "`x` cannot be read in the file: it is a parameter of a lambda"),
         ("X = 1\nX += 1\nnote(X)", "`X` cannot be read in the file: it is computed"),
         ("L = [1, 2]\nL[0] = 3\nnote(L)", "`L` cannot be read in the file: a part of it is set"),
-        ("[note(x) for x in (1,)]", "`x` cannot be read in the file: it changes in a comprehension"),
         ("for x in (1,):\n    note(x)", "`x` cannot be read in the file: it changes in a loop"),
-        ("L = [*(1, 2), 3]\nnote(L[2])", "`L[2]` is computed when the task runs"),
         ("L = [1, 2]\nnote(L[int(0)])", "`L[int(0)]` depends on what only the running task knows"),
-        ("L = list((1, 2))\nnote(L[0])", "`L[0]` is computed when the task runs"),
         ('D = {**{"x": 1}, "y": 2}\nnote(D["y"])', '`D["y"]` is computed when the task runs'),
-        ('D = dict({"x": 1}, **{"z": 1}, y=2)\nnote(D["y"])', '`D["y"]` is computed when the task runs'),
-        (
-            'def dict_(**given):\n    return given\nD = dict_(y=2)\nnote(D["y"])',
-            '`D["y"]` is computed when the task runs',
-        ),
         (
             "class A(list):\n    def __eq__(self, other):\n        return self.pop() == other\n"
             "X = A([1])\nnote(1.5 if X == 1 else 2.5)",
             "`X == 1` is computed when the task runs",
-        ),
-        (
-            "X = iter((1.5, 2.5))\nnote(X.__next__)",
-            "the assignment of `X.__next__` is not found in the file",
         ),
         (
             "for _ in range(2):\n    if _:\n        X = 1\n    else:\n        X = 1\n    note(X)",
@@ -200,22 +151,6 @@ def test_a_call_that_came_to_have_another_value_is_computed() -> None:
     assert told("note('x')", a="y") == "`'x'` is computed when the task runs"
     assert told("note(None)", a=0.0) == "`None` is computed when the task runs"
     assert told("note(None)", a=np.zeros(1)) == "`None` is computed when the task runs"
-
-
-def test_arguments_that_are_not_given_are_not_spoken_of() -> None:
-    _, trace = traced("def f():\n    note(b=1.5)\nf()", a=2.5)
-    assert set(trace.parts) == {"b"} and not trace.unknown
-    assert trace.function == "f" and trace.parts["b"].literal
-    project, trace = traced("note(1.5, b=f'{1}')")
-    assert set(trace.parts) == {"a"} and set(trace.unknown) == {"b"}
-    assert project.texts[FILE][trace.at.start : trace.at.end] == "note(1.5, b=f'{1}')"
-    assert trace.function == "<module>"
-
-
-def test_names_defined_by_names_are_followed_forty_deep() -> None:
-    chain = [f"N{i} = N{i - 1}\n" for i in range(1, 41)]
-    assert told(f"N0 = 1.5\n{''.join(chain[:-1])}note(N39)").startswith("1.5 < N39 < N38")
-    assert told(f"N0 = 1.5\n{''.join(chain)}note(N40)") == "`1.5` is defined by itself"
 
 
 TASK = """\
@@ -258,20 +193,6 @@ task.hook()
 )
 def test_attributes_are_those_of_the_running_object(call: str, what: str) -> None:
     assert told(TASK.format(call)) == what
-
-
-@pytest.mark.parametrize(
-    ("call", "places"),
-    [
-        ("self.own = 4.5; note(self.own)", ["task.py:17 in Task.__init__", "task.py:19 in Task.hook"]),
-        ("self.far = 4.5; note(self.far)", ["task.py:11 in Parent", "task.py:19 in Task.hook"]),
-    ],
-)
-def test_an_attribute_that_is_set_twice_is_refused_with_each_file_line_and_class(
-    call: str, places: list[str]
-) -> None:
-    refused = told(TASK.format(call))
-    assert all(place in refused for place in places), refused
 
 
 OTHER = """
@@ -325,13 +246,9 @@ assert len(made) == 1
             "A = 0.5\nX = A + 0.25",
             "A + 0.25 {0.25 < X times 1 plus 0.5} < X",
         ),
-        ("from places import X as Y\nnote(Y)", "X = 1.5", "1.5 < Y"),
-        ("from places import X\nnote([X, 1])", "A = 0.5\nX = A", "[X, 1] {0.5 < X < A, 1}"),
         ("from places import X\nnote(X)", "from more import X", "1.5 < X (places.py, line 1)"),
-        ("import places\nnote(places.X)", "from more import X", "1.5 < places.X (places.py, line 1)"),
         ("from places import *\nnote(X)", "X = 1.5", "X"),
         ("import places\nnote(places.X)", "Y = X = 1.5", "1.5 < places.X (line 1 gives it to several names)"),
-        ("from math import pi\nnote(pi)", "", "pi"),
         ("from math import *\nnote(pi / 180 * 5)", "", "pi / 180 * 5 {5 times degrees plus 0}"),
         ("from places import X\nnote(X)", "X = max(1, 2)", "`max(1, 2)` is computed when the task runs"),
         (
@@ -340,34 +257,15 @@ assert len(made) == 1
             "`X` gets other values than its current one in lines 1 and 2",
         ),
         (
-            "from places import X\nnote(X)",
-            "vars()['X'] = 1",
-            "`X` comes from places.X, which is not one of your files",
-        ),
-        (
             "import places\nnote(places.X)",
             "X = 1.5\ndef f():\n    return X",
             "1.5 < places.X (places.py, line 3)",
-        ),
-        ("from places import X\nnote(X)\nY = X", "X = 1.5", "1.5 < X (line 11)"),
-        (
-            "import places\nX = places.X\nnote(X)",
-            "Y = X = 1.5",
-            "1.5 < X (places.py, line 1) < places.X (line 10)",
         ),
     ],
 )
 def test_constants_of_files_beside_it_are_followed_there(text: str, others: str, what: str) -> None:
     more = {"/author/more.py": "X = 1.5"} if "more" in others else {}
     assert told(text, {**more, PLACES: others}) == what
-
-
-def test_an_import_from_the_same_package_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("pack", "pack.places"):
-        monkeypatch.setitem(sys.modules, name, ModuleType(name))
-    text = "import sys, places\nsys.modules['pack.places'] = places\n__package__ = 'pack'\n"
-    assert told(f"{text}from .places import X\nnote(X)", {PLACES: "X = 1.5"}) == "1.5 < X"
-    assert told(f"{text}from pack.places import X\nnote(X)", {PLACES: "X = 1.5"}) == "1.5 < X"
 
 
 def test_of_several_lines_the_one_with_the_running_value_is_meant() -> None:

@@ -16,10 +16,9 @@ import psutil
 import pytest
 
 from tests.jobs.pool.work import Run, Setup
-from workbench.authoring.problem import TaskError
 from workbench.jobs.pool import cluster as seam
 from workbench.jobs.pool.cluster import Cluster
-from workbench.jobs.pool.connect import NoCluster, connected
+from workbench.jobs.pool.connect import connected
 from workbench.jobs.pool.deal import PoolError
 from workbench.jobs.pool.job_file import JobFile, Kept, job_of
 from workbench.jobs.record.episodes import RecordOptions
@@ -27,7 +26,7 @@ from workbench.jobs.record.run import Recorded, record
 from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
 
-pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240), pytest.mark.slow]
 PLAIN = {"render_backend": "none"}
 TASK = """
 from pathlib import Path
@@ -115,7 +114,6 @@ def workers_of_ray() -> list[psutil.Process]:
     ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_episodes_have_the_same_bits_as_in_this_process_and_name_the_files_here(
     workers: int, address: str, task: Path
@@ -131,7 +129,6 @@ def test_episodes_have_the_same_bits_as_in_this_process_and_name_the_files_here(
     assert len(list(Path("there").iterdir())) == 24
 
 
-@pytest.mark.slow
 def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(
     address: str, task: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,7 +151,6 @@ def test_a_worker_that_is_killed_costs_no_episode_and_doubles_none(
     assert not capfd.readouterr().out
 
 
-@pytest.mark.slow
 def test_a_job_that_was_stopped_leaves_whole_episodes_and_goes_on(address: str, task: Path) -> None:
     here, asked = bits(record(wanted("here"))), wanted("there")
     over = threading.Event()
@@ -184,7 +180,6 @@ def test_a_job_that_was_stopped_leaves_whole_episodes_and_goes_on(address: str, 
     assert bits(second) == here and len(list(Path("there").glob("*.json"))) == 8
 
 
-@pytest.mark.slow
 def test_seeds_that_fail_are_told_with_the_line_here_and_the_others_are_kept(
     address: str, task: Path
 ) -> None:
@@ -209,23 +204,6 @@ def test_items_are_done_once_also_where_a_worker_dies(address: str, tmp_path: Pa
     assert os.getpid() not in pids and pids - {int((tmp_path / "killed").read_text())}
 
 
-@pytest.mark.parametrize(
-    ("how", "says", "error"),
-    [("value", "not such a number", PoolError), ("cannot be loaded", "it broke", TaskError)],
-)
-def test_what_ends_a_job_here_ends_it_there(
-    how: str, says: str, error: type[Exception], address: str, tmp_path: Path
-) -> None:
-    with pytest.raises(error, match=says):
-        Run(Setup(how, 3, folder=tmp_path), range(8), tries=3, goes_on=True).by(Cluster(address, 1))
-
-
-def test_stopping_ends_the_job_with_what_is_done(address: str, tmp_path: Path) -> None:
-    run = Run(Setup(folder=tmp_path), range(10**6), stop=lambda: len(run.results) > 5)
-    run.by(Cluster(address, 2))
-    assert 5 < len(run.results) < 10**5
-
-
 def test_other_versions_are_refused_and_named(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -235,26 +213,6 @@ def test_other_versions_are_refused_and_named(
         Run(Setup(folder=tmp_path), range(8)).by(Cluster(address, 1))
 
 
-def test_a_worker_that_fits_on_no_machine_is_refused(address: str, tmp_path: Path) -> None:
-    with pytest.raises(NoCluster, match="no machine of the cluster has 64 CPU for a worker"):
-        Run(Setup(folder=tmp_path), range(8)).by(Cluster(address, cpus_per_worker=64))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("line", ["breakpoint()", "import pdb; pdb.set_trace()"])
-def test_a_line_that_stops_for_a_debugger_is_refused_and_not_waited_at(
-    line: str, address: str, task: Path
-) -> None:
-    task.write_text(TASK.replace("        far = self", f"        {line}\n        far = self"))
-    with pytest.raises(TaskError, match="this line stops for a debugger.*--workers 1 without --cluster"):
-        record(wanted("there"), executor=Cluster(address, 1))
-
-
-def test_a_breakpoint_here_does_what_it_did_before_a_cluster_was_joined(address: str) -> None:
-    assert not os.environ.get("PYTHONBREAKPOINT", "").startswith("ray.")
-
-
-@pytest.mark.slow
 def test_a_folder_that_a_machine_does_not_see_is_refused(
     address: str, task: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

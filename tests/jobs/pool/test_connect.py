@@ -30,23 +30,8 @@ with connected("local") as ray:
 _, alive = psutil.wait_procs(family[1:], timeout=20)
 print(len(alive))
 """
-AUTO = """
-from pathlib import Path
-from workbench.jobs.pool.connect import connected
 
-with connected() as ray:
-    print(ray.get_runtime_context().gcs_address.partition(":")[0])
-"""
-TAKES = """
-import os
-from workbench.jobs.pool.connect import connected
 
-with connected() as ray:
-    print(ray.get_runtime_context().gcs_address)
-    # That it is connected does not say that a worker starts.
-    print(ray.get(ray.remote(lambda: 6 * 7).remote(), timeout=60))
-print(os.environ.get("RAY_AUTH_MODE"))
-"""
 FINDS_NONE = """
 from workbench.jobs.pool.connect import NoCluster, connected
 
@@ -91,53 +76,6 @@ def test_it_can_be_reached_from_this_machine_with_a_token_only_and_ends_with_the
 def test_an_address_where_nothing_answers_is_said(tmp_path: Path, ray_folder: str) -> None:
     (said,) = run(FINDS_NONE, tmp_path, ray_folder)
     assert said.startswith("no Ray cluster answers at 127.0.0.1:1 ") and "`ray start --head`" in said
-
-
-@pytest.mark.slow
-def test_what_a_cluster_that_has_ended_left_is_passed_over(tmp_path: Path, ray_folder: str) -> None:
-    left = Path(ray_folder) / "ray" / "ray_current_cluster"
-    left.parent.mkdir()
-    left.write_text("127.0.0.1:1")
-    assert run(AUTO, tmp_path, ray_folder) == ["127.0.0.1"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("asks_for_a_token", [True, False])
-def test_a_cluster_that_was_started_here_is_taken_also_where_it_asks_for_this_users_token(
-    asks_for_a_token: bool, tmp_path: Path, ray_folder: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / ".ray").mkdir()
-    (tmp_path / ".ray" / "auth_token").write_text("0" * 64)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
-    monkeypatch.delenv("RAY_AUTH_TOKEN", raising=False)
-    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
-    mode = {} if asks_for_a_token else {"RAY_AUTH_MODE": "disabled"}
-    start = (
-        "start",
-        "--head",
-        "--port",
-        "0",
-        "--node-ip-address",
-        "127.0.0.1",
-        "--include-dashboard",
-        "false",
-    )
-    try:
-        subprocess.run(
-            [sys.executable, "-m", "ray.scripts.scripts", *start],
-            check=True,
-            capture_output=True,
-            timeout=120,
-            env={**os.environ, "RAY_TMPDIR": ray_folder, **mode},
-        )
-        its_address, answer, mode_after = run(TAKES, tmp_path, ray_folder)
-        assert (answer, mode_after) == ("42", "None")
-        assert its_address == (Path(ray_folder) / "ray" / "ray_current_cluster").read_text()
-    finally:
-        for process in psutil.process_iter(["cmdline"]):
-            if any(ray_folder in word for word in process.info["cmdline"] or ()):
-                process.kill()
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pytest
 
 from workbench.jobs.pool.deal import Deal, ItemQueue, Shard, ThisProcess, Work
 from workbench.jobs.pool.job_file import JobFile, JobFileError, JobKey, Kept, job_of, read_parts, write_whole
-from workbench.jobs.record.episodes import RecordOptions, Written
+from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.task import TaskOptions
 
 WHOLE = Shard()
@@ -60,14 +60,6 @@ def test_parts_are_the_whole(tmp_path: Path) -> None:
     assert run(tmp_path / "whole.job") == ({n: n * n for n in range(9)}, [])
 
 
-def test_what_a_part_lacks_is_done_by_the_whole(tmp_path: Path) -> None:
-    run(tmp_path / "1.job", Shard(1, 3))
-    run(tmp_path / "3.job", Shard(3, 3))
-    write_whole(tmp_path / "whole.job", read_parts([tmp_path / "1.job", tmp_path / "3.job"]))
-    results, made = run(tmp_path / "whole.job")
-    assert results == {n: n * n for n in range(9)} and 0 < len(made) < 9
-
-
 def test_another_job_is_refused_with_what_differs(tmp_path: Path) -> None:
     run(tmp_path / "a.job")
     other = replace(JOB, about={"command": "square", "seeds": "10", "rules": "off"})
@@ -78,23 +70,6 @@ def test_another_job_is_refused_with_what_differs(tmp_path: Path) -> None:
     run(tmp_path / "b.job", job=other)
     with pytest.raises(JobFileError, match="b.job is of another job"):
         read_parts([tmp_path / "a.job", tmp_path / "b.job"])
-
-
-def test_one_part_twice_is_refused(tmp_path: Path) -> None:
-    run(tmp_path / "a.job", Shard(1, 2))
-    with pytest.raises(
-        JobFileError,
-        match="a.job and .*a.job hold the same results .number 0, for one.: they are the same part",
-    ):
-        read_parts([tmp_path / "a.job", tmp_path / "a.job"])
-
-
-def test_a_file_that_is_open_elsewhere_is_refused(tmp_path: Path) -> None:
-    file = JobFile(tmp_path / "a.job", JOB)
-    with pytest.raises(JobFileError, match="a.job cannot be used: another process has it open"):
-        JobFile(tmp_path / "a.job", JOB)
-    file.close()
-    JobFile(tmp_path / "a.job", JOB).close()
 
 
 def _text(path: Path) -> None:
@@ -119,17 +94,6 @@ def test_what_is_no_job_file_is_refused_and_left_alone(make: Callable[[Path], No
         with pytest.raises((JobFileError, FileNotFoundError), match=r"a\.job"):
             use()
     assert not path.is_file() or path.read_bytes() == before
-
-
-def test_a_result_of_another_type_is_refused(tmp_path: Path) -> None:
-    run(tmp_path / "a.job")
-    with pytest.raises(JobFileError, match="a result cannot be read"):
-        read_parts([tmp_path / "a.job"]).results(Written)
-
-
-def test_a_missing_folder_is_made(tmp_path: Path) -> None:
-    JobFile(tmp_path / "new" / "a.job", JOB).close()
-    assert (tmp_path / "new" / "a.job").is_file()
 
 
 # --- which job it is -------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.waiting import until
-from tests.jobs.pool import work
 from tests.jobs.pool.work import BEGUN, PROBLEM, Run, Setup, Squared
 from workbench.authoring.problem import Problem, TaskError
 from workbench.jobs.pool.deal import (
@@ -65,18 +64,6 @@ def test_each_item_is_done_once_with_the_same_result_whoever_does_it(
 
 
 @child_process
-def test_cores_are_shared_out_and_no_process_is_started_for_nothing(tmp_path: Path) -> None:
-    cores = sorted(os.sched_getaffinity(0))
-    given = [
-        line.rpartition(" ")[2].split(",")
-        for line in Run(Setup(folder=tmp_path), range(4)).by(Processes(2)).updates
-    ]
-    together = sorted(int(core) for one in given for core in one)
-    assert together == (cores if len(cores) > 1 else 2 * cores)
-    assert len(Run(Setup(folder=tmp_path), range(4), chunk=4).by(Processes(2)).updates) == 1
-
-
-@child_process
 @pytest.mark.parametrize("executor", EXECUTORS)
 def test_what_is_not_wanted_any_more_is_left_out_and_all_before_it_is_done(
     executor: Executor, tmp_path: Path
@@ -89,16 +76,6 @@ def test_what_is_not_wanted_any_more_is_left_out_and_all_before_it_is_done(
     assert set(range(8)) <= set(done.results)
     # One that was begun meanwhile may come.
     assert len(done.results) < 100
-
-
-@child_process
-def test_an_item_that_waits_for_others_is_dropped_when_it_is_not_wanted(tmp_path: Path) -> None:
-    def enough(run: Run, number: int) -> None:
-        if (tmp_path / "waits").exists():
-            run.deal.lower(4)
-
-    done = Run(Setup("waits", 4, folder=tmp_path), range(10**6), on_result=enough).by(Processes(2))
-    assert set(range(4)) <= set(done.results)
 
 
 @child_process
@@ -132,15 +109,11 @@ def fails(how: str, says: str, error: type[Exception] = PoolError) -> Any:
     ("how", "says", "error"),
     [
         fails("killed", "a process that squares was killed by SIGKILL"),
-        fails("left", "a process that squares ended with exit code 0"),
         fails("bug", "a process that squares ended with exit code 1"),
         fails("task", "it broke", TaskError),
-        fails("value", "not such a number"),
         fails("no UTF-8", r"there is no .*caf\\udce9"),
         fails("garbage", "a process that squares sent what cannot be read"),
-        fails("endless", "a process that squares sent what cannot be read"),
         fails("another type", "a process that squares sent what cannot be read"),
-        fails("no path", "a process that squares sent what cannot be read"),
         fails("another's", "a process that squares sent the result of an item that it does not have"),
     ],
 )
@@ -189,13 +162,6 @@ def test_a_task_that_cannot_be_loaded_is_said_once(executor: Executor, tmp_path:
     with pytest.raises(TaskError, match="it broke") as raised:
         run.by(executor)
     assert raised.value.problem == PROBLEM and not run.results
-
-
-@child_process
-def test_a_process_that_forgets_an_item_is_a_failure(tmp_path: Path) -> None:
-    run = Run(Setup(folder=tmp_path), range(8), run=work.forget)
-    with pytest.raises(PoolError, match="ended before it was done"):
-        run.by(Processes(1))
 
 
 @child_process
@@ -309,14 +275,6 @@ def test_failures_at_different_places_or_between_results_do_not() -> None:
             assert chunk is not None
             told.deal.result(number, chunk.numbers[0], 0)
     assert told.deal.count_left(99) == 100 - (2 * FIRST_ALIKE - 2) - 3 * LATER_ALIKE
-
-
-def test_a_job_without_a_result_is_a_failure() -> None:
-    told = Told(range(1))
-    told.deal.next("a")
-    told.deal.failed("a", problem(3))
-    with pytest.raises(TaskError, match="it broke at 3"):
-        told.deal.require_results()
 
 
 @given(total=st.integers(1, 200), count=st.integers(1, 40), chunk=st.integers(1, 9))

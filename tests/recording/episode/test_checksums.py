@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xxhash
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drive.episodes import Made
-from workbench.recording.episode.document import Checksum, check, checksum, write_into_description
+from workbench.recording.episode.document import write_into_description
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.reader.read_rows import read_found
@@ -72,27 +71,6 @@ def test_changed_bits_are_told_wherever_they_are(
         file.write_bytes(content)
 
 
-@pytest.mark.parametrize("suffix", [".rrd", ".h5", ".json"])
-def test_of_a_changed_file_the_others_are_read(episode: Made, tmp_path: Path, suffix: str) -> None:
-    path = episode.write(tmp_path).json
-    file = path.with_suffix(suffix)
-    flip(file, file.stat().st_size - 30)
-    found = read_episode(path)
-    (said,) = found.broken_files
-    assert said.file == file.name
-    assert (found.poses is None) == (suffix == ".rrd")
-    assert (found.env_states == {}) == (suffix == ".h5")
-    np.testing.assert_array_equal(found.action, episode.action)
-
-
-def test_where_both_are_changed_there_is_no_recording(episode: Made, tmp_path: Path) -> None:
-    files = episode.write(tmp_path)
-    flip(files.rrd, 3000)
-    flip(files.h5, 3000)
-    with pytest.raises(UnreadableRecording, match=r"\.rrd was cut short or changed .*\.h5 was cut short"):
-        read_episode(files.json)
-
-
 def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, tmp_path: Path) -> None:
     files = episode.write(tmp_path)
     write_into_description(files.json, ("good",), "a note")
@@ -123,29 +101,3 @@ def test_a_changed_document_gets_no_new_checksum_by_a_tag(episode: Made, tmp_pat
     with pytest.raises(ValueError, match="changed"):
         write_into_description(files.json, ("good",), "")
     assert files.json.read_bytes() == content
-
-
-def test_a_recording_of_before_opens_and_takes_tags(episode: Made, tmp_path: Path) -> None:
-    files = episode.write(tmp_path)
-    said = json.loads(files.json.read_bytes())
-    del said["workbench_checksum"]
-    said["workbench"]["format"] = 1
-    files.json.write_text(json.dumps(said))
-    for _ in range(2):
-        assert read_episode(files.json).broken_files == ()
-        write_into_description(files.json, ("good",), "")
-
-
-@pytest.mark.parametrize("size", [0, 1, 1 << 20, (1 << 20) + 1, 3_000_000])
-def test_a_checksum_is_of_the_whole_file(tmp_path: Path, size: int) -> None:
-    path = tmp_path / "a.h5"
-    content = np.random.default_rng(size).bytes(size)
-    path.write_bytes(content)
-    found = checksum(path)
-    assert found == Checksum(size, xxhash.xxh3_128(content).hexdigest())
-    described = {".h5": found, ".rrd": Checksum(5)}
-    check(path, described)
-    if size:
-        flip(path, size - 1)
-        with pytest.raises(OSError, match="its checksum differs"):
-            check(path, described)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -28,45 +27,6 @@ def through(rows: list[EpisodeRow]) -> dict[str, np.ndarray]:
     contents = [packed(one, packer, 2) for one in rows]
     runs = [np.frombuffer(content, layout_type(layout.text)) for layout, content in contents]
     return assemble(runs)
-
-
-def test_types_are_kept_where_every_row_has_the_entry() -> None:
-    vectors = np.arange(6.0).reshape(3, 2)
-    rows = [
-        row(success=flag, contacts=4, offset=vector) for flag, vector in zip((True, False, True), vectors)
-    ]
-    columns = through(rows)
-    assert columns["evaluate/success"].dtype == np.bool_
-    assert columns["evaluate/contacts"].dtype.kind == "i"
-    np.testing.assert_array_equal(columns["evaluate/success"], [True, False, True])
-    np.testing.assert_array_equal(columns["evaluate/offset"], vectors)
-
-
-def test_entries_that_come_and_go_leave_nan() -> None:
-    columns = through([row(early=True), row(late=np.ones(2)), row(late=np.ones(2), early=False)])
-    np.testing.assert_array_equal(columns["evaluate/early"], [1, np.nan, 0])
-    np.testing.assert_array_equal(columns["evaluate/late"], [[np.nan, np.nan], [1, 1], [1, 1]])
-
-
-def test_entries_that_change_their_shape_are_padded() -> None:
-    columns = through([row(d=np.float32(1)), row(d=np.full(2, 2.0))])
-    np.testing.assert_array_equal(columns["evaluate/d"], [[1, np.nan], [2, 2]])
-
-
-def check(one: EpisodeRow, bodies: int = 2) -> None:
-    packed(one, BatchPacker(), 2)[0].check(bodies, 2)
-
-
-def test_what_is_no_number_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"evaluate\(\)\['phase'\] has dtype <U5"):
-        check(row(phase="reach"))
-
-
-def test_actions_and_bodies_must_fit() -> None:
-    with pytest.raises(ValueError, match="3 numbers, but 2 action names"):
-        check(row(action=(0, 0, 0)))
-    with pytest.raises(ValueError, match="the scene has 3 bodies"):
-        check(row(), bodies=3)
 
 
 VALUE = st.sampled_from([np.bool_, np.int64, np.float32, np.float64]).flatmap(

@@ -50,11 +50,6 @@ def test_colour_keeps_rows_and_channels_apart() -> None:
     assert np.abs(found.astype(int) - image).max() < 12
 
 
-def test_what_is_no_picture_is_an_error() -> None:
-    with pytest.raises(OSError):
-        EncodedPictures("rgb", [b"not a picture"])[0]
-
-
 def test_a_picture_that_claims_too_many_pixels_or_is_of_another_format_is_refused() -> None:
     def png(width: int, height: int) -> bytes:
         header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)

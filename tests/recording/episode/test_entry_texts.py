@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -24,12 +23,9 @@ from workbench.recording.episode.columns import (
     CUT_MESSAGE,
     MOST_BYTES,
     TextEntry,
-    TextTrack,
     TextWriter,
-    entry_at,
     text_tracks,
 )
-from workbench.recording.episode.document import as_json
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.writing.episode_writer import EpisodeFiles
 from workbench.recording.writing.finish import recover
@@ -52,23 +48,6 @@ def write(made: Made, folder: Path, others: list[Others], finish: bool = True) -
     journal_of(writer).sync()
     writer.close()
     return None
-
-
-def test_a_line_is_written_where_a_text_changes() -> None:
-    writer = TextWriter()
-    states: list[Others] = [{}, {"a": said("x")}, {"a": said("x")}, {"a": said("y"), "b": said("z")}, {}]
-    lines = [writer.changes(state, others) for state, others in enumerate(states)]
-    assert [len(found) for found in lines] == [0, 1, 0, 2, 2]
-    tracks = text_tracks([line for found in lines for line in found])
-    x, y, z = (TextEntry("str", text, False, True) for text in "xyz")
-    assert tracks == {"a": ((1, x), (3, y), (4, None)), "b": ((3, z), (4, None))}
-    assert msgspec.convert(as_json(tracks), dict[str, TextTrack]) == tracks
-    assert [entry_at(tracks["a"], state) for state in range(5)] == [
-        None,
-        *[x] * 2,
-        y,
-        None,
-    ]
 
 
 def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
@@ -117,11 +96,6 @@ def test_numbers_texts_and_both_come_back(child_process: None, make_episode: Mak
     ]
 
 
-def test_an_episode_without_such_entries_has_no_place_for_them(make_episode: Maker, tmp_path: Path) -> None:
-    path = make_episode(2, evaluate={"success": np.zeros(3, bool)}).write(tmp_path).rrd
-    assert not [name for name in read_rrd(path) if name.startswith(("/batch", "/logs/evaluate"))]
-
-
 def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Path) -> None:
     write(make_episode(3), tmp_path, [{"phase": said(f"{state // 2}")} for state in range(4)], finish=False)
     (files,) = recover(tmp_path)
@@ -133,13 +107,6 @@ def test_a_killed_writers_texts_are_recovered(make_episode: Maker, tmp_path: Pat
         ("1",),
         ("1",),
     ]
-
-
-def test_the_json_that_a_library_reads_stays_small(make_episode: Maker, tmp_path: Path) -> None:
-    steps = 1500
-    made = make_episode(steps)
-    files = write(made, tmp_path, [{"clock": said(f"{state:060}")} for state in range(steps + 1)])
-    assert files is not None and files.json.stat().st_size < 3 * MOST_BYTES
 
 
 @settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])

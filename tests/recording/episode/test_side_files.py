@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.drive.episodes import Made, made, write
-from workbench.recording.episode.side_files import side_file_path, side_files, side_files_text
+from tests.drive.episodes import Made
+from workbench.recording.episode.side_files import side_files, side_files_text
 from workbench.recording.reader.read_episode import read_episode
 
 TEXT = """
@@ -66,17 +65,6 @@ def test_what_has_changed_or_gone_since_is_said(task: Path) -> None:
     assert side_files_text(str(task), {}) == ""
 
 
-@pytest.mark.parametrize(
-    "name", ["../beside.txt", "a/../../beside.txt", "..", "/etc/hostname", "", ".", "./"]
-)
-def test_what_lies_outside_the_tasks_folder_is_nowhere(tmp_path: Path, name: str) -> None:
-    assert side_file_path(tmp_path, name) is None
-    assert (
-        side_file_path(None, "a.txt") is None
-        and side_file_path(tmp_path, "a/b.txt") == tmp_path / "a" / "b.txt"
-    )
-
-
 def test_a_file_outside_is_not_said_to_be_as_then(task: Path) -> None:
     """Whoever shares a recording learns nothing of the files of whoever opens it."""
     outside = task.parent.parent / "outside.txt"
@@ -87,22 +75,6 @@ def test_a_file_outside_is_not_said_to_be_as_then(task: Path) -> None:
         assert "is not there" in side_files_text(str(task), {str(outside): hashed})
     finally:
         outside.unlink()
-
-
-def test_a_file_that_changed_within_its_second_is_another(task: Path) -> None:
-    recorded = side_files(str(task), {str(task): "load('notes.txt')"})
-    path = task.parent / "notes.txt"
-    before = path.stat()
-    path.write_text("MINE")
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
-    assert path.stat().st_size == before.st_size
-    assert "notes.txt has changed since" in side_files_text(str(task), recorded)
-
-
-def test_a_recording_says_them(tmp_path: Path) -> None:
-    json = write(tmp_path, made(3, side_files={"meshes/part.obj": "0123456789ab"}), pictures=False)
-    assert read_episode(json).info.side_files == {"meshes/part.obj": "0123456789ab"}
-    assert read_episode(json.with_suffix(".rrd")).info.side_files == {"meshes/part.obj": "0123456789ab"}
 
 
 def test_a_recording_that_was_copied_elsewhere_finds_its_task_where_one_looks_from(

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
-import resource
 from collections.abc import Callable
 from pathlib import Path
 
@@ -59,62 +57,6 @@ def test_a_call_that_fails_leaves_the_old_content_or_the_new(
         assert then or sorted(os.listdir(path.parent)) == beside, call
 
 
-@KINDS
-def test_the_new_content_is_on_the_disk_before_it_takes_the_old_ones_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begin: Callable[[Path], tuple[Path, Callable[[], None]]]
-) -> None:
-    path, write = begin(tmp_path)
-    fsync, lasting = os.fsync, []
-
-    def sync(descriptor: int) -> None:
-        lasting.append((Path(f"/proc/self/fd/{descriptor}").read_bytes(), b"typed now" in path.read_bytes()))
-        fsync(descriptor)
-
-    monkeypatch.setattr(os, "fsync", sync)
-    write()
-    assert lasting == [(path.read_bytes(), False)]
-
-
-@KINDS
-def test_a_full_disk_leaves_the_old_content(
-    tmp_path: Path, begin: Callable[[Path], tuple[Path, Callable[[], None]]]
-) -> None:
-    path, write = begin(tmp_path / "a")
-    before, beside = path.read_bytes(), sorted(os.listdir(path.parent))
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20, hard))
-    try:
-        with pytest.raises(OSError):
-            write()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert path.read_bytes() == before and sorted(os.listdir(path.parent)) == beside
-    write()
-    assert b"typed now" in path.read_bytes()
-
-
-@KINDS
-def test_a_link_stays_one_and_the_file_keeps_who_may_read_it(
-    tmp_path: Path, begin: Callable[[Path], tuple[Path, Callable[[], None]]]
-) -> None:
-    path, write = begin(tmp_path / "a")
-    aside = path.rename(tmp_path / f"aside{path.suffix}")
-    path.symlink_to(aside)
-    aside.chmod(0o640)
-    write()
-    assert path.is_symlink() and b"typed now" in aside.read_bytes()
-    assert aside.stat().st_mode & 0o777 == 0o640
-    assert sorted(os.listdir(tmp_path)) == ["a", aside.name]
-
-
-@pytest.mark.parametrize("indent", [None, 2])
-def test_a_description_stays_as_it_can_be_looked_at(tmp_path: Path, indent: int | None) -> None:
-    path, write = of_ours(tmp_path)
-    path.write_text(json.dumps(json.loads(path.read_text()), indent=indent))
-    write()
-    assert path.read_text() == json.dumps(json.loads(path.read_text()), indent=indent)
-
-
 def test_notes_of_one_trajectory_leave_those_of_the_others(tmp_path: Path) -> None:
     path = tmp_path / "demo.notes"
     for number in range(3):
@@ -140,11 +82,3 @@ def test_notes_that_cannot_be_read_are_not_written_over(tmp_path: Path, content:
     with pytest.raises(ValueError):
         write_notes(path, "traj_1", (), "")
     assert path.read_text() == content
-
-
-def test_notes_that_the_disk_does_not_give_are_not_written_over(tmp_path: Path) -> None:
-    path, write = of_others(tmp_path)
-    before = path.read_bytes()
-    with refused(1, ("open",)), pytest.raises(OSError, match="Input/output error"):
-        write()
-    assert path.read_bytes() == before

@@ -20,7 +20,7 @@ from workbench.recording.lerobot.format import Choice, frames_of
 from workbench.recording.lerobot.read import lerobot_rows, read_lerobot
 from workbench.recording.library.library import Library, LibraryError
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import find_all_sources, read_recording
+from workbench.recording.reader.reading import read_recording
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -63,13 +63,27 @@ def export(folder: Path, *episodes: Episode, options: ExportOptions | None = Non
     return export_lerobot(sources, folder, options or ExportOptions())
 
 
-def test_what_was_exported_is_read_back(episode: Episode, tmp_path: Path) -> None:
-    made = export(tmp_path / "set", shorter(episode, 5), episode)
-    assert (made.episodes, made.frames) == (2, 5 + episode.length)
-    first, second = lerobot_rows(tmp_path / "set")
-    assert (first.length, second.length, second.seed) == (5, episode.length, episode.info.seed)
-    assert second.total_reward == pytest.approx(float(episode.reward.sum()), rel=1e-5)
-    read = read_lerobot(tmp_path / "set", 1)
+@pytest.mark.parametrize(
+    "limits", [{}, {"DATA_MB": 0, "VIDEO_MB": 0, "CHUNK_SIZE": 2}], ids=["one", "many files"]
+)
+def test_what_was_exported_is_read_back(
+    episode: Episode, limits: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, limit in limits.items():
+        monkeypatch.setattr(f"workbench.recording.lerobot.format.{name}", limit)
+    made = export(tmp_path / "set", shorter(episode, 5), shorter(episode, 4), episode)
+    assert (made.episodes, made.frames) == (3, 9 + episode.length)
+    files = [
+        path.relative_to(tmp_path / "set/data").as_posix()
+        for path in (tmp_path / "set/data").rglob("*.parquet")
+    ]
+    expected = ["chunk-000/file-000.parquet", "chunk-000/file-001.parquet", "chunk-001/file-000.parquet"]
+    assert sorted(files) == expected[: 3 if limits else 1]
+    first, second, third = lerobot_rows(tmp_path / "set")
+    assert (first.length, second.length, third.length) == (5, 4, episode.length)
+    assert third.seed == episode.info.seed
+    assert third.total_reward == pytest.approx(float(episode.reward.sum()), rel=1e-5)
+    read = read_lerobot(tmp_path / "set", 2)
     assert read.geometry is None and read.info.control_dt == pytest.approx(episode.info.control_dt)
     assert read.action_names == tuple(name.replace("/", ".") for name in episode.action_names)
     np.testing.assert_array_equal(read.action, episode.action)
@@ -169,44 +183,6 @@ def test_episodes_that_do_not_fit_together_are_said_and_nothing_is_left(
         "c.rrd was cut short."
     ]
     assert len(read_lerobot(tmp_path / "rest", 1).reward) == episode.length
-
-
-def test_a_folder_with_something_in_it_is_not_written_to(episode: Episode, tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="something at"):
-        export(tmp_path, episode)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OSError, match="Cannot write the dataset"):
-        export(tmp_path / "file" / "set", episode)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "mine.txt"]
-
-
-def test_a_broken_dataset_is_said(episode: Episode, tmp_path: Path) -> None:
-    folder = tmp_path / "set"
-    export(folder, episode)
-    with pytest.raises(UnreadableRecording, match="no episode 7"):
-        read_lerobot(folder, 7)
-    info = json.loads((folder / "meta/info.json").read_text())
-    (folder / "meta/info.json").write_text(json.dumps({**info, "data_path": "../../secret.parquet"}))
-    with pytest.raises(UnreadableRecording, match="outside of it"):
-        read_lerobot(folder, 0)
-    (folder / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v2.1"}))
-    with pytest.raises(UnreadableRecording, match="version v2.1; version 3 can be read"):
-        lerobot_rows(folder)
-    (folder / "meta/info.json").write_text("{")
-    with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
-        lerobot_rows(folder)
-
-
-def test_a_broken_dataset_hides_nothing_beside_it(episode: Episode, tmp_path: Path) -> None:
-    for name in ("broken", "whole"):
-        export(tmp_path / name, episode)
-    (tmp_path / "broken/meta/info.json").write_text("{")
-    broken, whole = find_all_sources([tmp_path])
-    assert (broken.name, whole.name) == ("broken#0", "whole#0")
-    with pytest.raises(UnreadableRecording, match="cannot be read as a LeRobot dataset"):
-        read_recording(broken)
-    np.testing.assert_array_equal(read_recording(whole).action, episode.action)
 
 
 def test_a_dataset_is_in_the_library_an_episode_a_row(

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import msgspec
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -68,18 +67,6 @@ def test_it_is_written_once_a_second_and_its_end_at_once(tmp_path: Path) -> None
     assert read_jobs(tmp_path, now)[0].state == "stopped"
 
 
-def test_a_folder_that_is_not_there_is_not_made(tmp_path: Path) -> None:
-    StatusFile(tmp_path / "gone").write(RUNS)
-    assert not (tmp_path / "gone").exists() and read_jobs(tmp_path / "gone", 0.0) == ()
-
-
-def test_what_an_earlier_job_left_goes(tmp_path: Path) -> None:
-    file = StatusFile(tmp_path, lambda: 1e10)
-    file.write(RUNS)
-    file.remove_old(RUNS)
-    assert list(tmp_path.iterdir()) == [], "its time is years after that"
-
-
 def test_a_job_that_goes_on_replaces_its_last_word_and_no_other(tmp_path: Path) -> None:
     now = time.time()
     for status in (
@@ -122,21 +109,3 @@ def test_what_is_written_in_it_is_text_on_the_page(tmp_path: Path) -> None:
     shown = render("library_jobs", jobs=jobs)
     assert "<script" not in shown and "&lt;script&gt;" in shown and "\x1b" not in shown
     assert "2 failed" in shown
-
-
-@pytest.mark.usefixtures("child_process")
-def test_the_library_has_the_jobs_of_its_folder(tmp_path: Path) -> None:
-    from tests.drive.waiting import until
-
-    library = Library(tmp_path)
-    library.watch()
-    try:
-        file = StatusFile(tmp_path)
-        file.write(RUNS)
-        until(lambda: [job.done for job in library.view().jobs] == [40], "the job")
-        before = library.view().serial
-        file.write(JobStatus("record", "my_task.py", 100, 100, state="done"))
-        until(lambda: library.view().jobs[0].state == "done", "its end")
-        assert library.view().serial > before
-    finally:
-        library.close()

@@ -6,8 +6,6 @@ import os
 import re
 import shutil
 import sqlite3
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -19,7 +17,6 @@ import mani_skill.envs  # noqa: F401  (registers the tasks)
 import msgspec
 import numpy as np
 import pytest
-import rerun as rr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mani_skill.utils.wrappers.record import RecordEpisode
@@ -27,9 +24,9 @@ from PIL import Image
 
 from tests.drive.episodes import Made
 from tests.drive.waiting import until
-from tests.recording.library_files import describe, jpeg
+from tests.recording.library_files import describe
 from workbench.recording.episode.row import Facts, LibraryEntry, LibraryRow, clean_facts
-from workbench.recording.library.index import LibraryIndex, index_path
+from workbench.recording.library.index import index_path
 from workbench.recording.library.library import Library, LibraryError
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.reader.read_rows import read_found
@@ -76,31 +73,6 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 
 # --- what rows say --------------------------------------------------------------------------------------
-
-
-def test_a_recording_of_ours_is_a_row_with_what_its_description_says(
-    tmp_path: Path, library: Library
-) -> None:
-    describe(tmp_path / "monday", "a", id="ab12", tags=["good", "good", " "], note="slips")
-    library.refresh()
-    (row,) = library.view().rows
-    assert (row.id, row.name, row.kind, row.task, row.seed, row.length) == (
-        "ab12",
-        "monday/a",
-        "workbench",
-        "PushCube-v1",
-        7,
-        12,
-    )
-    assert (row.total_reward, row.success, row.source_hash) == (3.5, True, "aaaaaaaaaaaa")
-    assert (row.tags, row.note, row.problem) == (("good",), "slips", None)
-    assert row.date is not None and row.date.isoformat() == "2026-11-21T10:00:00+00:00"
-    assert [path.suffix for path in row.paths] == [".json", ".h5", ".rrd"]
-    assert row.size == sum(path.stat().st_size for path in row.paths)
-    assert (
-        library.thumbnails(("ab12",)).get("ab12") == jpeg()
-        and library.thumbnails(("other",)).get("other") is None
-    )
 
 
 def test_what_the_writer_wrote_is_a_row_and_is_read_as_before_when_it_has_tags(
@@ -157,31 +129,17 @@ def test_a_trajectory_with_pictures_has_a_thumbnail(
     assert red > 250 and green < 5
 
 
-def test_a_lone_rrd_is_a_row_with_its_properties(tmp_path: Path) -> None:
-    recording = rr.RecordingStream("workbench Old-v1")
-    memory = recording.memory_recording()
-    recording.send_property(
-        "episode", rr.AnyValues(task="Old-v1", seed=4, length=6, success=True, fail=False)
-    )
-    (tmp_path / "old.rrd").write_bytes(memory.drain_as_bytes())
-    (row,) = read(tmp_path)
-    assert (row.kind, row.task, row.seed, row.length, row.success) == ("rrd only", "Old-v1", 4, 6, True)
-
-
 @pytest.mark.parametrize(
     ("files", "said"),
     [
         ({"x.json": b'{"workbench": {"task": '}, "x.json is not JSON, or was cut short."),
-        ({"x.json": b"[" * 100_000}, "x.json is not JSON, or was cut short."),
         ({"x.rrd": b""}, "x.rrd is no recording that rerun can read"),
-        ({"x.rrd": b"RRF2" + bytes(300)}, "x.rrd is no recording that rerun can read"),
         ({"x.json": b'{"episodes": [{"episode_id": 0}], "env_info": {"env_id": "A-v1"}}'}, "is missing"),
         (
             {"x.json": b'{"episodes": [{"episode_id": 0}], "env_info": {"env_id": "A-v1"}}', "x.h5": b"HDF"},
             "x.h5 is damaged, or still being written.",
         ),
         ({"x.json": b'{"workbench": {"task": "A-v1"}}', "x.h5": b""}, "x.rrd is missing."),
-        ({"x.json": b"3", "x.h5": b""}, "x.json names neither an env nor episodes."),
     ],
 )
 def test_files_that_are_broken_are_rows_that_say_so(
@@ -191,15 +149,6 @@ def test_files_that_are_broken_are_rows_that_say_so(
         (tmp_path / name).write_bytes(content)
     (row,) = read(tmp_path)
     assert row.problem is not None and said in row.problem
-
-
-def test_an_h5_alone_is_a_row_once_it_is_clear_that_nothing_comes_to_it(tmp_path: Path) -> None:
-    path = tmp_path / "x.h5"
-    path.write_bytes(b"HDF")
-    assert read(tmp_path) == []
-    os.utime(path, (1e9, 1e9))
-    (row,) = read(tmp_path)
-    assert row.problem is not None and "needs x.json beside it" in row.problem
 
 
 def test_what_is_no_recording_is_no_row(tmp_path: Path) -> None:
@@ -267,34 +216,6 @@ def test_whatever_a_description_says_there_is_one_row_that_the_index_can_hold(fi
     assert picture is None or picture[:2] == b"\xff\xd8"
 
 
-def test_a_wrong_field_is_named_by_its_path_and_the_others_are_shown(tmp_path: Path, maniskill: Path) -> None:
-    describe(tmp_path, "ours", task="Push-v1", seed="seven", scene={"body_names": [], "body_kinds": []})
-    for suffix in (".json", ".h5"):
-        shutil.copy(maniskill / f"demo{suffix}", tmp_path)
-    said = json.loads((tmp_path / "demo.json").read_text())
-    said["episodes"][1]["elapsed_steps"] = "two"
-    (tmp_path / "demo.json").write_text(json.dumps(said))
-    good, wrong, ours = read(tmp_path)
-    assert (good.name, good.length, good.problem) == ("demo#traj_0", 3, None)
-    assert wrong.problem is not None and wrong.problem.endswith("at $.episodes[1].elapsed_steps.")
-    assert (ours.task, ours.seed, ours.length) == ("Push-v1", None, 12)
-    assert ours.problem == (
-        "ours.json is not as a recording is described: expected `int | null`, got `str` at $.workbench.seed."
-    )
-    describe(tmp_path, "ours", scene={"body_names": [], "body_kinds": []})
-    assert read(tmp_path)[2].problem == (
-        "ours.json is not as a recording is described: "
-        "object missing required field `body_hidden` at $.workbench.scene."
-    )
-
-
-def test_a_copy_of_a_recording_is_another_row(tmp_path: Path) -> None:
-    describe(tmp_path, "a", id="ab12")
-    shutil.copytree(tmp_path, tmp_path / "copy", ignore=shutil.ignore_patterns("copy"))
-    first, second = read(tmp_path)
-    assert first.id == "ab12" and second.id.startswith("at-")
-
-
 # --- keeping up -----------------------------------------------------------------------------------------
 
 
@@ -328,16 +249,6 @@ def test_only_what_changed_is_read_again(
     assert read_keys == []  # from the index
 
 
-def test_a_folder_that_comes_later_is_looked_into_and_has_its_thumbnails(tmp_path: Path) -> None:
-    library = Library(tmp_path / "later")
-    library.refresh()
-    assert library.view().rows == ()
-    describe(tmp_path / "later", "a", id="ab12")
-    library.refresh()
-    assert library.thumbnails(["ab12"]) == {"ab12": jpeg()}
-    library.close()
-
-
 @pytest.mark.parametrize(
     "damage", ["deleted", "garbage", "cut", "another program's", "rows of another version"]
 )
@@ -368,18 +279,6 @@ def test_an_index_that_is_wrong_is_made_anew(tmp_path: Path, damage: str) -> Non
     library.close()
 
 
-def test_a_page_of_garbage_within_the_index_costs_no_more_than_reading_again(tmp_path: Path) -> None:
-    for k in range(120):
-        describe(tmp_path, f"r{k:03}", seed=k)
-    good = read(tmp_path)
-    index = index_path(tmp_path)
-    content = bytearray(index.read_bytes())
-    for page in range(1, len(content) // 4096):
-        content[page * 4096 : page * 4096 + 200] = os.urandom(200)
-    index.write_bytes(content)
-    assert read(tmp_path) == good
-
-
 def test_an_index_that_came_with_the_folder_is_left_alone(tmp_path: Path) -> None:
     folder, mine = tmp_path / "recordings", tmp_path / "another program's.sqlite"
     describe(folder, "a")
@@ -392,56 +291,6 @@ def test_an_index_that_came_with_the_folder_is_left_alone(tmp_path: Path) -> Non
     assert [row.name for row in read(folder)] == ["a"]
     assert mine.read_bytes() == before
     assert sorted(path.name for path in (folder / ".workbench").iterdir()) == ["library.sqlite"]
-
-
-def test_without_a_place_for_the_index_it_is_in_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder, cache = tmp_path / "recordings", tmp_path / "cache"
-    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
-    describe(folder, "a")
-    assert index_path(folder).is_relative_to(cache)
-    LibraryIndex(folder).close()
-    assert index_path(folder).is_file()
-    shutil.rmtree(cache)
-    cache.write_text("no place here")
-    library = Library(folder)
-    library.refresh()
-    assert [row.name for row in library.view().rows] == ["a"]
-    assert library.thumbnails([row.id for row in library.view().rows]).keys() == {
-        row.id for row in library.view().rows
-    }
-    library.close()
-
-
-def test_indices_of_many_folders_do_not_add_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("workbench.recording.library.index.MOST_INDICES", 3)
-    for k in range(6):
-        index = LibraryIndex(tmp_path / f"{k}")
-        os.utime(index_path(tmp_path / f"{k}"), (k, k))
-        index.close()
-    LibraryIndex(tmp_path / "last").close()
-    left = {path.name for path in index_path(tmp_path).parent.iterdir()}
-    assert left == {index_path(tmp_path / name).name for name in ("4", "5", "last")}
-
-
-def test_two_processes_at_once_have_the_same_rows(tmp_path: Path) -> None:
-    for k in range(150):
-        describe(tmp_path, f"r{k:03}", seed=k)
-    program = (
-        "import sys, pathlib\n"
-        "from workbench.recording.library.library import Library\n"
-        "for _ in range(3):\n"
-        "    library = Library(pathlib.Path(sys.argv[1])); library.refresh(); library.close()\n"
-        "print(*(row.id for row in library.view().rows))\n"
-    )
-    running = [
-        subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
-    said = {process.communicate(timeout=100)[0] for process in running}
-    assert said == {" ".join(row.id for row in read(tmp_path)) + "\n"} and running[0].returncode == 0
 
 
 def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
@@ -469,40 +318,6 @@ def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
         assert "is not there" in str(library.view().problem)
     finally:
         library.close()
-
-
-def test_rows_are_shown_while_others_are_read_and_from_the_index_before_anything_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("workbench.recording.library.library.PUBLISH_SECONDS", 0.0)
-    for k in range(5):
-        describe(tmp_path, f"r{k}")
-        os.utime(tmp_path / f"r{k}.json", ns=(10**18 + k, 10**18 + k))
-    for suffix in (".h5", ".rrd"):
-        for path in tmp_path.glob(f"*{suffix}"):
-            os.utime(path, ns=(10**18, 10**18))
-    seen: list[tuple[int, object]] = []
-
-    def follow(library: Library) -> None:
-        real = library._publish
-
-        def publish(*arguments: Any, **changes: Any) -> None:
-            real(*arguments, **changes)
-            seen.append((len(library.view().rows), library.view().reading))
-
-        library._publish = publish  # type: ignore[method-assign]
-
-    library = Library(tmp_path)
-    follow(library)
-    library.refresh()
-    library.close()
-    assert seen == [*((k, (k, 5)) for k in range(1, 6)), (5, None)]
-    seen.clear()
-    library = Library(tmp_path)
-    follow(library)
-    library.refresh()
-    library.close()
-    assert seen == [(5, (0, 0)), (5, None)]
 
 
 # --- tags and notes ---------------------------------------------------------------------------------------
@@ -551,20 +366,6 @@ def test_files_of_others_are_not_written_into(tmp_path: Path, maniskill: Path, l
     assert tree(tmp_path) == before
 
 
-def test_a_note_that_cannot_be_kept_is_an_error_and_nothing_is_half_written(
-    tmp_path: Path, library: Library
-) -> None:
-    describe(tmp_path, "a", id="a1")
-    library.refresh()
-    (tmp_path / "a.json").write_text("{}")
-    before = tree(tmp_path)
-    with pytest.raises(LibraryError, match="a could not be kept .*is not a recording"):
-        library.set_note(["a1"], "x")
-    assert tree(tmp_path) == before
-    with pytest.raises(LibraryError, match="not in the library any more"):
-        library.set_tags(["a1", "zz"], add=["x"])
-
-
 # --- deleting ---------------------------------------------------------------------------------------------
 
 
@@ -585,21 +386,6 @@ def test_deleting_takes_all_files_and_can_be_taken_back(tmp_path: Path, library:
         library.undo_delete()
 
 
-def test_what_stands_there_now_is_not_written_over_when_a_deletion_is_taken_back(
-    tmp_path: Path, library: Library
-) -> None:
-    describe(tmp_path, "a", id="aaaa")
-    library.refresh()
-    library.delete(["aaaa"])
-    describe(tmp_path, "a", id="bbbb")
-    before = tree(tmp_path)
-    with pytest.raises(LibraryError, match="there is a file of that name already"):
-        library.undo_delete()
-    assert tree(tmp_path) == before
-    library.empty_trash()
-    assert not (tmp_path / ".trash").exists() and library.view().trash.files == 0
-
-
 def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
     tmp_path: Path, maniskill: Path, library: Library
 ) -> None:
@@ -616,30 +402,31 @@ def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
     assert library.view().rows == () and library.view().trash.files == 3
 
 
-def test_a_deletion_that_fails_leaves_the_recording_whole(tmp_path: Path, library: Library) -> None:
-    describe(tmp_path, "a", id="aaaa")
-    (tmp_path / ".trash").write_text("a file where the folder should be")
+def test_a_note_that_cannot_be_kept_is_an_error_and_nothing_is_half_written(
+    tmp_path: Path, library: Library
+) -> None:
+    describe(tmp_path, "a", id="a1")
+    library.refresh()
+    (tmp_path / "a.json").write_text("{}")
     before = tree(tmp_path)
-    library.refresh()
-    with pytest.raises(LibraryError, match="Not everything was deleted"):
-        library.delete(["aaaa"])
-    assert tree(tmp_path) == before and [row.id for row in library.view().rows] == ["aaaa"]
+    with pytest.raises(LibraryError, match="a could not be kept .*is not a recording"):
+        library.set_note(["a1"], "x")
+    assert tree(tmp_path) == before
+    with pytest.raises(LibraryError, match="not in the library any more"):
+        library.set_tags(["a1", "zz"], add=["x"])
 
 
-def test_a_trash_that_is_a_link_is_nobodys_trash(tmp_path: Path) -> None:
-    folder, other = tmp_path / "recordings", tmp_path / "other"
-    describe(folder, "a")
-    (other / "2026").mkdir(parents=True)
-    (other / "2026" / "precious.txt").write_text("mine")
-    (folder / ".trash").symlink_to(other)
-    library = Library(folder)
-    library.refresh()
+def test_a_scan_that_is_asked_for_is_made_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not when its time comes, which here is in an hour."""
+    for name in ("SCAN_SECONDS", "LONGEST_PAUSE"):
+        monkeypatch.setattr(f"workbench.recording.library.library.{name}", 3600.0)
+    library = Library(tmp_path)
+    library.watch()
     try:
-        assert library.view().trash.files == 0
-        with pytest.raises(LibraryError, match="is a link"):
-            library.delete([row.id for row in library.view().rows])
-        with pytest.raises(LibraryError):
-            library.empty_trash()
-        assert (folder / "a.json").exists() and (other / "2026" / "precious.txt").exists()
+        until(lambda: library.view().reading is None, "the first look", seen=library.view)
+        for count in (1, 2):
+            describe(tmp_path, f"r{count}")
+            library.request_scan()
+            until(lambda count=count: len(library.view().rows) == count, "the row", seen=library.view)
     finally:
         library.close()

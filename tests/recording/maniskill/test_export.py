@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from workbench.cli.main import main
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
-from workbench.recording.reader.read_episode import read_episode, read_maniskill
+from workbench.recording.reader.read_episode import read_episode
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -61,19 +60,6 @@ def test_maniskills_dataset_class_loads_what_was_recorded(recordings: list[Path]
     stock.close()
 
 
-def test_each_episode_is_numbered_in_both_files(recordings: list[Path], tmp_path: Path) -> None:
-    file = tmp_path / "new" / "demos.h5"
-    assert export(recordings[0].parent, "--maniskill", file) == 0
-    entries = json.loads(file.with_suffix(".json").read_text())["episodes"]
-    assert [entry["episode_id"] for entry in entries] == [0, 1, 2, 3]
-    with h5py.File(file) as written:
-        assert sorted(written) == ["traj_0", "traj_1", "traj_2", "traj_3"]
-        actions: list[Any] = [written[f"traj_{k}/actions"] for k in range(4)]
-        assert [len(each) for each in actions] == [one["elapsed_steps"] for one in entries]
-    assert {path.name for path in file.parent.iterdir()} == {"demos.h5", "demos.json"}
-    assert sorted(read_maniskill(file, f"traj_{k}").info.seed for k in range(4)) == [1, 1, 2, 3]
-
-
 @pytest.mark.slow
 def test_replay_trajectory_takes_them(recordings: list[Path], tmp_path: Path) -> None:
     file = tmp_path / "demos.h5"
@@ -84,22 +70,6 @@ def test_replay_trajectory_takes_them(recordings: list[Path], tmp_path: Path) ->
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert "3/3=100.00% demos saved" in done.stdout
-
-
-def test_an_episode_of_another_kind_is_refused_or_left_out(
-    recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other = TaskOptions(num_envs=1, env_kwargs={**PUSHED, "control_mode": "pd_joint_delta_pos"})
-    (joint,) = record(
-        RecordOptions("PushCube-v1", tmp_path / "r", 1, pictures=False, max_steps=2, options=other)
-    ).written
-    both = (recordings[0], joint.path)
-    assert export(*both, "--maniskill", tmp_path / "demos.h5") == 2
-    said = capsys.readouterr().err
-    assert "control mode" in said and "pd_joint_delta_pos" in said
-    assert not (tmp_path / "demos.h5").exists()
-    assert export(*both, "--maniskill", tmp_path / "demos.h5", "--only-fitting") == 0
-    assert len(json.loads((tmp_path / "demos.json").read_text())["episodes"]) == 1
 
 
 def test_nothing_that_is_there_is_written_over(
@@ -129,7 +99,9 @@ OBSERVED = "PickCube-v1", 7
 """Task and seed."""
 
 
-@pytest.mark.parametrize("obs_mode", ["rgb+depth+segmentation", "state+rgb"])
+@pytest.mark.parametrize(
+    "obs_mode", ["rgb+depth+segmentation", pytest.param("state+rgb", marks=pytest.mark.slow)]
+)
 def test_pictures_that_were_observed_are_as_maniskills_recorder_writes_them(
     renderer: None, tmp_path: Path, obs_mode: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

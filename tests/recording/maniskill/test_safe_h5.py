@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 
 from tests.recording.foreign_h5 import write
 from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.maniskill.safe_h5 import DEEPEST, RefusedH5, open_h5
+from workbench.recording.maniskill.safe_h5 import DEEPEST
 from workbench.recording.reader.read_episode import read_maniskill
 from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.scan import scan_folder
@@ -88,15 +89,12 @@ def words(group: h5py.Group) -> None:
     ("spoil", "says"),
     [
         (external_link, "traj_0/obs in another file (an external link)"),
-        (external_group, "traj_0/env_states in another file (an external link)"),
         (external_storage, "traj_0/obs stored in another file (external storage)"),
         (virtual, "traj_0/obs put together from other files (a virtual dataset)"),
         (soft_link_out, "traj_0/way in another file (an external link)"),
-        (terabytes, "claims 1,099,511,627,776 bytes of numbers for traj_0/obs"),
         (two_gigabytes, "claims 2,147,483,648 bytes of numbers for traj_0/rewards"),
         (huge_chunks, "claims chunks of 2,147,483,648 bytes for traj_0/rewards"),
         (circle, f"groups more than {DEEPEST} deep"),
-        (soft_circle, "links that lead round in a circle (at traj_0/obs)"),
         (strange_filter, "packed by a filter that h5py does not bring along (32015)"),
         (words, "no plain number"),
     ],
@@ -137,7 +135,14 @@ def test_what_stands_in_its_own_file_is_read_also_by_soft_links_and_packed(tmp_p
         group["obs/word"] = np.bytes_(b"what is no number is left out")
         group.create_dataset("obs/empty", shape=(4, 0), dtype=np.float32)
 
-    read = read_maniskill(write(tmp_path, spoil), "traj_0")
+    path = write(tmp_path, spoil)
+    described = path.with_suffix(".json")
+    kwargs = '"env_kwargs": {"sim_config": {"control_freq": 50}}, "env_id"'
+    described.write_text(described.read_text().replace('"env_id"', kwargs))
+    with path.open() as recorder:
+        fcntl.flock(recorder, fcntl.LOCK_EX)  # as HDF5 holds it while a recorder has the file open
+        read = read_maniskill(path, "traj_0")
+    assert read.info.control_dt == 0.02
     assert {name: values.shape for name, values in read.obs.items()} == {
         "empty": (4, 0),
         "fast": (4, 3000),
@@ -160,23 +165,6 @@ def test_one_dataset_under_many_names_is_not_read_for_ever(
 
     with pytest.raises(UnreadableRecording, match="GB of numbers"):
         read_maniskill(write(tmp_path, spoil), "traj_0")
-
-
-def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe.h5")
-    (tmp_path / "zero.h5").symlink_to("/dev/zero")
-    for name in ("pipe.h5", "zero.h5"):
-        with pytest.raises(OSError, match="not a regular file"), open_h5(tmp_path / name):
-            pass
-
-
-def test_a_group_of_no_such_name_is_missing_and_not_refused(tmp_path: Path) -> None:
-    with open_h5(write(tmp_path)) as file:
-        assert file.get("traj_0/nothing/below") is None and "traj_1" not in file
-        with pytest.raises(KeyError):
-            file["traj_1"]
-    with open_h5(write(tmp_path, external_link)) as other, pytest.raises(RefusedH5):
-        other["traj_0/obs"]
 
 
 PLUGINS = """

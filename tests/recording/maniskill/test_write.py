@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from tests.drive.episodes import Made
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.reader.read_episode import read_episode, read_maniskill
 
 STEPS = 6
@@ -212,31 +211,3 @@ def test_a_file_that_was_cut_takes_only_its_own_with_it(
     np.testing.assert_array_equal(read.reward, made.reward)
     assert read.info == made.info
     assert (read.poses is None, not read.env_states) == (lost == "poses", lost == "env_states")
-
-
-def test_what_is_no_recording_is_said(child_process: None, tmp_path: Path) -> None:
-    theirs, ours = record_both("MS-CartpoleBalance-v1", tmp_path, obs_mode="state")
-    for reading, why in (
-        (lambda: read_episode(tmp_path / "none.rrd"), "none.rrd is not there"),
-        (lambda: read_episode(theirs), "theirs.json is not from the workbench"),
-        (lambda: read_maniskill(theirs, "traj_7"), "has no entry for traj_7"),
-    ):
-        with pytest.raises(UnreadableRecording, match=why):
-            reading()
-    ours.with_suffix(".rrd").write_bytes(b"RRF2 and then nothing")
-    (said,) = read_episode(ours).broken_files
-    assert said.sentence.startswith(f"{ours.stem}.rrd was cut short or changed")
-    ours.with_suffix(".rrd").unlink()
-    assert read_episode(ours).length == STEPS
-    ours.with_suffix(".json").write_text('{"workbench": {"length": 3}}')
-    with pytest.raises(
-        UnreadableRecording,
-        match=r"is not as a recording is described: object missing required field `id` at \$\.workbench",
-    ):
-        read_episode(ours)
-    ours.with_suffix(".json").write_text('{"workbench": {"leng')
-    with pytest.raises(UnreadableRecording, match=r"is not JSON, or was cut short"):
-        read_episode(ours)
-    ours.with_suffix(".json").unlink()
-    with pytest.raises(UnreadableRecording, match=r"json is missing"):
-        read_episode(ours)

@@ -130,7 +130,7 @@ def use(episode: Episode, path: Path) -> None:
     assert Unpacker().unpack(pack(info), type(info)) is not None
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(
     which=st.sampled_from(["ours", "ours", "theirs"]),
     changes=st.lists(st.tuples(st.integers(0, 10**6), VALUES, st.booleans()), min_size=1, max_size=4),

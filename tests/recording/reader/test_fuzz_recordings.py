@@ -217,7 +217,7 @@ def test_damaged_recordings_are_rows_and_sentences(
     # A byte can make HDF5 look through a group for ever (seen): then this is how long it takes.
     monkeypatch.setattr(reading, "ROW_SECONDS", 4.0)
     monkeypatch.setattr(reading, "OPEN_SECONDS", 4.0)
-    assert fuzz(original, tmp_path / "set", 20, SEED) > 3
+    assert fuzz(original, tmp_path / "set", 10, SEED) > 1
 
 
 @pytest.mark.slow

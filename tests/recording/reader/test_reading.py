@@ -6,10 +6,8 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +16,15 @@ import psutil
 import pytest
 
 from tests.drive.waiting import until
-from tests.recording.foreign_h5 import write as write_h5
 from tests.recording.library_files import describe
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
 from workbench.recording.episode.row import Facts, Source, UnreadableRecording
-from workbench.recording.library.library import Library
 from workbench.recording.reader import reading
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.reader.scan import scan_folder
 
 pytestmark = pytest.mark.usefixtures("child_process")
-
-
-@pytest.fixture
-def library(tmp_path: Path) -> Iterator[Library]:
-    library = Library(tmp_path)
-    yield library
-    library.close()
 
 
 def rows(folder: Path) -> dict[str, Facts]:
@@ -50,26 +39,6 @@ def slow_json(path: Path) -> None:
 
 def reader_of(folder: Path, episodes: bool) -> int:
     return reading._readers[folder, episodes]._pid
-
-
-def test_pipes_and_devices_are_rows_and_not_waited_for(tmp_path: Path, library: Library) -> None:
-    describe(tmp_path, "good")
-    for suffix in (".json", ".rrd"):
-        os.mkfifo(tmp_path / f"pipe{suffix}")
-    os.mkfifo(tmp_path / "alone.rrd")
-    (tmp_path / "zero.json").symlink_to("/dev/zero")
-    write_h5(tmp_path)
-    (tmp_path / "theirs.h5").unlink()
-    (tmp_path / "theirs.h5").symlink_to("/dev/zero")
-    library.refresh()
-    problems = {row.name: row.problem for row in library.view().rows}
-    assert problems.pop("good") is None
-    assert problems.pop("theirs#traj_0") == "theirs.h5 is a character device, not a regular file."
-    assert problems == {
-        "alone": "alone.rrd is a named pipe, not a regular file.",
-        "pipe": "pipe.json is a named pipe, not a regular file.",
-        "zero": "zero.json is a character device, not a regular file.",
-    }
 
 
 def test_what_takes_too_long_is_given_up_and_the_others_are_read(
@@ -175,24 +144,6 @@ def test_pictures_go_on_where_the_reader_was_ended_and_where_the_file_is_gone(
     np.testing.assert_array_equal(camera.rgb[0], before)
 
 
-def test_a_link_out_of_the_folder_is_followed_to_that_file_alone(tmp_path: Path) -> None:
-    folder, elsewhere = tmp_path / "recordings", tmp_path / "elsewhere"
-    path = describe(elsewhere, "a", seed=3)
-    folder.mkdir()
-    for suffix in (".json", ".h5", ".rrd"):
-        (folder / f"b{suffix}").symlink_to(path.with_suffix(suffix))
-    assert rows(folder)["b"].problem is None and rows(folder)["b"].seed == 3
-
-
-def test_a_folder_that_is_made_anew_is_read_again(tmp_path: Path) -> None:
-    folder = tmp_path / "recordings"
-    describe(folder, "a")
-    assert rows(folder)["a"].problem is None
-    folder.rename(tmp_path / "old")
-    describe(folder, "b")
-    assert rows(folder)["b"].problem is None
-
-
 def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
     describe(tmp_path, "a")
     program = (
@@ -216,14 +167,6 @@ def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
     process.stdout.close()
     _, alive = psutil.wait_procs(family, timeout=10)
     assert not alive
-
-
-def test_serving_recordings_needs_none_of_what_reads_them() -> None:
-    program = "import sys\nimport workbench.recording.library.library, workbench.session.review.review\nprint(*sys.modules)"
-    said = subprocess.run(
-        python_command("-c", program), env=child_environment(), check=True, capture_output=True, text=True
-    ).stdout.split()
-    assert not {"h5py", "rerun", "imageio_ffmpeg", "pyarrow.parquet"} & set(said)
 
 
 def test_an_episode_that_claims_more_memory_than_there_may_be_is_refused(
@@ -277,11 +220,3 @@ print(tried(lambda: subprocess.run(["/bin/true"], check=True)), tried(lambda: op
         "did", no, no, no, no, no, "Operation not permitted", "no memory", "did", no
     ], said.stderr  # fmt: skip
     assert (folder / "inside").read_text() == "inside"
-
-
-def test_the_nursery_has_one_thread(tmp_path: Path) -> None:
-    describe(tmp_path, "a")
-    rows(tmp_path)
-    fork_server = psutil.Process(reader_of(tmp_path, episodes=False)).parent()
-    assert fork_server is not None and fork_server.num_threads() == 1
-    assert sys.executable == fork_server.exe() or fork_server.cmdline()[0] == sys.executable

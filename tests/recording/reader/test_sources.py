@@ -8,24 +8,8 @@ import pytest
 
 from tests.recording.foreign_h5 import write as write_h5
 from tests.recording.library_files import describe
-from workbench.recording.episode.row import Source, SourceKind, UnreadableRecording
-from workbench.recording.reader.reading import find_all_sources, read_recording
-
-
-@pytest.mark.parametrize(
-    ("path", "part", "kind", "stem"),
-    [
-        ("a/push.v2.json", None, "workbench", "push.v2"),
-        ("a/push.h5", None, "workbench", "push"),
-        ("a/push.h5", "traj_3", "maniskill", "push_traj_3"),
-        ("a/set.one", "4", "lerobot", "set.one_4"),
-    ],
-)
-def test_who_made_it_and_what_files_made_of_it_are_called(
-    path: str, part: str | None, kind: SourceKind, stem: str
-) -> None:
-    source = Source(Path(path), part)
-    assert (source.kind, source.stem) == (kind, stem)
+from workbench.recording.episode.row import UnreadableRecording
+from workbench.recording.reader.reading import find_all_sources
 
 
 def test_each_is_found_once_by_name_whatever_names_it(child_process: None, tmp_path: Path) -> None:
@@ -58,11 +42,3 @@ def test_an_empty_folder_is_passed_over_beside_others_and_a_file_that_is_none_is
         find_all_sources([folder, tmp_path / "none"])
     with pytest.raises(UnreadableRecording, match="No recording is named"):
         find_all_sources([])
-
-
-def test_an_episode_is_read_by_the_way_of_its_kind(child_process: None, tmp_path: Path) -> None:
-    theirs = write_h5(tmp_path)
-    episode = read_recording(Source(theirs, "traj_0"))
-    assert (episode.info.task, episode.length) == ("PickCube-v1", 3)
-    with pytest.raises(UnreadableRecording, match="theirs"):
-        read_recording(Source(theirs, "traj_1"))

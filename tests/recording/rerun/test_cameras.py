@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from tests.recording.read_rrd import Column, read_rrd
-from workbench.recording.rerun.layout import optical_pose
 
 
 @pytest.fixture(scope="module")
@@ -59,21 +58,3 @@ def test_the_pixel_of_the_cube_shows_the_cube(recorded: Any, entities: dict[str,
     assert at(read["Pinhole:resolution"], 0).tolist() == [96, 96]
     # RDF, right down forward, in rerun's numbering of directions.
     assert at(read["Pinhole:camera_xyz"], 0).tolist() == [3, 2, 5]
-
-
-def test_the_mounted_camera_moves_and_the_fixed_one_is_written_once(
-    entities: dict[str, dict[str, Column]],
-) -> None:
-    assert entities["/world/cameras/base_camera"]["Transform3D:translation"].steps is None
-    moving = entities["/world/cameras/hand_camera"]["Transform3D:translation"]
-    assert moving.steps is not None
-    assert np.ptp(np.stack(moving.values), axis=0).max() > 0.01
-
-
-def test_a_camera_that_looks_along_x_has_its_optical_axis_along_x() -> None:
-    translation, xyzw = optical_pose(np.array([[1, 2, 3, 1, 0, 0, 0]], dtype=np.float32))
-    np.testing.assert_array_equal(translation, [[1, 2, 3]])
-    # Right is -y, down is -z, forward is x.
-    np.testing.assert_allclose(
-        Rotation.from_quat(xyzw[0]).as_matrix().T, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-7
-    )

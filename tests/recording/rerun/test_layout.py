@@ -20,11 +20,6 @@ def test_bodies_go_by_their_names() -> None:
     assert entities("cube", "panda/panda_hand") == ("/world/cube", "/world/panda/panda_hand")
 
 
-def test_an_actor_named_like_an_articulation_gives_way() -> None:
-    assert entities("panda", "panda/hand") == ("/world/panda_", "/world/panda/hand")
-    assert entities("cameras", "cameras/eye") == ("/world/cameras__", "/world/cameras_/eye")
-
-
 @given(st.lists(NAME, max_size=6).map(tuple))
 @example(("a", "a/b", "a_", "a_/b"))
 @example(("", "/", "unnamed"))

@@ -49,14 +49,6 @@ def test_any_schema_stays_what_it_is(fields: list[pa.Field]) -> None:
     assert pa.ipc.read_schema(pa.py_buffer(packed)).equals(schema, check_metadata=True)
 
 
-def test_fields_that_are_alike_take_a_third() -> None:
-    metadata = {"rerun:archetype": "rerun.archetypes.Mesh3D", "rerun:kind": "data", "rerun:is_static": "true"}
-    kind = pa.list_(pa.list_(pa.field("item", pa.float32(), nullable=False), 3))
-    fields = [pa.field(f"/world/body{n}", kind, metadata={**metadata, "path": f"{n}"}) for n in range(50)]
-    message = pa.schema(fields).serialize().to_pybytes()
-    assert len(packed_schema(message)) < len(message) / 3
-
-
 @pytest.mark.parametrize(
     "schema",
     [
@@ -68,8 +60,3 @@ def test_fields_that_are_alike_take_a_third() -> None:
 def test_what_it_does_not_know_stays_as_it_is(schema: pa.Schema) -> None:
     message = schema.serialize().to_pybytes()
     assert packed_schema(message) == message
-
-
-def test_what_is_no_schema_stays_as_it_is() -> None:
-    for message in (b"", b"\xff\xff\xff\xff\x10\0\0\0" + bytes(16), bytes(range(64))):
-        assert packed_schema(message) == message

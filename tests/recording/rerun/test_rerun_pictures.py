@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import gc
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from tests.drive.episodes import made, write
 from tests.recording.refused_calls import descriptors
-from workbench.core.scene.shapes import SharedShapes
 from workbench.recording.episode.episode import CameraTrack, Episode
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun import layout, read
+from workbench.recording.rerun import read
 from workbench.recording.rerun.chunks import STEP
 from workbench.recording.rerun.private_api import IndexedChunk, decode_chunk, index_of
-from workbench.recording.rerun.read import RerunTable
 
 
 def camera_of(episode: Episode) -> CameraTrack:
@@ -60,12 +54,6 @@ def test_a_chunk_is_decoded_as_rerun_decodes_it(tmp_path: Path) -> None:
             )
 
 
-@given(st.binary(max_size=60))
-def test_what_is_no_chunk_is_said_to_be_none(content: bytes) -> None:
-    with pytest.raises(ValueError, match="not a chunk"):
-        decode_chunk(content)
-
-
 def test_pictures_are_read_when_they_are_looked_at(tmp_path: Path) -> None:
     rrd = write(tmp_path, made(9)).with_suffix(".rrd")
     intact, damaged = read_episode(rrd), read_episode(rrd)
@@ -80,33 +68,10 @@ def test_pictures_are_read_when_they_are_looked_at(tmp_path: Path) -> None:
     assert len(read_episode(rrd).reward) == 9, "all else can be read"
 
 
-def test_a_deleted_recording_that_is_open_still_has_its_pictures(tmp_path: Path) -> None:
-    rrd = write(tmp_path, made(9)).with_suffix(".rrd")
-    episode = read_episode(rrd)
-    rrd.unlink()
-    assert brightness(episode, 6) == pytest.approx(120, abs=3)
-    assert camera_of(episode).segmentation[3].tolist() == [[1] * 8] * 6  # type: ignore[index]
-
-
 def test_a_picture_here_and_there_is_of_the_state_that_it_was_taken_at(tmp_path: Path) -> None:
     episode = read_episode(write(tmp_path, made(10), every=3).with_suffix(".rrd"))
     assert camera_of(episode).frame.tolist() == [0, 3, 6, 9]
     assert [brightness(episode, i) for i in range(4)] == pytest.approx([0, 60, 120, 180], abs=3)
-
-
-def test_what_is_kept_of_pictures_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = read._ChunkCache()
-    monkeypatch.setattr(read, "_chunk_cache", kept)
-    monkeypatch.setattr(read, "KEPT_BYTES", 4000)
-    episodes = [read_episode(write(tmp_path, made(9, seed=s)).with_suffix(".rrd")) for s in range(6)]
-    for _ in range(2):
-        for episode in episodes:
-            assert brightness(episode, 3) == pytest.approx(60, abs=3)
-            assert 0 < kept._bytes == sum(rows.nbytes for _, rows in kept._chunks.values())
-    assert len(kept._chunks) < 6
-    monkeypatch.setattr(read, "KEPT_BYTES", 0)
-    brightness(episodes[0], 3)
-    assert len(kept._chunks) == 1, "the newest, however large"
 
 
 def test_its_file_is_closed_when_a_recording_is_let_go_of(
@@ -119,42 +84,3 @@ def test_its_file_is_closed_when_a_recording_is_let_go_of(
     del episode
     gc.collect()
     assert str(rrd) not in descriptors()
-
-
-def test_meshes_of_one_scene_are_read_once(tmp_path: Path) -> None:
-    first = made(3, seed=1)
-    second = dataclasses.replace(made(3, seed=2), geometry=first.geometry)
-    files = [write(tmp_path, episode).with_suffix(".rrd") for episode in (first, second)]
-    shapes = SharedShapes()
-    known = [len(RerunTable(file, shapes)._known) for file in files]
-    assert known == [0, 0], "until somebody has seen what they look like"
-    one, two = (read_episode(file, shapes) for file in files)
-    alone = read_episode(files[1])
-    table = RerunTable(files[1], shapes)
-    assert len(table._known) > 2
-    assert not any(entity in table._known for entity, _ in table._static)
-    assert one.geometry is not None and two.geometry is not None and alone.geometry is not None
-    for a, b, c in zip(one.geometry.visuals, two.geometry.visuals, alone.geometry.visuals, strict=True):
-        assert a.mesh is b.mesh and a.material is b.material
-        assert (b.name, b.bodies.tolist()) == (c.name, c.bodies.tolist())
-        np.testing.assert_array_equal(b.mesh.vertices, c.mesh.vertices)
-        np.testing.assert_array_equal(b.mesh.faces, c.mesh.faces)
-        assert b.material.base_color == c.material.base_color
-
-
-def test_the_same_scene_written_by_another_process_is_shared_as_well(
-    child_process: None, tmp_path: Path, fresh_chunks: Callable[[], None]
-) -> None:
-    shapes = SharedShapes()
-    found = []
-    for seed in (1, 2):
-        fresh_chunks()
-        found.append(read_episode(write(tmp_path, made(3, seed=seed)).with_suffix(".rrd"), shapes))
-    one, two = (episode.geometry for episode in found)
-    assert one is not None and two is not None
-    assert all(a.mesh is b.mesh for a, b in zip(one.visuals, two.visuals, strict=True))
-
-
-@pytest.fixture
-def fresh_chunks() -> Callable[[], None]:
-    return layout._made.clear

@@ -5,21 +5,15 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import rerun as rr
-from rerun.chunk import LazyChunkStream, RrdReader
+from rerun.chunk import RrdReader
 
 from tests.drive.episodes import Made
 from tests.recording.read_rrd import read_rrd
 from tests.recording.verify_rrd import verify_rrd
-from workbench.core.scene.shapes import SceneGeometry
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun.chunks import static_chunk
-from workbench.recording.rerun.private_api import index_of
-from workbench.recording.rerun.read import RerunTable
 
 Maker = Callable[..., Made]
 EPISODES = 4
@@ -53,11 +47,6 @@ def test_every_file_holds_the_same(written: list[Path]) -> None:
         assert episode.info.seed == seed and not episode.broken_files
 
 
-def test_no_file_is_larger_for_it(written: list[Path]) -> None:
-    whole, *_, joined = (path.stat().st_size for path in written)
-    assert joined < 1.01 * whole
-
-
 def test_rerun_finds_nothing_wrong(child_process: None, written: list[Path]) -> None:
     for path in (written[0], written[-1]):
         assert verify_rrd(path) is None
@@ -72,36 +61,3 @@ def test_rerun_finds_nothing_wrong(child_process: None, written: list[Path]) -> 
             chunk.id for chunk in reader.store().stream() if chunk.entity_path.startswith("/world")
         )
         assert found == streamed
-
-
-def test_the_index_has_the_rows_that_rerun_writes(written: list[Path]) -> None:
-    rows = []
-    for path in written:
-        index = index_of(RrdReader(path).store(), "step")
-        assert all(later.begin >= earlier.end for earlier, later in zip(index, index[1:]))
-        assert index[0].entity == "/__properties", "what a list of recordings reads comes first"
-        rows.append(
-            [
-                (one.entity, one.rows, one.static, one.components, one.steps)
-                for one in sorted(index, key=lambda one: (one.entity, one.static))
-            ]
-        )
-    assert rows == rows[:1] * EPISODES
-
-
-@pytest.mark.parametrize(
-    "numbers",
-    [
-        {"surface": [0.1, 0.2, 0.3, 1.0, 0.25, 0.75]},
-        {"base_color": [0.1, 0.2, 0.3, 1.0], "metallic": [0.25], "roughness": [0.75]},
-    ],
-)
-def test_files_of_versions_before_keep_their_colours(tmp_path: Path, numbers: dict[str, Any]) -> None:
-    mesh = rr.Mesh3D(vertex_positions=np.eye(3, dtype=np.float32), triangle_indices=[[0, 1, 2]])
-    chunk = static_chunk("/world/cube/0", mesh, rr.AnyValues(visual="cube/0", **numbers))
-    path = tmp_path / "before.rrd"
-    LazyChunkStream.from_iter([chunk]).write_rrd(path, application_id="before", recording_id="one")
-    bare = SceneGeometry(1, ("cube",), ("dynamic",), (False,), ())
-    (visual,) = RerunTable(path).geometry(bare, ["/world/cube"]).visuals
-    assert visual.name == "cube/0" and visual.material.base_color == (0.1, 0.2, 0.3, 1.0)
-    assert (visual.material.metallic, visual.material.roughness) == (0.25, 0.75)

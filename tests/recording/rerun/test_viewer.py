@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +19,6 @@ from workbench.recording.rerun.viewer import (
     await_port,
     end,
     free_port,
-    has_screen,
     open_window,
     quiet_environment,
     rerun_command,
@@ -102,24 +100,6 @@ def test_the_native_viewer_shows_the_whole_layout(headless: ViewerClient, file: 
     assert 20 < green.sum() < green.size / 20
     rows, columns = np.nonzero(green)
     assert 0.2 < rows.mean() / scene.shape[0] < 0.8 and 0.2 < columns.mean() / scene.shape[1] < 0.8
-
-
-def test_what_cannot_be_opened_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="No recording was named"):
-        open_window([])
-    with pytest.raises(FileNotFoundError, match=r"none\.rrd is not a file"):
-        open_window([tmp_path / "none.rrd"])
-    (tmp_path / "task.py").touch()
-    with pytest.raises(ValueError, match=r"task\.py is no \.rrd file"):
-        open_window([tmp_path / "task.py"])
-
-
-@pytest.mark.skipif(os.name != "posix", reason="looks at X11 and Wayland")
-def test_a_window_needs_a_screen() -> None:
-    assert not has_screen({})
-    assert not has_screen({"DISPLAY": ""})
-    assert has_screen({"DISPLAY": ":0"})
-    assert has_screen({"WAYLAND_DISPLAY": "wayland-0"})
 
 
 def test_a_window_without_a_screen_is_refused(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

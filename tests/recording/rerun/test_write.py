@@ -6,23 +6,16 @@ import dataclasses
 import errno
 import os
 import resource
-import subprocess
-import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rerun as rr
-from rerun.chunk import Chunk, LazyChunkStream, RrdReader
+from rerun.chunk import RrdReader
 
 from tests.drive.episodes import Made, header_of, journal_of
 from tests.drive.rows import append
 from tests.recording.verify_rrd import verify_rrd
-from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
-from workbench.machine.processes.child_python import child_environment, python_command
-from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.rerun import shared_bytes
 from workbench.recording.rerun import write as rrd
 from workbench.recording.rerun.append_blueprint import blueprint_stream
@@ -94,98 +87,6 @@ def test_whoever_has_turned_rerun_off_still_gets_the_whole_recording(
     assert os.environ["RERUN"] == "off"
 
 
-def test_options_of_a_reset_that_json_has_no_words_for_are_said_as_text(
-    child_process: None, make_episode: Maker, tmp_path: Path
-) -> None:
-    episode = make_episode()
-    episode.info = dataclasses.replace(episode.info, reset_options={"at": Path("/there")})
-    files = episode.write(tmp_path)
-    assert read_episode(files.json).info.reset_options == {"at": "/there"}
-
-
-@pytest.mark.slow
-def test_threads_that_write_episodes_of_one_scene_share_its_meshes(
-    child_process: None, make_episode: Maker, tmp_path: Path
-) -> None:
-    """A scene that names its bodies by env has more entities of one mesh than are kept."""
-    envs = 80
-    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
-    each = np.arange(envs, dtype=np.int32)
-    geometry = SceneGeometry(
-        num_envs=envs,
-        body_names=tuple(f"cube_{env}" for env in each),
-        body_kinds=("dynamic",) * envs,
-        body_hidden=(False,) * envs,
-        visuals=(Visual("cube", mesh, Material((1.0, 0.5, 0.0, 1.0)), each, each),),
-    )
-    failed: list[BaseException] = []
-    written: list[Path] = []
-
-    def write(envs: range) -> None:
-        try:
-            for env in envs:
-                poses = np.full((2, geometry.num_envs, 7), np.nan, np.float32)
-                poses[:, env] = [env, 0, 0, 1, 0, 0, 0]
-                episode = make_episode(1, geometry=geometry, poses=poses)
-                episode.info = dataclasses.replace(episode.info, env_index=env, id=f"{env}")
-                written.append(episode.write(tmp_path).json)
-        except BaseException as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=write, args=(range(k, envs, 8),)) for k in range(8)]
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    finally:
-        sys.setswitchinterval(interval)
-    assert not failed and len(written) == envs
-    for path in written[::16]:
-        found = read_episode(path)
-        assert found.geometry is not None
-        (visual,) = found.geometry.visuals
-        assert visual.bodies.tolist() == [found.info.env_index]
-
-
-def test_a_material_of_whole_numbers_leaves_those_behind_it_as_they_are(
-    child_process: None, tmp_path: Path
-) -> None:
-    # In a process of its own: rerun takes the type of the first value for all that follow.
-    program = """
-import sys
-from pathlib import Path
-import numpy as np
-from tests.drive.rows import EpisodeRow, append
-from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
-from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.writing.episode_writer import EpisodeWriter
-mesh, zero = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32)), np.zeros(1, np.int32)
-for seed, material in enumerate((Material((1, 0, 0, 1), 1, 0), Material((0.8, 0.5, 0.2, 1.0), 0.25, 0.5))):
-    visual = Visual("cube/0", mesh, material, zero, zero)
-    geometry = SceneGeometry(1, ("cube",), ("dynamic",), (False,), (visual,))
-    info = EpisodeInfo("Painted-v1", 0, seed, None, "", {}, 0.05, None, "cpu")
-    writer = EpisodeWriter(Path(sys.argv[1]), info, geometry, {}, (), ())
-    append(writer, EpisodeRow(np.array([[0, 0, 0, 1, 0, 0, 0]], np.float32), {}, {}, {}, None, 0.0))
-    append(writer, EpisodeRow(np.array([[0, 0, 0, 1, 0, 0, 0]], np.float32), {}, {}, {}, np.zeros(0, np.float32), 0.0))
-    print(writer.finish().rrd)
-"""
-    command = python_command("-c", program, str(tmp_path))
-    made = subprocess.run(command, env=child_environment(), capture_output=True, text=True, timeout=60)
-    paths = made.stdout.split()
-    assert len(paths) == 2, made.stderr
-    for path, color, numbers in zip(
-        paths, [(1, 0, 0, 1), (0.8, 0.5, 0.2, 1.0)], [(1, 0), (0.25, 0.5)], strict=True
-    ):
-        geometry = read_episode(Path(path)).geometry
-        assert geometry is not None
-        (visual,) = geometry.visuals
-        assert visual.material.base_color == color
-        assert (visual.material.metallic, visual.material.roughness) == numbers
-
-
 def test_a_blueprint_can_be_shown_before_the_recording(make_episode: Maker, tmp_path: Path) -> None:
     path = make_episode().write(tmp_path).rrd
     (inside,) = RrdReader(path).blueprints()
@@ -196,10 +97,3 @@ def test_a_blueprint_can_be_shown_before_the_recording(make_episode: Maker, tmp_
     again = RrdReader(alone)
     assert [entry.recording_id for entry in again.blueprints()] == [inside.recording_id]
     assert again.recordings() == []
-
-
-def test_a_file_of_another_writer_has_no_blueprint_to_show_before(tmp_path: Path) -> None:
-    path = tmp_path / "other.rrd"
-    chunk = Chunk.from_columns("/reward", [], rr.Scalars.columns(scalars=[1.0]))
-    LazyChunkStream.from_iter([chunk]).write_rrd(path, application_id="other", recording_id="one")
-    assert blueprint_stream(path) is None

@@ -3,59 +3,33 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import json
 import os
 import re
 import resource
-import shutil
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 import psutil
 import pytest
-import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.episodes import Made, Track, journal_of
 from tests.drive.rows import EpisodeRow, append
-from tests.recording.verify_rrd import verify_rrd
 from workbench.core.camera_data import CameraInfo, Picture
-from workbench.core.scene.shapes import Mesh
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun import write
 from workbench.recording.rerun.read import read_properties
-from workbench.recording.writing.episode_writer import EpisodeFiles, EpisodeWriter
+from workbench.recording.writing.episode_writer import EpisodeFiles
 from workbench.recording.writing.finish import episode_stem, recover
 from workbench.recording.writing.journal import FOLDER
 from workbench.recording.writing.publish import RecordingError
 
 Maker = Callable[..., Made]
-
-
-@pytest.fixture
-def unprivileged(tmp_path: Path) -> Iterator[None]:
-    """Not root, who may write anywhere."""
-    if os.geteuid() != 0:
-        yield
-        return
-    for folder in (tmp_path, *tmp_path.parents):
-        if folder.stat().st_mode & 0o077 == 0:  # pytest's own, as many as there are processes of tests
-            folder.chmod(0o755)
-    os.chown(tmp_path, 65534, 65534)
-    os.seteuid(65534)
-    try:
-        yield
-    finally:
-        os.seteuid(0)
 
 
 @contextmanager
@@ -109,20 +83,6 @@ def test_files_that_exist_are_never_written_over(make_episode: Maker, tmp_path: 
     assert names == [f"{stem}_3", f"{stem}_4"]
     assert (tmp_path / f"{stem}.rrd").read_text() == "mine"
     assert not (tmp_path / f"{stem}.h5").exists() and not (tmp_path / f"{stem}_2.rrd").exists()
-
-
-def test_names_are_kept_apart_without_hard_links(
-    child_process: None, make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: Any) -> None:
-        raise OSError(errno.EPERM, "Operation not permitted")
-
-    monkeypatch.setattr(os, "link", refuse)
-    episode = make_episode()
-    stems = [episode.write(tmp_path).rrd.stem for _ in range(2)]
-    assert stems == [episode_stem(episode.info), episode_stem(episode.info) + "_2"]
-    assert len(left(tmp_path)) == 6
-    assert verify_rrd(tmp_path / f"{stems[1]}.rrd") is None
 
 
 def test_threads_that_write_at_once_get_files_each(make_episode: Maker, tmp_path: Path) -> None:
@@ -189,43 +149,6 @@ def test_an_episode_that_is_discarded_leaves_nothing(make_episode: Maker, tmp_pa
     assert os.listdir(tmp_path) == []
 
 
-def test_finishing_twice_gives_the_same_files(make_episode: Maker, tmp_path: Path) -> None:
-    writer = make_episode().writer(tmp_path)
-    for row in make_episode().rows():
-        append(writer, row)
-    assert writer.finish() == writer.finish()
-    assert len(left(tmp_path)) == 3
-
-
-def test_a_folder_without_permission_is_said(make_episode: Maker, tmp_path: Path, unprivileged: None) -> None:
-    folder = tmp_path / "locked"
-    folder.mkdir(mode=0o555)
-    with pytest.raises(RecordingError, match="locked may not be written to. Choose another folder"):
-        make_episode().writer(folder)
-    assert os.listdir(folder) == []
-
-
-def test_a_file_in_place_of_the_folder_is_said(make_episode: Maker, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(RecordingError, match="file is not a folder"):
-        make_episode().writer(tmp_path / "file")
-
-
-def test_a_folder_that_is_removed_under_way_is_said(make_episode: Maker, tmp_path: Path) -> None:
-    folder = tmp_path / "gone"
-    writer = make_episode().writer(folder)
-    rows = list(make_episode().rows())
-    append(writer, rows[0])
-    shutil.rmtree(folder)
-    with pytest.raises(RecordingError, match="gone was removed"):
-        append(writer, rows[1])
-        writer.finish()
-    with pytest.raises(RecordingError, match="gone was removed"):
-        writer.finish()
-    assert not folder.exists()
-    assert len(left(make_episode().write(folder).rrd.parent)) == 3
-
-
 @pytest.mark.parametrize("room", [0, 4000, 40_000])
 def test_a_disk_without_room_leaves_the_journal_or_nothing(
     make_episode: Maker, tmp_path: Path, room: int
@@ -247,121 +170,6 @@ def test_a_disk_without_room_leaves_the_journal_or_nothing(
     assert read_episode(episode.write(tmp_path).rrd).length == 3
 
 
-@pytest.fixture
-def small_disk(child_process: None, tmp_path: Path) -> Iterator[Path]:
-    """A filesystem of 1 MB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode != 0:
-        pytest.skip("no filesystem may be mounted here")
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True)
-
-
-@pytest.mark.parametrize("ballast", [850_000, 940_000])
-def test_a_full_disk_is_said_and_what_was_recorded_is_found_when_there_is_room(
-    make_episode: Maker, small_disk: Path, ballast: int
-) -> None:
-    (small_disk / "ballast").write_bytes(bytes(ballast))
-    episode = wide(make_episode, steps=12)
-    with pytest.raises(RecordingError, match="disk that holds .* is full. Make room there"):
-        writer = episode.writer(small_disk)
-        for row in episode.rows():
-            append(writer, row)
-        writer.finish()
-    writer.close()
-    assert set(os.listdir(small_disk)) <= {"ballast", FOLDER}
-    (small_disk / "ballast").unlink()
-    for files in recover(small_disk):
-        assert 0 < read_episode(files.json).length <= 12
-        assert verify_rrd(files.rrd) is None
-    assert not (small_disk / FOLDER).exists()
-
-
-def test_who_acts_cannot_be_written_to_a_folder_that_is_gone(make_episode: Maker, tmp_path: Path) -> None:
-    writer = make_episode().writer(tmp_path / "gone")
-    append(writer, next(iter(make_episode().rows())))
-    journal_of(writer).write()
-    shutil.rmtree(tmp_path / "gone")
-    journal_of(writer).sync()
-    with pytest.raises(RecordingError, match="Cannot record Made-v1 .*gone was removed"):
-        writer.acted_by("somebody else")
-    writer.close()
-
-
-def test_finishing_again_helps_once_there_is_room(
-    child_process: None, make_episode: Maker, tmp_path: Path
-) -> None:
-    episode = wide(make_episode)
-    writer = episode.writer(tmp_path)
-    for row in episode.rows():
-        append(writer, row)
-    with little_room(30_000):
-        with pytest.raises(RecordingError):
-            writer.finish()
-    assert verify_rrd(writer.finish().rrd) is None
-    assert len(left(tmp_path)) == 3
-
-
-@pytest.mark.parametrize("suffix", [".rrd", ".h5"])
-@pytest.mark.parametrize("kept", [0.05, 0.5, 0.99])
-def test_files_that_were_cut_short_are_not_given_their_names(
-    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, kept: float
-) -> None:
-    def cut(path: Path) -> None:
-        if path.suffix == suffix:
-            os.truncate(path, int(path.stat().st_size * kept))
-
-    open_h5, write_chunks = h5py.File, write.write_chunks
-
-    def open_short(path: Path, mode: str, **how: Any) -> h5py.File:
-        if mode == "r":
-            cut(path)
-        return open_h5(path, mode, **how)
-
-    def write_short(chunks: Any, path: Path, application_id: str) -> None:
-        write_chunks(chunks, path, application_id)
-        cut(path)
-
-    monkeypatch.setattr(h5py, "File", open_short)
-    monkeypatch.setattr(write, "write_chunks", write_short)
-    writer = wide(make_episode).writer(tmp_path)
-    for row in wide(make_episode).rows():
-        append(writer, row)
-    with pytest.raises(RecordingError):
-        writer.finish()
-    assert {Path(name).suffix for name in left(tmp_path)} == {".arrow", ".scene"}
-
-
-def test_what_rerun_refuses_is_an_error_out_of_strict_mode_too(make_episode: Maker, tmp_path: Path) -> None:
-    rr.set_strict_mode(False)
-    episode = make_episode()
-    (visual,) = episode.geometry.visuals
-    flat = Mesh(np.zeros((3, 2), dtype=np.float32), visual.mesh.faces)  # vertices without z
-    broken = (dataclasses.replace(visual, mesh=flat),)
-    episode.geometry = dataclasses.replace(episode.geometry, visuals=broken)
-    with pytest.raises(ValueError):
-        episode.write(tmp_path)
-    assert {Path(name).suffix for name in left(tmp_path)} == {".arrow", ".scene"}
-
-
-def test_episodes_of_one_scene_share_its_meshes(make_episode: Maker, tmp_path: Path) -> None:
-    episode = make_episode()
-    writers: list[EpisodeWriter] = []
-    for env in range(3):
-        episode.info = dataclasses.replace(INFO, id=f"{env}")
-        writers.append(episode.writer(tmp_path))
-    scenes = list((tmp_path / FOLDER).glob("*.scene"))
-    assert len(scenes) == 3 and len({path.stat().st_ino for path in scenes}) == 1
-    for writer in writers:
-        append(writer, next(iter(episode.rows())))
-        writer.finish()
-    assert len(left(tmp_path)) == 9
-
-
 def test_writing_many_leaves_no_threads(make_episode: Maker, tmp_path: Path) -> None:
     process = psutil.Process()
     make_episode().write(tmp_path)
@@ -381,19 +189,6 @@ def test_writing_many_leaves_no_threads(make_episode: Maker, tmp_path: Path) -> 
 def test_names_are_safe_anywhere(task: str, seed: int, env: int) -> None:
     stem = episode_stem(dataclasses.replace(INFO, task=task, seed=seed, env_index=env))
     assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,150}", stem)
-
-
-def test_names_sort_by_seed_then_env_then_time() -> None:
-    infos = [(2, 0), (2, 3), (2, 11), (10, 0), (100, 0)]
-    names = [
-        episode_stem(
-            dataclasses.replace(INFO, seed=seed, env_index=env, written_at=f"2026-11-21T12:{m}:00+00:00")
-        )
-        for seed, env in infos
-        for m in ("00", "01")
-    ]
-    assert names == sorted(names)
-    assert re.fullmatch(r"PushCube-v1_seed0002_env00_2026-11-2\dT\d\d-\d\d-00", names[0])
 
 
 def test_a_row_holds_nothing_of_the_batch(make_episode: Maker, tmp_path: Path) -> None:

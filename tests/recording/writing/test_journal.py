@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
@@ -41,30 +40,6 @@ def rows(path: Path) -> list[bytes]:
 
 def numbers(*values: int) -> list[bytes]:
     return [bytes([value]) for value in values]
-
-
-@pytest.mark.parametrize("removed", ["folder", "file"])
-def test_a_folder_that_vanished_is_told_at_the_next_row(
-    tmp_path: Path, journal: Journal, removed: str
-) -> None:
-    journal.append(JournalEntry("row", 0, b"0"))
-    journal.sync()
-    journal.append(JournalEntry("row", 0, b"1"))
-    if removed == "folder":
-        shutil.rmtree(tmp_path / "folder")
-    else:
-        journal.path.unlink()
-    journal.sync()
-    for tell in (lambda: journal.append(JournalEntry("row", 0, b"2")), journal.append, journal.finish):
-        with pytest.raises(FileNotFoundError, match="was removed during the recording"):
-            tell()
-
-
-def test_a_folder_that_was_renamed_keeps_its_journal(tmp_path: Path, journal: Journal) -> None:
-    (tmp_path / "folder").rename(tmp_path / "elsewhere")
-    journal.append(JournalEntry("row", 0, b"0"))
-    journal.finish()
-    assert rows(tmp_path / "elsewhere" / "a.arrow") == [b"0"]
 
 
 def test_an_error_of_the_disk_is_told_at_the_next_row_and_the_next_sync_makes_no_good_of_it(
@@ -108,43 +83,6 @@ def test_what_could_not_be_written_is_written_once_there_is_room(
     assert journal.size == journal.path.stat().st_size
 
 
-@pytest.mark.parametrize("alone", [True, False])
-def test_a_row_that_was_taken_is_kept_and_one_that_was_refused_is_not(
-    journal: Journal, monkeypatch: pytest.MonkeyPatch, alone: bool
-) -> None:
-    """Also a row so large that whoever brings it writes it."""
-    monkeypatch.setattr(journals, "_BATCH_BYTES", 100)
-
-    def bring(value: bytes) -> bool:
-        try:
-            journal.append(
-                *([] if alone else [JournalEntry("camera/0", 0, value)]), JournalEntry("row", 0, value)
-            )
-        except OSError:
-            return False
-        return True
-
-    with refused(2, ("pwrite",), errno.ENOSPC, then=errno.ENOSPC):
-        taken = [value * 200 for value in numbers(1, 2, 3) if bring(value * 200)]
-    assert len(taken) < 3
-    journal.finish()
-    assert b"".join(rows(journal.path)) == b"".join(taken)
-
-
-def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
-    begin = journal.size
-    made: Future[list[JournalEntry]] = Future()
-    journal.append(JournalEntry("row", 0, b"0" * 100))
-    journal.append(made, JournalEntry("row", 0, b"1" * 100))
-    waiting = journal.size
-    assert begin + 200 < waiting < begin + 300
-    made.set_result([JournalEntry("picture/0/rgb", 1, b"p" * 1000)])
-    assert journal.size > waiting + 1000
-    for _ in range(2):
-        journal.write()
-        assert journal.size == journal.path.stat().st_size
-
-
 def test_a_picture_that_could_not_be_made_is_told_and_costs_its_own_state_alone(journal: Journal) -> None:
     made: Future[list[JournalEntry]] = Future()
     made.set_exception(MemoryError("no room"))
@@ -173,31 +111,6 @@ def test_rows_that_come_while_the_disk_fails_keep_their_order(
     assert journal.size == journal.path.stat().st_size
 
 
-def test_a_journal_that_cannot_be_removed_is_let_go_of(journal: Journal) -> None:
-    with refused(1, ("unlink",)), pytest.raises(OSError, match="Input/output error"):
-        journal.remove()
-    held = claim(journal.path)
-    assert held is not None
-    os.close(held)
-
-
-@pytest.mark.parametrize("then", [0, errno.EROFS])
-def test_a_journal_that_cannot_be_begun_leaves_nothing_open(tmp_path: Path, then: int) -> None:
-    with refused() as calls:
-        Journal(tmp_path / "0" / "a.arrow").remove()
-    assert len(calls) > 3
-    for at, call in enumerate(calls, 1):
-        before = descriptors()
-        with refused(at, then=then):
-            try:
-                Journal(tmp_path / str(at) / "a.arrow").remove()
-            except OSError as error:
-                assert error.errno == errno.EIO, call
-        assert descriptors() == before, call
-        left = list((tmp_path / str(at)).glob("*"))
-        assert not left or then or call.startswith("unlink"), call
-
-
 def test_one_process_writes_it_and_whoever_finds_it_later_has_it_alone(
     tmp_path: Path, journal: Journal
 ) -> None:
@@ -216,70 +129,6 @@ def test_one_process_writes_it_and_whoever_finds_it_later_has_it_alone(
     assert again is not None
     os.close(again)
     assert descriptors() == before
-
-
-def test_a_journal_that_its_writer_removes_meanwhile_is_not_claimed(
-    journal: Journal, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lock = journals.fcntl.flock
-
-    def late(descriptor: int, how: int) -> None:
-        journal.remove()
-        lock(descriptor, how)
-
-    before = descriptors()
-    monkeypatch.setattr(journals.fcntl, "flock", late)
-    assert claim(journal.path) is None
-    assert len(descriptors()) == len(before) - 1, "its own"
-
-
-def test_a_lock_that_the_disk_refuses_is_told_and_holds_nothing(
-    journal: Journal, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Network drives may have none."""
-
-    def refuse(descriptor: int, how: int) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    journal.close()
-    before = descriptors()
-    monkeypatch.setattr(journals.fcntl, "flock", refuse)
-    with pytest.raises(OSError, match="No locks available"):
-        claim(journal.path)
-    assert descriptors() == before
-
-
-def test_a_disk_that_does_not_give_what_was_written_is_no_end(
-    journal: Journal, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A journal may end anywhere, but what a network drive does not give for a moment is not lost."""
-    for value in numbers(0, 1, 2):
-        journal.append(JournalEntry("row", 0, value * 5000))
-        journal.write()
-    opened = journals.open_regular_file
-
-    def failing(path: Path):
-        file = opened(path)
-        read = file.read
-
-        class Failing:
-            closed = False
-            left = 3
-            mode = "rb"
-
-            def read(self, size: int = -1) -> bytes:
-                self.left -= 1
-                if self.left < 0:
-                    raise OSError(errno.EIO, "Input/output error")
-                return read(size)
-
-            seek, tell, close = file.seek, file.tell, file.close
-
-        return Failing()
-
-    monkeypatch.setattr(journals, "open_regular_file", failing)
-    with pytest.raises(OSError, match="Input/output error"):
-        rows(journal.path)
 
 
 def test_threads_write_all_journals_and_end_with_the_last(
@@ -312,30 +161,15 @@ def test_threads_write_all_journals_and_end_with_the_last(
     assert not thread.is_alive()
 
 
-def test_what_waits_is_written_to_all_journals_before_the_disk_is_waited_for_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    keeper = type(journals._journal_thread)()
-    monkeypatch.setattr(journals, "_journal_thread", keeper)
-    monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
-    three: list[Journal] = []
-    put: list[bool] = []
-    seen: list[list[list[bytes]]] = []
-    fsync = os.fsync
-
-    def noted(descriptor: int) -> None:
-        if put:
-            seen.append([rows(journal.path) for journal in three])
-        fsync(descriptor)
-        # The last of a round, so that the next one begins with all of them.
-        if len(three) == 3 and not put and descriptor == list(keeper._journals)[-1]._descriptor:
-            for number, journal in enumerate(three):
-                journal.append(JournalEntry("row", 0, bytes([number])))
-            put.append(True)
-
-    monkeypatch.setattr(os, "fsync", noted)
-    three += [Journal(tmp_path / f"{number}.arrow") for number in range(3)]
-    until(lambda: len(seen) >= 3, "three writes")
-    assert seen[0] == [[b"\0"], [b"\1"], [b"\2"]]
-    for journal in three:
-        journal.close()
+def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
+    begin = journal.size
+    made: Future[list[JournalEntry]] = Future()
+    journal.append(JournalEntry("row", 0, b"0" * 100))
+    journal.append(made, JournalEntry("row", 0, b"1" * 100))
+    waiting = journal.size
+    assert begin + 200 < waiting < begin + 300
+    made.set_result([JournalEntry("picture/0/rgb", 1, b"p" * 1000)])
+    assert journal.size > waiting + 1000
+    for _ in range(2):
+        journal.write()
+        assert journal.size == journal.path.stat().st_size

@@ -65,13 +65,6 @@ def test_steps_do_not_wait_for_their_pictures(seen: Made, held_back: threading.E
     assert pictures_of(writer.finish().json) == list(range(STATES))
 
 
-def test_what_is_too_much_to_wait_is_encoded_at_once(
-    seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(episode_writer, "MOST_PENDING_BYTES", 1)
-    assert pictures_of(seen.write(tmp_path).json) == list(range(STATES))
-
-
 def test_what_is_no_picture_is_refused_at_its_own_step(seen: Made, tmp_path: Path) -> None:
     writer = seen.writer(tmp_path)
     first, second, *_ = seen.rows()
@@ -128,21 +121,3 @@ def test_what_was_encoded_does_not_wait_any_more(
             lambda: episode_writer._pool is not None and episode_writer._pool._bytes == 0, "nothing to wait"
         )
     assert threading.current_thread() not in by and len(by) == 8
-
-
-def test_pictures_are_handed_over_as_soon_as_there_are_enough(
-    seen: Made, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """And each time anew: a thread that is woken for each takes longer than the pictures."""
-    picture = np.zeros((30, 40), np.int32)
-    monkeypatch.setattr(episode_writer, "_pool", None)
-    monkeypatch.setattr(episode_writer, "_BATCH_BYTES", 3 * picture.nbytes)
-    first = episode_writer.encode_async([])
-    soons = [first]
-    for number in range(7):
-        soons.append(
-            episode_writer.encode_async([("picture/0/segmentation", number, "segmentation", picture)])
-        )
-    until(lambda: all(soon.done() for soon in soons[:7]), "six pictures")
-    assert episode_writer._pool is not None and episode_writer._pool._gathered == soons[7:]
-    soons[7].result(60)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.recording.refused_calls import descriptors, left_open, refused
-from workbench.recording.writing.publish import publish, reason, sync_files
+from workbench.recording.writing.publish import publish, sync_files
 
 SUFFIXES = (".rrd", ".h5", ".json")
 
@@ -38,16 +38,6 @@ def test_an_error_of_the_disk_is_told_of_whichever_file_it_is(tmp_path: Path, at
     assert sorted(calls) == ["fsync id.h5", "fsync id.json", "fsync id.rrd"]
     assert left_open(before) == [] and threading.active_count() <= threads
     sync_files(paths)
-
-
-@pytest.mark.parametrize("at", [1, 2, 3])
-def test_a_name_that_cannot_be_given_takes_the_others_back(tmp_path: Path, at: int) -> None:
-    paths = made(tmp_path)
-    (tmp_path / "mine.rrd").write_text("mine")
-    with refused(at, ("link",)), pytest.raises(OSError, match="Input/output error"):
-        publish(paths, tmp_path, "episode")
-    assert names(tmp_path) == ["mine.rrd"] and all(path.exists() for path in paths)
-    assert [path.name for path in publish(paths, tmp_path, "episode")] == [f"episode{s}" for s in SUFFIXES]
 
 
 @pytest.mark.parametrize("at", [1, 2, 3])
@@ -96,21 +86,3 @@ def test_whatever_call_fails_all_three_have_names_or_none_has(
             assert names(folder) == [], call
         if links:
             assert all(path.exists() for path in paths), call
-
-
-@pytest.mark.parametrize(
-    "number, said",
-    [
-        (errno.ENOSPC, "is full. Make room there"),
-        (errno.EDQUOT, "is full. Make room there"),
-        (errno.EACCES, "may not be written to"),
-        (errno.EROFS, "may not be written to"),
-        (errno.ENOTDIR, "is not a folder"),
-        (errno.ENAMETOOLONG, "the name is too long"),
-        (errno.EFBIG, "larger than the system allows"),
-        (errno.ENOENT, "was removed while it was written to"),
-        (errno.EIO, "Input/output error."),
-    ],
-)
-def test_what_to_do_is_said(tmp_path: Path, number: int, said: str) -> None:
-    assert said in reason(OSError(number, os.strerror(number)), tmp_path / "there" / "not yet")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import tempfile
 import uuid
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.writing.finish import EpisodeFiles
 from workbench.recording.writing.publish import RecordingError
-from workbench.recording.writing.upload import remove_uploaded_id, require_place, upload_episode
+from workbench.recording.writing.upload import remove_uploaded_id, upload_episode
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +69,25 @@ def test_episodes_end_up_there_and_not_here(bucket: str, tmp_path: Path) -> None
     assert (episode.info.seed, episode.length) == (1, 3)
 
 
-def test_surplus_successes_are_removed_there_too(tmp_path: Path) -> None:
-    place = (tmp_path / "there").as_uri()
-    record(asked(tmp_path / "out", place, successes=1, tries=2, actions="hold"))
-    assert names(place) == [] if (tmp_path / "there").exists() else True
+FIRST_IS_LATE = """
+import torch
+from mani_skill.envs.tasks import PushCubeEnv
+from mani_skill.utils.registration import register_env
+
+
+@register_env("UploadedLate-v1", max_episode_steps=9, override=True)
+class LateEnv(PushCubeEnv):
+    def evaluate(self):
+        return {"success": self.elapsed_steps >= torch.where(torch.arange(self.num_envs) == 0, 3, 1)}
+"""
+
+
+def test_a_later_success_that_came_first_is_removed_there_too(tmp_path: Path) -> None:
+    place, file = (tmp_path / "there").as_uri(), tmp_path / "late.py"
+    file.write_text(FIRST_IS_LATE)
+    (kept,) = record(replace(asked(tmp_path / "out", place, successes=1), task=str(file))).written
+    assert (kept.seed, kept.steps) == (0, 3)
+    assert names(place) == sorted(f"{kept.path.stem}{suffix}" for suffix in (".rrd", ".h5", ".json"))
 
 
 def test_what_another_worker_has_left_is_replaced(tmp_path: Path) -> None:
@@ -119,21 +134,3 @@ def test_only_the_episode_with_that_id_is_removed(tmp_path: Path) -> None:
     assert len(names(place)) == 3
     remove_uploaded_id(place, "Task", 1, "mine")
     assert names(place) == []
-
-
-@pytest.mark.parametrize(
-    ("address", "says"),
-    [
-        ("nonsense://place", "Protocol not known: nonsense"),
-        ("file:///proc/nowhere", "Cannot record to file:///proc"),
-    ],
-)
-def test_a_place_that_cannot_be_written_is_said_before(address: str, says: str) -> None:
-    with pytest.raises(RecordingError, match=says):
-        require_place(address)
-
-
-def test_a_place_that_can_be_written_is_left_as_it_was() -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        require_place(f"file://{folder}")
-        assert list(Path(folder).iterdir()) == []

@@ -23,7 +23,7 @@ from workbench.recording.episode.columns import (
     layout_type,
     text_tracks,
 )
-from workbench.recording.episode.document import CameraJson, json_text
+from workbench.recording.episode.document import CameraJson, SceneJson, json_text
 from workbench.recording.episode.encoded_pictures import MODALITIES, EncodedPictures, LazyPictures, Modality
 from workbench.recording.episode.episode import CameraTrack, Episode, EpisodeInfo, parse_acted_by
 from workbench.recording.episode.made_here import is_sealed, seal_text
@@ -67,11 +67,13 @@ def header_from(text: str, visuals: tuple[Visual, ...]) -> Header:
     """The inverse of `header_text`, with the meshes in `visuals`. Raises ValueError, KeyError or TypeError."""
     data = json.loads(text)
     num_envs, names, kinds, hidden = data["bodies"]
+    # A kind of a damaged journal that no reader of the files would take.
+    scene = msgspec.convert({"body_names": names, "body_kinds": kinds, "body_hidden": hidden}, SceneJson)
     # Journals of earlier versions hold an object, without a seal.
     info = data["info"] if isinstance(data["info"], str) else json.dumps(data["info"])
     return Header(
         info=_info_from(json.loads(info)),
-        geometry=SceneGeometry(num_envs, tuple(names), tuple(kinds), tuple(hidden), visuals),
+        geometry=SceneGeometry(num_envs, scene.body_names, scene.body_kinds, scene.body_hidden, visuals),
         segmentation={int(key): name for key, name in data["segmentation"].items()},
         action_names=tuple(data["action_names"]),
         cameras=tuple(words.info() for words in msgspec.convert(data["cameras"], list[CameraJson])),
