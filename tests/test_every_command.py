@@ -15,6 +15,14 @@ WITHOUT_SUCCESS, WITHOUT_REWARD, SEVERAL_ROBOTS = "swing_up", "Empty-v1", "two_r
 NO_TABLE, FAILS_IN_PARTIAL_RESETS = "template minimal", "MS-HopperHop-v1"
 QUICK = (WITHOUT_SUCCESS, WITHOUT_REWARD, SEVERAL_ROBOTS, NO_TABLE, FAILS_IN_PARTIAL_RESETS)
 RULES = ALL_RULES.keys() - SOLVE_RULES
+OF_EACH_KIND = (
+    WITHOUT_REWARD,
+    FAILS_IN_PARTIAL_RESETS,
+    "TableTopFreeDraw-v1",
+    "PegInsertionSide-v1",
+    "PickCube-v1",
+)
+"""Built in, in processes too."""
 NO_REWARD = WITHOUT_REWARD, "TableTopFreeDraw-v1"
 OTHER_BODIES_IN_EACH_ENV = (
     "different_objects",
@@ -28,7 +36,9 @@ NO_PLAN = *NO_REWARD, *OTHER_BODIES_IN_EACH_ENV
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("task", QUICK)
+@pytest.mark.parametrize(
+    "task", [*QUICK, *(pytest.param(one, marks=pytest.mark.slow) for one in built_in() if one not in QUICK)]
+)
 def test_every_command_takes_each_kind_of_task(
     task: str, tmp_path: Path, renderer: None, child_process: None
 ) -> None:
@@ -38,11 +48,12 @@ def test_every_command_takes_each_kind_of_task(
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("task", [*EXAMPLES, *FROM_TEMPLATES, *built_in()])
+@pytest.mark.parametrize("task", [*EXAMPLES, *FROM_TEMPLATES, *OF_EACH_KIND])
 def test_a_task_can_be_opened_checked_recorded_rescored_exported_and_solved(
     task: str, tmp_path: Path, child_process: None
 ) -> None:
-    """By the commands as people give them: in processes, with the options that are there by default."""
+    """By the commands as people give them: in processes, with the options that are there by default. With all that are
+    built in it would take two hours; `python -m tests.sweeps.every_command` does it."""
     require_success(task, walk(task, tmp_path))
 
 
