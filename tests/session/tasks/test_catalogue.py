@@ -148,7 +148,7 @@ def test_the_list_follows_its_folder_and_stays_the_same_while_nothing_changes(
         "  {work}/my task.py \t",
         '"my task.py" ',
         "file://{work}/my%20task.py",
-        "~/tasks/my task.py",
+        "~/work/my task.py",
         "my task.py:88:4",
     ],
 )
