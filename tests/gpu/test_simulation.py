@@ -145,6 +145,7 @@ def test_what_follows_a_restore_is_what_followed_before(picks: tuple[TaskEnv, Ta
     np.testing.assert_allclose(again.poses[..., :3], first.poses[..., :3], atol=0.005)
 
 
+@pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
 def test_a_pose_that_was_set_and_not_applied_is_read_and_not_simulated(
     picks: tuple[TaskEnv, TaskEnv],
 ) -> None:

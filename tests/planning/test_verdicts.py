@@ -162,6 +162,5 @@ def test_rewards_that_are_no_numbers_do_not_end_it(value: float) -> None:
     broken = unsolved(0.4)
     for each in (broken.reward, broken.best, broken.hold, broken.worst):
         each[:] = value
-    with np.errstate(invalid="ignore"):
-        of_episodes([rises(0), broken])
+    of_episodes([rises(0), broken])
     assert in_the_way(broken, [rises(0), broken])

@@ -67,7 +67,8 @@ class PlannedEpisodes:
     @property
     def without_reward(self) -> bool:
         """Whether no rollout earned more than another before a success: a sparse reward, or none."""
-        flat = [(one.best - one.worst)[: (one.solved_at or one.steps + 1) - 1] for one in self.all]
+        with np.errstate(invalid="ignore"):  # of infinite rewards
+            flat = [(one.best - one.worst)[: (one.solved_at or one.steps + 1) - 1] for one in self.all]
         return bool(self.all) and all(not len(each) or float(each.max()) == 0 for each in flat)
 
 
@@ -254,7 +255,8 @@ def _earns_like_success(episodes: PlannedEpisodes, episode: PlannedEpisode) -> b
 
 
 def _spread_a_step(episode: PlannedEpisode) -> NDArray[Any]:
-    return (episode.best - episode.worst) / episode.horizon
+    with np.errstate(invalid="ignore"):  # of infinite rewards
+        return (episode.best - episode.worst) / episode.horizon
 
 
 def _gain_a_step(episode: PlannedEpisode) -> NDArray[Any]:

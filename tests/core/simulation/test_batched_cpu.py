@@ -17,7 +17,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 from tests.core.stock_env import batch_of
-from tests.core.test_written_for_the_cpu import ThrowsAFreeChain
+from tests.core.written import ThrowsAFreeChain
 from workbench.core.env.cpu_scene import batched_class
 from workbench.core.rules import Degree
 
