@@ -113,9 +113,12 @@ def take_film(desk: Desk, path: Path) -> None:
 
     film.scene("Place a camera", 2.5, 8, move)
     show.click()
-    page.get_by_role("button", name="Save to").evaluate("e => e.scrollIntoView({block: 'end'})")
+    save = page.get_by_role("button", name="Save to")
+    save.evaluate("e => e.scrollIntoView({block: 'end'})")
     time.sleep(2)
     film.scene("... and save it to the file", 1.5, 2, lambda frame: time.sleep(1))
+    save.click()
+    expect(page.locator(".wb-sight-moved")).to_have_count(0)
     desk.tab("Episodes")
     desk.press("Shift+C", "Space")
     film.scene("Record episodes", 1.5, 5, lambda frame: time.sleep(1.5))
