@@ -56,7 +56,7 @@ endif
 help:
 	@echo "make open      show tasks/push_cube.py in the browser (TASK=file or env id, ARGS=options of workbench open)"
 	@echo "make test      lint, types and the tests that need no GPU and little time (ARGS=options of pytest)"
-	@echo "make test-fast ruff and the tests that need no process, renderer or browser: about two minutes"
+	@echo "make test-fast ruff and the quickest of the tests that need no process, renderer or browser: about a minute"
 	@echo "make test-all  the slow tests too"
 	@echo "make test-order all of them in random order (SEED=1 makes one order again)"
 	@echo "make test MANISKILL=nightly  the same tests with ManiSkill's nightly build, in .venv-nightly; likewise make open"

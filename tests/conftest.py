@@ -69,10 +69,14 @@ ONE_AFTER_THE_OTHER = {
 """Files that share a page's server with another (tests/browser/conftest.py), so that one process has to run both."""
 
 
+EACH_ALONE = {"tests/test_every_command.py"}
+"""Files of long tests that share nothing: in one process they would go on long after all others."""
+
+
 def run_together(nodeid: str) -> str:
-    """The file whose tests run in one process with this one."""
+    """What runs in one process with this test: its file, or another with which that shares a server."""
     file = nodeid.split("::", 1)[0]
-    return ONE_AFTER_THE_OTHER.get(file, file)
+    return nodeid if file in EACH_ALONE else ONE_AFTER_THE_OTHER.get(file, file)
 
 
 def browsers_apart(items: list[pytest.Item]) -> list[pytest.Item]:

@@ -120,7 +120,7 @@ PROTECTED = {
     " -k 'not nothing_is_printed and not command and not palette and not many_that_start'",
     "ui/widgets/rescored": "ui/review/test_rescore.py ui/live/test_rescored.py",
     "ui/widgets/parts": "ui/widgets/test_parts.py",
-    "ui/widgets/click_targets": "ui/widgets/test_click_targets.py ui/live/test_env_panel.py ui/live/test_rescored.py ui/review/test_rescore.py",
+    "ui/widgets/paged": "ui/widgets/test_paged.py",
     "ui/server/responses": "ui/server/test_replies.py",
     "ui/live/timeline": "ui/live/test_timeline.py ui/live/test_timeline_strip.py",
     "ui/server/file_response": "ui/server/test_file_response.py",

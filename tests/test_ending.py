@@ -49,6 +49,7 @@ def test_a_worker_that_hangs_ends_with_its_server(tmp_path: Path, number: signal
         print(f"{number.name}: all gone after {time.monotonic() - began:.2f} s")
 
 
+@pytest.mark.slow
 def test_a_signal_that_the_kernel_hands_to_another_thread_ends_the_page(tmp_path: Path) -> None:
     """Python's handler runs in the main thread, which is not woken by it: on a busy machine Ctrl-C did nothing."""
     (tmp_path / "recordings").mkdir()
@@ -60,6 +61,7 @@ def test_a_signal_that_the_kernel_hands_to_another_thread_ends_the_page(tmp_path
     assert opened.process.returncode == 0
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:
     """Tabs, one of which reads nothing; a recording; a worker in an endless loop; a spare one and one that judges."""
     file = write_task(tmp_path)

@@ -15,15 +15,11 @@ WITHOUT_SUCCESS, WITHOUT_REWARD, SEVERAL_ROBOTS = "swing_up", "Empty-v1", "two_r
 NO_TABLE, FAILS_IN_PARTIAL_RESETS = "template minimal", "MS-HopperHop-v1"
 QUICK = (WITHOUT_SUCCESS, WITHOUT_REWARD, SEVERAL_ROBOTS, NO_TABLE, FAILS_IN_PARTIAL_RESETS)
 RULES = ALL_RULES.keys() - SOLVE_RULES
-OF_EACH_KIND = (
-    WITHOUT_REWARD,
-    FAILS_IN_PARTIAL_RESETS,
-    "TableTopFreeDraw-v1",
-    "PegInsertionSide-v1",
-    "PickCube-v1",
-)
+OF_EACH_KIND = WITHOUT_REWARD, FAILS_IN_PARTIAL_RESETS, "PickCube-v1"
 """Built in, in processes too."""
-NO_REWARD = WITHOUT_REWARD, "TableTopFreeDraw-v1"
+DRAWN = {"TableTopFreeDraw-v1", "DrawSVG-v1"}
+"""Each takes two minutes for its hundreds of bodies; DrawTriangle-v1 is of their kind."""
+WALKED = [*FROM_TEMPLATES, *(one for one in built_in() if one not in DRAWN)]
 OTHER_BODIES_IN_EACH_ENV = (
     "different_objects",
     "PegInsertionSide-v1",
@@ -31,13 +27,15 @@ OTHER_BODIES_IN_EACH_ENV = (
     "RotateSingleObjectInHandLevel1-v1",
     *(f"RotateValveLevel{level}-v1" for level in range(5)),
 )
-NO_PLAN = *NO_REWARD, *OTHER_BODIES_IN_EACH_ENV
+NO_PLAN = WITHOUT_REWARD, *OTHER_BODIES_IN_EACH_ENV
 """Tasks that ``solve`` refuses with exit code 2."""
 
 
 @pytest.mark.timeout(300)
+# Some of ManiSkill's own tasks break rules that only warn.
+@pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
 @pytest.mark.parametrize(
-    "task", [*QUICK, *(pytest.param(one, marks=pytest.mark.slow) for one in built_in() if one not in QUICK)]
+    "task", [*QUICK, *(pytest.param(one, marks=pytest.mark.slow) for one in WALKED if one not in QUICK)]
 )
 def test_every_command_takes_each_kind_of_task(
     task: str, tmp_path: Path, renderer: None, child_process: None
@@ -48,13 +46,14 @@ def test_every_command_takes_each_kind_of_task(
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("task", [*EXAMPLES, *FROM_TEMPLATES, *OF_EACH_KIND])
+@pytest.mark.parametrize("task", [*EXAMPLES, *OF_EACH_KIND])
 def test_a_task_can_be_opened_checked_recorded_rescored_exported_and_solved(
     task: str, tmp_path: Path, child_process: None
 ) -> None:
     """By the commands as people give them: in processes, with the options that are there by default. With all that are
     built in it would take two hours; `python -m tests.sweeps.every_command` does it."""
-    require_success(task, walk(task, tmp_path))
+    # The Checks tab looks at what the command looks at.
+    require_success(task, walk(task, tmp_path, checks=task in (WITHOUT_SUCCESS, FAILS_IN_PARTIAL_RESETS)))
 
 
 def require_success(task: str, walked: Iterable[Ran]) -> None:

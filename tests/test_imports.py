@@ -18,7 +18,19 @@ from packaging.utils import canonicalize_name
 
 PACKAGE = Path(__file__).parents[1] / "workbench"
 TESTS = Path(__file__).parent
-LAYERS = ("cli", "ui", "session", "jobs", "checks", "planning", "recording", "authoring", "core", "machine")
+LAYERS = (
+    "cli",
+    "ui",
+    "session",
+    "jobs",
+    "checks",
+    "planning",
+    "recording",
+    "authoring",
+    "core",
+    "commands",
+    "machine",
+)
 """From the top to the bottom: a layer imports those behind it. Recording and authoring do not import each other."""
 APART = {("recording", "authoring")}
 
@@ -32,9 +44,19 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+@cache
+def import_statements(file: Path) -> tuple[ast.Import | ast.ImportFrom, ...]:
+    """Also within functions, and of types alone. To parse the whole package takes seconds, so once."""
+    return tuple(
+        node
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    )
+
+
 def imported(file: Path) -> Iterator[tuple[int, str]]:
-    """Line and module below the package, with slashes; also within functions, and of types alone."""
-    for node in ast.walk(ast.parse(file.read_text())):
+    """Line and module below the package, with slashes."""
+    for node in import_statements(file):
         names: list[str] = []
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "workbench":
             names = [f"{node.module}.{alias.name}" for alias in node.names]
@@ -45,7 +67,7 @@ def imported(file: Path) -> Iterator[tuple[int, str]]:
             if path not in MODULES:
                 path = path.rsplit("/", 1)[0]
             if path in MODULES:
-                yield getattr(node, "lineno", 0), path
+                yield node.lineno, path
 
 
 @cache
@@ -63,6 +85,7 @@ def folder_of(module: str) -> str:
     return module.rpartition("/")[0]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("layer", LAYERS)
 def test_imports_run_one_way(layer: str) -> None:
     below = {layer, *LAYERS[LAYERS.index(layer) :]} - {b for a, b in APART if a == layer}
@@ -108,7 +131,7 @@ def test_the_page_is_the_only_part_that_knows_viser() -> None:
     knowing = {
         file.relative_to(PACKAGE).parts[0]
         for file in PACKAGE.rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text()))
+        for node in import_statements(file)
         if (isinstance(node, ast.Import) and any(a.name.split(".")[0] == "viser" for a in node.names))
         or (isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "viser")
     }
@@ -130,8 +153,7 @@ def test_what_is_imported_is_a_dependency_of_ours_and_not_only_of_one() -> None:
     names = {
         name.split(".")[0]
         for file in MODULES.values()
-        for node in ast.walk(ast.parse(file.read_text()))
-        if isinstance(node, (ast.Import, ast.ImportFrom))
+        for node in import_statements(file)
         for name in [getattr(node, "module", None), *(alias.name for alias in node.names)]
         if name and (isinstance(node, ast.Import) or name == node.module)
     }
@@ -142,6 +164,7 @@ def test_what_is_imported_is_a_dependency_of_ours_and_not_only_of_one() -> None:
     assert wanting == set()
 
 
+@pytest.mark.thorough
 def test_nothing_is_imported_from_a_test() -> None:
     """Whoever changes a test would change others, and the file would be run for a helper of a line."""
     names = {file.stem for file in TESTS.rglob("*.py") if file.name.startswith("test_")}
@@ -149,8 +172,7 @@ def test_nothing_is_imported_from_a_test() -> None:
     wrong = [
         f"{file.relative_to(TESTS)}:{node.lineno} imports {name}"
         for file in TESTS.rglob("*.py")
-        for node in ast.walk(ast.parse(file.read_text()))
-        if isinstance(node, (ast.Import, ast.ImportFrom))
+        for node in import_statements(file)
         for name in [getattr(node, "module", None), *(alias.name for alias in node.names)]
         if name and set(name.split(".")) & names
     ]

@@ -107,6 +107,7 @@ def test_the_time_limit_is_the_registered_one_or_the_one_given(given: int | None
 # --- what is made ----------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:.*which exists already")
 def test_a_file_and_a_class_of_it(tables_as_before: None) -> None:
     file = TASKS / "push_cube.py"
     for reference in (file, str(file), f"{file}:PushCubeEnv"):

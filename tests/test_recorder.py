@@ -172,6 +172,7 @@ for step in range(1, 10**6):
 """
 
 
+@pytest.mark.slow
 def test_a_killed_program_loses_a_second(child_process: None, tmp_path: Path) -> None:
     """A second is for all that waits anywhere."""
     child = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 TESTS = """
 import os, subprocess, sys, threading
@@ -44,6 +46,7 @@ def test_that_takes_long(): pass
 """
 
 
+@pytest.mark.slow
 def test_only_what_needs_nothing_is_fast_and_the_rest_is_named_its_fixture(
     child_process: None, tmp_path: Path
 ) -> None:

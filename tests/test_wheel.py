@@ -52,6 +52,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return venv / "bin"
 
 
+@pytest.mark.slow
 def test_web_assets_and_tasks_travel_in_the_wheel(wheel: Path) -> None:
     carried = set(ZipFile(wheel).namelist())
     wanted = {
@@ -65,6 +66,7 @@ def test_web_assets_and_tasks_travel_in_the_wheel(wheel: Path) -> None:
     assert not [name for name in carried if name.startswith("tests/") or "__pycache__" in name]
 
 
+@pytest.mark.slow
 def test_the_installed_command_is_not_the_clone(installed: Path, tmp_path: Path) -> None:
     where = "import workbench; print(workbench.__file__)"
     assert str(installed.parent) in _run([str(installed / "python"), "-c", where], tmp_path)

@@ -1,8 +1,8 @@
 // A click on a curve shows its step.
 //
 // uPlot's chart is not reachable from the page's elements, and what part of the steps it shows changes with its zoom. Its
-// legend says the step under the pointer, so that is sent, from the first step on that the panel names (data-first), by
-// the hidden number input that it names (data-seek). A drag is uPlot's zoom.
+// legend says the step under the pointer, so that is sent, with the command that the panel names (data-curve). A drag is
+// uPlot's zoom.
 "use strict";
 {
   const STILL = 4; // pixels between the two ends of a click
@@ -21,7 +21,7 @@
 
   function markOf(element) {
     for (let around = element; around; around = around.parentElement) {
-      const mark = around.querySelector("[data-seek]");
+      const mark = around.querySelector("[data-curve]");
       if (mark) return mark;
     }
     return null;
@@ -43,10 +43,9 @@
       down = null;
       if (!began || Math.hypot(event.clientX - began.x, event.clientY - began.y) > STILL) return;
       const mark = markOf(began.over);
-      const input = mark && document.getElementById(mark.dataset.seek);
       const legend = began.over.closest(".uplot")?.querySelector(".u-legend .u-value");
       const step = legend && whole(legend.textContent);
-      if (input && step !== null) wb.send(input, step - Number(mark.dataset.first));
+      if (mark && step !== null) wb.ask([mark.dataset.curve, { step }]);
     },
     true,
   );

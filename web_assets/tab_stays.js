@@ -2,7 +2,7 @@
 //
 // Which tab is open is the browser's own matter, and a page that is built again begins with its first. The page says in
 // `data-which` what it shows (which.html); what was chosen there is kept for as long as the browser's tab lives. Where the
-// server asks for it (`data-says`, a hidden number input), it is told which one is open, counted from 0.
+// server asks for it (`data-says`), it is told which one is open.
 "use strict";
 {
   const KEEPS = "workbench tab of ";
@@ -53,11 +53,10 @@
   let said = {};
   function sayWhichIsOpen() {
     const mark = marker();
-    const input = mark?.dataset.says && document.getElementById(mark.dataset.says);
-    const place = input ? tabsOf(mark).findIndex((tab) => tab.getAttribute("aria-selected") === "true") : -1;
-    if (place < 0 || (said.input === input && said.place === place)) return;
-    said = { input, place };
-    wb.send(input, place);
+    const open = mark && "says" in mark.dataset && tabsOf(mark).find((tab) => tab.getAttribute("aria-selected") === "true");
+    if (!open || (said.mark === mark && said.tab === nameOf(open))) return;
+    said = { mark, tab: nameOf(open) };
+    wb.ask(["tell_open_tab", { tab: said.tab }]);
   }
 
   new MutationObserver(() => {

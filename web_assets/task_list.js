@@ -1,7 +1,7 @@
 // The keyboard in the list of tasks: what is typed goes to its search, the arrows walk through the rows, Enter opens one.
 //
-// The marked row is the browser's own matter: two people at two browsers do not move each other's. A row is pressed as by
-// a mouse (pressed.js), so only its number is sent. Enter waits until the list is that of the words in the field: they
+// The marked row is the browser's own matter: two people at two browsers do not move each other's. Enter asks for what a press
+// on the row would (input.js). It waits until the list is that of the words in the field: they
 // arrive a moment after they were typed, and it would open what was marked before.
 //
 // The list follows its folder: where a row comes or goes above the one under the pointer, the page is scrolled by as much.
@@ -68,7 +68,7 @@
     }
     markAgain(list);
     const row = list.querySelector(`[data-row="${CSS.escape(marked)}"]`);
-    row?.dispatchEvent(new PointerEvent("pointerdown", { bubbles: true, button: 0, pointerType: "mouse" }));
+    if (row) wb.ask(JSON.parse(row.dataset.do));
   }
 
   window.addEventListener(
@@ -79,14 +79,14 @@
       const asked = [...document.querySelectorAll("[role=dialog]")].at(-1);
       if (asked && !asked.contains(list)) return; // a question over the list
       const field = searchOf(list);
-      const elsewhere = event.target instanceof Element && event.target.matches("input, textarea, button, summary, a[href]");
+      const elsewhere = event.target instanceof Element && event.target.matches("input, textarea, select, button, summary, a[href], .wb-button");
       if (event.target !== field && elsewhere) return;
       const key = event.key;
       const sideways = key === "ArrowLeft" || key === "ArrowRight";
       if (key === "ArrowDown" || key === "ArrowUp" || (sideways && (event.target !== field || !field.value))) walk(list, key);
       else if (key === "Enter") open(performance.now());
       else if (key === "Escape" && field?.value) {
-        Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, "");
+        field.value = "";
         field.dispatchEvent(new Event("input", { bubbles: true }));
       } else {
         // The letter itself goes into the field, which has the focus by then; and no key of the page below acts.
@@ -126,18 +126,19 @@
     }
   }
 
-  let there = null;
+  let search = null; // the field that was given the focus
   new MutationObserver(() => {
     const list = lists();
     if (!list) {
-      there = null;
+      search = null;
       return;
     }
     keepUnderPointer(list);
     markAgain(list);
-    if (there) return;
-    there = list;
+    const field = searchOf(list);
+    if (!field || field === search) return;
+    search = field; // It may come after the list, or anew.
     words = list.dataset.words;
-    searchOf(list)?.focus({ preventScroll: true });
+    field.focus({ preventScroll: true });
   }).observe(document, { childList: true, subtree: true });
 }

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 from workbench.authoring.loading.load import LoadedTask, load_task
 from workbench.authoring.problem import Problem, problem_from_exception, shorten
 
+pytestmark = pytest.mark.thorough
+
 Write = Callable[..., Path]
 
 

@@ -15,6 +15,8 @@ from workbench.authoring.loading.load import LoadedTask, load_task
 from workbench.authoring.problem import Problem, check_step_returns
 from workbench.core.env.evaluate_entries import wrong_reward
 
+pytestmark = pytest.mark.thorough
+
 Write = Callable[..., Path]
 N = 4
 YES = torch.ones(N, dtype=torch.bool)

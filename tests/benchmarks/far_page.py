@@ -44,6 +44,7 @@ from workbench.session.live.session import Session
 from workbench.ui.app.live_page import Page
 from workbench.ui.scene.viewpoint import FOV, Stage
 from workbench.ui.server.gated_server import ServerOptions, open_server
+from workbench.ui.widgets.visitors import Visitors
 
 BITS, DELAY = 2e6, 0.04
 COMMAND = "Play or pause"
@@ -128,7 +129,7 @@ def measure(played: Played, options: Options) -> str:
             recordings=Path(folder) / "kept",
             make_worker=partial(Playing, played, made),  # type: ignore[arg-type]
         )
-        page = Page(gated.server, session, stage=Stage(gated.server))
+        page = Page(gated.server, Visitors(gated.server), session, stage=Stage(gated.server))
         wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
         page.redraw()
         page.start()

@@ -44,6 +44,7 @@ from workbench.session.protocol.messages import Status
 from workbench.ui.app.live_page import Page
 from workbench.ui.scene.viewpoint import FOV, Stage
 from workbench.ui.server.gated_server import ServerOptions, open_server
+from workbench.ui.widgets.visitors import Visitors
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 HERTZ, SPEED, EPISODE = 30, 4.0, 50
@@ -161,7 +162,7 @@ def measure(played: Played, options: Options, exact: bool) -> Update:
             recordings=Path(folder) / "kept",
             make_worker=partial(Player, played, made),  # type: ignore[arg-type]
         )
-        page = Page(gated.server, session, stage=stage, clock=clock)
+        page = Page(gated.server, Visitors(gated.server), session, stage=stage, clock=clock)
         mark = gated.server.gui.add_text("mark", "")
         wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
         page.redraw()

@@ -135,8 +135,7 @@ def prepare(page: Page, options: Options, url: str) -> None:
             if tick.is_checked():
                 tick.uncheck(force=True)
     page.get_by_role("tab", name="Run").click()
-    page.locator('input[role="combobox"][value="1 ×"]').click()
-    page.get_by_role("option", name=options.speed, exact=True).click()
+    page.get_by_label("Speed", exact=True).select_option(label=options.speed)
     page.mouse.click(5, 690)  # keys are ignored inside an input
     if options.draw == "none":
         page.evaluate(TRANSPARENT)
@@ -158,7 +157,7 @@ def timed_click(page: Page, label: str, effect: str) -> float:
     # Timed inside the page, so that the way between this script and Chromium does not count.
     return page.evaluate(
         """([label, effect]) => new Promise((done) => {
-            const find = (text) => [...document.querySelectorAll('button')].find((b) => b.innerText.trim() === text);
+            const find = (text) => [...document.querySelectorAll('button, [role=button]')].find((b) => b.textContent.trim() === text);
             const start = performance.now();
             find(label).click();
             const look = () => find(effect) ? done((performance.now() - start) / 1000) : setTimeout(look, 2);
@@ -286,9 +285,8 @@ def without_success(file: Path) -> None:
     file.write_text(text.replace(test, "(distance < 0)"))
 
 
-def choose_source(page: Page, now: str, wanted: str) -> None:
-    page.locator(f'input[role="combobox"][value="{now}"]').click()
-    page.get_by_role("option", name=wanted, exact=True).click()
+def choose_source(page: Page, wanted: str) -> None:
+    page.get_by_label("Source", exact=True).select_option(label=wanted)
     page.mouse.click(5, 690)
 
 
@@ -330,7 +328,7 @@ def main(options: Options) -> None:
                 print(f"paused, while the camera turns: {told_of_view(windows)}", flush=True)
                 timed_click(page, "Play", "Pause")
             if options.solve:
-                choose_source(page, "random", "solve")
+                choose_source(page, "solve")
                 # The envs of the rollouts are made, and the first plan.
                 page.wait_for_function(
                     f"() => ({PACE})() === '' && /plan/.test(document.body.innerText)", timeout=60_000

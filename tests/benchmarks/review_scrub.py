@@ -85,7 +85,7 @@ def command(*arguments: str) -> Iterator[str]:
 
 def scrub(page: Page, seconds: float) -> tuple[float, float]:
     """Positions and animation frames a second while the slider is dragged back and forth."""
-    box = page.locator(".mantine-Slider-root").last.bounding_box()
+    box = page.locator("input[type=range]:visible").last.bounding_box()
     assert box is not None
     y, low, high = box["y"] + box["height"] / 2, box["x"] + 4, box["x"] + box["width"] - 4
     page.mouse.move(low, y)

@@ -103,8 +103,7 @@ def take_film(desk: Desk, path: Path) -> None:
     film.scene("Find the env that failed", 3.5, 5, find)
     desk.tab("Studio")
     desk.choose("Camera", "base_camera · sensor")
-    show = page.get_by_role("button", name="Show the change")
-    expect(show).to_be_visible()
+    expect(page.get_by_text("Show the change", exact=True)).to_be_visible()
     time.sleep(4)
 
     def move(frame: int) -> None:
@@ -112,7 +111,7 @@ def take_film(desk: Desk, path: Path) -> None:
         time.sleep(1.5)
 
     film.scene("Place a camera", 2.5, 8, move)
-    show.click()
+    page.get_by_role("button", name="Show the change").click()
     save = page.get_by_role("button", name="Save to")
     save.evaluate("e => e.scrollIntoView({block: 'end'})")
     time.sleep(2)

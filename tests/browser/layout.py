@@ -67,7 +67,7 @@ FAULTS = r"""() => {
     }
 
     // Buttons.
-    const buttons = [...document.querySelectorAll(".mantine-Button-root, .wb-pill, .wb-button, .wb-rules-mark, .wb-tag[data-press]")]
+    const buttons = [...document.querySelectorAll(".mantine-Button-root, .wb-pill, .wb-button, .wb-rules-mark, .wb-tag[data-do]")]
         .filter((element) => visible(element) && !inView(element) && !element.closest(".mantine-Notification-root"))
         .map((element) => ({ element, box: element.getBoundingClientRect(), ...seen(element, element.getBoundingClientRect()) }))
         .filter((one) => one.shown);
@@ -80,14 +80,14 @@ FAULTS = r"""() => {
         if (text.width && (text.left < a.box.left + 3 || text.right > a.box.right - 3)) faults.add(`text over a button's edge: ${name(a.element)}`);
     });
 
-    // Scroll bars and slider thumbs over text.
-    for (const bar of document.querySelectorAll(".mantine-ScrollArea-scrollbar, .mantine-Slider-thumb")) {
+    // Scroll bars over text.
+    for (const bar of document.querySelectorAll(".mantine-ScrollArea-scrollbar")) {
         if (!visible(bar) || style(bar).opacity === "0") continue;
         const box = seen(bar, bar.getBoundingClientRect());
         if (!box.shown) continue;
         for (const text of texts)
             if (panelOf(text.element) === panelOf(bar) && overlap(text, box, -1) && onTop({ ...text }) !== null)
-                faults.add(`a ${bar.className.includes("Slider") ? "slider" : "scroll bar"} lies over: ${text.text}`);
+                faults.add(`a scroll bar lies over: ${text.text}`);
     }
 
     // Panels.

@@ -87,9 +87,8 @@ def take_live(page: Page, folder: Path) -> None:
                 tick.check(force=True)
             expect(page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
         if name == "Studio":
-            page.locator("input[aria-haspopup=listbox]:visible").first.click()
-            page.get_by_role("option", name="eye · sensor", exact=True).click()
-            expect(page.get_by_role("button", name="Show the change")).to_be_visible()
+            page.get_by_label("Camera", exact=True).select_option(label="eye · sensor")
+            expect(page.get_by_text("Show the change", exact=True)).to_be_visible()
         shoot(page, folder, f"live-{name.lower()}")
 
 

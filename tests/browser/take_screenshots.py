@@ -64,8 +64,7 @@ class Desk:
             time.sleep(0.1)
 
     def choose(self, label: str, option: str) -> None:
-        self.page.get_by_label(label, exact=True).locator("visible=true").first.click()
-        self.page.get_by_role("option", name=option, exact=True).click()
+        self.page.get_by_label(label, exact=True).locator("visible=true").first.select_option(label=option)
 
     def edit(self, old: str, new: str) -> None:
         """Save the example with this change."""
@@ -230,10 +229,9 @@ def shoot_studio(browser: Browser) -> None:
     with live_page(browser, "--num-envs", "4") as desk:
         desk.tab("Studio")
         desk.choose("Camera", "base_camera · sensor")
-        show = desk.page.get_by_role("button", name="Show the change")
-        expect(show).to_be_visible()
+        expect(desk.page.get_by_text("Show the change", exact=True)).to_be_visible()
         desk.press(*12 * ["Alt+ArrowLeft"], *12 * ["Alt+Shift+ArrowRight"])
-        show.click()
+        desk.page.get_by_role("button", name="Show the change").click()
         write = desk.page.get_by_role("button", name=re.compile("^Save to"))
         write.evaluate("e => e.scrollIntoView({block: 'end'})")
         desk.shoot("studio")
@@ -403,8 +401,8 @@ def shoot_sweep(browser: Browser) -> None:
             desk = Desk(page, file)
             time.sleep(FRAME)
             desk.tab("Sweep")
-            page.locator(".wb-sweep-scroll tr[data-press]").first.click()
-            page.locator(".wb-sweep-episodes tr[data-press]").first.click()
+            page.locator(".wb-sweep-scroll tr[data-do]").first.click()
+            page.locator(".wb-sweep-episodes tr[data-do]").first.click()
             time.sleep(FRAME)
             desk.press(*5 * ["ArrowRight"])
             desk.shoot("sweep")

@@ -31,7 +31,7 @@ FOLDERS = {
 PLACES_OF_A_PILL = """
 window.places = [];
 const look = () => {
-    const pill = document.querySelector(".wb-offer [data-press]");
+    const pill = document.querySelector(".wb-offer [data-do]");
     if (pill) places.push(Math.round(pill.getBoundingClientRect().top));
     if (places.length < 40) requestAnimationFrame(look);
 };
@@ -46,8 +46,7 @@ def opened(example: At, browser: Browser) -> Iterator[Page]:
     with example(browser, height=900) as desk:
         page = desk.page
         desk.tab("Studio")
-        page.locator("input[aria-haspopup=listbox]:visible").first.click()
-        page.get_by_role("option", name=f"{CAMERA} · sensor", exact=True).click()
+        page.get_by_label("Camera", exact=True).select_option(label=f"{CAMERA} · sensor")
         # The first picture pushes the folders down: a click that is under way then falls beside its folder.
         expect(page.locator(PICTURE).first).to_be_visible(timeout=180_000)
         for folder, inside in FOLDERS.items():
@@ -120,7 +119,7 @@ def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of
     assert float(pixels.removesuffix(" px")) > 10 and of_picture.endswith(" %")
     expect(page.get_by_text("measure again")).to_have_count(0)
     press(page, "Keep this placement as A")
-    page.locator(".wb-planes [data-press]").last.click()
+    page.locator(".wb-planes [data-do]").last.click()
     expect(page.get_by_text("measure again")).to_be_visible()
     press(page, "Show side by side")
     expect(page.locator(".wb-pair img")).to_have_count(2)
@@ -139,7 +138,7 @@ def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:
     before = shown_matrix(page)
     moved = before.copy()
     moved[2, 3] += 0.1  # world to camera, OpenCV: what is seen goes a decimetre away
-    field = page.locator("textarea:visible")
+    field = page.get_by_label("Calibration")
     field.fill("\n".join(" ".join(map(str, row)) for row in moved))
     press(page, "Apply to the camera")
     until(lambda: bool(np.allclose(shown_matrix(page), moved, atol=1e-6)), "the pasted pose")
@@ -159,7 +158,7 @@ def test_placements_are_suggested_with_pictures_and_taken(page: Page) -> None:
     page.keyboard.press("Enter")
     page.evaluate(PLACES_OF_A_PILL)
     press(page, "Search")
-    take = page.locator(".wb-offer [data-press]")
+    take = page.locator(".wb-offer [data-do]")
     expect(take.first).to_be_visible(timeout=180_000)
     page.wait_for_function("() => places.length >= 40")
     places = page.evaluate("places.slice(3)")

@@ -87,11 +87,11 @@ def test_a_row_is_pressed_and_its_env_selected_also_while_the_envs_play(page: Pa
 
 
 def test_an_odd_env_is_flagged_with_its_reason_and_found_by_the_filter(page: Page) -> None:
-    until(lambda: "flagged 1" in page.locator(".wb-pills").inner_text(), "the flag")
-    press(page, ".wb-pills span:nth-child(4)")
+    until(lambda: "flagged 1" in page.locator(".wb-envs .wb-pills").first.inner_text(), "the flag")
+    press(page, ".wb-envs .wb-pills span:nth-child(4)")
     until(lambda: envs(page) == [4], "the filter")
     assert "cube_height is NaN (" in page.locator("tr[data-why='4']").inner_text()
-    press(page, ".wb-pills span:nth-child(1)")
+    press(page, ".wb-envs .wb-pills span:nth-child(1)")
     until(lambda: len(envs(page)) == ENVS, "all rows again")
     page.keyboard.press("Shift+E")
     until(lambda: selected(page) == [4], "the flagged env selected by its key")
@@ -104,8 +104,7 @@ def test_an_odd_env_is_flagged_with_its_reason_and_found_by_the_filter(page: Pag
 
 
 def show(page: Page, what: str) -> None:
-    page.locator("input[aria-haspopup=listbox]:visible").first.click()
-    page.get_by_role("option", name=what, exact=True).click()
+    page.get_by_label("Show", exact=True).locator("visible=true").first.select_option(label=what)
 
 
 def test_a_pose_is_copied(page: Page) -> None:

@@ -46,9 +46,9 @@ def step_of(page: Firefox) -> int:
 
 def test_it_plays(page: Firefox) -> None:
     page.click("[role=tab]", "Run")
-    page.click("button", "Play")
+    page.click("[role=button]", "Play")
     until(lambda: step_of(page) > 3, "steps", 120, page.text)
-    page.click("button", "Pause")
+    page.click("[role=button]", "Pause")
     until(lambda: "paused" in page.text(), "the pause")
 
 
@@ -88,7 +88,7 @@ def test_each_tab_is_opened_and_nothing_is_cut_or_covered(page: Firefox, tab: st
 def test_inputs_are_written_as_their_labels(page: Firefox) -> None:
     page.click("[role=tab]", "Run")
     fonts = page.evaluate(
-        "[...document.querySelectorAll('[data-dock-region=right] label, [data-dock-region=right] .mantine-Input-input')]"
+        "[...document.querySelectorAll('[data-dock-region=right] .wb-field > :is(span, input[type=text], select)')]"
         ".filter(e => e.checkVisibility()).map(e => getComputedStyle(e)).map(s => [s.fontSize, s.fontFamily].join())"
     )
     assert len(fonts) > 8 and len(set(fonts)) == 1, set(fonts)

@@ -62,10 +62,8 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
     address: str, author: Path, browser: Browser
 ) -> None:
     with page_at(browser, address) as (page, errors):
-        page.locator("tr", has_text="WorkbenchPushCube").first.click()
-        page.keyboard.press("Enter")
         live = page.get_by_role("button", name="Continue live from here")
-        expect(live).to_be_visible(timeout=PATIENT)
+        expect(live).to_be_visible(timeout=PATIENT)  # the newest recording is opened by itself
 
         page.get_by_role("tab", name="Rescore").click()
         expect(page.get_by_text(f"With {author / 'push_cube.py'} as it is now.")).to_be_visible()
@@ -77,7 +75,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         page.get_by_role("tab", name="Review").click()
         page.keyboard.press("ArrowRight")
         expect(page.get_by_text("step 2 / 15").first).to_be_visible()
-        page.keyboard.press("b")  # the library is open: there is little room for the timeline
+        # The library is open beside it: there is little room for the timeline.
         until(lambda: timeline_width(page) < 500, "the narrow timeline")
         page.evaluate(COUNT_BODIES)
         live.click()
@@ -96,8 +94,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         page.get_by_role("tab", name="Episodes").click()
         page.get_by_role("button", name="Review recordings").click()
         page.get_by_text("Continue live", exact=True).click()
-        page.locator('input[value="today\'s"]:visible').click()
-        page.get_by_role("option", name="as recorded", exact=True).click()
+        page.get_by_label("Code", exact=True).locator("visible=true").select_option(label="as recorded")
         live.click()
         told = page.get_by_text("seed 5 as it was recorded, step 2: its actions were replayed")
         expect(told).to_be_visible(timeout=PATIENT)

@@ -51,6 +51,7 @@ def test_letters_typed_beside_a_field_reset_and_record_nothing(desk: Desk) -> No
     expect(desk.page.locator(".wb-sight-rec")).to_have_count(0)
 
 
+@pytest.mark.slow
 def test_recording_is_in_sight_on_every_tab_and_in_the_title(desk: Desk) -> None:
     mark = desk.page.locator(".wb-sight-rec")
     desk.tab("Reward")
@@ -68,6 +69,7 @@ def test_recording_is_in_sight_on_every_tab_and_in_the_title(desk: Desk) -> None
     expect(desk.page).not_to_have_title(re.compile("REC"))
 
 
+@pytest.mark.slow
 def test_a_moved_camera_is_in_sight_until_it_is_put_back(desk: Desk) -> None:
     mark = desk.page.locator(".wb-sight-moved")
     desk.tab("Studio")

@@ -144,13 +144,13 @@ def test_compares_two_and_says_where_they_part(desk: tuple[Page, list[str]]) -> 
     assert [e for e in errors if LATE not in e] == []
 
 
+@pytest.mark.slow
 def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) -> None:
     page, errors = desk
     open_both(page)
     page.get_by_role("tab", name="Share").click()
     expect(page.get_by_text("Selected in the library, 2 recordings")).to_be_visible()
-    page.locator('input[value="Video of a camera (mp4)"]:not([type="hidden"])').click()
-    page.get_by_role("option", name="Sheet of pictures (png)").click()
+    page.get_by_label("Make", exact=True).select_option(label="Sheet of pictures (png)")
     expect(page.get_by_text(re.compile("Makes 2 files"))).to_be_visible()
     page.get_by_role("button", name="Make", exact=True).click()
     links = page.locator("a[download]")

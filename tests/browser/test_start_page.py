@@ -87,6 +87,7 @@ def open_list(page: Page) -> None:
         expect(page.get_by_role("dialog").locator(".wb-tasks")).to_be_visible()
 
 
+@pytest.mark.slow
 def test_the_list_follows_its_folder_and_takes_a_path(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
@@ -186,6 +187,7 @@ def test_from_the_start_page_to_a_task_to_another_and_back(
         assert errors == []
 
 
+@pytest.mark.slow
 def test_a_new_task_is_created_with_the_mouse_and_opens(
     started: Opened, folder: Path, browser: Browser
 ) -> None:
@@ -193,11 +195,11 @@ def test_a_new_task_is_created_with_the_mouse_and_opens(
         open_list(page)
         close_notice(page)
         page.get_by_text("New task", exact=True).click()
-        # viser's text fields are not tied to their labels.
-        name = page.get_by_text("Name", exact=True).locator("xpath=following::input[1]")
-        page.get_by_role("combobox", name="Template").click()
-        expect(page.get_by_role("option")).to_have_text([f"{one.name}: {one.about}" for one in TEMPLATES])
-        page.get_by_role("option", name="locomotion").click()
+        name = page.get_by_label("Name", exact=True)
+        template = page.get_by_label("Template", exact=True)
+        about = [f"{one.name}: {one.about}" for one in TEMPLATES]
+        expect(template.locator("option")).to_have_text(about)
+        template.select_option(label=next(one for one in about if one.startswith("locomotion")))
         create = page.get_by_role("button", name="Create", exact=True)
         name.click()
         page.keyboard.type("push")

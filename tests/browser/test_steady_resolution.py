@@ -22,6 +22,7 @@ from workbench.ui.scene.env_grid import lay_out
 from workbench.ui.scene.glb import as_glb
 from workbench.ui.scene.in_software import PATIENCE, InSoftware
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.ui.widgets.visitors import PATH, Visitors
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 A_CARD = """
@@ -147,6 +148,9 @@ def test_shapes_are_simpler_only_while_every_page_draws_in_software(
 ) -> None:
     now = 0.0
     in_software = InSoftware(gated_server.server, clock=lambda: now)
+    visitors = Visitors(gated_server.server)
+    visitors.do = lambda command, visitor: in_software.told_by(visitor)
+    gated_server.add_channel(PATH, visitors.serve)
     page = show()
     until(lambda: len(gated_server.server.get_clients()) == 1, "the page")
     assert not in_software.all_pages

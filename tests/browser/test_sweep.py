@@ -7,16 +7,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
-import viser
 from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
-from workbench.machine.folders import web_assets_folder
 from workbench.recording.library.library import Library
 from workbench.session.review.view import ReviewView
 from workbench.ui.review.sweep import SweepPanel
+from workbench.ui.server.gated_server import ServerOptions, open_server
+from workbench.ui.widgets.visitors import PATH, Visitors
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -31,12 +31,15 @@ class Shown:
 def shown(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Shown]:
     folder = tmp_path_factory.mktemp("sweep")
     sweep_folder(folder)
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    gated_server = open_server(ServerOptions(port=0))
+    server, visitors = gated_server.server, Visitors(gated_server.server)
+    gated_server.add_channel(PATH, visitors.serve)
     library, opened = Library(folder), []
     library.refresh()
     window = server.gui.add_panel()
     with window.add_tab("Sweep"):
         panel = SweepPanel(server, library, opened.append)
+    visitors.do = panel.do
     window.dock_left()
     window.set_width(520)
     stopping = threading.Event()
@@ -50,17 +53,14 @@ def shown(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterato
     drawing.start()
     with page_at(browser, "about:blank") as (page, errors):
         page.set_default_timeout(60_000)
-        for script in ("pressed.js", "pressed_by_key.js"):
-            page.add_init_script(path=web_assets_folder() / script)
-        page.goto(f"http://127.0.0.1:{server.get_port()}")
-        page.add_style_tag(path=web_assets_folder() / "panels" / "page.css")
+        page.goto(gated_server.url)
         page.wait_for_selector(".wb-parallel")
         yield Shown(page, opened)
         assert not errors
     stopping.set()
     drawing.join()
     library.close()
-    server.stop()
+    gated_server.close()
 
 
 def test_a_line_a_row_and_an_episode_are_pressed_with_the_mouse(shown: Shown) -> None:

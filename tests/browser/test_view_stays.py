@@ -10,19 +10,24 @@ from playwright.sync_api import Browser, expect
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
+from workbench.commands.run import Step
+from workbench.commands.timeline import StepBack
 from workbench.ui.server.gated_server import ServerOptions, open_server
-from workbench.ui.widgets.hotkeys import Command, register
+from workbench.ui.widgets.hotkeys import register
+from workbench.ui.widgets.visitors import PATH, Visitors
 
 pytestmark = pytest.mark.browser
 
 
+@pytest.mark.slow
 def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
     gated_server = open_server(ServerOptions(port=0))
     stepped, walked = threading.Event(), threading.Event()
-    register(
-        gated_server.server,
-        [Command("step", stepped.set, "S"), Command("a step back", walked.set, "arrowleft")],
-    )
+    visitors = Visitors(gated_server.server)
+    gated_server.add_channel(PATH, visitors.serve)
+    events = {Step(): stepped, StepBack(): walked}
+    visitors.do = lambda command, visitor: events[command].set()
+    register(gated_server.server, visitors, {Step, StepBack}, "live page")
     # It comes after them: a key that is pressed before the page knows the commands is lost.
     gated_server.server.gui.add_markdown("the commands are there")
     try:

@@ -35,8 +35,8 @@ BESIDES = {
     "nudge_ball": {"loop-over-envs"},
 }
 """Rules that the same mistake breaks too."""
-QUICK = {"knock_can", "nudge_ball", "touch_cube"}
-"""One of each kind; every rule has tests of its own in the files beside this one."""
+QUICK = {"knock_can"}
+"""Every rule has tests of its own in the files beside this one."""
 
 
 def test_every_small_task_is_listed() -> None:
@@ -61,7 +61,8 @@ def test_its_rule_is_broken_at_its_line_and_no_other(name: str, renderer: None) 
 def test_its_rule_is_broken_where_it_is_solved_and_no_other(name: str) -> None:
     rule, line = WHEN_SOLVED[name]
     # Of fewer seeds none is solved, and then nothing says what success pays.
-    results = check_rules(RULES, str(FOLDER / f"{name}.py"), num_envs=4, seeds=8, render_backend="none")
+    file = str(FOLDER / f"{name}.py")
+    results = check_rules(SOLVE_RULES, file, num_envs=4, seeds=8, render_backend="none")
     finding = the_finding(results[rule])
     assert finding.code.startswith(line) and "without success" in finding.message
     assert results[rule].notes[0].startswith("planning solved 2 of 8 seeds")
@@ -72,6 +73,10 @@ def test_its_rule_is_broken_where_it_is_solved_and_no_other(name: str) -> None:
 
 @pytest.mark.slow
 def test_the_mended_version_of_it_breaks_none() -> None:
-    results = check_rules(SOLVE_RULES, str(FOLDER / "mended" / "reach_ball.py"), num_envs=4, seeds=4)
-    assert {result.state for result in results.values()} == {"kept"}
-    assert results["reward-exploited"].notes[0].startswith("planning solved 4 of 4 seeds")
+    # Of fewer seeds it says that they are few.
+    file = str(FOLDER / "mended" / "reach_ball.py")
+    results = check_rules(SOLVE_RULES, file, num_envs=4, seeds=8, render_backend="none")
+    states = {rule: result.state for rule, result in results.items()}
+    assert states.pop("failing-pays") == "not_applicable"  # it has no `fail`
+    assert set(states.values()) == {"kept"}, states
+    assert results["reward-exploited"].notes[0].startswith("planning solved 8 of 8 seeds")

@@ -6,6 +6,8 @@ import pytest
 
 from tests.checks.checked import Checked, the_finding
 
+pytestmark = pytest.mark.thorough
+
 EYE = "pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])"
 HUMAN_EYE = "pose = sapien_utils.look_at(eye=[0.7, 0.7, 0.6], target=[0.0, 0.0, 0.2])"
 CAMERA = '[CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]'
@@ -19,6 +21,7 @@ def test_a_camera_that_looks_past_the_objects(checked: Checked, renderer: None) 
     assert result.findings[0].code.startswith("return [CameraConfig")
 
 
+@pytest.mark.slow
 def test_an_object_needs_one_camera_of_several_and_a_fixed_camera_an_object(
     checked: Checked, renderer: None
 ) -> None:

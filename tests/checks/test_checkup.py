@@ -46,6 +46,7 @@ ONE_ENV = "        super().__init__(*args, robot_uids=robot_uids, **kwargs)\n"
 ONLY = "        if kwargs.get('num_envs', 1) != 1: raise ValueError('one env only')\n"
 
 
+@pytest.mark.slow
 def test_of_one_env_no_rule_makes_more_and_what_needs_more_is_not_known(
     tmp_path: Path, renderer: None
 ) -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.checks.checked import Checked, the_finding
 from workbench.checks.by_hook.run import RuleResult
+
+pytestmark = pytest.mark.thorough
 
 AT = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
 WITH_DEVICE = "        with torch.device(self.device):\n            b = len(env_idx)\n"
@@ -116,6 +120,7 @@ def test_what_a_gpu_takes(checked: Checked) -> None:
         "Pose.create_from_pq(torch.zeros((1, 3))).p + torch.ones((1, 3))",
         "distance + torch.Tensor([1])",  # its origin is not seen
         "self.cube.pose * sapien.Pose(p=[0, 0, 1])",
+        "with torch.device(self.device): distance + torch.zeros(self.num_envs)",
     )
     assert in_evaluate(checked, "foreign-device", *lines).state == "kept"
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.checks.checked import Checked, check_rule, the_finding
+
+pytestmark = pytest.mark.thorough
 
 
 def test_success_right_after_a_reset(checked: Checked) -> None:

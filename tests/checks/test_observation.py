@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.checks.checked import Checked, the_finding
+
+pytestmark = pytest.mark.thorough
 
 GOAL = '"goal_pos": self.goal.pose.p,'
 HIDDEN_GOAL = (

@@ -125,6 +125,7 @@ def test_successes_are_counted_over_all_parts() -> None:
     holds = result("success-flickers", flickers(20, 0))
     assert over_seeds([often, holds], "warn").state == "kept", "2 of 24 times"
     assert over_seeds([never, never], "warn").state == "not_known"
+    assert result("success-flickers", flickers(4, 1)).state == "kept", "once is chance"
 
 
 @pytest.mark.parametrize("state", ["not_known", "failed"])

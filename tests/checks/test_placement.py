@@ -8,6 +8,8 @@ from scipy import __version__ as scipy_version
 
 from tests.checks.checked import Checked, the_finding
 
+pytestmark = pytest.mark.thorough
+
 CUBE_POSE = "self.cube.set_pose(Pose.create_from_pq(p=cube, q=[1, 0, 0, 0]))"
 HEIGHT = "cube[:, 2] = CUBE_HALF_SIZE\n"
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.checks.checked import Checked, the_finding
+
+pytestmark = pytest.mark.thorough
 
 DRAWN = "torch.rand((b, 2))"
 GOAL_POSE = "self.goal.set_pose(Pose.create_from_pq(p=goal, q=[1, 0, 0, 0]))"

@@ -8,6 +8,8 @@ import pytest
 
 from tests.checks.checked import EXAMPLE, Checked, check_rules, the_finding
 
+pytestmark = pytest.mark.thorough
+
 
 def test_a_reward_that_is_nan(checked: Checked) -> None:
     edit = "reward = reach + push\n", "reward = reach + push + torch.sqrt(0.7 - reach) * 0\n"

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import trimesh
 
 from tests.checks.checked import Checked, the_finding
+
+pytestmark = pytest.mark.thorough
 
 CUBE = 'self.cube = builder.build(name="cube")\n'
 CUBE_AT = "builder.initial_pose = sapien.Pose(p=[0, 0, CUBE_HALF_SIZE])"

@@ -12,6 +12,8 @@ from workbench.authoring.loading.load import load_task, undo_load
 from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.evidence.step_profile import StepProfile, profile_step
 
+pytestmark = pytest.mark.thorough
+
 SLOW = "        height = self.cube.pose.p[:, 2] - CUBE_HALF_SIZE\n"
 
 

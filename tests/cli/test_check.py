@@ -17,6 +17,8 @@ import pytest
 from workbench.checks.rules import RULES
 from workbench.cli.main import main
 
+pytestmark = pytest.mark.thorough
+
 TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
 REASON = "the parts are for people"
 NORMALIZED = next(line for line in TEXT.splitlines() if "def compute_normalized_dense_reward" in line)
@@ -350,7 +352,8 @@ for group in GROUPS:
 """Breaks checks of the workbench, in each process that imports the task."""
 
 
-@pytest.mark.parametrize("workers", [pytest.param("1", marks=pytest.mark.slow), "2"])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", ["1", "2"])
 def test_a_rule_whose_check_raises_fails_and_no_other(
     place: Path, capsys: pytest.CaptureFixture[str], child_process: None, workers: str
 ) -> None:

@@ -151,6 +151,7 @@ def test_the_whole_ones_beside_it_are_used(tmp_path: Path, capsys: pytest.Captur
         assert "half.h5" in said.err and "theirs.h5" in said.err and "1 episode" in said.out
 
 
+@pytest.mark.slow
 def test_a_name_that_is_not_utf_8_is_one_like_the_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

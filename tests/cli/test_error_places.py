@@ -12,6 +12,8 @@ import pytest
 from tests.drive.session import TASKS
 from workbench.cli.main import main
 
+pytestmark = pytest.mark.thorough
+
 FEW = ("--num-envs", "2", "--seeds", "2", "--workers", "1", "--env", "render_backend=none")
 Check = Callable[..., dict[str, Any]]
 

@@ -17,6 +17,8 @@ from workbench.cli.terminal.output import Exit
 from workbench.machine.processes.child_python import python_command
 from workbench.ui.app.help_pages import Topic, topics
 
+pytestmark = pytest.mark.thorough
+
 
 def said(capsys: pytest.CaptureFixture[str], *call: str) -> tuple[int, str]:
     with pytest.raises(SystemExit) as ended:

@@ -80,6 +80,7 @@ def options_of(file: Path, seeds: int = 3) -> SolveOptions:
     )
 
 
+@pytest.mark.slow
 def test_each_seed_is_told_and_its_episode_is_in_the_library(lift: Path) -> None:
     report = solve(options_of(lift))
     assert [one.seed for one in report.seeds] == [4, 5, 6]
@@ -93,6 +94,7 @@ def test_each_seed_is_told_and_its_episode_is_in_the_library(lift: Path) -> None
         assert one.steps == min(8, one.solved_at + 5)
 
 
+@pytest.mark.slow
 def test_what_pays_without_success_is_told_with_its_seeds(lift: Path) -> None:
     # Where the cube begins beyond x, no height is a success: what the reward does not know.
     lift.write_text(LIFT.replace("half = 9.0", "half = 0.013"))
@@ -152,6 +154,7 @@ def test_the_report_is_the_same_with_several_processes(lift: Path) -> None:
     assert same(solve(what)) == same(solve(replace(what, workers=2, out=lift.parent / "two")))
 
 
+@pytest.mark.slow
 def test_what_is_done_is_kept_and_reported_where_it_is_stopped(lift: Path) -> None:
     done = threading.Event()
 

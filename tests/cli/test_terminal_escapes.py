@@ -107,6 +107,7 @@ def on_terminal(folder: Path, *arguments: str) -> Iterator[Terminal]:
         terminal.close()
 
 
+@pytest.mark.slow
 def test_a_task_and_a_request_full_of_escapes_do_nothing_to_the_terminal(
     child_process: None, tmp_path: Path
 ) -> None:
@@ -152,6 +153,7 @@ def test_a_task_that_is_recorded_does_nothing_to_the_terminal(
     assert all(word in text for word in ("printed", "said", "green", "raised"))
 
 
+@pytest.mark.slow
 def test_a_recording_full_of_escapes_is_told_as_text(child_process: None, tmp_path: Path) -> None:
     info: dict[str, Any] = {"task": f"Push{EVIL}-v1", "source_file": f"{EVIL}.py"}
     first = write(tmp_path, made(3, **info), pictures=False)

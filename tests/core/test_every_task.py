@@ -21,7 +21,7 @@ from workbench.core.env.task_env import TaskEnv
 
 ROOT = Path(__file__).parents[2]
 WITH_CAMERAS = (
-    "PushCube-v1",
+    pytest.param("PushCube-v1", marks=pytest.mark.slow),
     pytest.param("TriFingerRotateCubeLevel4-v1", marks=pytest.mark.slow),
     "MS-CartpoleBalance-v1",
 )
@@ -122,6 +122,7 @@ def test_a_task_that_does_not_come_back_is_one_row(child_process: None) -> None:
 # --- the page -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_page_has_a_row_for_every_registered_id_and_no_failure(child_process: None) -> None:
     rows = rows_of_the_page()
     # Asked of a new process: in this one other tests may have loaded copies of ManiSkill's files, whose ids they take.

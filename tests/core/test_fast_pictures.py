@@ -123,6 +123,7 @@ def drawn_by(env: Any, camera: str) -> dict[str, int]:
     return count
 
 
+@pytest.mark.slow
 def test_a_wrist_camera_draws_nothing_of_what_is_beside_and_behind_it(wrist: Any) -> None:
     exact, fast = (
         take_pictures(wrist, 0, [("hand_camera", "sensor", ["rgb", "segmentation"])], degree=degree)[0]
@@ -136,6 +137,7 @@ def test_a_wrist_camera_draws_nothing_of_what_is_beside_and_behind_it(wrist: Any
     assert drawn["camera_link"] == drawn["panda_link7"] == drawn["panda_link0"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("at", "turned"),
     [

@@ -82,7 +82,7 @@ draws, slow = pytest.mark.render, pytest.mark.slow
         "state",
         "state_dict",
         "none",
-        pytest.param("rgb+depth+segmentation", marks=draws),
+        pytest.param("rgb+depth+segmentation", marks=slow),
         pytest.param("pointcloud", marks=draws),
         pytest.param("depth+state_dict", marks=slow),
         pytest.param("position", marks=slow),
@@ -272,7 +272,7 @@ def rendered(renderer: None, request: pytest.FixtureRequest) -> Iterator[tuple[A
     stock.close()
 
 
-@pytest.mark.parametrize("render_mode", ["rgb_array", "sensors", "all"])
+@pytest.mark.parametrize("render_mode", [pytest.param("rgb_array", marks=slow), "sensors", "all"])
 def test_rendering(rendered: tuple[Any, Any], render_mode: str) -> None:
     batch, stock = rendered
     put_in_same_state(batch, stock)

@@ -266,6 +266,7 @@ def leaves(nest: Any) -> list[np.ndarray]:
     return [np.asarray(nest, np.float64)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WRAPPERS)
 def test_a_wrapper_gives_of_one_env_what_it_gives_of_stocks(renderer: None, name: str) -> None:
     task, wrap, kwargs = WRAPPERS[name]

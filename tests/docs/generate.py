@@ -2,7 +2,7 @@
 
     python -m tests.docs.generate          # `test_generated.py` fails where a page says something else
 
-Keys are those of both pages as they are built, commands what ``--help`` prints, rules what `checks.rules` and `core.rules`
+Keys are those of the list of commands, commands what ``--help`` prints, rules what `checks.rules` and `core.rules`
 list.
 """
 
@@ -11,29 +11,24 @@ from __future__ import annotations
 import io
 import os
 import re
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, redirect_stdout
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from unittest.mock import patch
 
 from tests.docs.pages import DOCS
-from tests.drive.scripted import no_success, scripted
 from workbench.checks.rules import CHECK_RULES
 from workbench.cli import main
+from workbench.commands import COMMANDS, cameras
+from workbench.commands.command import Command
 from workbench.core.rules import RULES, Rule
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import ServerOptions, open_server
-from workbench.ui.widgets.hotkeys import Command
+from workbench.ui.widgets.hotkeys import key_rows
 
 KEYS = DOCS / "reference" / "keys.md"
 CLI = DOCS / "reference" / "cli.md"
 RULES_PAGE = DOCS / "batched_env.md"
 ALL_RULES = DOCS / "reference" / "rules.md"
-COMMANDS = (
+CLI_COMMANDS = (
     "start",
     "new",
     "open",
@@ -56,44 +51,10 @@ COMMANDS = (
 # --- keys ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Commands:
-    live: tuple[Command, ...]
-    review: tuple[Command, ...]
-
-
-def commands_of_both_pages() -> Commands:
-    """As the pages register them; built on a session without a worker, and an empty folder of recordings."""
-    found: list[tuple[Command, ...]] = []
-
-    def keep(server: object, commands: Sequence[Command]) -> None:
-        found.append(tuple(commands))
-
-    with ExitStack() as stack:
-        for module in ("live_page", "review_page"):
-            stack.enter_context(patch(f"workbench.ui.app.{module}.register", keep))
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        gated_server = open_server(ServerOptions(port=0))
-        stack.callback(gated_server.close)
-        worker = scripted(2, no_success, None)
-        session = Session(str(folder / "push.py"), TaskOptions(2), recordings=folder, make_worker=worker)
-        stack.callback(session.close)
-
-        def no_session(task: object, options: object) -> Session:
-            raise AssertionError("nothing is opened from a recording")
-
-        place = Workplace(gated_server, folder, no_session, TaskOptions(), session)
-        stack.callback(place.close)
-        place.pages.start("live")
-        place.pages.show("review")
-        assert place.pages.wait_for("review", 60)
-    live, review = found
-    return Commands(live, review)
-
-
-def keys_page(commands: Commands) -> str:
-    live = [one for one in commands.live if one.key]
-    camera = [one for one in live if "camera" in one.label.lower().split()]
+def keys_page() -> str:
+    studio = [kind for kind in COMMANDS if kind.__module__ == cameras.__name__]
+    live = [kind for kind in COMMANDS if kind.context in ("page", "live") and kind not in studio]
+    review = [kind for kind in COMMANDS if kind.context in ("page", "review", "library")]
     return "\n".join(
         [
             "# Keys",
@@ -104,22 +65,24 @@ def keys_page(commands: Commands) -> str:
             "",
             "## Live page",
             "",
-            *table(one for one in live if one not in camera),
+            *table(live),
             "",
             "### The camera that is chosen in the Studio",
             "",
-            *table(camera),
+            *table(studio),
             "",
             "## Review and library",
             "",
-            *table(commands.review),
+            "The keys of the library work while it is open.",
+            "",
+            *table(review),
             "",
         ]
     )
 
 
-def table(commands: Iterator[Command] | Sequence[Command]) -> list[str]:
-    rows = [f"| {one.key_name} | {one.label} |" for one in commands if one.key]
+def table(kinds: Sequence[type[Command]]) -> list[str]:
+    rows = [f"| {key} | {what} |" for key, what in key_rows(kinds)]
     return ["| key | what it does |", "| --- | --- |", *rows]
 
 
@@ -133,7 +96,7 @@ def cli_page() -> str:
         "What `workbench COMMAND --help` prints. This page is made from the code.",
         "",
     ]
-    for name in COMMANDS:
+    for name in CLI_COMMANDS:
         lines += [f"## {name}", "", "```text", help_of(name), "```", ""]
     return "\n".join(lines)
 
@@ -215,7 +178,7 @@ def with_rules(text: str) -> str:
 def pages() -> dict[Path, str]:
     """The text of every page that is made here."""
     return {
-        KEYS: keys_page(commands_of_both_pages()),
+        KEYS: keys_page(),
         CLI: cli_page(),
         RULES_PAGE: with_rules(RULES_PAGE.read_text()),
         ALL_RULES: all_rules_page(),

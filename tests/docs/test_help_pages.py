@@ -11,6 +11,8 @@ from workbench.machine.folders import web_assets_folder
 from workbench.ui.app import help_pages
 from workbench.ui.app.help_pages import ADDRESS, Topic, find_topic, html_of, reply, topics
 
+pytestmark = pytest.mark.thorough
+
 ELSEWHERE = {"github.com"}
 """Hosts that pages link to."""
 

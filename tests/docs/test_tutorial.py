@@ -40,6 +40,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.title)
 def test_a_step_does_what_the_page_says(
     step: Step, folder: Path, renderer: None, child_process: None, capfd: pytest.CaptureFixture[str]

@@ -17,7 +17,6 @@ from tests.ui.scenes import EMPTY
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.view import SessionView
 from workbench.ui.app.live_page import Page
-from workbench.ui.server import viser_private
 
 FILE = "push.py"
 
@@ -85,12 +84,12 @@ class Live(Panels):
         on_look: Callable[[Any], None] = lambda path: None,
     ) -> None:
         super().__init__(server)
-        viser_private.read_icons_once()
         self.clock, self.session = clock or Clock(), HandedSession()
         self._envs = self._scenes = 0
         self.asked_by_drawing: list[tuple[Any, ...]] = []
         """Of the session, by the last drawing."""
-        self.page = Page(server, self.session, on_look=on_look, clock=self.clock)  # type: ignore[arg-type]
+        self.page = Page(server, self.visitors, self.session, on_look=on_look, clock=self.clock)  # type: ignore[arg-type]
+        self.visitors.do = self.page.do
 
     @property
     def asked(self) -> list[tuple[Any, ...]]:

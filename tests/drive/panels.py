@@ -1,8 +1,7 @@
-"""Reads and presses the controls of a viser server without a browser. Uses viser's private names, so that tests need none.
+"""Reads and presses the controls of a page without a browser. Uses viser's private names, so that tests need none.
 
-A control is found by its label, or by its name (`name_control`); a pressable part of our HTML by the key of its hidden
-button. A press goes through viser's handling of a page's message, and returns when everything that it began on viser's
-threads is done. Only controls that a page offers can be pressed; `claim` sends any message, as an attacker can.
+A control is found by what is written on it, a part of our HTML by its command. A press is a command, and returns when
+everything that it began on viser's threads is done. Only what a page offers can be pressed.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportPrivateUsage=false
@@ -10,20 +9,21 @@ threads is done. Only controls that a page offers can be pressed; `claim` sends 
 from __future__ import annotations
 
 import asyncio
-import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 import viser
-from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage, GuiUpdateMessage
+from markupsafe import escape
+from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage
 
-from workbench.ui.server.control_values import check_value, name_of
-from workbench.ui.server.viser_private import element_id
+from tests.drive.own_controls import Controls, SeenButton, SeenField
+from workbench.commands.command import Command, Refused
 from workbench.ui.widgets.parts import Parts
+from workbench.ui.widgets.templates import asks
+from workbench.ui.widgets.visitors import Visitor, Visitors
 
 Kind = Literal["button", "field"]
 """Of an input. A button and what it is for may have the same label."""
@@ -63,21 +63,8 @@ class _Threads:
     def __init__(self, pool: Any) -> None:
         self._pool = pool
         self._begun: list[Future[Any]] = []
-        self._held: list[Callable[[], object]] | None = None
-
-    @contextmanager
-    def held(self) -> Iterator[list[Callable[[], object]]]:
-        """What is begun within waits for whoever calls it."""
-        self._held = []
-        try:
-            yield self._held
-        finally:
-            self._held = None
 
     def submit(self, call: Callable[..., Any], *args: Any) -> Future[Any]:
-        if self._held is not None:
-            self._held.append(lambda: call(*args))
-            return Future()
         future = self._pool.submit(call, *args)
         self._begun.append(future)
         return future
@@ -140,6 +127,14 @@ class Panels:
         self._threads = _Threads(gui._thread_executor)
         gui._thread_executor = self._threads
         gui._resolve_client = lambda client_id: self.client
+        self.visitor = Visitor("a page", self.client)  # type: ignore[arg-type]
+        self.come_to(Visitors(server))
+        self.visitors.do = _nobody_does
+
+    def come_to(self, visitors: Visitors) -> None:
+        """Be one of the open pages that these know."""
+        self.visitors = visitors
+        visitors._by_name[self.visitor.name] = visitors._by_client[self.client.client_id] = self.visitor
 
     def part(self, label: str) -> Panels:
         """One tab, folder or tab of a panel."""
@@ -149,21 +144,11 @@ class Panels:
 
     # --- what is seen ------------------------------------------------------------------------------
 
-    def control(self, name: str, kind: Kind | None = None) -> Any:
-        """viser's handle of an input. Where several have the name, the one that is seen."""
-        found = list(self._named(name, kind))
-        if len(found) > 1:
-            found = [(handle, seen) for handle, seen in found if seen]
-        assert len(found) == 1, (name, len(found), sorted(name_of(handle) for handle, _ in self._inputs()))
-        return found[0][0]
-
     def shows(self, name: str, kind: Kind | None = None) -> bool:
-        """Whether an input is there and can be seen."""
-        return any(seen for _, seen in self._named(name, kind))
-
-    def offers(self, option: str) -> bool:
-        """Whether a group of buttons has one with this on it."""
-        return any(option in group.options for group in self._of(viser.GuiButtonGroupHandle))
+        """Whether a button or a field is there and can be seen."""
+        own = [one.text.strip() for one in self.buttons()] if kind != "field" else []
+        own += [one.label for one in self.fields()] if kind != "button" else []
+        return name in own
 
     @property
     def seen(self) -> bool:
@@ -220,8 +205,6 @@ class Panels:
 
     def everything(self) -> dict[str, object]:
         """All that can be seen, by its place on the page: to be compared with what is seen at another time."""
-        names = {element_id(handle): name_of(handle) for handle in inputs_of(self.server.gui)}
-        anonymous = re.compile("|".join(map(re.escape, names)) or "(?!)")
 
         def plain(value: object) -> object:
             if isinstance(value, bytes):
@@ -229,7 +212,7 @@ class Panels:
             if isinstance(value, np.ndarray):
                 return value.shape, hash(value.tobytes())
             if isinstance(value, str):
-                return anonymous.sub(lambda found: names[found[0]], value)
+                return value
             if isinstance(value, (tuple, list)):
                 return tuple(map(plain, value))
             return value if isinstance(value, (int, float, bool, type(None))) else repr(value)
@@ -241,7 +224,7 @@ class Panels:
         seen: dict[str, object] = {}
         for child, is_seen in self._walk(self._roots()):
             label = getattr(child, "label", None) or ""
-            if is_seen and label != "·":  # what our HTML presses
+            if is_seen:
                 value = plain(getattr(child._impl, "value", None))
                 key = f"{type(child).__name__} {label if isinstance(label, str) else ''}"
                 seen[f"{key} {sum(one.startswith(key) for one in seen)}"] = value, of(child)
@@ -256,42 +239,73 @@ class Panels:
     # --- what a person does ------------------------------------------------------------------------
 
     def press(self, name: str) -> None:
-        """Press a button, or a part of our HTML by the key that `Presses` has for it."""
-        button = self.control(name, "button")
-        offered = self.html(f'="{element_id(button)}"') if button.label == "·" else self.shows(name, "button")
-        assert offered and not button.disabled, f"no page offers {name}"
-        self._say(button, True)
+        """Press the button with this on it."""
+        button = self.button(name)
+        assert button.command is not None, f"no page offers {name}"
+        self.do(button.command)
 
-    def press_late(self, name: str) -> Callable[[], None]:
-        """Press a button whose press is on its way: what it does it does when this is called."""
-        with self._threads.held() as calls:
-            self.press(name)
+    def type(self, label: str, value: object, at: int = 0) -> None:
+        """Type into one of our own fields, and leave it; `at` is the place in a row of them."""
+        self._enter(self.field(label), value, at)
 
-        def arrives() -> None:
-            for call in calls:
-                call()
+    def typed(self, label: str) -> Any:
+        """What one of our own fields shows."""
+        return self.field(label).value
 
-        return arrives
+    def field(self, label: str) -> SeenField:
+        """One of our own inputs, that is seen."""
+        found = [one for one in self.fields() if one.label == label]
+        assert len(found) == 1, (label, [one.label for one in self.fields()])
+        return found[0]
+
+    def fields(self) -> list[SeenField]:
+        """Our own inputs that are seen."""
+        return self._own().fields
+
+    def buttons(self) -> list[SeenButton]:
+        """What of our own can be pressed, or could if it were not off."""
+        return self._own().buttons
+
+    def button(self, text: str) -> SeenButton:
+        """One of our own buttons, by what is on it."""
+        (found,) = (one for one in self.buttons() if one.text.strip() == text)
+        return found
+
+    def _own(self) -> Controls:
+        return Controls("\n".join(one.content for one in self.htmls()))
+
+    def _enter(self, field: SeenField, value: Any, at: int = 0) -> None:
+        assert not field.off, f"no page offers {field.label}"
+        try:
+            command = field.command(value, at)
+        except Refused as reason:
+            self.client.notices.append(str(reason))
+        else:
+            self.do(command)
+
+    def presses(self, command: Command) -> bool:
+        """Whether something that does this can be seen."""
+        return f"{escape(asks(command))}" in self.html("data-do")
+
+    def ask(self, command: Command) -> None:
+        """Press the part of our HTML that does this."""
+        assert self.presses(command), f"no page offers {command}"
+        self.do(command)
+
+    def do(self, command: Command) -> None:
+        """Ask for this, as a key or a script does; why it was refused is among the notices."""
+        try:
+            self.visitors.do(command, self.visitor)
+        except Refused as reason:
+            self.client.notices.append(str(reason))
+        self._threads.wait()
 
     def set(self, name: str, value: object) -> None:
-        """Move a slider, choose of a list, type a text."""
-        control = self.control(name, "field")
-        assert self.shows(name, "field") and not control.disabled, f"no page offers {name}"
-        assert value in getattr(control, "options", (value,)), (name, value, control.options)
-        self._say(control, value)
-
-    def choose(self, option: str) -> None:
-        """Press one button of a group, by what is on it."""
-        groups = self._of(viser.GuiButtonGroupHandle)
-        (group,) = (group for group in groups if option in group.options)
-        self._say(group, option)
-
-    def claim(self, name: str, value: object, kind: Kind = "field") -> None:
-        """Say that an input has this value, whether or not any page offers it."""
-        self._say(self.control(name, kind), value)
+        """Move a slider, choose of a list, tick, type a text or a number."""
+        self._enter(self.field(name), value)
 
     def command(self, label: str) -> None:
-        """Choose a command of the palette, as its key does."""
+        """Choose a command of the palette."""
         uuid, handle = self._commands()[label]
         assert not handle.disabled, f"{label} is greyed"
         self._handled(self.server.gui._handle_command_trigger, CommandTriggerMessage(uuid))
@@ -306,16 +320,6 @@ class Panels:
 
     # --- viser's own -------------------------------------------------------------------------------
 
-    def _say(self, control: Any, value: object) -> None:
-        try:
-            # The door's own, before viser hears of it (`workbench.ui.server.page_guard`).
-            check_value(control, list(value) if isinstance(value, tuple) else value)
-        except ValueError as error:
-            self.client.notices.append(str(error))
-            return
-        update = GuiUpdateMessage(control._impl.uuid, {"value": value})
-        self._handled(self.server.gui._handle_gui_updates, update)
-
     def _handled(self, handler: Callable[..., Any], message: object) -> None:
         loop = self.server.gui._event_loop
         asyncio.run_coroutine_threadsafe(handler(self.client.client_id, message), loop).result(60)
@@ -324,18 +328,6 @@ class Panels:
     def _commands(self) -> dict[str, tuple[str, viser.CommandHandle]]:
         commands = self.server.gui._command_handle_from_uuid
         return {handle.label: (uuid, handle) for uuid, handle in commands.items()}
-
-    def _named(self, name: str, kind: Kind | None) -> Iterator[tuple[Any, bool]]:
-        return (
-            (handle, seen)
-            for handle, seen in self._inputs()
-            if name_of(handle) == name
-            and kind in (None, "button" if isinstance(handle, viser.GuiButtonHandle) else "field")
-        )
-
-    def _inputs(self) -> Iterator[tuple[Any, bool]]:
-        inputs = self.server.gui._gui_input_handle_from_uuid
-        return ((handle, seen) for handle, seen in self._walk(self._roots()) if _id_of(handle) in inputs)
 
     def _of(self, kind: type[Any], hidden: bool = False) -> list[Any]:
         there = self._walk(self._roots())
@@ -358,6 +350,10 @@ class Panels:
                 yield child, seen and child.visible
 
 
+def _nobody_does(command: Command, visitor: Visitor) -> None:
+    raise AssertionError(f"the test does not say who does {command}")
+
+
 def _containers(roots: _Roots) -> Iterator[tuple[Any, bool]]:
     for container, seen in roots:
         yield container, seen
@@ -368,7 +364,3 @@ def _containers(roots: _Roots) -> Iterator[tuple[Any, bool]]:
 
 def _label_of(container: Any) -> str | None:
     return getattr(container, "_label", None) or getattr(container, "label", None)
-
-
-def _id_of(handle: Any) -> str:
-    return handle._impl.uuid

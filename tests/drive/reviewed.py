@@ -27,10 +27,12 @@ class Reviewed(Panels):
     def __init__(self, gated_server: GatedServer, folder: Path) -> None:
         super().__init__(gated_server.server)
         self.place = Workplace(gated_server, folder, no_session, TaskOptions())
+        self.come_to(self.place.visitors)
         self.review, self.library = self.place.shelf.review, self.place.shelf.library
         self.library.refresh()
         self.clock = Clock()
         self.page = ReviewPage(self.place, clock=self.clock)
+        self.visitors.do = self.page.do
 
     def draw(self) -> None:
         self.clock.passes()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from playwright.sync_api import FloatRect, Locator, Page
+from playwright.sync_api import FloatRect, Page
 
 from tests.drive.page import picture_of_view
 from tests.drive.waiting import until
@@ -16,20 +16,7 @@ VIEW: FloatRect = {"x": 40, "y": 0, "width": WIDTH - 430, "height": HEIGHT - 200
 
 def choose(page: Page, name: str) -> None:
     """Among the cameras."""
-    _take(page, page.locator("input[aria-haspopup=listbox]:visible").first, name)
-
-
-def _take(page: Page, box: Locator, name: str) -> None:
-    """One of a dropdown's list, which closes by itself when what is above it changes its height at that moment."""
-    one = page.get_by_role("option", name=name, exact=True)
-
-    def opened() -> bool:
-        box.click()
-        page.wait_for_timeout(200)
-        return one.is_visible()
-
-    until(opened, f"the list with {name}")
-    one.click()
+    page.get_by_label("Camera", exact=True).select_option(label=name)
 
 
 def tool(page: Page, name: str) -> dict:
@@ -58,8 +45,7 @@ def press(page: Page, name: str) -> None:
 def numbers(page: Page, label: str) -> list[float]:
     return page.evaluate(
         """l => {
-            let e = [...document.querySelectorAll('label')].find(e => e.textContent === l);
-            while (!e.querySelector('input')) e = e.parentElement;
+            const e = [...document.querySelectorAll('label')].find(e => e.textContent.trim() === l && e.offsetParent);
             return [...e.querySelectorAll('input')].map(i => Number(i.value));
         }""",
         label,
@@ -92,12 +78,3 @@ def picture(page: Page) -> str:
             return canvas.toDataURL();
         }"""
     )
-
-
-def field(page: Page, label: str, number: int = 1) -> str:
-    """XPath: viser's fields are not tied to their labels."""
-    return f"(//label[text()='{label}']/ancestor::*[.//input][1]//input)[{number}]"
-
-
-def option(page: Page, label: str, name: str) -> None:
-    _take(page, page.locator(field(page, label)), name)

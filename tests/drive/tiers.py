@@ -5,6 +5,7 @@ In that run a test that starts a process or renders fails with the name of the f
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -45,7 +46,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--fast", action="store_true", help=words)
 
 
+QUICK = "WORKBENCH_TESTS_ARE_QUICK"
+
+
+def tries(quick: int, whole: int) -> int:
+    """How many examples of a property are tried: fewer of those that take long, where the slow tests are left out."""
+    return quick if QUICK in os.environ else whole
+
+
 def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("fast") or config.getoption("markexpr") == "not slow":
+        os.environ[QUICK] = "yes"
     if config.getoption("fast"):
         guard = Guard()
         config.pluginmanager.register(guard)

@@ -119,6 +119,7 @@ def test_of_a_damaged_one_the_file_is_named_and_the_rest_is_read(
         read_episode(both)
 
 
+@pytest.mark.slow
 def test_they_are_judged_as_they_were(
     place: Path, expected: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -230,7 +231,14 @@ def assert_close(poses: np.ndarray, recorded: np.ndarray) -> None:
     np.testing.assert_allclose(np.abs((poses[:, 3:] * recorded[:, 3:]).sum(1)), 1, atol=METRES)
 
 
-@pytest.mark.parametrize(("kind", "state"), [("cameras", 0), ("cameras", 5), ("tagged", 3), ("recovered", 4)])
+@pytest.mark.parametrize(
+    ("kind", "state"),
+    [
+        *(pytest.param("cameras", state, marks=pytest.mark.slow) for state in (0, 5)),
+        ("tagged", 3),
+        ("recovered", 4),
+    ],
+)
 def test_one_goes_on_live_from_them(live: Session, place: Path, kind: str, state: int) -> None:
     (path,) = (place / kind).glob("*.json")
     goes_on_as_recorded(live, path, state)

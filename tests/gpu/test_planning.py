@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import workbench
 from tests.gpu.conftest import Simulation
 
+pytestmark = pytest.mark.thorough
+
 MADE = {"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
 
 
+@pytest.mark.slow
 def test_a_plan_earns_at_least_what_holding_still_earns_and_is_followed(simulation: Simulation) -> None:
     env = workbench.make("PushCube-v1", 2, backend=simulation, **MADE)  # type: ignore[arg-type]
     rollouts = 64 if simulation == "gpu" else 16

@@ -177,6 +177,7 @@ def test_an_applied_pose_is_simulated(picks: tuple[TaskEnv, TaskEnv]) -> None:
         assert bool(((fallen > 0) & (fallen < 0.05)).all()), "it falls from where it was put"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("task", TASKS)
 def test_a_task_runs_through_ten_steps(task: str, simulation: Simulation) -> None:
     try:

@@ -13,6 +13,8 @@ from workbench.jobs.task import TaskOptions
 from workbench.session.protocol.messages import Load
 from workbench.session.worker.reload import load_version
 
+pytestmark = pytest.mark.thorough
+
 KWARGS = {"render_backend": "none"}
 FOR_ONE = "        lifted = float(self.cube.pose.p[:, 2]) > 0.1\n"
 FIRST_ROW = '        return {"success": self.cube.pose.p[:1, 2] > 0.1}\n'

@@ -22,6 +22,8 @@ from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
 
+pytestmark = pytest.mark.thorough
+
 TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
 AT_ONCE = '"success": (distance < GOAL_RADIUS)', '"success": (distance < 1)'
 LOSES_ROWS = "b = len(env_idx)\n", "b = len(env_idx)\n            self.drawn = torch.rand((b, 2))\n"
@@ -53,6 +55,7 @@ def states(report: CheckReport) -> dict[str, str]:
     return {result.rule: result.state for result in report.results}
 
 
+@pytest.mark.slow
 def test_each_rule_has_its_result_in_the_order_of_the_table_whoever_looked(
     tmp_path: Path, child_process: None
 ) -> None:
@@ -249,6 +252,7 @@ def test_the_actions_of_a_file_reach_what_random_ones_do_not(tmp_path: Path) -> 
     assert "4 of 4 given" in notes(check(what))["success-stays-possible"][1]
 
 
+@pytest.mark.slow
 def test_a_recording_begins_where_it_was_recorded(tmp_path: Path, child_process: None) -> None:
     """Its seed is not among those of the check, and its success is at its last step."""
     task = task_of(tmp_path, TURNED)

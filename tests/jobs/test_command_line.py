@@ -5,12 +5,15 @@ from __future__ import annotations
 import shlex
 from typing import Any
 
+import pytest
 import tyro
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from workbench.cli.terminal.arguments import EnvArguments
 from workbench.jobs.task import TaskOptions, changed_options, command_line
+
+pytestmark = pytest.mark.thorough
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers(-(2**60), 2**60) | st.floats(allow_nan=False, allow_infinity=False)

@@ -62,6 +62,7 @@ def step_with(session: Session, action: np.ndarray) -> SessionView:
     return step(session)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", [0, 23])
 def test_the_live_env_stands_in_the_recorded_state_and_goes_on_from_there_as_it_did(
     live: Session, run: RecordedRun, state: int

@@ -94,6 +94,7 @@ def test_it_is_recorded_and_read_back(recordings: Path) -> None:
         assert episode.broken_files == ()
 
 
+@pytest.mark.slow
 def test_what_is_not_per_env_is_no_difference_when_it_is_rescored(recordings: Path, file: Path) -> None:
     verdicts, _ = rescore_all(RescoreOptions((recordings,), num_envs=2))
     assert len(verdicts) == N

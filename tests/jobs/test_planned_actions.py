@@ -65,6 +65,7 @@ def test_planned_episodes_are_the_same_on_any_number_of_envs_and_processes(
         np.testing.assert_array_equal(one.planned.best, other.planned.best)
 
 
+@pytest.mark.slow
 def test_an_episode_goes_on_after_its_success_where_that_is_asked_for(tmp_path: Path) -> None:
     easy = tmp_path / "easy.py"
     easy.write_text(

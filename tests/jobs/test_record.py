@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -299,6 +300,7 @@ def test_pictures_of_every_camera_are_recorded(renderer: None, tmp_path: Path) -
     assert depth is not None and depth[0].shape == (128, 128)
 
 
+@pytest.mark.slow
 def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
     broken = tmp_path / "broken.py"
     text = (TASKS / "minimal.py").read_text()
@@ -312,17 +314,31 @@ def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+@pytest.fixture
+def tires(tmp_path: Path) -> RecordOptions:
+    """Two episodes of three steps; the policy raises in the second one."""
     (tmp_path / "tires.py").write_text(
         "asked = 0\n\n\ndef act(obs):\n    global asked\n    asked += 1\n"
         "    if asked > 4:\n        raise RuntimeError('tired')\n    return obs.new_zeros(len(obs), 8)\n"
     )
     policy = f"{tmp_path}/tires.py:act"
     options = TaskOptions(num_envs=1, env_kwargs=PLAIN)
-    what = RecordOptions(
+    return RecordOptions(
         "PushCube-v1", tmp_path / "out", 2, actions=policy, pictures=False, max_steps=3, options=options
     )
-    assert record_in_terminal(what) == 1
+
+
+def test_an_episode_that_failed_is_no_longer_under_way(tires: RecordOptions) -> None:
+    progress: list[RecordProgress] = []
+    record(tires, on_progress=progress.append)
+    assert any(1 in now.running for now in progress)
+    last = progress[-1]
+    assert [list(failure.numbers) for failure in last.failures] == [[1]]
+    assert last.running == {} and last.done == last.kept == 1
+
+
+def test_what_was_kept_before_a_failure_is_said(tires: RecordOptions, capsys: pytest.CaptureFixture) -> None:
+    assert record_in_terminal(tires) == 1
     said = capsys.readouterr()
     assert "policy failed" in said.err and "tired" in said.err
     assert "without a result, 1 in all: episode 1" in said.err
@@ -359,6 +375,17 @@ def test_a_rule_that_the_task_breaks_is_told_once_by_however_many_processes(
     assert len(record(off, on_finding=found.append).written) == 4 and len(found) == 1
 
 
+def test_a_file_with_the_name_of_a_library_is_told_once_in_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = Path(shutil.copy(TASKS / "minimal.py", tmp_path))
+    (tmp_path / "numpy.py").write_text("")
+    options = TaskOptions(num_envs=1, env_kwargs=PLAIN)
+    what = RecordOptions(str(file), tmp_path / "out", 1, pictures=False, max_steps=2, options=options)
+    assert record_in_terminal(what) == 0
+    assert capsys.readouterr().err.count(str(tmp_path / "numpy.py")) == 1
+
+
 @pytest.mark.slow
 def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
     (tmp_path / "hangs.py").write_text(
@@ -392,7 +419,8 @@ def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
     assert "Traceback" not in errors
 
 
-@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", ["1", "2"])
 def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
     command = [
         *(sys.executable, "-m", "workbench.cli.main", "record", "PushCube-v1", "--no-pictures"),

@@ -49,9 +49,8 @@ def replayed(path: Path, *arguments: str) -> Episode:
     return read_maniskill(path.with_suffix(".state.pd_ee_delta_pos.physx_cpu.h5"), "traj_0")
 
 
-@pytest.mark.parametrize(
-    "mode", ["--use-env-states", pytest.param("--use-first-env-state", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["--use-env-states", "--use-first-env-state"])
 def test_a_replay_ends_in_success_and_is_the_episode_again(recorded: Path, mode: str) -> None:
     ours, again = read_episode(recorded), replayed(recorded, mode)
     assert again.info.seed == ours.info.seed

@@ -5,10 +5,12 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import os
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -19,17 +21,21 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.drive.episodes import made, write
 from tests.drive.session import rescored
+from workbench.authoring.loading.load import undo_load
 from workbench.authoring.problem import TaskError
 from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.cli.main import main
 from workbench.cli.share import export_in_terminal
 from workbench.cli.terminal.arguments import JobArguments
 from workbench.jobs.actions import read_actions
+from workbench.jobs.open_task import open_task
 from workbench.jobs.pool.deal import Deal, ThisProcess, Work
 from workbench.jobs.pool.travel import pack_baggage, relocated
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
 from workbench.jobs.rescore.job import Recording, RescoredBy, rescore_recordings, setup_of
+from workbench.jobs.rescore.run import answer
+from workbench.jobs.rescore.verdict import Rescore
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions
@@ -93,6 +99,7 @@ def edit(author: Path, old: str, new: str) -> None:
     (author / "push_cube.py").write_text(TEXT.replace(old, new))
 
 
+@pytest.mark.slow
 def test_no_recording_is_opened_in_this_process(
     author: Path, foreign: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -141,6 +148,7 @@ def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: P
             np.testing.assert_allclose(verdict.new_reward, verdict.old_reward, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, tmp_path: Path) -> None:
     write(tmp_path / "made", made(6, seed=1), pictures=False)
     dataset = tmp_path / "set"
@@ -227,6 +235,22 @@ def test_an_episode_in_which_the_code_raises_is_a_row_and_the_others_are_judged(
     verdicts, _ = rescore_all(RescoreOptions((author / "recordings",), num_envs=1))
     assert ["not this one" in verdict.why_not for verdict in verdicts] == [False, True, False]
     assert not any(verdict.differs for verdict in verdicts)
+
+
+def test_each_verdict_is_told_once_however_often_progress_is(
+    author: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = itertools.count()
+    monkeypatch.setattr("workbench.jobs.rescore.run.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    files, said = find_all_sources((author / "recordings",)), []
+    opened = open_task(str(author / "push_cube.py"), TaskOptions(1, env_kwargs={"render_backend": "none"}))
+    try:
+        said.append(answer(opened, Rescore(tuple(files), False), lambda steps, _, now: said.append(now)))
+    finally:
+        opened.env.close()
+        undo_load(opened.loaded)
+    names = [verdict.of.name for now in said for verdict in now.verdicts]
+    assert sorted(names) == sorted(file.name for file in files) and len(said) > EPISODES
 
 
 class Elsewhere:

@@ -55,6 +55,7 @@ def test_a_robot_stands_in_the_scene_and_is_built_anew_by_a_save(tmp_path: Path)
         opened.env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("child_process")
 def test_a_record_of_it_has_no_return_and_says_in_which_scene_it_stands_and_how_long(tmp_path: Path) -> None:
     file = tmp_path / "my_panda.py"

@@ -26,6 +26,8 @@ from workbench.session.live.session import Session
 from workbench.session.protocol.messages import Event, Load, RulesBroken
 from workbench.session.worker.reload import Running, load_version
 
+pytestmark = pytest.mark.thorough
+
 TASK = """
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
@@ -297,6 +299,7 @@ def test_a_version_that_is_not_taken_changes_no_row(desk: Desk) -> None:
 # --- the page ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_page_keeps_the_mark_until_the_file_is_mended(child_process: None, tmp_path: Path) -> None:
     file, events = tmp_path / "task.py", []
     counts = STANDS.format(reward="torch.arange(self.num_envs) % 2 == 1")

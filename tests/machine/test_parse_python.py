@@ -12,6 +12,8 @@ import pytest
 
 from workbench.machine.parse_python import parse_python
 
+pytestmark = pytest.mark.thorough
+
 PACKAGE = Path(__file__).parents[2] / "workbench"
 
 

@@ -126,7 +126,7 @@ def test_a_style_goes_on_over_lines_and_text_that_is_hidden_is_not_hidden() -> N
     assert only_colours("\x1b[31;8msecret\x1b[0m") == "\\x1b[31;8msecret\x1b[0m"
 
 
-def test_a_logged_traceback_is_some_lines_of_bounded_length() -> None:
+def test_a_logged_traceback_is_some_lines_of_bounded_length(child_process: None) -> None:
     program = (
         "import logging\nfrom workbench.machine.text import guard_terminal\nguard_terminal()\n"
         "def deeper(n):\n    other(n)\ndef other(n):\n    if not n: raise ValueError('z' * 100_000)\n    deeper(n - 1)\n"

@@ -67,6 +67,19 @@ def test_a_shift_brings_forward_what_was_planned_for_later() -> None:
     torch.testing.assert_close(after[:7, :2], before[3:, :2])
 
 
+def test_candidates_spread_again_as_at_first_once_the_plan_has_moved_on() -> None:
+    sampler = sampler_of(PlanOptions("cem", rollouts=300, knots=4), steps=10)
+
+    def width() -> torch.Tensor:
+        return sampler.candidates(torch.zeros(3))[1::6, :, :2].std()
+
+    first = width()
+    improved(sampler, 8, torch.tensor([0.0, 0.0, 1.0]))
+    narrow = width()
+    sampler.shift(1)
+    assert narrow < 0.6 * first and width() > 0.9 * first
+
+
 def test_a_gripper_switches_where_an_arm_goes_along_a_line() -> None:
     sampler = sampler_of(PlanOptions(rollouts=4, knots=2), steps=5)
     line = torch.tensor([[[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]])

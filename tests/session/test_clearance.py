@@ -26,6 +26,8 @@ from workbench.recording.writing.finish import recover
 from workbench.session.clearance import Clearances, CodeToRun, Consent, NotCleared, Since, TrustQuestion
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
 
+pytestmark = pytest.mark.thorough
+
 TEXT = "import helper\nclass Push: ...\n"
 
 

@@ -162,6 +162,7 @@ def run(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> tuple[int, s
     return int(ended.value.code or 0), told.out + told.err
 
 
+@pytest.mark.slow
 def test_without_a_terminal_it_is_refused_with_an_exit_code_that_is_its_own(
     foreign: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,6 +179,7 @@ def test_without_a_terminal_it_is_refused_with_an_exit_code_that_is_its_own(
     assert run([recordings, "--task", str(foreign / "push_cube.py")], capfd)[0] == 0 and ran(foreign)
 
 
+@pytest.mark.slow
 def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
     foreign: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

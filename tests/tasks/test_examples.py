@@ -11,6 +11,8 @@ import torch
 import workbench
 from tests.tasks.conftest import FOLDER, IDS, LOGGED
 
+pytestmark = pytest.mark.thorough
+
 Make = Callable[..., Any]
 EXAMPLES = ("push_cube", "minimal")
 """Those that a reader begins with; the other files of `IDS` have one idea each."""

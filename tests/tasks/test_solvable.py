@@ -12,6 +12,8 @@ import workbench
 from tests.tasks import solvers
 from tests.tasks.conftest import FOLDER
 
+pytestmark = pytest.mark.thorough
+
 SEEDS = 6
 Policy = Callable[[torch.Tensor], torch.Tensor]
 
@@ -53,7 +55,7 @@ def two_robots(actions: torch.Tensor) -> Any:
     [
         ("articulated", solvers.open_drawer, one_robot),
         ("reward_terms", solvers.lift_cube, one_robot),
-        ("two_robots", solvers.lift_bar, two_robots),
+        pytest.param("two_robots", solvers.lift_bar, two_robots, marks=pytest.mark.slow),
     ],
 )
 def test_a_script_succeeds_from_every_seed_and_earns_most_then(

@@ -16,7 +16,6 @@ from websockets.sync.connection import Connection
 from tests.drive.waiting import until
 from workbench.ui.server.access import cookie_name
 from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.server.viser_private import element_id
 
 PROTOCOL = f"viser-v{viser.__version__}"
 CAMERA = {
@@ -104,8 +103,29 @@ def say(connection: Connection, message: object) -> None:
     connection.send(msgspec.msgpack.encode(message))
 
 
-def claim(handle: viser.GuiInputHandle, value: object, prop: str = "value") -> dict:
-    return {"type": "GuiUpdateMessage", "uuid": element_id(handle), "updates": {prop: value}}
+class Bell:
+    """An entry of the palette that a page chooses: it rings when the server has taken what that page sent before."""
+
+    def __init__(self, gated_server: GatedServer) -> None:
+        self.rung = 0
+        self._handle = gated_server.server.gui.add_command("bell")
+
+        async def ring(_: object) -> None:
+            self.rung += 1
+
+        self._handle.on_trigger(ring)
+
+    @property
+    def message(self) -> dict[str, str]:
+        return {"type": "CommandTriggerMessage", "uuid": self._handle._impl.uuid}
+
+    def rings(self, connection: Connection) -> None:
+        before = self.rung
+        say(connection, self.message)
+        until(lambda: self.rung > before, "the bell")
+
+    def remove(self) -> None:
+        self._handle.remove()
 
 
 def close_code(connection: Connection) -> int:

@@ -37,7 +37,6 @@ from workbench.ui.app.open_task import Choices
 from workbench.ui.app.workplace import Which, Workplace
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.listening import ServerError
-from workbench.ui.widgets.hotkeys import Command
 
 
 def open_in_terminal(
@@ -241,7 +240,7 @@ def _serve(
     requests: _PageRequests,
 ) -> NoReturn:
     if gated_server.options.token:
-        place.commands += (Command("Renew the token and close every page", requests.renew),)
+        place.renew_token = requests.renew
     requests.handle_signals()
     try:
         place.pages.start(first)

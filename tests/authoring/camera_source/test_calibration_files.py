@@ -44,6 +44,7 @@ def assert_same_pose(a: Any, b: Any, atol: float = 1e-9) -> None:
     assert abs(float(np.dot(a[3:], b[3:]))) == pytest.approx(1, abs=1e-7)
 
 
+@pytest.mark.thorough
 def test_json_says_every_number_and_is_read_back() -> None:
     text = cameras_as_json([STANDING, RIDING])
     told = json.loads(text)
@@ -129,6 +130,7 @@ def test_many_ways_to_write_one_pose_are_read(text: str) -> None:
     assert_same_pose(camera_pose(found, "maniskill", "camera_to_world"), (0, 0, 2, 1, 0, 0, 0))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("text", "says"),
     [

@@ -54,6 +54,14 @@ def test_line_ends_encoding_and_mode_stay(tmp_path: Path, encoding: str, end: st
     assert os.listdir(tmp_path) == ["task.py"]
 
 
+def test_a_file_that_is_marked_read_only_is_left_also_by_root(tmp_path: Path) -> None:
+    path = tmp_path / "task.py"
+    path.write_text(SOURCE)
+    path.chmod(0o444)
+    assert "read-only" in refusal(apply, planned(path))
+    assert path.read_text() == SOURCE
+
+
 def test_two_files_are_changed_together_or_not_at_all(tmp_path: Path) -> None:
     one, other = tmp_path / "one.py", tmp_path / "other.py"
     one.write_text("a = 1\n")

@@ -27,6 +27,7 @@ from tests.authoring.camera_source.real_cameras import (
     unit,
 )
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
+from tests.drive.tiers import tries
 from workbench.authoring.camera_source.cameras import HOOKS as KINDS
 from workbench.authoring.camera_source.cameras import changed_fields
 from workbench.authoring.camera_source.disk import SourceEdit
@@ -108,8 +109,9 @@ def near_enough(written: CameraSettings, wanted: CameraSettings) -> bool:
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", WRITTEN)
-@settings(max_examples=10)
+@settings(max_examples=tries(4, 10))
 @given(data=st.data(), what=st.sampled_from(["edit", "edit", "add", "duplicate", "rename", "remove"]))
 def test_a_file_says_what_was_asked_for_and_nothing_else_moves(
     name: str, data: st.DataObject, what: str

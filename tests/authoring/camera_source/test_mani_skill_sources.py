@@ -21,6 +21,8 @@ from workbench.authoring.camera_source.run_hooks import hook_camera, recording_c
 from workbench.core.camera_data import CameraKey
 from workbench.core.maniskill_private import parse_cameras
 
+pytestmark = pytest.mark.thorough
+
 PACKAGE = Path(mani_skill.__file__).parent
 FILES = sorted(
     path

@@ -12,6 +12,8 @@ from workbench.authoring.loading.load import load_task
 from workbench.authoring.problem import TaskError
 from workbench.jobs.policy import load_policy
 
+pytestmark = pytest.mark.thorough
+
 TASK = """
 @register_env("AuthorNamed-v1", max_episode_steps=5)
 class NamedEnv(BaseEnv):
@@ -34,6 +36,7 @@ def plant(write: Write, *names: str) -> None:
         write(f"{name}.py", "raise RuntimeError('the author\\'s')\n")
 
 
+@pytest.mark.slow
 def test_a_librarys_name_is_the_librarys_wherever_it_is_imported_late(
     write: Write, late: tuple[str, ...]
 ) -> None:

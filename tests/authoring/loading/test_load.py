@@ -25,6 +25,8 @@ from workbench.authoring.loading.load import (
     with_late_imports,
 )
 
+pytestmark = pytest.mark.thorough
+
 Write = Callable[..., Path]
 
 PUSH = """

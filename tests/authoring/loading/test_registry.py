@@ -57,7 +57,12 @@ def test_registering_writes_only_the_tables_that_are_kept() -> None:
     assert registered() == before
     registrations.redo()
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is Task
+    # A second save that fails to load.
     registrations.undo()
+    registrations.redo()
+    assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is Task
+    registrations.undo()
+    assert registered() == before
 
 
 def _registered(env_id: str, *, override: bool = False) -> tuple[registry.Registrations, type[BaseEnv]]:

@@ -48,13 +48,17 @@ def recorded(file: Path) -> RecordedTask:
         ("from pack import *", {"pack/__init__.py", "pack/one.py"}),
         ("import chain", {"chain.py", "alone.py"}),
         ("import numpy, json", set()),
+        # Within a package a name is the package's own, also one that a library has.
+        ("import bag", {"bag/__init__.py", "bag/random.py"}),
     ],
 )
 def test_modules_are_found_by_their_imports(tmp_path: Path, imports: str, found: set[str]) -> None:
     (tmp_path / "pack").mkdir()
     (tmp_path / "pack" / "__init__.py").write_text("from . import one\n")
     (tmp_path / "pack" / "one.py").write_text("")
-    file = lay(tmp_path, task=imports, alone="", chain="import alone", far__near="", other="")
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "__init__.py").write_text("from . import random\n")
+    file = lay(tmp_path, task=imports, alone="", chain="import alone", far__near="", other="", bag__random="")
     assert set(read_content(file).modules) == found
     assert ran(tmp_path) == set()
 

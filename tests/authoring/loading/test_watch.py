@@ -14,6 +14,8 @@ import pytest
 from workbench.authoring.loading import watch
 from workbench.authoring.loading.watch import SourceWatcher
 
+pytestmark = pytest.mark.thorough
+
 PATIENCE = 20.0
 """Seconds to wait for what must come. Nothing is asserted of how soon it does."""
 

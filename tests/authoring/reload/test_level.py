@@ -144,6 +144,11 @@ def test_what_a_name_refers_to_is_followed_through_several_hands() -> None:
             "may keep",
         ),
         ("def evaluate(self):\n    self.w = self.w or {n}\n    return {{'w': self.w}}\n", "", "may keep"),
+        (
+            "def evaluate(self):\n    if self.done:\n        return {{}}\n    self.w = {n}\n    return {{'w': self.w}}\n",
+            "",
+            "may keep",
+        ),
         ("def evaluate(self):\n    return {{'w': self.kept.setdefault('w', {n})}}\n", "", "setdefault"),
         (
             "@functools.lru_cache\ndef table(self):\n    return {n}\ndef evaluate(self):\n    return {{'w': self.table()}}\n",

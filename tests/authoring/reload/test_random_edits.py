@@ -21,6 +21,8 @@ from workbench.jobs.task import TaskOptions
 from workbench.session.protocol.messages import Load
 from workbench.session.worker.reload import Running, load_version
 
+pytestmark = pytest.mark.thorough
+
 TEXT = (TASKS / "push_cube.py").read_text()
 OPTIONS = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})
 

@@ -22,6 +22,8 @@ from workbench.authoring.templates.new_task import (
 )
 from workbench.machine.folders import example_tasks
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.mark.parametrize("template", TEMPLATES, ids=lambda template: template.name)
 def test_a_template_is_an_example_with_other_names_and_nothing_else(

@@ -130,6 +130,14 @@ def test_quaternion_matrix_axes_and_rpy_are_one_rotation(quaternion: Any) -> Non
     assert_allclose(frames.rotation_matrix(frames.quaternion_from_rpy(*rpy)), r, atol=3e-6)
 
 
+@pytest.mark.parametrize("pitch", [90.0, -90.0])
+@fewer
+@given(yaw=st.floats(-179, 179))
+def test_of_a_camera_that_looks_straight_down_or_up_all_of_the_turn_is_yaw(pitch: float, yaw: float) -> None:
+    q = frames.quaternion_from_rpy(0, pitch, yaw)
+    assert_allclose(frames.rpy_of(q), (0, pitch, yaw), atol=1e-3)
+
+
 @fewer
 @given(st.floats(-180, 180), st.floats(-90, 90), st.floats(-180, 180))
 def test_rpy_is_that_of_urdf_and_ros(roll: float, pitch: float, yaw: float) -> None:
@@ -137,6 +145,7 @@ def test_rpy_is_that_of_urdf_and_ros(roll: float, pitch: float, yaw: float) -> N
     assert_allclose(frames.rotation_matrix(frames.quaternion_from_rpy(roll, pitch, yaw)), theirs, atol=1e-9)
 
 
+@pytest.mark.thorough
 @fewer
 @given(poses)
 @pytest.mark.parametrize("convention", ["maniskill", "opencv", "opengl"])

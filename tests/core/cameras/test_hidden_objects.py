@@ -93,6 +93,7 @@ def ids(env: Any, number: int) -> dict[str, int]:
     return {kind: int(entity.per_scene_id) for kind, entity in found.items() if entity is not None}
 
 
+@pytest.mark.slow
 def test_each_camera_sees_what_that_of_a_stock_env_sees(env: Any) -> None:
     stocks = [single(Hides, first_env=number, **RENDERED) for number in range(N)]
     ours, _ = env.reset(seed=list(range(N)))

@@ -27,6 +27,7 @@ def env(renderer: None) -> Iterator[Any]:
     env.close()
 
 
+@pytest.mark.slow
 def test_pictures_are_those_of_a_stock_env_before_and_after_the_mounts_moved(env: Any) -> None:
     obs, _ = env.reset(seed=[0, 1, 2])
     still = pictures(obs)

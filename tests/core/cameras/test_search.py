@@ -35,6 +35,7 @@ def measured(env: Any, placement: Placement, size: tuple[int, int]) -> CameraRep
     return join_reports([measure_placement(env, e, placement, size=size) for e in range(N)])
 
 
+@pytest.mark.slow
 def test_suggestions_see_the_objects_and_stand_apart(env: Any) -> None:
     space = SearchSpace(("cube", "goal_region"), LOW, HIGH, LENS, candidates=12, best=2, apart=0.2)
     told: list[tuple[int, int]] = []
@@ -99,6 +100,7 @@ def test_a_camera_on_a_link_is_suggested_places_in_that_links_frame_that_keep_it
         suggest_cameras(env, replace(space, mount="panda/tail"), [0])
 
 
+@pytest.mark.slow
 def test_the_robots_hand_can_be_what_must_be_seen_and_the_rest_of_the_robot_hides_it(env: Any) -> None:
     (robot,) = (thing for thing in objects_to_see(env) if thing.robot)
     assert set(robot.links[:3]) == {"panda/panda_leftfinger", "panda/panda_rightfinger", "panda/panda_hand"}

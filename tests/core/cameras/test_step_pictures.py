@@ -17,6 +17,7 @@ pytestmark = pytest.mark.usefixtures("renderer")
 ALL = ("rgb", "depth", "segmentation")
 
 
+@pytest.mark.slow
 def test_what_was_observed_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
     task = TaskEnv(batched("PickCube-v1", obs_mode="rgb+depth+segmentation", robot_uids="panda_wristcam"))
     task.reset(seed=1)

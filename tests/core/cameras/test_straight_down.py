@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.sensors.camera import CameraConfig
@@ -27,6 +28,7 @@ class SeenFromAbove(PushCubeEnv):
         return CameraConfig("above", sapien_utils.look_at([0, 0, 0.6], [0, 0, 0]), 64, 64, 1.0, 0.01, 10)
 
 
+@pytest.mark.slow
 def test_pictures_and_parameters_are_those_of_stock(renderer: None) -> None:
     register_env(ID, max_episode_steps=50, override=True)(SeenFromAbove)
     try:

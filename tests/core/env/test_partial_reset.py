@@ -24,6 +24,7 @@ def made(task: str | type[BaseEnv] = PICK_CUBE, num_envs: int = 4, **kwargs: Any
     return batched(task, num_envs, rules="off", **kwargs)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("control_mode", ["pd_joint_target_delta_pos", "pd_ee_target_delta_pose"])
 def test_an_env_that_is_not_reset_goes_on_to_the_target_that_it_had(control_mode: str) -> None:
     env = made(control_mode=control_mode)

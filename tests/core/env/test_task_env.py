@@ -25,6 +25,8 @@ from workbench.core.env import actions
 from workbench.core.env.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
 from workbench.core.scene.scene_index import scene_index
 
+pytestmark = pytest.mark.thorough
+
 N = 4
 
 

@@ -10,6 +10,8 @@ import pytest
 import workbench
 from workbench.core.env.wrong_options import WrongOption
 
+pytestmark = pytest.mark.usefixtures("renderer")
+
 
 @pytest.mark.parametrize(
     ("given", "names"),
@@ -49,3 +51,19 @@ def test_an_error_of_the_task_itself_stays_the_tasks(tmp_path: Path) -> None:
     with pytest.raises(TypeError) as caught:
         workbench.make(str(file), num_envs=2, size=2)
     assert not isinstance(caught.value, WrongOption)
+
+
+def test_a_task_that_names_no_robot_is_told_which_option_names_one(tmp_path: Path) -> None:
+    file = tmp_path / "nobody.py"
+    file.write_text(
+        "from mani_skill.envs.sapien_env import BaseEnv\n"
+        "from mani_skill.utils.registration import register_env\n"
+        "@register_env('Nobody-v1')\n"
+        "class Nobody(BaseEnv):\n"
+        "    def _load_scene(self, options):\n"
+        "        pass\n"
+    )
+    with pytest.raises(IndexError) as caught:
+        workbench.make(str(file), num_envs=2)
+    assert "robot_uids" in " ".join(caught.value.__notes__)
+    workbench.make(str(file), num_envs=2, robot_uids="panda").close()

@@ -18,6 +18,8 @@ from mani_skill.utils.structs.pose import Pose
 from tests.core.by_hand import box, by_hand
 from tests.core.stock_env import Bare, batch_of, follow
 
+pytestmark = pytest.mark.thorough
+
 
 class Mixed(Bare):
     """Even envs: a box and a chain of one hinge. Odd envs: a ball and a chain of two. A floor everywhere."""

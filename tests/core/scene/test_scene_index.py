@@ -40,6 +40,7 @@ def assert_poses_are_those_of_the_structs(env: Any) -> None:
     np.testing.assert_array_equal(checked, ~np.isnan(poses).any(axis=-1))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("make", [stock, batched])
 @pytest.mark.parametrize("task", TASKS)
 def test_poses_are_those_of_maniskill(task: str, make: Any) -> None:
@@ -55,6 +56,7 @@ def test_poses_are_those_of_maniskill(task: str, make: Any) -> None:
     env.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("task", TASKS)
 def test_poses_are_those_of_the_physics(task: str) -> None:
     """Against the entities themselves, which know nothing of ManiSkill's tensors."""

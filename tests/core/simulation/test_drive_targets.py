@@ -13,6 +13,8 @@ from tests.drive.envs import batched
 from workbench.core.broken_rule import RuleWarning
 from workbench.core.env.task_env import TaskEnv
 
+pytestmark = pytest.mark.thorough
+
 N = 4
 
 

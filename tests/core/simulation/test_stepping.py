@@ -48,7 +48,9 @@ def watching(task: type[BaseEnv]) -> type[BaseEnv]:
     return Watches
 
 
-@pytest.mark.parametrize("env_id", ["PickCube-v1", "StackCube-v1", "MS-CartpoleBalance-v1"])
+@pytest.mark.parametrize(
+    "env_id", [pytest.param("PickCube-v1", marks=pytest.mark.slow), "StackCube-v1", "MS-CartpoleBalance-v1"]
+)
 def test_threads_and_merged_substeps_change_no_bit(env_id: str) -> None:
     task = REGISTERED_ENVS[env_id].cls
     alone = trajectory(watching(task), threads=1)

@@ -27,6 +27,7 @@ def packs(env: BaseEnv) -> list[bytes]:
     return [system.pack() for system in env.scene.px.systems]
 
 
+@pytest.mark.thorough
 def test_a_grasp_goes_the_same_way_whatever_was_touched_before() -> None:
     env = batched(PICK_CUBE, 6)
     env.reset(seed=list(range(6)))

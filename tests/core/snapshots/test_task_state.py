@@ -167,6 +167,16 @@ def test_what_was_not_written_yet_goes_back_to_how_it_was_built() -> None:
     env.close()
 
 
+def test_what_describes_the_scene_and_was_changed_goes_back_to_how_it_was_built_in_that_env() -> None:
+    env = batched(Remembers, N)
+    env.reset(seed=[0, 1, 2, 3])
+    snapshot = take_snapshot(env, [3])
+    env.object_heights = env.object_heights + 10
+    restore_snapshot(env, snapshot, [1])
+    assert env.object_heights.tolist() == [10, 1, 12, 13]
+    env.close()
+
+
 def test_what_holds_for_the_batch_goes_back_when_all_envs_do(env: Any) -> None:
     snapshot, count = take_snapshot(env), env.total_resets
     env.total_resets += 5

@@ -23,6 +23,8 @@ from workbench.jobs.rescore.job import RescoredRecording, RescoreUpdate
 from workbench.machine.processes.wire import MessageSocket, Unreadable
 from workbench.planning.report import SolveReport
 
+pytestmark = pytest.mark.thorough
+
 KINDS = (
     ItemOutcome,
     CheckUpdate,

@@ -150,6 +150,7 @@ def test_a_family_is_ended_when_asked_and_nobody_else(begin: Callable[..., subpr
     assert ours.wait() == -signal.SIGKILL and gone(all_of_other)
 
 
+@pytest.mark.slow
 def test_a_keeper_that_was_stopped_is_not_waited_for(
     begin: Callable[..., subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

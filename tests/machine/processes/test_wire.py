@@ -29,6 +29,7 @@ from workbench.session.protocol.questions import QUESTIONS
 EVENTS: tuple[type, ...] = get_args(Event)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", [*EVENTS, *QUESTIONS], ids=lambda kind: kind.__name__)
 @settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(st.data())

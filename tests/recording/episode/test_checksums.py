@@ -19,6 +19,8 @@ from workbench.recording.reader.read_rows import read_found
 from workbench.recording.reader.scan import scan_folder
 from workbench.recording.writing.finish import EpisodeFiles
 
+pytestmark = pytest.mark.thorough
+
 Maker = Callable[..., Made]
 
 

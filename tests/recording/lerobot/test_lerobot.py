@@ -63,6 +63,7 @@ def export(folder: Path, *episodes: Episode, options: ExportOptions | None = Non
     return export_lerobot(sources, folder, options or ExportOptions())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "limits", [{}, {"DATA_MB": 0, "VIDEO_MB": 0, "CHUNK_SIZE": 2}], ids=["one", "many files"]
 )
@@ -104,6 +105,7 @@ def test_what_was_exported_is_read_back(
             assert int(np.argmin(distances)) == state
 
 
+@pytest.mark.slow
 def test_the_tables_are_of_the_format(episode: Episode, succeeding: Episode, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     export(folder, episode, succeeding, options=ExportOptions(instruction="pick it up"))

@@ -5,13 +5,18 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
+from workbench.cli.jobs.run_by import told_in_folder
+from workbench.cli.terminal.arguments import JobArguments
+from workbench.jobs.record.run import RecordProgress
 from workbench.recording.library.jobs import (
     SILENT_SECONDS,
     JobFailure,
@@ -38,6 +43,22 @@ def test_a_job_is_seen_while_it_runs_and_a_while_after(tmp_path: Path) -> None:
     assert [one.state for one in read_jobs(tmp_path, now + 60)] == ["done"]
     assert read_jobs(tmp_path, now + 3601) == ()
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_rate_of_a_job_that_goes_on_is_that_of_this_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimpleNamespace(monotonic=lambda: now)
+    monkeypatch.setattr("workbench.cli.jobs.run_by.time", clock)
+    with told_in_folder(JobArguments(), "record", "my_task.py", tmp_path, 100, str) as told:
+        tell = told.beside(lambda progress: None)
+        now = 50.0
+        tell(RecordProgress(80, 0, done=80.0, was_there=True))
+        now = 55.0
+        tell(RecordProgress(90, 0, done=90.0))
+        told.end("stopped")
+    (status,) = read_jobs(tmp_path, time.time())
+    assert (status.done, status.rate) == (90, 2.0)
 
 
 def test_jobs_of_folders_below_are_seen_with_their_place(tmp_path: Path, child_process: None) -> None:

@@ -293,6 +293,7 @@ def test_an_index_that_came_with_the_folder_is_left_alone(tmp_path: Path) -> Non
     assert sorted(path.name for path in (folder / ".workbench").iterdir()) == ["library.sqlite"]
 
 
+@pytest.mark.slow
 def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
     folder = tmp_path / "later"
     library = Library(folder)
@@ -384,6 +385,10 @@ def test_deleting_takes_all_files_and_can_be_taken_back(tmp_path: Path, library:
     assert library.view().trash.files == 0
     with pytest.raises(LibraryError, match="trash is empty"):
         library.undo_delete()
+    library.delete(["aaaa"])
+    library.delete(["bbbb"])
+    library.undo_delete()
+    assert [row.name for row in library.view().rows] == ["b", "sub/c"], "the last one first"
 
 
 def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(

@@ -43,6 +43,7 @@ def export(*arguments: object) -> int:
     return int(ended.value.code or 0)
 
 
+@pytest.mark.slow
 def test_maniskills_dataset_class_loads_what_was_recorded(recordings: list[Path], tmp_path: Path) -> None:
     file = tmp_path / "demos.h5"
     assert export(*recordings, "--maniskill", file, "--only-successes") == 0
@@ -99,9 +100,8 @@ OBSERVED = "PickCube-v1", 7
 """Task and seed."""
 
 
-@pytest.mark.parametrize(
-    "obs_mode", ["rgb+depth+segmentation", pytest.param("state+rgb", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("obs_mode", ["rgb+depth+segmentation", "state+rgb"])
 def test_pictures_that_were_observed_are_as_maniskills_recorder_writes_them(
     renderer: None, tmp_path: Path, obs_mode: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -130,6 +130,16 @@ def test_names_types_shapes_and_numbers_are_theirs(
     assert len(states) == STEPS + 1
 
 
+def test_success_is_of_the_state_that_a_step_leads_to(
+    make_episode: Callable[..., Made], tmp_path: Path
+) -> None:
+    success = np.array([False, False, False, True])
+    files = make_episode(3, evaluate={"success": success}).write(tmp_path)
+    with h5py.File(files.h5) as file:
+        group: Any = file["traj_0"]
+        assert group["success"][:].tolist() == [False, False, True]
+
+
 def test_long_columns_are_packed_and_read_the_same(make_episode: Callable[..., Made], tmp_path: Path) -> None:
     """Longer than a piece of the journal and than a chunk of the file."""
     count = np.arange(3001, dtype=np.float32)
@@ -163,6 +173,7 @@ def test_theirs_is_read_as_ours_is(child_process: None, tmp_path: Path) -> None:
     assert found.info.env_kwargs["obs_mode"] == "state_dict"
 
 
+@pytest.mark.slow
 def test_their_cameras_are_read_too(recorded: Any, tmp_path: Path) -> None:
     """`recorded` is the same episode as plain arrays."""
     env: Any = gym.make(

@@ -207,7 +207,9 @@ def fuzz(original: Original, folder: Path, count: int, seed: int) -> int:
     return told
 
 
-@pytest.mark.parametrize("kind", ["ours", "alone", pytest.param("theirs", marks=pytest.mark.slow), "dataset"])
+@pytest.mark.parametrize(
+    "kind", ["ours", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("alone", "theirs", "dataset"))]
+)
 def test_damaged_recordings_are_rows_and_sentences(
     kind: str, originals: dict[str, Original], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -228,4 +230,4 @@ def test_very_many_damaged_recordings_are_rows_and_sentences(
 ) -> None:
     monkeypatch.setattr(reading, "ROW_SECONDS", 4.0)
     monkeypatch.setattr(reading, "OPEN_SECONDS", 4.0)
-    assert fuzz(originals[kind], tmp_path / "set", 600, SEED + 1) > 100
+    assert fuzz(originals[kind], tmp_path / "set", 240, SEED + 1) > 40

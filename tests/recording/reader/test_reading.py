@@ -61,6 +61,7 @@ def test_what_takes_too_long_is_given_up_and_the_others_are_read(
     assert sorted(rows(tmp_path)) == ["a", "c", "d"]
 
 
+@pytest.mark.slow
 def test_reading_that_is_not_needed_any_more_is_given_up(tmp_path: Path) -> None:
     whole = describe(tmp_path, "a")
     slow_json(tmp_path / "b.json")
@@ -127,6 +128,7 @@ def test_an_episode_is_what_reading_it_here_gives(recorded: Any, tmp_path: Path)
                 np.testing.assert_array_equal(again[1], seen[1], strict=True)
 
 
+@pytest.mark.slow
 def test_pictures_go_on_where_the_reader_was_ended_and_where_the_file_is_gone(
     recorded: Any, tmp_path: Path
 ) -> None:
@@ -144,6 +146,7 @@ def test_pictures_go_on_where_the_reader_was_ended_and_where_the_file_is_gone(
     np.testing.assert_array_equal(camera.rgb[0], before)
 
 
+@pytest.mark.slow
 def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
     describe(tmp_path, "a")
     program = (

@@ -115,6 +115,7 @@ def test_what_cannot_be_written_is_said_as_on_a_thread(tmp_path: Path, process: 
     assert appended(tmp_path, made(3), pictures=False).finish(process).json.is_file()  # it goes on
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_the_episode_is_made_once(tmp_path: Path) -> None:
     for wait in (0, 0.02):
         folder, process = tmp_path / str(wait), started()
@@ -177,6 +178,7 @@ def written(folder: Path) -> EpisodeWriter:
     return appended(folder, made(3), pictures=False)
 
 
+@pytest.mark.slow
 def test_it_ends_with_the_program_that_started_it(tmp_path: Path) -> None:
     program = (
         "import os, time\n"

@@ -18,6 +18,8 @@ from workbench.recording.writing.finish import SUFFIXES, recover
 from workbench.recording.writing.journal import FOLDER
 from workbench.recording.writing.publish import RecordingError
 
+pytestmark = pytest.mark.thorough
+
 Maker = Callable[..., Made]
 
 
@@ -31,7 +33,11 @@ def recorded(make_episode: Maker, folder: Path) -> EpisodeWriter:
 
 @pytest.mark.parametrize(
     "again, then",
-    [("finish", 0), pytest.param("recover", 0, marks=pytest.mark.slow), ("recover", errno.EROFS)],
+    [
+        ("finish", 0),
+        pytest.param("recover", 0, marks=pytest.mark.slow),
+        pytest.param("recover", errno.EROFS, marks=pytest.mark.slow),
+    ],
 )
 def test_whatever_call_fails_the_next_try_makes_the_files_once(
     make_episode: Maker, tmp_path: Path, again: str, then: int

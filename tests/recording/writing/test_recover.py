@@ -29,6 +29,7 @@ from workbench.recording.writing.publish import RecordingError
 Maker = Callable[..., Made]
 
 
+@pytest.mark.thorough
 def test_a_killed_writer_was_given_time_to_lose_nothing(make_episode: Maker, tmp_path: Path) -> None:
     """Rows that were appended long ago are there though none came after them."""
     episode = make_episode(5)
@@ -57,6 +58,7 @@ DAMAGE = st.one_of(
 )
 
 
+@pytest.mark.thorough
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(damage=DAMAGE, bit=st.integers(0, 7))
 def test_a_journal_that_is_cut_or_changed_anywhere_gives_its_whole_states_or_stays(
@@ -179,7 +181,8 @@ def test_of_a_writer_that_died_between_two_names_only_what_it_named_itself_is_ta
     assert lengths(tmp_path) == {"0": 2, "1": 4}
 
 
-@pytest.mark.parametrize("then", [0, errno.EROFS])
+@pytest.mark.thorough
+@pytest.mark.parametrize("then", [0, pytest.param(errno.EROFS, marks=pytest.mark.slow)])
 def test_whatever_call_fails_the_next_recovery_makes_each_episode_whole_and_once(
     make_episode: Maker, tmp_path: Path, then: int
 ) -> None:

@@ -57,6 +57,7 @@ def names(address: str) -> list[str]:
     return sorted(name.rpartition("/")[2] for name in system.ls(path, detail=False))
 
 
+@pytest.mark.slow
 def test_episodes_end_up_there_and_not_here(bucket: str, tmp_path: Path) -> None:
     done = record(asked(tmp_path / "out", bucket, episodes=3))
     assert [one.address.partition("pushed/")[0] for one in done.written] == ["s3://demos/"] * 3

@@ -70,6 +70,7 @@ def there(session: Session, key: CameraKey) -> CameraSettings:
     return found
 
 
+@pytest.mark.slow
 def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_between(
     session: Session, task_file: Path
 ) -> None:
@@ -105,6 +106,7 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
     studio.back_to_file(BASE)
 
 
+@pytest.mark.slow
 def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session, task_file: Path) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.9))
@@ -160,6 +162,7 @@ def test_a_change_that_the_hook_itself_makes_another_of_is_refused_before_it_is_
     session.studio.back_to_file(BASE)
 
 
+@pytest.mark.slow
 def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
     session: Session, task_file: Path
 ) -> None:

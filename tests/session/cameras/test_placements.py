@@ -25,6 +25,8 @@ from workbench.session.cameras.view import EditRequest
 from workbench.session.protocol.messages import PlaceCamera, Placed
 from workbench.session.protocol.questions import RunCameras
 
+pytestmark = pytest.mark.thorough
+
 EYE, TARGET = (0.45, 0.0, 0.6), (0.08, 0.0, 0.2)
 """It looks at something above the ground, which a line of sight does not tell."""
 LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0, None, 128, 128, 0.01, 10.0, "minimal")

@@ -135,6 +135,24 @@ def test_the_same_version_is_not_checked_twice(checks: Checks, background: Scrip
     assert len(background.asked) == 4
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"env_kwargs": {"control_mode": "pd_joint_pos"}},
+        {"rules": "warn"},
+    ],
+    ids=lambda changed: next(iter(changed)),
+)
+def test_envs_that_are_made_otherwise_are_checked_anew(
+    checks: Checks, background: ScriptedBackground, changed: dict[str, Any]
+) -> None:
+    checks.loaded(LOAD, same_task=True)
+    ended(checks)
+    checks.loaded(replace(LOAD, options=replace(LOAD.options, **changed)), same_task=True)
+    ended(checks)
+    assert len(background.asked) == 4
+
+
 def test_findings_of_the_version_before_stay_until_their_rule_is_checked(
     checks: Checks, background: ScriptedBackground
 ) -> None:

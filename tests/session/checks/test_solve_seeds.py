@@ -49,6 +49,7 @@ def test_each_seed_is_solved_recorded_and_told_and_what_is_done_stays_when_it_is
     assert solver.view.stale and solver.view.report is view.report
 
 
+@pytest.mark.slow
 def test_a_task_that_fails_says_where(solver: SeedsSolver, tmp_path: Path) -> None:
     file = tmp_path / "broken.py"
     file.write_text("raise KeyError('goal')\n")

@@ -28,6 +28,7 @@ from workbench.session.protocol.messages import (
     LoadFailed,
     Loading,
     Pictures,
+    ReadPolicyAgain,
     Request,
     RulesBroken,
     Settings,
@@ -174,6 +175,27 @@ def test_what_failed_while_running_stands_until_a_step_follows_and_each_time_ane
         assert len(view.loads) == 1, "it is no load"
         played.step()
         assert played.view.problem is None and not played.view.problem_at_run
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_mended_policy_plays_on_although_the_task_was_loaded_anew_before_its_file_is_read(
+    played: Told, tmp_path: Path, paused: bool
+) -> None:
+    # Both the task's watcher and the policy's notice the save, in either order.
+    policy = tmp_path / "policy.py"
+    policy.write_text("def act(obs): return None\n")
+    played.session.change(action_source="policy", policy=f"{policy}:act")
+    played.session.play()
+    failed = replace(problem(), stage="policy", file=str(policy))
+    played.tell(Status(True, 20.0, 1.0), LoadFailed(failed, kept=True, at_run=True), Status(False, 0.0, 0.0))
+    if paused:
+        played.session.pause()
+    played.load("same")
+    played.asked(object)
+    policy.write_text("def act(obs): return obs\n")
+    asked: list[ReadPolicyAgain] = []
+    until(lambda: asked.extend(played.asked(ReadPolicyAgain)) or asked, "the policy is read again")
+    assert asked == [ReadPolicyAgain(play=not paused)]
 
 
 def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before_runs_on(

@@ -122,7 +122,7 @@ def test_what_a_version_set_that_ran_goes_with_its_line(
 LATE = {"a raise": ("pass", False), "a default type": ("torch.set_default_dtype(torch.float64)", True)}
 
 
-@pytest.mark.parametrize("what", LATE)
+@pytest.mark.parametrize("what", [pytest.param("a raise", marks=pytest.mark.slow), "a default type"])
 def test_after_a_failure_while_it_runs_a_reset_and_steps_are_those_of_a_clean_process(
     mended: Session, task_file: Path, good: str, expected: SessionView, what: str
 ) -> None:
@@ -162,6 +162,7 @@ def test_a_file_of_which_nothing_ran_costs_no_process(
     assert mended.worker_pid == worker, mended.view().reload
 
 
+@pytest.mark.slow
 def test_recording_and_playing_go_on_after_a_refused_version(
     task_file: Path, good: str, tmp_path: Path
 ) -> None:

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from tests.drive.session import live_session, start_over, step, wait_until
+from tests.drive.session import Told, live_session, start_over, step, wait_until
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.protocol.messages import CameraRequest
+from workbench.session.protocol.messages import CameraRequest, EnterRecording
+
+pytestmark = pytest.mark.thorough
 
 DRAWS = True
 
@@ -158,7 +161,9 @@ POLICIES = {
 }
 
 
-def test_what_a_policy_returns_for_several_robots_and_is_no_action_is_named(tmp_path: Path) -> None:
+def test_what_a_policy_returns_for_several_robots_and_is_no_action_is_named(
+    tmp_path: Path, child_process: None
+) -> None:
     policy = tmp_path / "policy.py"
     text = "import numpy as np, torch\n"
     text += "".join(f"def {name}(obs): return {returned}\n" for name, (returned, _) in POLICIES.items())
@@ -251,3 +256,12 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 2, "another step")
     assert not session.view().pictures, "nobody looks any more"
     session.change(cameras=())
+
+
+def test_a_recording_that_waited_for_the_task_is_gone_into_once(told: Told) -> None:
+    told.session.enter_recording(cast(Any, "a run"))
+    assert told.asked(EnterRecording) == []
+    told.load()
+    assert [request.env_idx for request in told.asked(EnterRecording)] == [(0,)]
+    told.load(level="rebuilt")
+    assert told.asked(EnterRecording) == []

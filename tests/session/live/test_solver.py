@@ -62,6 +62,7 @@ def test_what_an_episode_came_to_is_kept_until_it_is_over(played: Told) -> None:
     assert played.view.solve.solved == () and len(played.view.solve.achieved) == 0
 
 
+@pytest.mark.slow
 def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(session: Session) -> None:
     start_over(session, 3)
     before = session.view().step
@@ -124,6 +125,7 @@ def test_a_pressed_step_is_made_also_if_another_env_is_selected_while_it_is_plan
     session.change(selected_env=0)
 
 
+@pytest.mark.slow
 def test_a_pressed_step_that_waited_for_its_plan_is_found_hanging_and_can_be_interrupted(
     session: Session, file: Path, tmp_path: Path
 ) -> None:

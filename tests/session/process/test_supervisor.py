@@ -146,6 +146,7 @@ def test_the_end_says_what_it_was_at_and_where_and_what_was_sent_before_is_taken
         assert "exit code 7" in death.why and death.doing == "stepping" and "in leave" in death.stack
 
 
+@pytest.mark.slow
 def test_the_third_death_in_a_row_is_the_last_until_somebody_asks_and_a_load_forgives_the_earlier_ones() -> (
     None
 ):
@@ -166,6 +167,7 @@ def test_the_third_death_in_a_row_is_the_last_until_somebody_asks_and_a_load_for
     assert one.worker.pid is None, "it ends while it waits to be asked"
 
 
+@pytest.mark.slow
 def test_long_work_is_told_again_and_again_and_that_it_is_over() -> None:
     with minded() as one:
         one.worker.send(do("work 2.0"))
@@ -176,6 +178,7 @@ def test_long_work_is_told_again_and_again_and_that_it_is_over() -> None:
         assert one.deaths == [] and one.busy.count(None) == 1
 
 
+@pytest.mark.slow
 def test_an_interrupt_leaves_work_and_nothing_that_is_idle_or_held() -> None:
     with minded() as one:
         one.worker.interrupt()
@@ -214,6 +217,7 @@ def test_a_load_waits_for_short_work_only() -> None:
         one.until(lambda: not one.worker.load_pending, "that it was taken up")
 
 
+@pytest.mark.slow
 def test_a_save_while_the_first_requests_of_the_next_worker_are_made_is_loaded_after_them() -> None:
     with minded() as one:
 
@@ -252,9 +256,9 @@ def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
 @pytest.mark.parametrize(
     ("does", "fails", "says"),
     [
-        ("nonsense x", 0, "unreadable data"),
+        pytest.param("nonsense x", 0, "unreadable data", marks=pytest.mark.slow),
         ("say this", 1, "no such step"),
-        ("without_a_main_thread 600", 0, "main thread"),
+        pytest.param("without_a_main_thread 600", 0, "main thread", marks=pytest.mark.slow),
     ],
 )
 def test_what_cannot_go_on_is_ended_with_a_reason_and_another_comes(does: str, fails: int, says: str) -> None:
@@ -274,6 +278,7 @@ def test_one_that_is_about_to_end_without_its_main_thread_is_left_to_it(
         assert "exit code 7" in one.until_dead().why
 
 
+@pytest.mark.slow
 def test_a_greeting_that_fails_loses_the_worker_and_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
     with minded() as one:
         failures = iter(range(5))
@@ -338,6 +343,7 @@ def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
     assert [thread.name for thread in threading.enumerate() if thread.name == "session"] == []
 
 
+@pytest.mark.slow
 def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor, "_SPARE_DELAY", 0.0)
     with minded(WorkerOptions(spare=True)) as one:
@@ -353,6 +359,7 @@ def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatc
         assert one.worker.pid not in (None, first) and not one.worker.vitals.spare_ready
 
 
+@pytest.mark.slow
 def test_a_spare_that_dies_of_its_warming_up_is_tried_once_more_and_no_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -134,7 +134,9 @@ def test_a_loop_in_the_middle_of_a_replay_is_left_and_the_batch_is_where_it_was(
     np.testing.assert_allclose(view.step.poses, shown, atol=1e-5)
 
 
-@pytest.mark.parametrize("place", ["import", "reset", pytest.param("build", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "place", ["import", *(pytest.param(place, marks=pytest.mark.slow) for place in ("reset", "build"))]
+)
 def test_a_loop_in_a_load_can_be_left_and_the_last_good_version_stays(
     session: Session, file: Path, place: str
 ) -> None:
@@ -153,6 +155,7 @@ def test_a_loop_in_a_load_can_be_left_and_the_last_good_version_stays(
     wait_until(session, lambda v: v.problem is None and not v.stale, "the new version")
 
 
+@pytest.mark.slow
 def test_a_hang_that_a_save_waits_for_is_left_and_the_new_version_loaded_where_it_never_ran(
     session: Session, file: Path
 ) -> None:
@@ -186,6 +189,7 @@ def test_what_cannot_be_interrupted_is_said_and_a_restart_brings_the_moment_back
     assert back(session, before).problem is None, "the file as it is now is not the one that hung"
 
 
+@pytest.mark.slow
 def test_what_is_only_slow_is_told_and_left_alone(session: Session, file: Path) -> None:
     before, worker = session.view(), session.worker_pid
     provoke(file, "build", "slow")
@@ -222,7 +226,7 @@ WAYS = [
     ("headless", "main thread", ...),
     ("thread", "exit code 1", ...),
 ]
-QUICK = ("segfault", "garbage")
+QUICK = ("segfault",)
 """The others end the process in the same ways, and each costs a new one."""
 
 
@@ -328,7 +332,11 @@ def test_what_would_wait_or_leave_or_is_no_ordinary_exception_is_named_with_its_
 
 
 @pytest.mark.parametrize(
-    ("place", "error"), [("evaluate", 'KeyboardInterrupt("two")'), ("import", 'GeneratorExit("two")')]
+    ("place", "error"),
+    [
+        ("evaluate", 'KeyboardInterrupt("two")'),
+        pytest.param("import", 'GeneratorExit("two")', marks=pytest.mark.slow),
+    ],
 )
 def test_what_a_saved_version_raises_is_shown_with_the_text_of_that_version(
     session: Session, file: Path, place: str, error: str

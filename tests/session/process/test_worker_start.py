@@ -76,6 +76,7 @@ def has_ended(process: psutil.Process) -> bool:
         return True
 
 
+@pytest.mark.slow
 def test_workers_are_forks_that_end_apart_from_each_other_and_say_how(forks: WorkerForks) -> None:
     one, other = started(), started()
     assert listens(one) and listens(other)
@@ -87,6 +88,7 @@ def test_workers_are_forks_that_end_apart_from_each_other_and_say_how(forks: Wor
     until(lambda: not workers_of(psutil.Process()), "the end of both")
 
 
+@pytest.mark.slow
 def test_those_that_are_ended_at_once_leave_the_others_alone(forks: WorkerForks) -> None:
     worker = started()
     assert listens(worker)
@@ -112,6 +114,7 @@ def test_two_forks_do_not_draw_the_same_random_numbers(tmp_path: Path) -> None:
     assert all(a != b for a, b in zip(*drawn, strict=True))
 
 
+@pytest.mark.slow
 def test_a_worker_that_would_be_of_something_else_is_no_fork(
     forks: WorkerForks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

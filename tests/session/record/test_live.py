@@ -160,6 +160,7 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
     )
 
 
+@pytest.mark.slow
 def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_a_reset(
     session: Session,
 ) -> None:
@@ -203,6 +204,7 @@ def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session)
     assert episode.length == 2 and episode.info.acted_by == ((0, "random"), (1, "zero"))
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
     session: Session, tmp_path: Path
 ) -> None:
@@ -224,6 +226,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
     session.stop_recording()
 
 
+@pytest.mark.slow
 def test_what_is_recorded_says_where_a_moved_camera_was_and_where_the_file_has_it(
     session: Session, tmp_path: Path
 ) -> None:

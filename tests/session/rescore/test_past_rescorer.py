@@ -121,6 +121,7 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
     assert not view.warnings
 
 
+@pytest.mark.slow
 def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk, record) -> None:
     """Success becomes "the gripper is above a height", which the recorded poses tell by themselves."""
     hand = desk.session.view().task.geometry.body_names.index("panda/panda_hand_tcp")
@@ -146,6 +147,7 @@ def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk,
     assert all(verdict.success[0] is None for verdict in view.verdicts)
 
 
+@pytest.mark.slow
 def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk, record) -> None:
     late = "if bool((self.elapsed_steps > 20).any()): raise KeyError('late')"
     # The process that judges now stands at the end of an episode, where the new code raises at once.
@@ -164,6 +166,7 @@ def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk,
     assert 0 < view.done < view.total
 
 
+@pytest.mark.slow
 def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(desk: Desk, record) -> None:
     calls = desk.file.with_name("calls")
     slow = f"if {IN_THE_JUDGE}: time.sleep(0.1) or open({str(calls)!r}, 'a').write('.')"

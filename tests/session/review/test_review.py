@@ -164,12 +164,22 @@ def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytes
 
 
 def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
-    review, _ = review_of(
-        a=made(3),
-        b=UnreadableRecording("it is a picture of a cat"),
-        c=ZeroDivisionError("oh"),
-        d=OSError("gone"),
+    shelf = Shelf(
+        {
+            "a": made(3),
+            "b": UnreadableRecording("it is a picture of a cat"),
+            "c": ZeroDivisionError("oh"),
+            "d": OSError("gone"),
+        }
     )
+    readable = threading.Event()
+    readable.set()
+
+    def read(row: Row, *_: object) -> Episode:
+        assert readable.wait(60)
+        return shelf.read(row)
+
+    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
     review.open(["a", "b", "c", "d", "e"])
     view = reach(review, lambda view: bool(view.opened) and not view.loading, "the one that can be read")
     assert [o.id for o in view.opened] == ["a"]
@@ -180,8 +190,10 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
         and "file d was not opened. gone" in said
     )
     assert "no longer in the folder" in said and view.not_opened == ("b", "c", "d")
+    readable.clear()
     review.open_again()
     assert review.view().not_opened == () and review.view().loading
+    readable.set()
     view = reach(review, lambda view: len(view.not_opened) == 3 and not view.loading, "the second try")
     assert [o.id for o in view.opened] == ["a"]
     review.open(["b"])
@@ -258,6 +270,9 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
     assert [o.id for o in view.opened] == ["b", "c", "d", "e"], "what was closed does not come back"
     assert (view.selected, view.position, view.playing, view.last) == (0, 15, True, 30)
     assert "first success" in view.alignments
+    review.open("ab")
+    view = reach(review, lambda view: not view.loading, "both")
+    assert [o.id for o in view.opened] == ["a", "b"], "who opens it again sees it again"
 
 
 def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.MonkeyPatch) -> None:

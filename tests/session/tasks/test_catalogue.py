@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import io
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 from PIL import Image
 
-from tests.drive.waiting import until
+from tests.drive.waiting import PATIENCE, until
 from workbench.jobs.task import TaskOptions
 from workbench.session.tasks import catalogue as catalogue_module
 from workbench.session.tasks import registered as registered_module
@@ -138,6 +140,29 @@ def test_the_list_follows_its_folder_and_stays_the_same_while_nothing_changes(
     serial = catalogue.view().serial
     until(lambda: (catalogue.follow(), len(searches))[1] > 2, "further searches")
     assert catalogue.view().serial == serial
+
+
+def test_what_changes_behind_a_search_that_is_under_way_is_found_by_the_next(
+    made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    passed_by, go_on, search = threading.Event(), threading.Event(), catalogue_module.find_task_files
+
+    def slow(*asked: Any) -> Any:
+        found = search(*asked)
+        passed_by.set()
+        go_on.wait(PATIENCE)
+        return found
+
+    catalogue, file = made(), tmp_path / "work" / "push.py"
+    file.write_text(TASK)
+    monkeypatch.setattr(catalogue_module, "find_task_files", slow)
+    catalogue.refresh()
+    assert passed_by.wait(PATIENCE)
+    file.unlink()
+    catalogue.refresh()
+    go_on.set()
+    until(lambda: catalogue._searching is None, "the end of both searches")
+    assert not [one for one in catalogue.view().entries if one.section is Section.FOLDER]
 
 
 @pytest.mark.parametrize(

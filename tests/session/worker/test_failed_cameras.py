@@ -56,6 +56,7 @@ def task(folder: Path, code: str, old: str = "", new: str = "") -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
     file = task(
         tmp_path,
@@ -87,6 +88,7 @@ def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
         assert not view.failed_cameras
 
 
+@pytest.mark.slow
 def test_a_picture_that_never_comes(tmp_path: Path) -> None:
     file = task(tmp_path, HANGS)
     with live_session(file, tmp_path / "recordings", draw=True, render_backend="cpu") as session:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from workbench.authoring.loading.load import load_task
 from workbench.authoring.problem import Interrupted, TaskError
@@ -23,6 +24,7 @@ from workbench.session.worker import go_back
 
 N = 3
 T = 12
+LATER = [0, 100, 200]
 
 
 class EnvMoment:
@@ -32,6 +34,8 @@ class EnvMoment:
         self.opened, self.told = opened, []
         task, rng = opened.env, np.random.default_rng(0)
         task.reset(2)
+        # As if each had begun at another time.
+        opened.env.env._elapsed_steps += torch.tensor(LATER)
         self.snapshots: list[Snapshot] = [task.snapshot()]
         self.actions: list[np.ndarray] = []
         self.packs: list[list[bytes]] = [self.packed()]
@@ -81,11 +85,12 @@ def lived() -> Iterator[EnvMoment]:
     opened.env.close()
 
 
+@pytest.mark.thorough
 def test_a_humanoid_goes_on_as_it_did_to_the_last_byte(lived: EnvMoment) -> None:
     did = lived.back(T, dict.fromkeys(range(N), 0))
     assert did.replayed == tuple(range(N)) and not did.not_carried
     assert lived.told == [(done, T) for done in range(1, T + 1)]
-    assert lived.opened.env.env.elapsed_steps.tolist() == [T] * N
+    assert lived.opened.env.env.elapsed_steps.tolist() == [T + later for later in LATER]
     for after in range(T, 2 * T):
         assert lived.packed() == lived.packs[after]
         lived.opened.env.step(lived.actions[after])
@@ -97,7 +102,7 @@ def test_one_env_alone_and_as_another_while_the_others_notice_nothing(lived: Env
     did = lived.back(T, {1: 0}, {1: 2})
     assert did.replayed == (1,)
     now = lived.packed()
-    assert now[1] == lived.packs[T][2]
+    assert now[1] == lived.packs[T][2] and lived.opened.env.env.elapsed_steps[1] == T + LATER[2]
     assert [now[0], now[2]] == [before[0], before[2]]
 
 
@@ -153,7 +158,7 @@ def test_an_interrupt_in_the_middle_of_a_replay_ends_it_and_another_failure_on_t
     fails_in_the_fifth_step(KeyError("edited"))
     did = lived.back(T, dict.fromkeys(range(N), 0))
     assert did.replayed == () and len(lived.told) == 4
-    assert lived.opened.env.env.elapsed_steps.tolist() == [T] * N, "it was put there"
+    assert lived.opened.env.env.elapsed_steps.tolist() == [T + later for later in LATER], "it was put there"
     fails_in_the_fifth_step(Interrupted("stopped by hand"))
     with pytest.raises(TaskError) as ended:
         lived.back(T, dict.fromkeys(range(N), 0))

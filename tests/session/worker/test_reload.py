@@ -190,16 +190,16 @@ def test_a_module_that_a_hook_imports_when_it_runs_is_compared_with_what_is_on_d
 # --- never a mixture -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("edits_tried", [8, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_a_reload_as_random_as_can_be_equals_a_fresh_env_step_for_step(
-    tmp_path_factory: pytest.TempPathFactory, edits_tried: int
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     """Anywhere in real tasks: in hooks, constants, defaults, scenes and cameras."""
     folder = tmp_path_factory.mktemp("author")
     desks = [open_desk(Path(shutil.copy(path, folder / path.name)), obs_mode="state") for path in EDITED]
     tried: list[str] = []
 
-    @settings(max_examples=edits_tried, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+    @settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
     @given(st.integers(0, len(EDITED) - 1), st.integers(0, 10**6), st.integers(1, 2))
     def edit(number: int, seed: int, edits: int) -> None:
         desk = desks[number]

@@ -23,7 +23,8 @@ def test_an_empty_file_becomes_a_running_task_by_a_press(child_process: None, tm
     session = Session(str(file), TaskOptions(num_envs=2), recordings=tmp_path / "recordings")
     try:
         panels, clock = Panels(server), Clock()
-        page = Page(server, session, clock=clock)
+        page = Page(server, panels.visitors, session, clock=clock)
+        panels.visitors.do = page.do
         view = wait_until(session, lambda view: view.problem is not None, "the problem")
         assert view.problem is not None and "`workbench new`" in view.problem.message
         clock.passes()

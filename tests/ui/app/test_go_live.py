@@ -7,12 +7,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import viser
 
 from tests.drive.episodes import made, write
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
 from tests.ui.scenes import problem
 from workbench.authoring.loading.reference import TaskName
+from workbench.commands.review import ReturnToFirstTask
 from workbench.jobs.task import TaskOptions
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
@@ -48,6 +50,7 @@ class Desk:
         self.opened: list[TaskName] = []
         self.go_live = GoLive(place, self._make, self.person, TaskOptions())
         self.part = GoLivePart(place.server, self.go_live)
+        panels.visitors.do = self.part.do
         place.go_live = self.go_live
 
     def _make(self, task: TaskName, options: TaskOptions) -> Session:
@@ -59,6 +62,12 @@ class Desk:
 
     def draw(self) -> None:
         self.part.draw(self.place.shelf.review.view())
+
+
+@pytest.fixture
+def server(gated_server: GatedServer) -> viser.ViserServer:
+    """Of the review."""
+    return gated_server.server
 
 
 @pytest.fixture
@@ -122,8 +131,24 @@ def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_y
     until(lambda: desk.other.view().timeline.entered, "the recorded state")
     desk.draw()
     assert desk.place.pages._wish == "live"
-    desk.go_live.go_home()
+    desk.panels.press("Back to the first task")
     assert desk.place.session is desk.live and not desk.go_live.can_go_home()
+    desk.draw()
+    assert not desk.panels.shows("Back to the first task")
+
+
+def test_which_code_and_which_envs_are_kept_for_the_next_review(desk: Desk) -> None:
+    desk.draw()
+    assert desk.panels.field("Code").value == "today's"
+    desk.panels.set("Code", "as recorded")
+    desk.panels.set("Into", "all envs")
+    assert desk.go_live.recorded_source and desk.go_live.everywhere
+    desk.place.server.gui.reset()
+    desk.part = GoLivePart(desk.place.server, desk.go_live)
+    desk.draw()
+    assert desk.panels.field("Code").value == "as recorded" and desk.panels.field("Into").value == "all envs"
+    desk.panels.do(ReturnToFirstTask())
+    assert desk.panels.client.notices == ["No other task is open."]
 
 
 def test_who_presses_again_stays_and_nobody_is_asked_any_more(desk: Desk) -> None:

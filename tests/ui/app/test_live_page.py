@@ -13,11 +13,12 @@ import websockets.sync.client
 from tests.drive.panels import Clock, Panels
 from tests.drive.session import TASKS, wait_until
 from tests.ui.tabs import handshake, messages_in
+from workbench.commands.envs import ToggleOnlySelected
+from workbench.commands.run import ResetAll
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.app.live_page import Page
-from workbench.ui.live.run_panel import RESET_ALL
 
 WAITS = """
 
@@ -66,7 +67,8 @@ def opened(
         str(task_file), TaskOptions(num_envs=3), recordings=tmp_path_factory.mktemp("recordings")
     )
     panels, clock = Panels(server), Clock()
-    page = Page(server, session, clock=clock)
+    page = Page(server, panels.visitors, session, clock=clock)
+    panels.visitors.do = page.do
     page.redraw()
     task_file.with_name("drawn").touch()
     yield Opened(page, session, panels, clock)
@@ -77,10 +79,10 @@ def opened(
 def test_says_what_it_waits_for_and_then_shows_the_scene(opened: Opened) -> None:
     # The fixture drew it before there was a task.
     run = opened.panels.part("Run")
-    assert run.control("Play").disabled and not run.offers(RESET_ALL)
+    assert run.button("Play").command is None and not run.presses(ResetAll())
     view = opened.load()
-    assert not run.control("Play").disabled and run.offers(RESET_ALL)
-    assert run.control("Selected").max == 2
+    assert run.button("Play").command is not None and run.presses(ResetAll())
+    assert run.field("Selected").bounds == (0, 2)
     assert all(opened.panels.bodies(name) for name in ("cube", "panda_hand", "ground"))
     assert "3 envs" in opened.panels.html("wb-status")
     run.set("Source", "sliders")
@@ -88,6 +90,11 @@ def test_says_what_it_waits_for_and_then_shows_the_scene(opened: Opened) -> None
     opened.draw()
     assert view.task is not None and all(run.shows(action.name) for action in view.task.actions)
     run.set("Source", "hold still")
+    opened.panels.set("Pictures", "fast")
+    assert opened.session.view().settings.pictures == "fast"
+    opened.draw()
+    assert opened.panels.field("Pictures").value == "fast"
+    opened.panels.set("Pictures", "auto")
 
 
 def test_a_step_moves_the_robots_and_fills_the_numbers(opened: Opened) -> None:
@@ -122,7 +129,7 @@ def test_while_steps_go_on_a_press_is_shown_at_once_and_the_robots_move_with_eve
         assert (hand.batched_positions != before).any()
     session.change(selected_env=1)
     opened.page.redraw()
-    assert opened.panels.control("Selected").value == 1
+    assert opened.panels.field("Selected").value == 1
     session.pause()
     opened.page.redraw()
     assert opened.panels.part("Run").shows("Play")
@@ -158,12 +165,12 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
 
 def test_one_env_alone_is_one_instance_of_each_shape(opened: Opened) -> None:
     opened.load()
-    opened.panels.command("Show all envs or the selected one")
+    opened.panels.do(ToggleOnlySelected())
     opened.draw()
     hand = opened.panels.bodies("panda_hand")[0]
     assert hand.batched_positions.shape == (1, 3)
     assert opened.panels.labels() == []
-    opened.panels.command("Show all envs or the selected one")
+    opened.panels.do(ToggleOnlySelected())
     opened.draw()
     assert all(len(h.batched_positions) == 3 for h in opened.panels.bodies("panda_hand"))
 

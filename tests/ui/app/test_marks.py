@@ -8,6 +8,7 @@ from typing import Any, cast
 from tests.drive.panels import Panels
 from tests.ui.env_rows import rows_of
 from tests.ui.scenes import running
+from workbench.commands.envs import ShowFirstFlagged
 from workbench.core.capture.outliers import Outlier, OutlierKind
 from workbench.session.history.env_table import EnvRows
 from workbench.session.process.job_lane import JobProgress
@@ -27,16 +28,14 @@ class OneTable:
         raise AssertionError("nothing is recorded")
 
 
-def marks(panels: Panels, rows: EnvRows, went: list[str]) -> Marks:
-    tabs = OpenTabs(panels.server, "push")
-    return Marks(panels.server, cast(Any, OneTable(rows)), tabs, lambda: went.append("first"))
+def marks(panels: Panels, rows: EnvRows) -> Marks:
+    return Marks(panels.server, cast(Any, OneTable(rows)), OpenTabs(panels.visitors))
 
 
 def test_flagged_envs_are_in_sight_and_a_press_leads_to_the_first(panels: Panels) -> None:
     """A reward that was NaN in most envs left a green "running"."""
     lost = Outlier(OutlierKind.REWARD_NOT_FINITE, 3, "the reward is <b>NaN</b>")
-    rows, went = rows_of(outliers={4: (lost,), 2: (lost,)}), list[str]()
-    row = marks(panels, rows, went)
+    row = marks(panels, rows_of(outliers={4: (lost,), 2: (lost,)}))
     row.draw(running(6))
     (standing,) = (html for html in panels.htmls() if "wb-sight-flagged" in html.content)
     content = standing.content
@@ -46,12 +45,11 @@ def test_flagged_envs_are_in_sight_and_a_press_leads_to_the_first(panels: Panels
     )
     row.draw(running(6, steps_per_second=21.0))
     assert standing.content is content, "it stays under the finger that presses"
-    panels.press("flagged")
-    assert went == ["first"]
+    assert panels.presses(ShowFirstFlagged())
 
 
 def test_what_is_saved_of_the_past_is_in_sight_until_it_is_saved(panels: Panels) -> None:
-    row, view = marks(panels, rows_of(outliers={}), []), running(6)
+    row, view = marks(panels, rows_of(outliers={})), running(6)
     saves = SaveStatus(progress=JobProgress("replaying", 3, 20))
     saving = replace(view, recording=replace(view.recording, saving=saves))
     assert row.urgent(saving) != row.urgent(view)

@@ -37,6 +37,7 @@ class Desk:
     def __init__(self, place: Workplace, opened: list[tuple[TaskName, TaskOptions]], folder: Path) -> None:
         self.place, self.opened, self.folder = place, opened, folder
         self.panels = Panels(place.server)
+        self.panels.come_to(place.visitors)
         self.catalogue = place.open_task.catalogue
         self.catalogue.refresh()
         until(lambda: self.rows(Section.FOLDER), "the files of the folder")
@@ -106,6 +107,7 @@ def test_a_file_of_the_folder_opens_unasked_with_the_options_of_the_run(desk: De
     assert desk.place.home is session, "what is open is not opened again"
 
 
+@pytest.mark.thorough
 def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
     desk.choose("push.py")
     first = desk.session_of("push.py")
@@ -132,6 +134,7 @@ def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
     assert again.studio.placed_cameras() == (), "the way back is kept too"
 
 
+@pytest.mark.thorough
 def test_a_file_from_elsewhere_asks_once_and_a_no_leaves_all_as_it_is(desk: Desk) -> None:
     desk.choose("push.py")
     first = desk.session_of("push.py")
@@ -206,8 +209,8 @@ def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
 def test_a_new_task_is_written_where_the_workbench_was_started_and_opened(desk: Desk) -> None:
     for name in ("push", "../elsewhere/mine", "class"):
         with pytest.raises(ValueError):
-            desk.place.open_task.create(name, 0)
-    desk.place.open_task.create("stack_two", 1)
+            desk.place.open_task.create(name, "minimal")
+    desk.place.open_task.create("stack_two", "tabletop")
     desk.session_of("stack_two.py")
     assert "class StackTwoEnv" in (desk.folder / "work" / "stack_two.py").read_text()
     assert desk.row("stack_two.py").section is Section.FOLDER

@@ -102,6 +102,7 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
         place.close()
 
 
+@pytest.mark.slow
 def test_serving_the_pages_needs_no_simulator(child_process: None) -> None:
     said = subprocess.run(
         [sys.executable, "-c", "import sys, workbench.cli.page; print(*sys.modules)"],

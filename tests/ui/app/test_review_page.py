@@ -17,9 +17,17 @@ from tests.drive.panels import difference
 from tests.drive.reviewed import Reviewed, review_of
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
+from workbench.commands.review import (
+    AlignRecordings,
+    ChooseReviewCurve,
+    CompareWith,
+    SwapWithFirst,
+    ToggleOverlaid,
+)
+from workbench.commands.run import TogglePlay
+from workbench.commands.timeline import Seek
 from workbench.recording.episode.columns import TextEntry
-from workbench.ui.app.review_page import walk
-from workbench.ui.review.panel import GHOSTS, GO_LIVE, TRY_AGAIN
+from workbench.ui.review.panel import GHOSTS, GO_LIVE, GRID, TRY_AGAIN
 from workbench.ui.server.gated_server import GatedServer
 
 
@@ -40,6 +48,7 @@ def shown(child_process: None, folder: Path, gated_server: GatedServer) -> Itera
 SLIDER = "step of the timeline"
 
 
+@pytest.mark.slow
 def test_the_results_of_a_sweep_have_a_tab_also_if_they_come_later(
     child_process: None, gated_server: GatedServer, tmp_path: Path
 ) -> None:
@@ -111,7 +120,7 @@ def test_an_opened_recording_fills_every_part(shown: Reviewed) -> None:
     shown.seek(7)
     shown.draw()  # the Cameras tab has asked for its pictures meanwhile
     assert np.allclose(cube.batched_positions[:, 0], 0.07)
-    assert shown.control(SLIDER).max == 10 and shown.control(SLIDER).value == 7
+    assert shown.field(SLIDER).bounds == (0, 10) and shown.field(SLIDER).value == 7
     assert "step 7 / 10" in shown.html("wb-timeline") and "success" in shown.html("wb-timeline")
     assert "success" in shown.part("Curves").html("wb-numbers")
     assert shown.chart("reward")
@@ -123,14 +132,14 @@ def test_an_opened_recording_fills_every_part(shown: Reviewed) -> None:
 
 def test_two_recordings_are_compared_and_aligned(shown: Reviewed, monkeypatch: pytest.MonkeyPatch) -> None:
     shown.open(1, 2)
-    assert shown.control("Layout").value == GHOSTS and shown.shows("Layout")
+    assert shown.field("Layout").value == GHOSTS
     shown.seek(5)
     ghost = shown.bodies("cube")
     assert sorted(float(h.batched_positions[0, 0]) for h in ghost if h.visible) == pytest.approx([0.05, 0.15])
     assert "They diverge at step 1" in shown.part("Compare").html()
     assert "reward = 2" in shown.part("Compare").html()
     assert len(shown.chart("reward").series) == 4, "step, two lines and the dot"
-    shown.command("Overlaid or side by side")
+    shown.do(ToggleOverlaid())
     shown.draw()
     (cubes,) = shown.bodies("cube")
     assert len(cubes.batched_positions) == 2 and sorted(shown.labels()) == ["A, seed 1", "B"]
@@ -144,7 +153,29 @@ def test_two_recordings_are_compared_and_aligned(shown: Reviewed, monkeypatch: p
     shown.review.align("first success")
     shown.draw()
     assert "B has no success" in shown.part("Review").html()
-    assert shown.control(SLIDER).min == -7
+    bounds = shown.field(SLIDER).bounds
+    assert bounds is not None and bounds[0] == -7
+
+
+def test_what_a_person_chooses_for_several_is_shown_and_done(shown: Reviewed) -> None:
+    shown.open(1, 2)
+    chosen = {"Speed": "2 ×", "Loop": True, "Layout": GRID, "Align at": "first success", "Tolerance": "1 cm"}
+    for label, value in chosen.items():
+        shown.set(label, value)
+    shown.draw()
+    assert {label: shown.field(label).value for label in chosen} == chosen
+    view = shown.review.view()
+    assert (view.speed, view.loop, view.align) == (2.0, True, "first success")
+    assert shown.labels(), "side by side"
+    shown.press("Swap A and B")
+    assert [one.id for one in shown.review.view().opened] == [one.id for one in reversed(view.opened)]
+    shown.press("Play")
+    shown.draw()
+    assert shown.review.view().playing and shown.shows("Pause")
+    for command in (AlignRecordings(at="noon"), CompareWith(index=2), SwapWithFirst(index=2)):
+        shown.do(command)
+    shown.do(ChooseReviewCurve(curve="noon"))
+    assert len(shown.client.notices) == 4
 
 
 def test_what_could_not_be_read_is_tried_again_with_a_press(shown: Reviewed, folder: Path) -> None:
@@ -178,7 +209,7 @@ def strip_of(shown: Reviewed) -> dict[str, list[tuple[str, ...]]]:
     """What the strip draws: extents of recordings, marks, and upright lines, with their places in per cent."""
     html = shown.html("wb-timeline")
     extent = r'wb-length" style="left:([-\d.]+)%;width:([-\d.]+)%;background:(#\w+)"'
-    mark = r'wb-mark wb-mark-(\w+)" style="left:([-\d.]+)%" data-at="-?\d+" title="([^"]*)"'
+    mark = r'wb-mark wb-mark-(\w+)" style="left:([-\d.]+)%" data-do="[^"]*" title="([^"]*)"'
     return {
         "extents": re.findall(extent, html),
         "marks": re.findall(mark, html),
@@ -216,7 +247,7 @@ def test_the_strip_has_each_recording_where_it_is_aligned(shown: Reviewed) -> No
     html = shown.html("wb-timeline")
     assert ">B: step 0 / 6, 0.00 s<" in html and "(no state there)" in html
     assert "aligned at first success" in html and "stroke:#f08c00" in html
-    rows = re.findall(r"<tr data-press.*?</tr>", shown.part("Review").html("wb-opened-list"), re.DOTALL)
+    rows = re.findall(r"<tr data-do.*?</tr>", shown.part("Review").html("wb-opened-list"), re.DOTALL)
     assert len(rows) == 2 and "wb-selected" in rows[1] and "wb-selected" not in rows[0]
     assert "background:#f08c00" in rows[1] and ">B</span>" in rows[1] and "no success" in rows[1]
     status = shown.html("wb-status")
@@ -225,8 +256,8 @@ def test_the_strip_has_each_recording_where_it_is_aligned(shown: Reviewed) -> No
 
 def test_the_timeline_has_its_buttons_and_is_not_drawn_again_where_nothing_moved(shown: Reviewed) -> None:
     shown.open(1)
-    buttons = shown.control("step to take")
-    assert buttons.options == walk(playing=False) and "play" in buttons.options
+    buttons = shown.html("wb-tools")
+    assert ">play<" in buttons and shown.presses(TogglePlay())
     (strip,) = (html for html in shown.htmls() if "wb-timeline" in html.content)
     points = re.findall(r'<polyline points="([^"]*)"', strip.content)
     places = [float(point.partition(",")[0]) for line in points for point in line.split()]
@@ -238,15 +269,14 @@ def test_the_timeline_has_its_buttons_and_is_not_drawn_again_where_nothing_moved
     assert "step 3 / 10" in strip.content
     shown.review.toggle_play()
     shown.draw()
-    assert buttons.options == walk(playing=True) and "pause" in buttons.options
+    assert ">pause<" in shown.html("wb-tools")
     shown.review.toggle_play()
 
 
 def test_pressing_a_row_of_the_comparison_goes_there(shown: Reviewed) -> None:
     shown.open(1, 2)
-    assert re.search(r'data-press="[^"]+"', shown.part("Compare").html())
     shown.review.seek(9)
-    shown.part("Compare").press("0")
+    shown.part("Compare").ask(Seek(step=1))
     assert shown.review.view().position == 1
 
 
@@ -277,7 +307,7 @@ def test_what_is_not_per_env_is_shown_marked_and_drawn(shown: Reviewed, folder: 
         "wb-numbers"
     )
     line = "progress: all (not per env)"
-    assert {line, "reward (evaluate)"} <= set(shown.control("Also").options)
+    assert {line, "reward (evaluate)"} <= set(shown.field("Also").options)
     shown.set("Also", line)
     shown.seek(4)
     np.testing.assert_array_equal(shown.chart(line).data[1], np.linspace(0, 1, 5))

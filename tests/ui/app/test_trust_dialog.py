@@ -11,8 +11,11 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
+from workbench.commands.command import Command
+from workbench.commands.page import AnswerTrust
 from workbench.session.clearance import CodeFile, Consent, Since, TrustQuestion
 from workbench.ui.app.trust_dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
+from workbench.ui.widgets.visitors import Visitor
 
 PUSH = CodeFile("/home/me/push.py", "0123456789ab", "import helper\n")
 HELPER = CodeFile("helper.py", "ba9876543210", "A = 1\n")
@@ -38,7 +41,14 @@ def window_with(panels: Panels, text: str) -> None:
 
 @pytest.fixture
 def dialog(panels: Panels) -> TrustDialog:
-    return TrustDialog(panels.server)
+    dialog = TrustDialog(panels.server)
+
+    def do(command: Command, visitor: Visitor) -> None:
+        assert isinstance(command, AnswerTrust)
+        dialog.answer(command)
+
+    panels.visitors.do = do
+    return dialog
 
 
 @pytest.mark.parametrize(
@@ -52,7 +62,6 @@ def test_a_press_is_the_answer_and_the_window_goes(
     panels.press(label)
     assert future.result(20) is answer
     assert not panels.shows(label) and panels.html() == ""
-    assert panels.commands() == [], "Escape is free again"
 
 
 def test_only_the_first_answer_counts_and_none_comes_before_its_question(
@@ -60,16 +69,27 @@ def test_only_the_first_answer_counts_and_none_comes_before_its_question(
 ) -> None:
     future = asked(dialog)
     window_with(panels, "/home/me/push.py")
-    refuse, allow, allow_again = (panels.press_late(label) for label in (DO_NOT, ALWAYS, ALWAYS))
-    refuse()
-    allow()
+    refuse, allow = (panels.button(label).command for label in (DO_NOT, ALWAYS))
+    assert refuse is not None and allow is not None
+    panels.do(refuse)
+    panels.do(allow)
     assert future.result(20) is Consent.NO
+    panels.do(allow)
     second = asked(dialog, about("/home/me/other.py"))
     window_with(panels, "/home/me/other.py")
-    allow_again()
-    assert not second.done()
+    panels.do(allow)
+    assert not second.done() and len(panels.client.notices) == 3
     panels.press(DO_NOT)
-    assert second.result(20) is Consent.NO
+    assert second.result(20) is Consent.NO and len(panels.client.notices) == 3
+
+
+def test_enter_in_a_window_that_opens_runs_nothing(dialog: TrustDialog, panels: Panels) -> None:
+    future = asked(dialog, replace(PLAIN, more=2))
+    window_with(panels, "/home/me/push.py")
+    others = "Don't run the other 2 either"
+    assert [one.text for one in panels.buttons()] == [DO_NOT, others, ONCE, ALWAYS], "the first has the focus"
+    panels.press(others)
+    assert future.result(20) is Consent.NONE
 
 
 def test_questions_come_one_after_the_other(dialog: TrustDialog, panels: Panels) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from tests.drive.panels import Panels
-from tests.drive.waiting import until
 from tests.ui.scenes import camera
+from workbench.commands.cameras import ChooseShader
 from workbench.core.camera_data import CameraSettings, differences
 from workbench.core.cameras.conventions import (
     LookAt,
@@ -27,6 +27,8 @@ from workbench.core.cameras.conventions import (
 from workbench.session.live.session import Session
 from workbench.ui.cameras.fields import AXES, FOV, INTRINSIC, RPY, WXYZ, CameraNumbers
 from workbench.ui.cameras.pose_math import Placing
+
+pytestmark = pytest.mark.thorough
 
 EYE, TARGET = (0.45123456, 0.0, 0.61), (0.08, 0.0, 0.2)
 LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0123456, None, 128, 96, 0.0123456, 10.0, "minimal")
@@ -50,17 +52,14 @@ class Desk:
     def draw(self) -> None:
         self.numbers.draw(self.session.view().studio.placeable)
 
-    def types(self, label: str, value: object) -> CameraSettings:
-        """Type it, and wait until it is taken."""
+    def types(self, label: str, value: object, at: int = 0) -> CameraSettings:
+        """Type it, or choose it; `at` is the place in a row."""
         self.draw()
-        before = self.session.view().studio.serial
-        self.panels.set(label, value)
-
-        def taken() -> bool:
-            self.draw()
-            return self.session.view().studio.serial > before or bool(self.panels.client.notices)
-
-        until(taken, f"{label} being taken")
+        if isinstance(value, str):
+            self.panels.set(label, value)
+        else:
+            self.panels.type(label, value, at)
+        self.draw()
         return self.now
 
 
@@ -70,13 +69,14 @@ def desk(scripted_session: Callable[..., Session], panels: Panels, request: pyte
     session, two_handles = scripted_session(1, camera=info), [False]
     session.studio.select(info.key)
     numbers = CameraNumbers(panels.server, Placing(session), look_at=lambda: two_handles[0])
+    panels.visitors.do = numbers.do
     desk = Desk(session, numbers, panels, two_handles)
     desk.draw()
     return desk
 
 
 def shown(desk: Desk, label: str) -> Any:
-    return desk.panels.control(label).value
+    return desk.panels.field(label).value
 
 
 with_a_fov, with_a_matrix = (
@@ -105,7 +105,7 @@ def test_all_is_shown_as_it_is_and_of_the_lens_and_the_orientation_one_way_to_sa
         "Degrees": pytest.approx((0.0, 47.84, 180.0)),
         "Vertical fov": 58.0,
         "Radians": 1.0123,
-        "Width, height": (128.0, 96.0),
+        "Width, height": (128, 96),
         "Near, far": (0.0123, 10.0),
     }
     assert shown(desk, "Lens as") == FOV and shown(desk, "Shader") == "minimal"
@@ -128,18 +128,21 @@ def test_all_is_shown_as_it_is_and_of_the_lens_and_the_orientation_one_way_to_sa
 
 @with_a_fov
 def test_what_is_typed_is_taken_and_what_is_shown_beside_it_stays_to_the_last_digit(desk: Desk) -> None:
-    now = desk.types("Position", (0.4512, 0.1, 0.61))
+    now = desk.types("Position", 0.1, at=1)
     assert now == replace(FILE, position=(EYE[0], 0.1, EYE[2]))
     assert now.distance == FILE.distance, "what it looks at goes along"
-    now = desk.types("Looks at", (0.0, 0.1, 0.3))
+    desk.types("Looks at", 0.0)
+    desk.types("Looks at", 0.1, at=1)
+    now = desk.types("Looks at", 0.3, at=2)
     assert now.position == (EYE[0], 0.1, EYE[2])
     np.testing.assert_allclose(target_of(now), (0.0, 0.1, 0.3), atol=1e-9)
     turned = rpy_of(now.quaternion)
-    now = desk.types("Degrees", (round(turned[0], 2), round(turned[1], 2), 90.0))
+    now = desk.types("Degrees", 90.0, at=2)
     np.testing.assert_allclose(rpy_of(now.quaternion), (*turned[:2], 90.0), atol=1e-9)
-    now = desk.types("Width, height", (64.0, 48.0))
+    desk.types("Width, height", 64)
+    now = desk.types("Width, height", 48, at=1)
     assert (now.width, now.height, now.fov) == (64, 48, FILE.fov)
-    assert desk.types("Near, far", (0.0123, 5.0)).near == FILE.near and desk.now.far == 5.0
+    assert desk.types("Near, far", 5.0, at=1).near == FILE.near and desk.now.far == 5.0
     assert desk.types("Vertical fov", 90.0).fov == pytest.approx(math.pi / 2)
     assert desk.types("Radians", 1.1).fov == 1.1
     assert desk.types("Shader", "default").shader_pack == "default"
@@ -147,17 +150,30 @@ def test_what_is_typed_is_taken_and_what_is_shown_beside_it_stays_to_the_last_di
 
 
 @with_a_fov
+def test_an_eye_that_is_typed_alone_keeps_looking_at_its_target(desk: Desk) -> None:
+    desk.two_handles[0] = True
+    now = desk.types("Eye", 0.7, at=2)
+    assert now.position == (EYE[0], EYE[1], 0.7) and not desk.panels.shows("Position")
+    np.testing.assert_allclose(target_of(now), TARGET, atol=1e-9)
+    now = desk.types("Target", 0.3)
+    np.testing.assert_allclose(target_of(now), (0.3, *TARGET[1:]), atol=1e-9)
+    assert desk.panels.field("Target").value == (0.3, 0.0, 0.2)
+
+
+@with_a_fov
 def test_an_orientation_is_typed_as_a_quaternion_or_by_its_axes(desk: Desk) -> None:
     desk.panels.set("Rotation", WXYZ)
     assert desk.types("w x y z", "[0.5, 0.5, 0.5, 0.5]").quaternion == (0.5, 0.5, 0.5, 0.5)
     desk.panels.set("Rotation", AXES)
-    desk.types("Forward", (0.0, 0.6, -0.8))
+    desk.types("Forward", -0.75, at=2)
     forward, _, up = axes_of(desk.now.quaternion)
-    np.testing.assert_allclose(forward, (0.0, 0.6, -0.8), atol=1e-9)
+    np.testing.assert_allclose(forward, (0.0, 0.8, -0.6), atol=1e-9)
     np.testing.assert_allclose(up, (1.0, 0.0, 0.0), atol=1e-9)
-    desk.types("Up", (0.0, 0.8, 0.6))
+    desk.types("Up", -1.0)
+    desk.types("Up", 0.6, at=1)
+    desk.types("Up", 0.0)
     forward, _, up = axes_of(desk.now.quaternion)
-    np.testing.assert_allclose([forward, up], [(0.0, 0.6, -0.8), (0.0, 0.8, 0.6)], atol=1e-9)
+    np.testing.assert_allclose([forward, up], [(0.0, 0.8, -0.6), (0.0, 0.6, 0.8)], atol=1e-9)
     desk.panels.set("Rotation", RPY)
     desk.draw()
     assert desk.panels.shows("Degrees")
@@ -167,11 +183,12 @@ def test_an_orientation_is_typed_as_a_quaternion_or_by_its_axes(desk: Desk) -> N
 def test_a_lens_that_is_a_matrix_is_typed_in_pixels_and_is_of_another_size_the_same_view(desk: Desk) -> None:
     assert shown(desk, "Lens as") == INTRINSIC and not desk.panels.shows("Vertical fov")
     assert shown(desk, "fx, fy") == (100.12, 90.0) and shown(desk, "cx, cy") == (64.0, 48.0)
-    now = desk.types("fx, fy", (100.12, 95.0))
+    now = desk.types("fx, fy", 95.0, at=1)
     assert now.intrinsic == ((100.123, 0.0, 64.0), (0.0, 95.0, 48.0), (0.0, 0.0, 1.0))
-    now = desk.types("cx, cy", (60.0, 48.0))
+    now = desk.types("cx, cy", 60.0)
     assert now.intrinsic == ((100.123, 0.0, 60.0), (0.0, 95.0, 48.0), (0.0, 0.0, 1.0))
-    now = desk.types("Width, height", (256.0, 192.0))
+    desk.types("Width, height", 256)
+    now = desk.types("Width, height", 192, at=1)
     assert now.intrinsic == matrix3(np.diag([2.0, 2.0, 1.0]) @ [(100.123, 0, 60), (0, 95, 48), (0, 0, 1)])
     now = desk.types("Lens as", FOV)
     assert now.intrinsic is None and now.fov == pytest.approx(2 * math.atan(48 / 95))
@@ -182,19 +199,34 @@ def test_a_lens_that_is_a_matrix_is_typed_in_pixels_and_is_of_another_size_the_s
 @pytest.mark.parametrize(
     ("label", "value", "why"),
     [
-        ("Near, far", (3.0, 2.0), "less than far"),
-        ("Width, height", (64.4, 48.0), "whole number"),
-        ("Width, height", (128.4, 96.0), "whole number"),
+        ("Near, far", 10.0, "less than far"),
+        ("Width, height", 64.4, "`int`"),
+        ("Width, height", 5000, "4096"),
+        ("Position", 1001.0, "1000"),
         ("w x y z", "1 0 0", "four numbers"),
         ("w x y z", "one 1 0 0 0", "four numbers"),
         ("w x y z", "0 0 0 0", "zeros"),
-        ("Looks at", EYE, "same point"),
-        ("Forward", (0.0, 0.0, 0.0), "no length"),
     ],
 )
 @with_a_fov
 def test_what_no_camera_has_is_refused_in_words(desk: Desk, label: str, value: Any, why: str) -> None:
-    desk.panels.set("Rotation", {"w x y z": WXYZ, "Forward": AXES}.get(label, RPY))
+    desk.panels.set("Rotation", WXYZ)
     now = desk.types(label, value)
     assert why in desk.panels.client.notices[0]
     assert not differences(FILE, now)
+
+
+@with_a_fov
+def test_a_target_at_the_eye_an_axis_of_no_length_and_an_unknown_shader_are_refused(desk: Desk) -> None:
+    desk.types("Looks at", EYE[0])
+    desk.types("Looks at", EYE[1], at=1)
+    desk.types("Looks at", EYE[2], at=2)
+    assert "same point" in desk.panels.client.notices[-1]
+    desk.panels.set("Rotation", WXYZ)
+    desk.types("w x y z", "1 0 0 0")
+    desk.panels.set("Rotation", AXES)
+    desk.types("Forward", 0.0)
+    assert "no length" in desk.panels.client.notices[-1]
+    desk.panels.do(ChooseShader(shader="none"))
+    assert "no shader pack 'none'" in desk.panels.client.notices[-1]
+    assert desk.now.quaternion == (1, 0, 0, 0) and len(desk.panels.client.notices) == 3

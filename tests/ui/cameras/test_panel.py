@@ -8,6 +8,7 @@ import numpy as np
 
 from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import camera, description, running, table_scene
+from workbench.commands.cameras import ShowPictures
 from workbench.core.camera_data import CameraInfo, Picture
 from workbench.session.live.view import ShownCameras
 from workbench.session.protocol.messages import CameraRequest
@@ -46,6 +47,7 @@ def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) ->
 def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:
     asked = RequestParts()
     panel = CamerasPanel(panels.server, asked, clock=clock)
+    panels.visitors.do = panel.do
     panel.draw(seen(1, (camera("base"), camera("hand"))))
     base = panels.part(BASE)
     base.set("depth", True)
@@ -53,7 +55,7 @@ def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: P
     clock.passes()
     panel.draw(seen(2, (camera("top"), replace(camera("base"), width=640))))
     assert panels.folders() == [TOP, BASE]
-    assert base.control("depth").value and base.images() == [image]
+    assert base.field("depth").value and base.images() == [image]
     assert "640 × 6" in base.html()
     assert asked.cameras == (
         CameraRequest("top", "sensor", ("rgb",)),
@@ -62,6 +64,29 @@ def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: P
     # What it can show is another choice of ticks.
     panel.draw(seen(3, (replace(camera("base"), modalities=("rgb",)),)))
     assert panels.folders() == [BASE] and not base.shows("depth") and base.images() != [image]
+
+
+def test_what_is_ticked_is_asked_for_and_stays_ticked_while_its_camera_is_gone(panels: Panels) -> None:
+    asked = RequestParts()
+    panel = CamerasPanel(panels.server, asked)
+    panels.visitors.do = panel.do
+    panel.draw(None)
+    assert not panels.shows("Show in 3D view")
+    panel.draw(seen(1, (camera("base"),)))
+    assert asked.cameras == (CameraRequest("base", "sensor", ("rgb",)),)
+    base = panels.part(BASE)
+    base.set("rgb", False)
+    base.set("segmentation", True)
+    panels.set("Show in 3D view", False)
+    panel.draw(seen(1, (camera("base"),)))
+    assert asked.cameras == (CameraRequest("base", "sensor", ("segmentation",)),)
+    assert not base.field("rgb").value and not panels.field("Show in 3D view").value
+    assert not panel.show_frustums
+    panel.draw(seen(2, (camera("top"),)))
+    panel.draw(seen(3, (camera("base"),)))
+    assert asked.cameras == (CameraRequest("base", "sensor", ("segmentation",)),)
+    panels.do(ShowPictures(kind="sensor", name="base", modality="albedo", on=True))
+    assert panels.client.notices == ["No camera base gives albedo."]
 
 
 def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:

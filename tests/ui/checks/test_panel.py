@@ -12,6 +12,7 @@ from tests.drive.live import Live
 from tests.ui.scenes import running
 from workbench.authoring.problem import Problem
 from workbench.checks.results import HookTime, LineTime, RuleResult, StepProfile, failed
+from workbench.commands.checks import ShowSolved, ToggleRule, ToggleVerdict
 from workbench.core.rules import Finding
 from workbench.machine.kept_choices import kept_choices
 from workbench.planning.report import SolvedSeed, SolveReport
@@ -111,10 +112,10 @@ def test_why_and_the_rules_without_a_finding_are_folded_out_and_in_by_a_press(ch
     view = replace(DONE, results=(*RESULTS, *unknown))
     assert "<b>Why</b>" not in checks.draw(view)
     for key in ("success-at-reset", REST):
-        checks.live.press(f"fold {key}")
+        checks.live.ask(ToggleRule(rule=key))
     text = checks.again()
     assert "<b>Why</b>" in text and "it has no camera" in text and text.count(why) == 1
-    checks.live.press(f"fold {REST}")
+    checks.live.ask(ToggleRule(rule=REST))
     assert "it has no camera" not in checks.again() and "<b>Why</b>" in checks.again()
 
 
@@ -237,7 +238,7 @@ def test_seeds_are_solved_as_typed_and_stopped(checks: Checks) -> None:
     checks.draw(seeds=SeedsView("solving", 2, total=12, done=0.6, activity="seed 0 at step 30 of 50"))
     html = checks.live.html()
     assert "0 of 12 seeds" in html and "seed 0 at step 30 of 50" in html and "width: 5%" in html
-    assert not checks.live.shows(SOLVE, "button") and checks.live.control("Seeds", "field").disabled
+    assert not checks.live.shows(SOLVE, "button") and checks.live.field("Seeds").off
     checks.live.press(STOP_SOLVING)
     assert checks.live.asked == [("solve_seeds", 12), ("seeds_solver.stop",)]
     checks.draw(seeds=SeedsView("failed", 3, why="the task failed", total=12))
@@ -250,10 +251,10 @@ def test_each_seed_has_a_row_that_opens_its_recording_and_verdicts_are_cards(ser
     live.show(running(1, seeds=SEEDS))
     said = live.html()
     assert "1 of 2 seeds" in said and "earned &lt;0.9&gt; a step without success" in said and "21.5" in said
-    live.press("look 1")
+    live.ask(ShowSolved(seed=1))
     assert looked_at == [Path("/r/seed1.rrd")]
     assert 'data-rule="reward-exploited"' in said and "(seeds 1)" in said and "<b>Mend</b>" not in said
-    live.press("fold reward-exploited")
+    live.ask(ToggleVerdict(rule="reward-exploited"))
     live.again()
     assert "<b>Mend</b>" in live.html()
     third = replace(REPORT.seeds[0], seed=2)

@@ -1,4 +1,4 @@
-"""The table's HTML and what its hidden buttons do, on real files without a browser."""
+"""The table's HTML and what its rows and pills do, on real files without a browser."""
 
 from __future__ import annotations
 
@@ -7,17 +7,38 @@ import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
 from tests.drive.panels import Clock, Panels, told_so_far
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
+from workbench.commands.command import Command
+from workbench.commands.library import (
+    AlsoPreviousRow,
+    ClearRowFilter,
+    DeleteSelected,
+    FilterRows,
+    NextRow,
+    NextRows,
+    NoteSelected,
+    OpenRow,
+    OpenSelected,
+    PressRow,
+    RescoreSelected,
+    SelectAllRows,
+    SelectNoRows,
+    SortRows,
+    TagSelected,
+    UndoDelete,
+)
+from workbench.commands.page import AnswerDialog, CloseDialog
 from workbench.recording.library.library import Library
-from workbench.ui.library.listing import MOST_ROWS, RANGE, TOGGLE, Action
-from workbench.ui.library.panel import OPEN, LibraryPanel
-from workbench.ui.widgets.click_targets import NUMBERS
-from workbench.ui.widgets.hotkeys import register
+from workbench.ui.library.listing import MOST_ROWS, Action
+from workbench.ui.library.panel import LibraryPanel
+from workbench.ui.library.rows import OpenVersion
+from workbench.ui.widgets.visitors import Visitor
 
 COUNT = MOST_ROWS + 5
 
@@ -56,22 +77,22 @@ class Table:
 
     def __init__(self, panel: LibraryPanel, panels: Panels, clock: Clock) -> None:
         self.panel, self.panels, self.clock = panel, panels, clock
-        self.presses = 0
 
     def draw(self) -> None:
         self.clock.passes()
         self.panel.draw()
 
-    def press(self, key: str) -> None:
-        self.panels.press(f"library {key}")
+    def ask(self, command: Command) -> None:
+        """Press the part of the table that does this."""
+        self.panels.ask(command)
         self.draw()
 
-    def command(self, label: str) -> None:
-        self.panels.command(label)
+    def key(self, command: Command) -> None:
+        self.panels.do(command)
         self.draw()
 
     def look_for(self, words: str) -> None:
-        self.panels.set("Find", words)
+        self.panels.type("Find", words)
         self.draw()
 
     def numbers(self) -> dict[str, int]:
@@ -81,14 +102,9 @@ class Table:
         )
         return {re.sub(r"^r(?=\d)", "id", name): int(number) for number, name in rows}
 
-    def send_row(self, sent: int) -> None:
-        """As `choosable.html` writes it: with a running part, since the same number says nothing."""
-        self.presses += 1
-        self.panels.set("rows", NUMBERS * self.presses + sent)
-        self.draw()
-
-    def press_row(self, id: str, held: int = 0) -> None:
-        self.send_row(self.numbers()[id] * 8 + held)
+    def press_row(self, id: str, held: Literal["", "ctrl", "shift", "ctrl+shift"] = "") -> None:
+        assert self.panels.presses(PressRow(id=id))
+        self.key(PressRow(id=id, held=held))
 
     def shown(self) -> list[str]:
         return list(self.numbers())
@@ -104,15 +120,17 @@ class Table:
 
 @pytest.fixture
 def table(panels: Panels, library: Library, told: Told, clock: Clock) -> Table:
-    panel = LibraryPanel(panels.server, library, told.opened.append, clock)
-    register(panels.server, panel.commands())
+    panel = LibraryPanel(panels.server, library, told.opened.append)
+
+    def do(command: Command, visitor: Visitor) -> None:
+        if isinstance(command, CloseDialog):
+            panel.close()
+        else:
+            panel.do(command, visitor)
+
+    panels.visitors.do = do
     panel.draw()
     return Table(panel, panels, clock)
-
-
-NEXT = "Next recording in the table"
-DELETE = "Delete the selected recordings"
-ESCAPE = "Cancel, or show all recordings again"
 
 
 def newest(first: int, last: int) -> list[str]:
@@ -121,13 +139,13 @@ def newest(first: int, last: int) -> list[str]:
 
 def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
     assert table.shown() == newest(0, MOST_ROWS)
-    table.press("on")
+    table.ask(NextRows())
     assert table.shown() == newest(MOST_ROWS, COUNT)
-    table.press("sort seed")
+    table.ask(SortRows(column="seed"))
     assert table.shown()[:3] == ["id00", "id01", "id02"]
-    table.press("sort seed")
+    table.ask(SortRows(column="seed"))
     assert table.shown()[0] == newest(0, 1)[0]
-    table.press("outcome no success")
+    table.ask(FilterRows(outcome="no success"))
     assert len(table.shown()) == COUNT // 2 and table.shown()[0] == "id53"
     table.look_for("seed:7")
     assert table.shown() == ["id07"]
@@ -135,27 +153,70 @@ def test_pages_sorting_and_filters_are_pressed(table: Table) -> None:
     assert table.shown() == [] and "nothing has this" in table.panels.html("wb-library")
 
 
+def test_rows_of_another_version_than_the_open_one_are_marked_as_soon_as_it_is_another(
+    panels: Panels, library: Library, clock: Clock
+) -> None:
+    (recorded,) = {(row.task, row.source_hash) for row in library.view().rows}
+    open_version = OpenVersion(*recorded)
+    panel = LibraryPanel(panels.server, library, lambda ids: None, lambda: open_version)
+    panel.draw()
+    assert "another version" not in panels.html("wb-library")
+    open_version = OpenVersion(recorded[0], "edited")
+    clock.passes()
+    panel.draw()
+    assert panels.html("wb-library").count("another version") == MOST_ROWS
+
+
 def test_another_search_filter_or_order_begins_on_the_first_page(table: Table) -> None:
     for arrange in (
         lambda: table.look_for("r"),  # all of them have it
         lambda: table.look_for(""),
-        lambda: table.press("outcome all"),
-        lambda: table.press("sort seed"),
-        lambda: table.press("sort seed"),
+        lambda: table.ask(FilterRows(outcome="all")),
+        lambda: table.ask(SortRows(column="seed")),
+        lambda: table.ask(SortRows(column="seed")),
     ):
-        table.press("on")
+        table.ask(NextRows())
         assert len(table.shown()) == COUNT - MOST_ROWS
         arrange()
         assert len(table.shown()) == MOST_ROWS
 
 
+def test_the_recordings_of_one_task_are_listed_until_it_has_none_or_all_are_wanted_again(
+    table: Table, library: Library, tmp_path: Path
+) -> None:
+    assert not table.panels.shows("Task")
+    for name in ("z0", "z1"):
+        describe(tmp_path, name, id=name, task=f"Other-{name}", written_at="2026-11-21T11:00:00")
+    library.refresh()
+    table.draw()
+    (first,) = {row.task for row in library.view().rows} - {"Other-z0", "Other-z1"}
+    assert table.panels.field("Task").options == {
+        "all tasks": None,
+        first: first,
+        "Other-z0": "Other-z0",
+        "Other-z1": "Other-z1",
+    }
+    table.panels.set("Task", "Other-z0")
+    table.draw()
+    assert table.shown() == ["z0"] and table.panels.field("Task").value == "Other-z0"
+    library.delete(["z0"])
+    table.draw()
+    table.draw()
+    assert table.shown()[0] == "z1" and table.panels.field("Task").value == "all tasks"
+    table.panels.set("Task", "Other-z1")
+    table.draw()
+    assert table.shown() == ["z1"]
+    table.key(ClearRowFilter())
+    assert len(table.shown()) == MOST_ROWS and table.panels.field("Task").value == "all tasks"
+
+
 def test_all_selects_what_is_listed_and_leaves_the_filter(table: Table) -> None:
-    table.press("outcome no success")
+    table.ask(FilterRows(outcome="no success"))
     failed = table.shown()
     table.press_row(failed[0])
-    table.press("select all")
+    table.ask(SelectAllRows())
     assert table.shown() == failed and len(table.selected()) == COUNT // 2
-    table.press("select none")
+    table.ask(SelectNoRows())
     assert table.selected() == () and table.shown() == failed
 
 
@@ -168,7 +229,7 @@ def test_what_cannot_be_read_is_not_opened_and_says_why(
     table.draw()
     (damaged,) = (row for row in library.view().rows if row.problem)
     table.panel.select([damaged.id])
-    table.command("Open the selected recordings")
+    table.key(OpenSelected())
     assert told.opened == []
 
 
@@ -182,7 +243,7 @@ def test_of_a_damaged_recording_what_is_left_is_opened(
     table.draw()
     (damaged,) = (row for row in library.view().rows if row.problem)
     table.panel.select([damaged.id])
-    table.command("Open the selected recordings")
+    table.key(OpenSelected())
     assert told.opened == [(damaged.id,)]
 
 
@@ -190,71 +251,69 @@ def test_rows_are_selected_as_in_a_list_of_files(table: Table, told: Told) -> No
     ids = newest(0, 9)
     table.press_row(ids[2])
     assert table.selected() == (ids[2],) and table.marked() == [ids[2]]
-    table.press_row(ids[5], RANGE)
+    table.press_row(ids[5], "shift")
     assert table.selected() == tuple(ids[2:6]) == tuple(table.marked())
-    table.press_row(ids[3], TOGGLE)
-    table.press_row(ids[8], TOGGLE)
+    table.press_row(ids[3], "ctrl")
+    table.press_row(ids[8], "ctrl")
     assert table.selected() == (ids[2], ids[4], ids[5], ids[8])
-    table.press_row(ids[6], TOGGLE | RANGE)
+    table.press_row(ids[6], "ctrl+shift")
     assert table.selected() == (ids[2], *ids[4:9])
     table.press_row(ids[0])
     assert table.selected() == (ids[0],)
-    table.press_row(ids[1], OPEN)
+    table.ask(OpenRow(id=ids[1]))
     assert told.opened == [(ids[1],)] and table.selected() == (ids[1],)
 
 
 def test_keys_walk_over_the_pages(table: Table) -> None:
-    table.command(NEXT)
+    table.key(NextRow())
     assert table.selected() == (newest(0, 1)[0],)
     for _ in range(MOST_ROWS):
-        table.command(NEXT)
+        table.key(NextRow())
     table.draw()
     assert table.selected() == tuple(newest(MOST_ROWS, MOST_ROWS + 1))
     assert table.shown() == newest(MOST_ROWS, COUNT) and "wb.follow" in table.panels.html("<style")
-    table.command("Also select the previous recording")
-    table.command("Also select the previous recording")
+    table.key(AlsoPreviousRow())
+    table.key(AlsoPreviousRow())
     assert table.selected() == tuple(newest(MOST_ROWS - 2, MOST_ROWS + 1))
 
 
 def test_what_is_no_longer_listed_is_no_longer_selected(table: Table, library: Library, told: Told) -> None:
-    table.command("Select all listed recordings")
+    table.key(SelectAllRows())
     assert len(table.selected()) == COUNT
-    table.press("outcome success")
+    table.ask(FilterRows(outcome="success"))
     assert len(table.selected()) == (COUNT + 1) // 2
     library.delete(table.selected()[:3])
     table.draw()
     assert len(table.selected()) == (COUNT + 1) // 2 - 3
 
 
-def test_a_press_on_a_row_that_has_moved_selects_that_row_and_made_up_numbers_select_nothing(
+def test_a_press_on_a_row_that_has_moved_selects_that_row_and_one_that_is_gone_selects_nothing(
     table: Table, library: Library, tmp_path: Path
 ) -> None:
     wanted = newest(3, 4)[0]
-    number = table.numbers()[wanted]
     describe(tmp_path, "new", id="new", written_at="2026-11-21T11:00:00")
     library.refresh()
     table.draw()
     assert table.shown()[0] == "new"
-    table.send_row(number * 8)
+    table.key(PressRow(id=wanted))
     assert table.selected() == (wanted,)
-    for made_up in (0, 7, 10**7, (COUNT + 2) * 8):
-        table.send_row(made_up)
+    table.key(PressRow(id="nothing has this"))
     assert table.selected() == (wanted,)
 
 
 def test_buttons_are_there_for_as_many_as_they_take(table: Table, told: Told) -> None:
     rescored: list[tuple[str, ...]] = []
-    table.panel.add_action(Action("Rescore", "With today's code", rescored.append))
+    table.panel.add_action(Action("Rescore", RescoreSelected(), "With today's code", rescored.append))
     table.draw()
     assert table.panels.html("wb-pill").count("wb-off") >= 5
     ids = newest(0, 5)
     table.press_row(ids[0])
-    table.press_row(ids[4], RANGE)
+    table.press_row(ids[4], "shift")
     assert '<span class="wb-pill wb-off" title="At most 4 at once">Open' in table.panels.html("wb-pill")
-    table.press("action 4")
+    table.ask(RescoreSelected())
     assert rescored == [tuple(ids)]
-    table.press_row(ids[4], TOGGLE)
-    table.press("action 0")
+    table.press_row(ids[4], "ctrl")
+    table.ask(OpenSelected())
     assert told.opened == [tuple(ids[:4])]
 
 
@@ -266,31 +325,29 @@ def test_tags_note_and_deletion_are_asked_for_and_done(
     library.set_tags([second], add=["both"])
     table.draw()
     table.press_row(first)
-    table.press_row(second, RANGE)
-    table.press("action 1")
-    assert not any(map(table.panels.takes, (NEXT, DELETE))) and table.panels.takes(ESCAPE)
-    table.panels.set("", "good, new <b>")
-    table.panels.press("Save")
-    assert all(map(table.panels.takes, (NEXT, DELETE))) and not table.panels.takes(ESCAPE)
+    table.press_row(second, "shift")
+    table.ask(TagSelected())
+    table.panels.type("", "good, new <b>")
+    table.panels.ask(AnswerDialog())
     assert [library.row(id).tags for id in (first, second)] == [  # type: ignore[union-attr]
         ("mine", "good", "new <b>"),
         ("good", "new <b>"),
     ]
     table.draw()
     assert "new &lt;b&gt;" in table.panels.html("wb-library") and "<b>" not in table.panels.html("wb-library")
-    table.press("action 2")
-    table.panels.set("", "look again")
-    table.panels.press("Save")
+    table.ask(NoteSelected())
+    table.panels.type("", "look again")
+    table.panels.ask(AnswerDialog())
     assert json.loads((tmp_path / f"r{second[2:]}.json").read_text())["workbench"]["note"] == "look again"
-    table.press("action 3")
+    table.ask(DeleteSelected())
     table.panels.press("Cancel")
     assert len(library.view().rows) == COUNT
-    table.press("action 3")
-    table.panels.press("Delete")
+    table.ask(DeleteSelected())
+    table.panels.ask(AnswerDialog())
     table.draw()
     assert len(library.view().rows) == COUNT - 2 and table.selected() == ()
     assert "In the trash: 6 files" in table.panels.html()
-    table.press("undo")
+    table.ask(UndoDelete())
     assert len(library.view().rows) == COUNT and "In the trash" not in table.panels.html()
 
 

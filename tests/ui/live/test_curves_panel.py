@@ -10,6 +10,8 @@ import pytest
 
 from tests.drive.live import Live
 from tests.ui.scenes import running, step_of
+from workbench.commands.run import ToggleCurve
+from workbench.commands.timeline import SeekOnCurve
 from workbench.core.env.step_result import StepResult
 from workbench.session.history.curves import Curves, Group, StepCurves
 from workbench.session.live.timeline import TimelineView
@@ -62,6 +64,7 @@ def test_selected_env_against_the_mean(live: Live) -> None:
     assert [series.get("label") for series in chart.series] == ["step", "mean of the batch", "env 2"]
 
 
+@pytest.mark.thorough
 def test_all_steps_are_sent_in_few_points(live: Live) -> None:
     live.show(seen(3000, 2))
     for chart in live.part("Reward").charts():
@@ -77,6 +80,7 @@ def test_other_env_shows_its_own_past(live: Live) -> None:
     assert chart.series[2].get("label") == "env 3"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("length", [50, 3000])
 def test_a_moment_that_is_shown_is_a_dot_on_the_selected_envs_line(live: Live, length: int) -> None:
     live.show(seen(length, 4, env=3, past=17))
@@ -112,8 +116,8 @@ def test_any_entry_and_joint_can_be_chosen_and_the_choice_is_kept_for_the_task(l
     view = seen(3, 2, env=1, **entries)
     live.show(view)
     for entry in ((Group.EVALUATE, "height"), (Group.EVALUATE, "at"), (Group.JOINT, "slide")):
-        live.part("Reward").press(f"{entry[0].value} {entry[1]}")
-    live.part("Reward").press("evaluate success")
+        live.part("Reward").ask(ToggleCurve(group=entry[0].value, name=entry[1]))
+    live.part("Reward").ask(ToggleCurve(group="evaluate", name="success"))
     live.show(view)
     assert [chart.title for chart in live.part("Reward").charts()] == [
         "reward",
@@ -140,14 +144,14 @@ def test_any_entry_and_joint_can_be_chosen_and_the_choice_is_kept_for_the_task(l
 def test_a_click_on_a_curve_asks_for_its_step_and_one_that_is_forgotten_is_named(live: Live) -> None:
     view = seen(50, 2)
     live.show(view)
-    live.part("Reward").set("step of a curve", 7 + 10**8 * 3)
+    live.do(SeekOnCurve(step=7))
     assert live.asked == [("past.seek_tick", 7)]
     kept = TimelineView(30, 50, 30, tick=31)
     live.show(replace(view, timeline=kept))
     assert (
         "Step 7 is no longer in memory: the oldest that is, step 31, is shown" in live.part("Reward").html()
     )
-    live.part("Reward").set("step of a curve", 40)
+    live.do(SeekOnCurve(step=40))
     live.show(replace(view, timeline=replace(kept, shown=39, tick=40)))
     assert "no longer in memory" not in live.part("Reward").html()
 

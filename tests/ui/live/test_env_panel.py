@@ -11,11 +11,22 @@ import pytest
 from tests.drive.live import Live
 from tests.ui.env_rows import FELL, rows_of
 from tests.ui.scenes import running
+from workbench.commands.command import Command
+from workbench.commands.envs import (
+    FilterEnvs,
+    NextFailedEnv,
+    NextFlaggedEnv,
+    ShowEnvAtEvent,
+    SortEnvs,
+    TurnEnvs,
+)
+from workbench.commands.page import ToggleTable
 from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
 from workbench.ui.live.env_panel import MOST_ROWS
 
+pytestmark = pytest.mark.thorough
+
 MANY = MOST_ROWS + 6
-TABLE = "Open or close the table of envs"
 
 
 def many(**changes: Any) -> EnvRows:
@@ -57,8 +68,8 @@ class Table:
     def html(self) -> str:
         return self.live.part("Envs").html()
 
-    def press(self, name: str) -> list[int]:
-        self.live.part("Envs").press(name)
+    def ask(self, command: Command) -> list[int]:
+        self.live.part("Envs").ask(command)
         self.live.again(0.1)  # two frames
         return self.envs()
 
@@ -67,37 +78,37 @@ class Table:
 def table(live_page: Live) -> Table:
     table = Table(live_page)
     table.show()
-    live_page.command(TABLE)
+    live_page.do(ToggleTable())
     table.show()
     return table
 
 
 def test_pages_filters_and_rows_are_pressed(table: Table) -> None:
     assert table.envs() == list(range(MOST_ROWS))
-    assert table.press("on") == list(range(MOST_ROWS, MANY))
-    table.press(f"env {MANY - 3}")
+    assert table.ask(TurnEnvs(by=1)) == list(range(MOST_ROWS, MANY))
+    table.ask(ShowEnvAtEvent(env=MANY - 3))
     assert table.live.asked == [("change", {"selected_env": MANY - 3})], "there is no moment to go to"
-    table.press(f"env {MANY - 1}")
+    table.ask(ShowEnvAtEvent(env=MANY - 1))
     assert table.live.asked[1:] == [("change", {"selected_env": MANY - 1}), ("past.seek_step", MANY - 1, 12)]
-    table.live.claim(
-        "on", True, "button"
-    )  # it is pressed on a page that was drawn before the last one was shown
+    table.live.do(TurnEnvs(by=1))  # it is pressed on a page that was drawn before the last one was shown
     table.live.again()
     assert table.envs() == list(range(MOST_ROWS, MANY))
-    assert table.press("filter flagged") == [MANY - 2, MANY - 1]
+    assert table.ask(FilterEnvs(which="flagged")) == [MANY - 2, MANY - 1]
     assert "&lt;b&gt;odd" in table.html and "<b>odd" not in table.html
 
 
 def test_another_filter_and_another_order_begin_on_the_first_page(table: Table) -> None:
-    table.press("on")
-    assert table.press("filter running") == list(range(MOST_ROWS))
-    assert table.press("filter failed") == list(range(1, MANY, 2))
-    assert table.press("filter all") == list(range(MOST_ROWS))
-    table.press("on")
-    assert table.press("sort return") == list(range(MOST_ROWS))
-    table.press("on")
-    assert table.press("sort return") == list(range(MANY - 1, MANY - 1 - MOST_ROWS, -1))
-    assert table.press("sort env") == list(range(MOST_ROWS)), "another column begins with its smallest"
+    table.ask(TurnEnvs(by=1))
+    assert table.ask(FilterEnvs(which="running")) == list(range(MOST_ROWS))
+    assert table.ask(FilterEnvs(which="failed")) == list(range(1, MANY, 2))
+    assert table.ask(FilterEnvs(which="all")) == list(range(MOST_ROWS))
+    table.ask(TurnEnvs(by=1))
+    assert table.ask(SortEnvs(column="return")) == list(range(MOST_ROWS))
+    table.ask(TurnEnvs(by=1))
+    assert table.ask(SortEnvs(column="return")) == list(range(MANY - 1, MANY - 1 - MOST_ROWS, -1))
+    assert table.ask(SortEnvs(column="env")) == list(range(MOST_ROWS)), (
+        "another column begins with its smallest"
+    )
 
 
 def test_a_step_is_in_the_table_a_moment_later_and_a_press_at_once(table: Table) -> None:
@@ -109,7 +120,7 @@ def test_a_step_is_in_the_table_a_moment_later_and_a_press_at_once(table: Table)
     assert "wb-selected" in table.html and table.html != before
     before = table.html
     table.show(3, 0.0, env=3, rows=many(steps=np.full(MANY, 6, np.int32)))
-    table.press("sort return")
+    table.ask(SortEnvs(column="return"))
     assert table.html != before
 
 
@@ -120,30 +131,30 @@ def test_a_folded_table_is_not_drawn_while_steps_go_on(table: Table) -> None:
 
     shown = stepped(4)
     assert stepped(5) != shown
-    table.live.command(TABLE)
+    table.live.do(ToggleTable())
     folded = stepped(6)
     assert stepped(7) == folded
-    table.live.command(TABLE)
+    table.live.do(ToggleTable())
     assert stepped(7) != folded, "unfolded it shows what is now"
 
 
 def test_keys_go_round_the_envs_that_failed_and_that_are_flagged(table: Table) -> None:
-    def after(env: int, command: str) -> int:
+    def after(env: int, command: Command) -> int:
         table.live.asked.clear()
         table.show(env=env)
-        table.live.command(command)
+        table.live.do(command)
         return table.live.asked[0][1]["selected_env"]
 
-    assert [after(env, "Next env whose last episode failed") for env in (0, 1, MANY - 1)] == [1, 3, 1]
-    assert [after(env, "Next flagged env") for env in (0, MANY - 2, MANY - 1)] == [
+    assert [after(env, NextFailedEnv()) for env in (0, 1, MANY - 1)] == [1, 3, 1]
+    assert [after(env, NextFlaggedEnv()) for env in (0, MANY - 2, MANY - 1)] == [
         MANY - 2,
         MANY - 1,
         MANY - 2,
     ]
 
 
-def test_a_press_on_an_env_that_a_smaller_version_lacks_does_nothing(table: Table) -> None:
+def test_a_press_on_an_env_that_a_smaller_version_lacks_is_refused(table: Table) -> None:
     table.show()
     table.live.session.rows = rows_of()
-    table.live.part("Envs").press("env 40")
-    assert table.live.asked == []
+    table.live.part("Envs").ask(ShowEnvAtEvent(env=40))
+    assert table.live.asked == [] and "no env 40" in table.live.client.notices[-1]

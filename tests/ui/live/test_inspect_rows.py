@@ -132,3 +132,21 @@ def test_what_changed_since_the_reading_before_is_marked_of_the_same_env_alone(l
         changed(*one)
         for one in ((0, 1, 1.0), (0, 2, 2.0), (0, 3, 2.0), (1, 3, 5.0), (1, 4, 6.0), (0, 4, 9.0))
     ] == [0, 1, 0, 0, 1, 0]
+
+
+def test_only_what_is_chosen_is_read_and_contacts_for_the_arrows(live_page: Live) -> None:
+    def read() -> list[object]:
+        live_page.show(running(2, step_serial=len(asked)))
+        asked.extend(live_page.asked_by_drawing)
+        return [call[1] for call in live_page.asked_by_drawing if call[0] == "inspect"]
+
+    asked: list[object] = []
+    inspect = live_page.part("Inspect")
+    assert read() == [], "no page has opened the tab"
+    inspect.set("Force arrows", True)
+    assert read() == [("contacts",)]
+    inspect.set("Show", "state")
+    assert read() == [("state", "contacts")] and inspect.field("Force arrows").value is True
+    inspect.set("Force arrows", False)
+    inspect.set("Show", "nothing")
+    assert read() == []

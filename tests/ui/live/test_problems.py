@@ -11,12 +11,15 @@ import pytest
 
 from tests.drive.live import Live
 from tests.ui.scenes import EMPTY, PLAN, problem, running
+from workbench.commands.run import ChooseClass, FillEmptyFile
 from workbench.session.live.solver import SolveView
 from workbench.session.live.view import PastLoad, SessionView
 from workbench.session.process.heartbeat import Busy, busy_at
 from workbench.session.protocol.messages import ReloadReport
 from workbench.ui.live.banners import FILL, INTERRUPT, NEW_WORKER, REBUILD, RELOAD, RESTART, SHOWN_AFTER
 from workbench.ui.live.version_panel import MOST_SHOWN
+
+pytestmark = pytest.mark.thorough
 
 EVIL = "<img src=x onerror=alert(1)><script>alert(2)</script>\"'&"
 LOOP = Busy(6.4, "in evaluate", "/home/me/push.py", 88, "while True:", "Traceback ...")
@@ -119,6 +122,9 @@ def test_an_empty_file_is_filled_by_a_press_and_only_while_it_is_empty(live: Liv
     assert not live.shows(FILL), "it holds a task"
     live.show(replace(view, problem=replace(problem(), file=str(other)), problem_serial=3))
     assert not live.shows(FILL), "it is not the task's"
+    noticed = len(live.client.notices)
+    live.do(FillEmptyFile())
+    assert other.read_text() == "" and len(live.client.notices) == noticed + 1
 
 
 def test_what_takes_long_can_be_ended_and_stands_instead_of_a_problem(live: Live) -> None:
@@ -257,11 +263,24 @@ def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fail
     assert not live.part("Code version").shows("Task")
     live.show(running(4, task=None, state="error", refused=problem(), choices=("TwoEnv", "OneEnv")))
     task = live.part("Code version")
-    assert task.control("Task").value == "TwoEnv" and task.control("Task").options == ("OneEnv", "TwoEnv")
+    assert task.field("Task").value == "TwoEnv" and list(task.field("Task").options) == ["OneEnv", "TwoEnv"]
     task.set("Task", "OneEnv")
     assert live.asked[-1] == ("versions.choose_class", "OneEnv")
     live.show(running(4, choices=("OneEnv", "TwoEnv")))
-    assert task.control("Task").value == "OneEnv"
+    assert task.field("Task").value == "OneEnv"
+    live.do(ChooseClass(name="ThreeEnv"))
+    assert live.asked[-1] == ("versions.choose_class", "OneEnv") and live.client.notices
+
+
+def test_the_file_is_loaded_again_by_the_level_that_is_pressed(live: Live) -> None:
+    live.show(running(4))
+    part = live.part("Code version")
+    for name in ("Reload", REBUILD, "Only reload code", "Only reload cameras"):
+        part.press(name)
+    levels = [("versions.reload", level) for level in ("rebuilt", "patched", "cameras")]
+    assert live.asked == [("versions.reload",), *levels]
+    live.show(running(4, state="stopped"))
+    assert not part.shows("Reload")
 
 
 def test_the_last_loads_are_listed_newest_first(live: Live) -> None:

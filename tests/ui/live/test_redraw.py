@@ -17,6 +17,7 @@ from tests.drive.panels import difference
 from tests.ui.env_rows import rows_of
 from tests.ui.scenes import PLAN, camera, problem, running, step_of
 from workbench.checks.results import HookTime, RuleResult, StepProfile
+from workbench.commands.page import ToggleTable
 from workbench.core.camera_data import CameraSettings, Picture
 from workbench.core.capture.inspection import Inspection, Leaf
 from workbench.core.env.keywords import HowMade, Keyword
@@ -42,6 +43,8 @@ from workbench.session.record.live import RecordingStatus
 from workbench.session.record.save_past import SaveStatus
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
+
+pytestmark = pytest.mark.thorough
 
 ENVS = 6
 FOUND = Finding("reward-changes", "warn", "a message", "/home/me/push.py", 24, "code", "evaluate", 3, 1)
@@ -199,7 +202,7 @@ def made() -> Live:
         "past.strip": lambda low, high: strip(low, high, live.session.shown.selected_env),
         "rescorer.curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
     }
-    live.command("Open or close the table of envs")
+    live.do(ToggleTable())
     return live
 
 

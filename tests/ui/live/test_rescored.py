@@ -12,6 +12,13 @@ from tests.drive.live import Live
 from tests.drive.panels import Panels
 from tests.ui.scenes import running
 from workbench.authoring.problem import Problem
+from workbench.commands.timeline import (
+    ChooseRescoredCurve,
+    NextDifference,
+    PreviousDifference,
+    ShowRescored,
+    TurnRescored,
+)
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.session.live.timeline import TimelineView
 from workbench.session.rescore import verdict_text
@@ -74,6 +81,9 @@ def test_the_stand_is_said_above_and_below_and_only_what_runs_can_be_stopped(res
     ):
         shown = rescored.draw(done(episode(), same(1), state=state, serial=hash(state), done=26))
         assert shown.shows(STOP) is (state != "done") and says in shown.html()
+        if state == "rescoring":
+            shown.press(STOP)
+            assert rescored.live.asked == [("rescorer.stop",)]
     rescored.draw(RescoreView("stopped", 9, why="the file was saved again"))
     assert "the file was saved again" in rescored.panels.html()
 
@@ -92,7 +102,10 @@ def test_the_new_line_lies_over_the_recorded_one(rescored: Rescored) -> None:
     assert (old == 3).all() and (new == 6).all()
     rescored.panels.set("Curve", "success")
     assert [str(one.title)[:7] for one in rescored.draw(done(episode(3)), env=2).charts()] == ["success"]
-    rescored.panels.claim("Curve", "../../etc")
+    rescored.panels.do(ChooseRescoredCurve(curve="../../etc"))
+    assert rescored.panels.client.notices and rescored.panels.field("Curve").value == "success"
+    rescored.draw(done(episode(3), names=("reward",)))
+    assert rescored.panels.field("Curve").value == "reward", "there is no such curve any more"
     rescored.draw(done(same(3), serial=2), env=3)
     assert rescored.panels.charts() == [] and not rescored.panels.shows("Curve")
 
@@ -100,19 +113,20 @@ def test_the_new_line_lies_over_the_recorded_one(rescored: Rescored) -> None:
 def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescored: Rescored) -> None:
     many = done(same(30), *(episode(env) for env in range(MOST_ROWS + 3)))
     assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in rescored.draw(many).html()
-    rescored.panels.press("row 2")
-    rescored.panels.press("on")
+    rescored.panels.ask(ShowRescored(run="2 25"))
+    rescored.panels.ask(TurnRescored(by=1))
     assert f"{MOST_ROWS + 1} to {MOST_ROWS + 3} of" in rescored.draw(many).html(), "the page is turned"
-    rescored.panels.press("row 2")
-    rescored.panels.claim("row 3", True, "button")  # there is no such row on the last part
+    last = MOST_ROWS + 2
+    rescored.panels.ask(ShowRescored(run=f"{last} {10 * last + 5}"))
+    rescored.panels.do(ShowRescored(run="99 1"))  # there is no such run
     asked = rescored.live.asked
-    assert asked == [("show", 2, 25), ("show", MOST_ROWS + 2, 10 * (MOST_ROWS + 2) + 5)]
-    rescored.panels.press("back")
+    assert asked == [("show", 2, 25), ("show", last, 10 * last + 5)]
+    rescored.panels.ask(TurnRescored(by=-1))
     rescored.draw(many)
     rescored.draw(many, first=500)
-    rescored.panels.press("row 0")
+    rescored.panels.ask(ShowRescored(run="0 5"))
     assert asked[-1] == ("change", {"selected_env": 0})
-    rescored.panels.press("on")
+    rescored.panels.ask(TurnRescored(by=1))
     rescored.draw(RescoreView())
     assert f"1 to {MOST_ROWS} of" in rescored.draw(replace(many, serial=5)).html(), (
         "a new past begins with its first page"
@@ -120,15 +134,14 @@ def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescore
 
 
 def test_the_key_goes_round(rescored: Rescored) -> None:
-    key = "Next episode with a different result"
-    rescored.live.command(key)
+    rescored.live.do(NextDifference())
     assert rescored.live.asked == []
     rescored.draw(done(episode(0), episode(1)))
     for env, moment in ((0, 5), (1, 15), (0, 5)):
-        rescored.live.command(key)
+        rescored.live.do(NextDifference())
         assert rescored.live.asked[-1] == ("show", env, moment)
         rescored.draw(done(episode(0), episode(1)), shown=moment, env=env)
-    rescored.live.command("Previous episode with a different result")
+    rescored.live.do(PreviousDifference())
     assert rescored.live.asked[-1] == ("show", 1, 15)
 
 

@@ -11,6 +11,7 @@ import pytest
 from tests.drive.live import Live
 from tests.ui.env_rows import rows_of
 from tests.ui.scenes import PLAN, problem, running
+from workbench.commands.solve import FollowBody, LookAtRollout, SaveSolved
 from workbench.core.env.keywords import HowMade, Keyword
 from workbench.planning.options import PlanOptions
 from workbench.session.live.solver import SolveView
@@ -26,6 +27,8 @@ from workbench.ui.live.solve_panel import (
     in_words,
     solve_html,
 )
+
+pytestmark = pytest.mark.thorough
 
 SOLVED = SolveView(
     "planning",
@@ -60,7 +63,7 @@ def test_it_tells_what_the_rollouts_earned_and_what_came_of_it(solve: Solve) -> 
     assert not solve.live.part("Solve").seen
     solve.draw()
     part = solve.live.part("Solve")
-    assert part.seen and part.control("Rollouts").value == 32
+    assert part.seen and part.field("Rollouts").value == 32 and part.field("Horizon").value == 0.5
     for told in (
         "Env 0 is solved at step 3",
         "3.5",
@@ -99,11 +102,18 @@ def test_controls_ask_for_other_plans(solve: Solve) -> None:
     solve.live.set("Method", "CEM")
     solve.live.set("Plan for", ALL_ENVS)
     solve.live.set("Lines follow", "cube")
+    solve.live.set("Rollouts", 64)
+    solve.live.set("Plan every", 2)
+    solve.live.set("Horizon", 99.0)
+    solve.live.do(FollowBody(body="table"))
     assert solve.live.asked == [
         ("change", {"plan": PlanOptions(rollouts=32, method="cem")}),
         ("change", {"solve_all": True}),
         ("change", {"traced": "cube"}),
+        ("change", {"plan": PlanOptions(rollouts=64)}),
+        ("change", {"plan": PlanOptions(rollouts=32, every=2)}),
     ]
+    assert len(solve.live.client.notices) == 2, "too far, and what does not move"
 
 
 def test_a_solved_episode_is_saved_and_a_playing_one_is_not_offered(solve: Solve) -> None:
@@ -112,13 +122,16 @@ def test_a_solved_episode_is_saved_and_a_playing_one_is_not_offered(solve: Solve
     solve.draw()
     solve.live.press(SAVE_SOLVED)
     assert solve.live.asked == [("save_past", (0,))]
-    # Before the session has answered.
     part = solve.live.part("Solve")
-    assert ">saving<" in part.html() and part.control(SAVE_SOLVED).disabled
     solve.draw(recording=RecordingStatus(saving=SaveStatus(progress=JobProgress("rendering it again", 2, 8))))
-    assert "2 of 8 moments" in part.html() and part.control(SAVE_SOLVED).disabled
+    assert "2 of 8 moments" in part.html() and part.button(SAVE_SOLVED).command is None
+    solve.live.do(SaveSolved())
     solve.draw(recording=RecordingStatus(saving=SaveStatus("saved 1 episode, 7 steps")))
-    assert "saved 1 episode, 7 steps" in part.html() and not part.control(SAVE_SOLVED).disabled
+    assert "saved 1 episode, 7 steps" in part.html() and part.button(SAVE_SOLVED).command is not None
+    solve.draw(replace(SOLVED, solved=()))
+    assert not solve.live.shows(SAVE_SOLVED)
+    solve.live.do(SaveSolved())
+    assert solve.live.asked == [("save_past", (0,))] and len(solve.live.client.notices) == 2
 
 
 def test_a_success_is_told_once_for_each_episode(solve: Solve, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,6 +151,11 @@ def test_a_rollout_of_the_last_plan_can_be_looked_at_while_it_is_paused(solve: S
     solve.live.set("Look at", 2)
     solve.draw()
     assert "Rollout 3 of 5: return 1.25" in solve.live.html()
+    assert solve.live.field("Look at").bounds == (1, 3)
+    solve.live.do(LookAtRollout(number=4))
+    assert solve.live.client.notices
+    solve.draw(replace(SOLVED, plan=replace(PLAN, drawn=(0, 2))))
+    assert solve.live.field("Look at").value == 2
     solve.draw(replace(SOLVED, plan=replace(PLAN, drawn=(0,))))
     assert not solve.live.shows("Look at")
     assert in_words(replace(PLAN, drawn=(0, 1, 3)), 2).startswith("Rollout 4 of 5: return 1")

@@ -10,13 +10,26 @@ import pytest
 
 from tests.drive.panels import Clock, Panels
 from tests.drive.session import wait_until
-from tests.drive.waiting import until
+from workbench.commands import COMMANDS
+from workbench.commands.command import Refused
+from workbench.commands.run import ResetAll
+from workbench.commands.timeline import (
+    ContinueFromHere,
+    GoToFirst,
+    GoToLast,
+    NextEvent,
+    PreviousEvent,
+    SeekBack,
+    StepBack,
+    UndoReset,
+    ZoomTimeline,
+)
 from workbench.session.live.session import Session
 from workbench.session.live.timeline import TimelineView
 from workbench.session.protocol.messages import CameraRequest
 from workbench.ui.app.live_page import Page
-from workbench.ui.live import timeline as panel
-from workbench.ui.widgets.inputs import Control
+
+pytestmark = pytest.mark.thorough
 
 SLIDER = "step of the past"
 
@@ -46,8 +59,9 @@ class EnvMoment:
         self.draw()
 
     def ends(self) -> tuple[int, int, int]:
-        slider = self.panels.control(SLIDER)
-        return slider.min, slider.max, slider.value
+        slider = self.panels.field(SLIDER)
+        assert slider.bounds is not None
+        return int(slider.bounds[0]), int(slider.bounds[1]), slider.value
 
     def strip(self) -> str:
         return self.panels.html("wb-timeline")
@@ -60,7 +74,9 @@ class EnvMoment:
 @pytest.fixture
 def lived(panels: Panels, clock: Clock, scripted_session: Callable[..., Session]) -> EnvMoment:
     session = scripted_session(3)
-    return EnvMoment(session, Page(panels.server, session, clock=clock), panels, clock)
+    page = Page(panels.server, panels.visitors, session, clock=clock)
+    panels.visitors.do = page.do
+    return EnvMoment(session, page, panels, clock)
 
 
 def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(lived: EnvMoment) -> None:
@@ -69,8 +85,8 @@ def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(live
     assert lived.panels.part("Timeline").seen
     lived.step(4)
     assert lived.ends() == (-4, 0, 0)
-    assert not lived.panels.shows("way to continue"), "nobody is in the past"
-    assert lived.panels.control("step to take").options == panel.WALK, "nothing was before the first reset"
+    assert not lived.panels.presses(ContinueFromHere()), "nobody is in the past"
+    assert not lived.panels.presses(UndoReset()), "nothing was before the first reset"
     assert "live" in lived.strip()
 
 
@@ -84,26 +100,25 @@ def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: Env
     assert lived.past.shown == 2
     assert np.array_equal(lived.hand(), there)
     assert "2 steps ago" in lived.panels.html("wb-status") and "2 steps ago" in lived.strip()
-    travel = lived.panels.control("way to continue")
-    assert travel.options == ("Continue from here: env 0", "all envs", "env 0 into all envs")
-    assert lived.panels.shows("way to continue") and lived.ends() == (-4, 0, -2)
-    lived.panels.command("Go to live")
+    ways = (ContinueFromHere(), ContinueFromHere(scope="all"), ContinueFromHere(scope="into all"))
+    assert all(map(lived.panels.presses, ways)) and lived.ends() == (-4, 0, -2)
+    lived.panels.do(GoToLast())
     lived.draw()
-    assert "live" in lived.strip() and not lived.panels.shows("way to continue")
+    assert "live" in lived.strip() and not lived.panels.presses(ContinueFromHere())
 
 
 def test_going_on_puts_the_envs_that_were_named_back(lived: EnvMoment) -> None:
     lived.step(4)
-    lived.panels.choose(panel.LAST_STEP)
-    lived.panels.choose(panel.LAST_STEP)
+    lived.panels.ask(StepBack())
+    lived.panels.ask(StepBack())
     lived.draw()
-    lived.panels.choose("Continue from here: env 0")
+    lived.panels.ask(ContinueFromHere())
     view = wait_until(lived.session, lambda view: view.timeline.last == 5, "the jump")
     assert view.step is not None and view.step.elapsed_steps.tolist() == [2, 4, 4]
     lived.draw()
-    lived.panels.choose(panel.LAST_STEP)
+    lived.panels.ask(StepBack())
     lived.draw()
-    lived.panels.choose("all envs")
+    lived.panels.ask(ContinueFromHere(scope="all"))
     view = wait_until(lived.session, lambda view: view.timeline.last == 6, "the other jump")
     assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
@@ -111,26 +126,26 @@ def test_going_on_puts_the_envs_that_were_named_back(lived: EnvMoment) -> None:
 def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: EnvMoment) -> None:
     lived.step(4)
     last = lived.past.last
-    lived.panels.command("Reset all envs")
+    lived.panels.do(ResetAll())
     wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
     lived.step(3)
-    lived.panels.choose(panel.EPISODE)
+    lived.panels.ask(ZoomTimeline(episode_only=True))
     lived.draw()
     assert lived.ends()[0] == -3
-    lived.panels.command("Go to the first moment")
+    lived.panels.do(GoToFirst())
     assert lived.past.shown == lived.past.last - 3, "of the episode"
     assert lived.past.steps_ago == 3
-    lived.panels.command("Go to live")
+    lived.panels.do(GoToLast())
     lived.draw()
-    assert lived.panels.control("step to take").options[-2:] == (panel.EVERYTHING, "undo reset of all")
-    lived.panels.choose(panel.EVERYTHING)
+    assert "undo reset of all" in lived.panels.html("wb-tools")
+    lived.panels.ask(ZoomTimeline(episode_only=False))
     lived.draw()
     assert lived.ends()[0] == -7
-    lived.panels.command("Go to the first moment")
+    lived.panels.do(GoToFirst())
     assert lived.past.shown == lived.past.first
-    lived.panels.command("Go to live")
+    lived.panels.do(GoToLast())
     lived.draw()
-    lived.panels.choose("undo reset of all")
+    lived.panels.ask(UndoReset())
     view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the episode before")
     assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
@@ -138,10 +153,10 @@ def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: EnvM
 def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived: EnvMoment) -> None:
     lived.step(4)
     last = lived.past.last
-    lived.panels.command("Reset all envs")
+    lived.panels.do(ResetAll())
     wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
     lived.step(2)
-    lived.panels.choose(panel.EPISODE)
+    lived.panels.ask(ZoomTimeline(episode_only=True))
     lived.page.redraw()
     assert lived.ends() == (-2, 0, 0)
     lived.session.step()
@@ -156,42 +171,22 @@ def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived
     assert lived.ends() == (-7, -3, -5)
 
 
-def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: EnvMoment) -> None:
+def test_a_value_that_the_slider_had_a_moment_ago_shows_the_nearest_that_there_is(lived: EnvMoment) -> None:
     lived.step(3)
-    until(lambda: not Control.took_the_key(), "a moment in which nobody touches anything")
-    lived.panels.command("One step back")
-    assert lived.past.shown == 2
-    lived.draw()
-    lived.panels.set(SLIDER, -2)
-    lived.panels.command("One step back")
-    assert lived.past.shown == 1, "only the slider went back"
-    until(lambda: not Control.took_the_key(), "the key to be over")
-    lived.panels.command("One step back")
-    assert lived.past.shown == 0
-
-
-def test_a_value_that_no_slider_has_is_refused(lived: EnvMoment) -> None:
-    lived.step(3)
-    lived.panels.claim(SLIDER, 1)
-    lived.panels.claim(SLIDER, -4)
-    assert lived.panels.client.notices == ["The step of the past goes from -3 to 0."] * 2
-    assert lived.past.shown is None
-    lived.panels.claim(SLIDER, -3)
-    assert lived.past.shown == lived.past.first
-    lived.panels.claim("way to continue", "rm -rf")
-    lived.panels.claim("step to take", "rm -rf")
-    assert len(lived.panels.client.notices) == 4
+    lived.panels.do(SeekBack(steps=-9))
     assert lived.past.shown == lived.past.first and lived.past.last == 3
+    with pytest.raises(Refused):
+        COMMANDS.decode("seek_back", {"steps": 1})
 
 
 def test_one_moment_alone_has_nothing_to_slide_along(lived: EnvMoment) -> None:
     lived.draw()
     assert lived.panels.shows(SLIDER), "the panel does not grow at the first step"
-    assert lived.panels.control(SLIDER).disabled
+    assert lived.panels.field(SLIDER).off
     assert lived.ends() == (-1, 0, 0), "a browser divides by the range"
     assert "history: 0 steps," in lived.strip()
     lived.step(1)
-    assert not lived.panels.control(SLIDER).disabled and lived.ends() == (-1, 0, 0)
+    assert not lived.panels.field(SLIDER).off and lived.ends() == (-1, 0, 0)
     assert "history: 1 step," in lived.strip()
 
 
@@ -218,18 +213,18 @@ def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures(
 
 def test_home_is_the_left_end_of_the_slider(lived: EnvMoment) -> None:
     lived.step(3)
-    lived.panels.command("Go to the first moment")
+    lived.panels.do(GoToFirst())
     assert lived.past.shown == 0
     last = lived.past.last
-    lived.panels.command("Reset all envs")
+    lived.panels.do(ResetAll())
     wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
     lived.step(2)
-    lived.panels.choose(panel.EPISODE)
-    lived.panels.command("Go to live")
+    lived.panels.ask(ZoomTimeline(episode_only=True))
+    lived.panels.do(GoToLast())
     lived.draw()
-    lived.panels.command("Go to the first moment")
+    lived.panels.do(GoToFirst())
     assert lived.past.shown == 4
-    lived.panels.command("Previous event")
+    lived.panels.do(PreviousEvent())
     assert lived.past.shown == 0
-    lived.panels.command("Next event")
+    lived.panels.do(NextEvent())
     assert lived.past.shown == 4

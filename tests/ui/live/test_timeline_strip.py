@@ -40,7 +40,7 @@ def past(shown: int | None = None) -> TimelineView:
 def marks(html: str) -> list[tuple[float, str, str]]:
     """Per cent from the left, style and words of each."""
     found = re.findall(
-        r'class="wb-mark wb-mark-(\w+)" style="left:([\d.]+)%" data-at="\d+" title="([^"]*)"', html
+        r'class="wb-mark wb-mark-(\w+)" style="left:([\d.]+)%" data-do="[^"]*" title="([^"]*)"', html
     )
     return [(float(place), style, words) for style, place, words in found]
 

@@ -10,7 +10,6 @@ import pytest
 import viser
 
 from tests.drive.episodes import made
-from tests.drive.panels import Panels
 from workbench.session.review.view import Opened, ReviewView, find_events
 from workbench.ui.live.reward import NumberRow
 from workbench.ui.review.curves import ReviewCurves, compared
@@ -77,15 +76,6 @@ def test_of_a_long_recording_the_dot_is_on_the_point_nearest_to_the_position(
         value = position + anchor  # its own, and not that of the point
         assert dot[at] == (None if value == 0 else value)
         assert line[at] in (None, positions[at] + anchor)
-
-
-def test_a_click_on_a_curve_asks_for_its_position_also_before_the_common_start(panels: Panels) -> None:
-    asked: list[int] = []
-    curves = ReviewCurves(panels.server, asked.append)
-    curves.draw(aligned((10, 5), (6, 2)))
-    assert 'data-first="-5"' in panels.html("data-seek")
-    panels.set("position of a curve", 2 + 3 * 10**8)
-    assert asked == [-3]
 
 
 def test_a_peak_of_one_step_in_a_long_recording_is_drawn(server: viser.ViserServer) -> None:

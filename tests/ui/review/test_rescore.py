@@ -14,6 +14,8 @@ import pytest
 from tests.drive.episodes import made, write
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
+from workbench.commands.review import ChooseRescoreCode
+from workbench.commands.timeline import ShowRescored, TurnRescored
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
@@ -96,7 +98,7 @@ class Told:
         """Nothing is judged here."""
 
     def stop(self) -> None:
-        raise AssertionError("nobody asked for that")
+        self.view = replace(self.view, state="stopped")
 
 
 @dataclass
@@ -120,6 +122,7 @@ class Rescoring:
 def rescoring(panels: Panels, library: Library, review: Review, clock: Clock) -> Rescoring:
     told, choices = Told(), RescoreChoices(AS_RECORDED)
     panel = RescorePanel(panels.server, cast(Any, told), review, library, choices)
+    panels.visitors.do = panel.do
     return Rescoring(panel, panels, clock, review, choices, told)
 
 
@@ -134,7 +137,7 @@ def test_a_row_opens_its_episode_at_the_first_difference(
     rescoring.draw(RescoreView("done", 1, tuple(given), 3, 3))
     assert "3 of 3 episodes differ" in rescoring.panels.html() and "seed 3" in rescoring.panels.html()
     assert not any(rescoring.panels.shows(name) for name in ("Rescore the open recordings", "Stop"))
-    rescoring.panels.press("row 1")  # by the change of their returns: 3, 2, 1
+    rescoring.panels.ask(ShowRescored(run=rows[2].id))  # by the change of their returns: 3, 2, 1
     until(lambda: review.view().opened, "the recording", seen=lambda: review.view().problems)
     view = review.view()
     assert view.opened[0].id == rows[2].id and view.states == (3,)
@@ -166,12 +169,11 @@ def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     many = tuple(verdict(str(k), first_difference=1, returns=(0.0, 99.0 - k), seed=k) for k in range(23))
     rescoring.draw(RescoreView("done", 1, many, 23, 23))
     assert (
-        rescoring.panels.html().count('data-press="') == MOST_ROWS + 2
+        rescoring.panels.html().count('data-do="') == MOST_ROWS + 2
         and "1 to 10 of 23" in rescoring.panels.html()
     )
-    rescoring.panels.press("on")
-    rescoring.panels.press("on")
-    rescoring.panels.press("on")
+    for _ in range(3):
+        rescoring.panels.ask(TurnRescored(by=1))
     rescoring.draw(RescoreView("done", 2, many, 23, 23))
     assert "21 to 23 of 23" in rescoring.panels.html()
     rescoring.panel.rescore(["no such"])
@@ -180,12 +182,23 @@ def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
 
 
 def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -> None:
-    assert rescoring.panels.control("Code").value == "as recorded"
+    rescoring.draw(RescoreView())
+    assert rescoring.panels.field("Code").value == "as recorded"
     rescoring.panels.set("Recorded states", True)
-    rescoring.panels.claim("Code", "../../etc")
-    assert rescoring.choices == RescoreChoices(AS_RECORDED, True)
+    rescoring.panels.do(ChooseRescoreCode(code="../../etc"))
+    assert (
+        rescoring.choices == RescoreChoices(AS_RECORDED, True) and len(rescoring.panels.client.notices) == 1
+    )
     rescoring.panels.set("Code", "today's")
     assert rescoring.choices == RescoreChoices(TODAYS_CODE, True)
+
+
+def test_it_can_be_stopped_while_it_runs(rescoring: Rescoring) -> None:
+    rescoring.draw(RescoreView("rescoring", 1, total=3))
+    rescoring.panels.press("Stop")
+    assert rescoring.told.view.state == "stopped"
+    rescoring.draw(replace(rescoring.told.view, serial=2))
+    assert not rescoring.panels.shows("Stop")
 
 
 def test_recordings_that_are_gone_are_not_judged(library: Library) -> None:

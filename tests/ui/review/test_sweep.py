@@ -1,4 +1,4 @@
-"""The Sweep tab's HTML and what its hidden buttons do, on real files without a browser."""
+"""The Sweep tab's HTML and what its rows and lines do, on real files without a browser."""
 
 from __future__ import annotations
 
@@ -17,6 +17,15 @@ from tests.drive.episodes import made
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
+from workbench.commands.command import Command, name_of
+from workbench.commands.review import (
+    ClearSweepFilter,
+    FilterSweep,
+    OpenSweepEpisode,
+    ShowSweepPoint,
+    SortSweep,
+    TurnSweep,
+)
 from workbench.recording.library.library import Library
 from workbench.recording.sweeps import RESULTS, SweepEpisode, SweepResults, write_results
 from workbench.session.review.view import Opened, ReviewView
@@ -33,6 +42,7 @@ class Tab:
         self.opened: list[tuple[str, ...]] = []
         self.panel = SweepPanel(server, self.library, self.opened.append, clock)
         self.panels, self.clock = Panels(server), clock
+        self.panels.visitors.do = self.panel.do
         self.view = ReviewView()
         until(lambda: self.draw() or "Reading" not in self.panels.html("wb-note"), "the results")
 
@@ -41,13 +51,13 @@ class Tab:
         self.panel.key(self.view)
         self.panel.draw(self.view)
 
-    def press(self, key: str) -> None:
-        self.panels.press(f"sweep {key}")
+    def ask(self, command: Command) -> None:
+        self.panels.ask(command)
         self.draw()
 
     def points(self) -> list[str]:
         """Of the table, the first two cells of each row."""
-        rows = re.findall(r"<tr data-press.*?</tr>", self.panels.html("wb-sweep-scroll"), re.DOTALL)
+        rows = re.findall(r"<tr data-do.*?</tr>", self.panels.html("wb-sweep-scroll"), re.DOTALL)
         return [" ".join(re.findall(r"<td[^>]*>(.*?)</td>", row)[:2]) for row in rows]
 
     def seeds(self) -> list[str]:
@@ -75,34 +85,34 @@ def test_points_are_listed_the_best_first_and_sorted_by_any_column(tab: Tab) -> 
     best = ["2 panda", "2 fetch", "1 panda", "1 fetch", "0.5 panda", "0.5 fetch"]
     assert tab.points()[:6] == best and len(tab.points()) == 9
     assert "36 seeds failed" in tab.panels.html("wb-note")
-    tab.press("sort set reach_weight")
+    tab.ask(SortSweep(column="set reach_weight"))
     assert [one.split()[0] for one in tab.points()] == ["0.5"] * 3 + ["1"] * 3 + ["2"] * 3
-    tab.press("sort set reach_weight")
+    tab.ask(SortSweep(column="set reach_weight"))
     assert tab.points()[0].startswith("2")
-    tab.press("sort mean reward_terms/reach")
+    tab.ask(SortSweep(column="mean reward_terms/reach"))
     assert tab.points()[0] == "0.5 panda"
 
 
 def test_the_best_and_the_worst_episodes_of_a_point_open_with_a_press(tab: Tab) -> None:
     assert tab.seeds() == ["0", "1", "2", "3", "4", "11", "10", "9", "8", "7"]
-    tab.press("open 6 11")
+    tab.ask(OpenSweepEpisode(id="p6s11"))
     assert tab.opened == [("p6s11",)]
-    tab.press("point 8")
+    tab.ask(ShowSweepPoint(index=8))
     assert tab.seeds() == [] and "12 seeds failed: push.py:12: KeyError" in tab.panels.html(
         "wb-sweep-episodes"
     )
 
 
 def test_a_value_of_an_axis_leaves_the_other_points_out(tab: Tab) -> None:
-    tab.press('only robot_uids "fetch"')
+    tab.ask(FilterSweep(name="robot_uids", value='"fetch"'))
     assert tab.points() == ["2 fetch", "1 fetch", "0.5 fetch"]
     assert tab.panels.html("wb-parallel").count("wb-left-out") == 6
     assert "robot_uids = fetch" in tab.panels.html("wb-sweep-point"), (
         "what is chosen is among those that are shown"
     )
-    tab.press('only robot_uids "panda"')
+    tab.ask(FilterSweep(name="robot_uids", value='"panda"'))
     assert len(tab.points()) == 6
-    tab.press("clear")
+    tab.ask(ClearSweepFilter())
     assert len(tab.points()) == 9
 
 
@@ -115,11 +125,15 @@ def test_another_order_and_other_values_begin_on_the_first_page(
 ) -> None:
     monkeypatch.setattr(sweep, "ROWS", 2)
     tab = Tab(server, folder, clock)
-    for press in ("sort set reach_weight", 'only robot_uids "fetch"', "clear"):
-        tab.press("on")
+    for command in (
+        SortSweep(column="set reach_weight"),
+        FilterSweep(name="robot_uids", value='"fetch"'),
+        ClearSweepFilter(),
+    ):
+        tab.ask(TurnSweep(by=1))
         assert "3 to" in tab.panels.html("wb-sweep-scroll")
-        tab.press(press)
-        assert "1 to 2 of" in tab.panels.html("wb-sweep-scroll"), press
+        tab.ask(command)
+        assert "1 to 2 of" in tab.panels.html("wb-sweep-scroll"), command
     tab.library.close()
 
 
@@ -129,7 +143,7 @@ def test_the_point_of_the_open_episode_is_shown_until_another_one_is_chosen(tab:
     tab.view = ReviewView(opened=(opened("p0s03"),))
     tab.draw()
     assert "reach_weight = 0.5, robot_uids = panda" in tab.panels.html(place)
-    tab.press("point 1")
+    tab.ask(ShowSweepPoint(index=1))
     assert "reach_weight = 0.5, robot_uids = fetch" in tab.panels.html(place)
     tab.view = ReviewView(opened=(opened("p6s11"),))
     tab.draw()
@@ -171,8 +185,7 @@ def test_hostile_results_are_shown_as_text_and_open_nothing(
     assert max(map(len, re.findall(r"\S+", shown))) < 1000
     assert "inf" not in tab.panels.html("wb-parallel").lower() and "nan" not in tab.panels.html("wb-parallel")
     assert "Its recording is not in this folder" in tab.panels.html("wb-sweep-episodes")
-    with pytest.raises(Exception, match="open 0 0"):
-        tab.press("open 0 0")
+    assert name_of(OpenSweepEpisode) not in tab.panels.html("wb-sweep-episodes")
     tab.library.close()
 
 

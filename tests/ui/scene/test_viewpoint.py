@@ -6,12 +6,23 @@ import websockets.sync.client
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.drive.panels import Panels
 from tests.drive.waiting import until
-from tests.ui.scenes import table_scene
+from tests.ui.scenes import running, table_scene
 from tests.ui.tabs import camera_message, handshake
 from workbench.core.camera_data import Picture
+from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.scene.viewpoint import FOV, Framing, Viewpoint, frame_box, frame_one
+from workbench.ui.scene.viewpoint import (
+    FOV,
+    ONE,
+    Framing,
+    ViewChoice,
+    ViewPanel,
+    Viewpoint,
+    frame_box,
+    frame_one,
+)
 
 
 @given(
@@ -105,3 +116,24 @@ def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
         assert framing.is_new("live")
         framing.frame_new(frame)
         assert np.allclose(client.camera.position, moved), "back from the review"
+
+
+def test_what_is_chosen_in_the_view_panel_holds_for_the_pages_to_come(panels: Panels) -> None:
+    choice = ViewChoice()
+    panel = ViewPanel(panels.server, dark=True, chosen=choice)
+    panels.visitors.do = panel.do
+    panel.draw(running(1))
+    assert not panels.shows("Show")
+    panel.draw(running(4))
+    panels.set("Show", ONE)
+    panels.set("Detail", "coarse")
+    panels.set("Theme", "light")
+    panel.draw(running(4))
+    assert [panels.field(name).value for name in ("Show", "Detail", "Theme")] == [ONE, "coarse", "light"]
+    assert panel.only_selected and panel.looks == Looks(50_000, False)
+    panel.toggle_only_selected()
+    panel.toggle_dark()
+    panel.draw(running(4))
+    assert [panels.field(name).value for name in ("Show", "Theme")] == ["all envs", "dark"]
+    with panels.server.gui.add_folder("The next page"):
+        assert ViewPanel(panels.server, chosen=choice).looks == Looks(50_000, True)

@@ -13,6 +13,8 @@ from websockets.exceptions import ConnectionClosed
 
 from workbench.ui.server import strangers
 
+pytestmark = pytest.mark.thorough
+
 MESSAGE = b"x" * 2**20
 
 
@@ -52,6 +54,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strangers, "READ_WITHIN", 1.0)
 
 
+@pytest.mark.slow
 def test_one_that_reads_slowly_gets_all_of_it_however_long_it_takes() -> None:
     async def read_a_little_now_and_then(connection: ClientConnection) -> None:
         took = asyncio.create_task(connection.recv())

@@ -21,6 +21,8 @@ from tests.ui.tabs import camera_message, handshake, messages_in
 from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.server.line import CompressWhenFar, Line, WhenFar
 
+pytestmark = pytest.mark.thorough
+
 BITS, DELAY = 2e6, 0.04
 """A slow line: 250 kB a second, 80 ms there and back."""
 
@@ -126,6 +128,7 @@ def test_a_message_for_a_page_that_leaves_meanwhile_is_not_waited_for() -> None:
     asyncio.run(asyncio.wait_for(talk_to_one_that_leaves(), 60))
 
 
+@pytest.mark.slow
 def test_a_page_on_a_slow_line_is_given_the_newest_and_no_queue(gated_server: GatedServer) -> None:
     """The real server: 60 changes a second are four times what the line carries."""
     server = gated_server.server

@@ -24,6 +24,9 @@ from workbench.ui.app.live_page import Page
 from workbench.ui.scene.viewpoint import Stage
 from workbench.ui.server import strangers
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.ui.widgets.visitors import Visitors
+
+pytestmark = pytest.mark.thorough
 
 
 @dataclass
@@ -58,7 +61,7 @@ class Told(Session):
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     gated_server, told = open_server(ServerOptions(port=0)), [0]
     session, stage = Told(told, tmp_path_factory.mktemp("author")), Stage(gated_server.server)
-    page = Page(gated_server.server, session, stage=stage)
+    page = Page(gated_server.server, Visitors(gated_server.server), session, stage=stage)
     page.start()
     try:
         with tabs_of(gated_server.url) as tabs:
@@ -80,6 +83,7 @@ def test_the_session_knows_whether_any_tab_is_open(house: House) -> None:
     until(lambda: house.told[-1] == 0, "the end of the other")
 
 
+@pytest.mark.slow
 def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
     house: House, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -102,6 +106,7 @@ def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
     house.tabs.close(reads)
 
 
+@pytest.mark.slow
 def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
     server = house.gated_server.server
 

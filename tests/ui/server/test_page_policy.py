@@ -85,6 +85,7 @@ def test_every_reply_isolates_the_page_and_gives_it_no_devices(gated_server):
 # In a real browser --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_code_that_came_into_the_page_as_html_does_not_run(gated_server, browser):
     attacks = (
@@ -116,6 +117,7 @@ def test_code_that_came_into_the_page_as_html_does_not_run(gated_server, browser
     handle.remove()
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
     gated_server = open_server(ServerOptions(port=0))

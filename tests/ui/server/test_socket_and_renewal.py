@@ -14,21 +14,19 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import msgspec
 import psutil
 import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import unix_connect
 
 from tests.drive.waiting import until
-from tests.ui.knocking import PROTOCOL, ask, both, client, close_code, cookie_of, token_of
+from tests.ui.knocking import CAMERA, PROTOCOL, Bell, ask, both, client, close_code, cookie_of, say, token_of
 from tests.ui.tabs import open_deaf_tab
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.ui.server import listening
 from workbench.ui.server.access import cookie_name
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.listening import ServerError
-from workbench.ui.server.viser_private import element_id
 
 
 @pytest.fixture
@@ -91,7 +89,7 @@ def test_the_gate_is_the_same_as_on_a_port(gated_server):
 
 
 def test_a_websocket_works_over_it(gated_server):
-    box = gated_server.server.gui.add_checkbox("x", False)
+    bell = Bell(gated_server)
     with unix_connect(
         str(gated_server.options.socket),
         uri="ws://localhost:8080/",
@@ -101,9 +99,8 @@ def test_a_websocket_works_over_it(gated_server):
         max_size=None,
         close_timeout=0.2,
     ) as connection:
-        update = {"type": "GuiUpdateMessage", "uuid": element_id(box), "updates": {"value": True}}
-        connection.send(msgspec.msgpack.encode(update))
-        until(lambda: box.value, "the value")
+        say(connection, CAMERA)  # without one viser counts no page as come
+        bell.rings(connection)
 
 
 def test_the_file_is_gone_at_the_end_and_one_that_was_left_is_taken_over(folder):
@@ -243,6 +240,7 @@ def until_line(process: subprocess.Popen[str], wanted: Callable[[str], bool]) ->
     pytest.fail("it ended without the line")
 
 
+@pytest.mark.slow
 def test_the_command_renews_at_a_signal_and_ends_at_another(child_process: None, tmp_path, folder):
     place = folder / "review.sock"
     process = subprocess.Popen(

@@ -35,6 +35,7 @@ def is_closed(sock: socket.socket) -> bool:
         return True
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "said", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nX: ", b"\x16\x03"]
 )
@@ -46,6 +47,7 @@ def test_a_connection_that_asks_nothing_is_closed_after_a_while(gated_server, mo
     assert both(gated_server) == (200, 101)
 
 
+@pytest.mark.thorough
 def test_a_head_that_comes_a_byte_at_a_time_gains_no_time(gated_server, monkeypatch):
     monkeypatch.setattr(strangers, "PATIENCE", 0.5)
     with connected(gated_server) as slow, pytest.raises(OSError):
@@ -64,6 +66,7 @@ def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(gated_server
     assert answer.startswith(b"HTTP/1.1 403")
 
 
+@pytest.mark.thorough
 def test_a_page_that_has_shown_the_token_is_not_hurried(gated_server, monkeypatch):
     monkeypatch.setattr(strangers, "PATIENCE", 0.3)
     slow = (200, "application/octet-stream", b"x" * 1000)
@@ -215,12 +218,13 @@ def fails(gated_server: GatedServer) -> None:
 
 
 def presses(gated_server: GatedServer) -> None:
-    (button,) = gated_server.server.gui._gui_input_handle_from_uuid
-    message = {"type": "GuiUpdateMessage", "uuid": button, "updates": {"value": True}}
+    (entry,) = gated_server.server.gui._command_handle_from_uuid
+    message = {"type": "CommandTriggerMessage", "uuid": entry}
     with client(gated_server) as page:
         page.send(msgspec.msgpack.encode(message))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("attack", "times"),
     [(zeros, 60), (long_protocol, 30), (pings, 5), (broken_frames, 30), (fails, 60), (presses, 60)],
@@ -236,7 +240,7 @@ def test_whatever_is_sent_prints_a_few_short_lines(
         raise RuntimeError("z" * 100_000)
 
     gated_server.add_route("/fails/", fail)
-    gated_server.server.gui.add_button("Fails").on_click(fail)
+    gated_server.server.gui.add_command("Fails").on_trigger(fail)
     for _ in range(times):
         attack(gated_server)
     assert both(gated_server) == (200, 101)

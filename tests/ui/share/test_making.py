@@ -70,6 +70,7 @@ class Told:
         return self.making.view()
 
 
+@pytest.mark.slow
 def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
     told = Told()
     told.making.start(MakeRequest("film", find_all_sources([recordings]) * 20, tmp_path / "films", "eye"))
@@ -80,6 +81,7 @@ def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
     assert not [path for path in (tmp_path / "films").iterdir() if path.suffix != ".mp4"]
 
 
+@pytest.mark.slow
 def test_an_archive_unpacked_is_the_recording_again(recordings: Path, tmp_path: Path) -> None:
     (source,) = find_all_sources([recordings])
     made = make(MakeRequest("zip", (source,), tmp_path))

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.panels import Panels
+from workbench.commands.share import MakeShared
 from workbench.recording.episode.row import Source
 from workbench.ui.server.file_response import Downloads
 from workbench.ui.server.gated_server import GatedServer
@@ -53,7 +54,9 @@ def panels(gated_server: GatedServer) -> Panels:
 
 @pytest.fixture
 def panel(panels: Panels, gated_server: GatedServer, making: Noted, tmp_path: Path) -> SharePanel:
-    return SharePanel(gated_server.server, Downloads(gated_server), making, tmp_path)
+    panel = SharePanel(gated_server.server, Downloads(gated_server), making, tmp_path)
+    panels.visitors.do = panel.do
+    return panel
 
 
 RECORDING = Source(Path("/recordings/Push_seed1.json"))
@@ -63,9 +66,9 @@ def test_without_a_recording_there_is_nothing_to_make(
     panel: SharePanel, panels: Panels, making: Noted
 ) -> None:
     panel.draw(Chosen())
-    assert panels.control("Make", "button").disabled and "Select recordings" in panels.html()
-    panels.claim("Make", True, "button")
-    assert making.wanted == []
+    assert panels.button("Make").command is None and "Select recordings" in panels.html()
+    panels.do(MakeShared())
+    assert making.wanted == [] and "Select recordings" in panels.client.notices[-1]
 
 
 def test_recordings_and_files_are_named_before_they_are_made(
@@ -91,11 +94,7 @@ def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(
     panel: SharePanel, panels: Panels, making: Noted
 ) -> None:
     panel.draw(Chosen((RECORDING,), ("base_camera", "hand_camera")))
-    assert panels.shows("Camera") and panels.control("Camera").options == (
-        ALL_CAMERAS,
-        "base_camera",
-        "hand_camera",
-    )
+    assert list(panels.field("Camera").options) == [ALL_CAMERAS, "base_camera", "hand_camera"]
     panels.press("Make")
     panels.set("Camera", "hand_camera")
     panels.press("Make")
@@ -129,18 +128,20 @@ def test_only_successes_cannot_be_ticked_where_none_reaches_success(
     several = tuple(Source(Path(f"/recordings/r{k}.json")) for k in range(3))
     panels.set("Make", "LeRobot dataset")
     panel.draw(Chosen(several, successes=0))
-    ticked = panels.control("Only successes")
-    assert ticked.disabled and not ticked.value and "None of them reaches success" in panels.html()
+    ticked = panels.field("Only successes")
+    assert ticked.off and not ticked.value and "None of them reaches success" in panels.html()
     panels.press("Make")
     assert not making.wanted[-1].export.only_successes
     panel.draw(Chosen(several, successes=2))
-    assert not ticked.disabled and ticked.value and "None of them" not in panels.html()
+    ticked = panels.field("Only successes")
+    assert not ticked.off and ticked.value and "None of them" not in panels.html()
     assert "one dataset of the 2 of these 3 recordings that reach success" in panels.html()
     panels.set("Only successes", False)
     panel.draw(Chosen(several, successes=2))
-    assert not ticked.value and "one dataset of these 3 recordings" in panels.html()
+    assert not panels.field("Only successes").value and "one dataset of these 3 recordings" in panels.html()
     panel.draw(Chosen(several))
-    assert not ticked.disabled and not ticked.value
+    ticked = panels.field("Only successes")
+    assert not ticked.off and not ticked.value
 
 
 def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(

@@ -23,6 +23,7 @@ from workbench.ui.server.access import cookie_name
 from workbench.ui.server.file_response import Downloads
 from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.share.rerun_view import RerunPages, RerunView
+from workbench.ui.widgets.visitors import PATH, Visitors
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +119,10 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         gated_server.server.gui.add_html("...")
     library.dock_left()
     library.minimize()
+    visitors = Visitors(gated_server.server)
+    gated_server.add_channel(PATH, visitors.serve)
     view = RerunView(gated_server.server, pages, lambda fold: 850)
+    visitors.do = view.do
     stopping = threading.Event()
 
     def draw() -> None:

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import running
+from workbench.commands import COMMANDS, Refused
+from workbench.commands.run import ResetEnvOptions
 from workbench.core.env.keywords import HowMade, Keyword
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
@@ -48,6 +50,7 @@ class Form:
         monkeypatch.setattr(session.versions, "apply_options", self.applied.append)
         self.panel = EnvOptionsPanel(panels.server, session)
         self.parts = Parts([self.panel])
+        panels.visitors.do = self.parts.do
         self.draw()
 
     def draw(self) -> None:
@@ -59,7 +62,6 @@ class Form:
 
     def press(self, name: str) -> None:
         self.panels.press(name)
-        self.panels.settle()
         self.draw()
 
 
@@ -70,7 +72,7 @@ def form(panels: Panels, scripted_session: Callable[..., Session], monkeypatch: 
 
 def test_each_keyword_has_the_input_of_its_type_and_shows_what_is_in_effect(form: Form) -> None:
     shown = {
-        name: form.panels.control(name, "field").value
+        name: form.panels.field(name).value
         for name in ("Envs", "Robot", "Control", "size", "count", "flag", "name", "way", "where", "made")
     }
     assert shown == {
@@ -85,9 +87,9 @@ def test_each_keyword_has_the_input_of_its_type_and_shows_what_is_in_effect(form
         "where": "[0, 1]",
         "made": "<object>",
     }
-    assert form.panels.control("Robot").options == ("panda", "fetch")
-    assert form.panels.control("made").disabled
-    assert form.panels.control("Apply", "button").disabled and not form.panels.shows("Discard", "button")
+    assert tuple(form.panels.field("Robot").options) == ("panda", "fetch")
+    assert form.panels.field("made").off
+    assert form.panels.button("Apply").command is None and not form.panels.shows("Discard", "button")
 
 
 def test_only_what_was_changed_is_given_and_all_at_once(form: Form) -> None:
@@ -108,16 +110,39 @@ def test_a_value_that_is_none_is_refused_in_words(form: Form, text: str, why: st
     form.set("where", text)
     form.press("Apply")
     assert form.applied == [] and why in form.panels.client.notices[-1]
-    assert form.panels.control("where").value == text, "to be mended"
+    assert form.panels.field("where").value == text, "to be mended"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("made", "1"), ("nothing_like_it", 1), ("name", "a\0b"), ("where", "x" * 2001)]
+)
+def test_what_no_input_takes_is_refused_and_the_form_stays(form: Form, name: str, value: Any) -> None:
+    before = form.panels.everything()
+    fields = {"name": name, "value": value}
+    with pytest.raises(Refused):
+        form.parts.do(COMMANDS.decode("set_keyword", fields), form.panels.visitor)
+    form.draw()
+    assert form.panels.everything() == before
+
+
+def test_whole_numbers_stay_whole_and_a_value_of_another_type_is_refused_in_words(form: Form) -> None:
+    form.set("count", 5)
+    form.set("size", 2)
+    form.press("Apply")
+    (options,) = form.applied
+    assert [(one, type(one)) for one in options.env_kwargs.values()] == [(2.0, float), (5, int)]
+    form.set("count", 2.5)
+    form.press("Apply")
+    assert form.panels.client.notices == ["count takes a whole number; got '2.5'."]
 
 
 def test_what_is_typed_survives_a_save_and_goes_with_discard(form: Form) -> None:
     form.set("size", 0.5)
     form.view = replace(form.view, task_serial=9)
     form.draw()
-    assert form.panels.control("size").value == 0.5
+    assert form.panels.field("size").value == 0.5
     form.press("Discard")
-    assert form.panels.control("size").value == 0.02 and form.applied == []
+    assert form.panels.field("size").value == 0.02 and form.applied == []
     assert not form.panels.shows("Discard", "button")
 
 
@@ -128,7 +153,7 @@ def test_a_number_that_is_typed_while_the_task_loads_stays(form: Form) -> None:
     form.set("Envs", 7)
     form.view = replace(loaded, options=TaskOptions(5))
     form.draw()
-    assert form.panels.control("Envs").value == 7 and form.panels.control("size").value == 0.02
+    assert form.panels.field("Envs").value == 7 and form.panels.field("size").value == 0.02
 
 
 def test_refused_options_stay_in_the_form_and_discard_takes_the_problem_away(form: Form) -> None:
@@ -137,9 +162,9 @@ def test_refused_options_stay_in_the_form_and_discard_takes_the_problem_away(for
     form.view = replace(form.view, options_refused=form.applied[0], state="error")
     form.draw()
     assert "Not taken: num_envs = 4000" in form.panels.html("wb-env-options")
-    assert form.panels.control("Envs").value == 4000
+    assert form.panels.field("Envs").value == 4000
     form.press("Discard")
-    assert form.panels.control("Envs").value == 4 and form.applied[-1] == TaskOptions(4)
+    assert form.panels.field("Envs").value == 4 and form.applied[-1] == TaskOptions(4)
 
 
 def test_options_that_were_taken_are_what_is_in_effect(form: Form) -> None:
@@ -151,9 +176,9 @@ def test_options_that_were_taken_are_what_is_in_effect(form: Form) -> None:
         form.view, options=form.applied[0], task=replace(form.view.task, made=made), task_serial=2
     )
     form.draw()
-    assert form.panels.control("size").value == 0.5 and form.panels.control("Apply", "button").disabled
+    assert form.panels.field("size").value == 0.5 and form.panels.button("Apply").command is None
     assert "--env size=0.5" in form.panels.html("wb-env-options")
-    form.press("as the task does")
+    form.panels.ask(ResetEnvOptions())
     assert form.applied[-1] == TaskOptions(4)
 
 

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.panels import Clock, Panels
+from tests.drive.panels import Panels
+from workbench.authoring.templates.new_task import TEMPLATES
+from workbench.commands.tasks import ClearTaskSearch, OpenListedTask, OpenTaskList, TemplateName
 from workbench.jobs.task import TaskOptions
 from workbench.session.tasks.catalogue import Catalogue, CatalogueView, Entry, Section
 from workbench.session.tasks.recents import RecentTasks
@@ -32,12 +34,12 @@ class Chosen:
     def __init__(self, catalogue: Catalogue) -> None:
         self.catalogue, self.numbers = catalogue, list[int]()
         self.says = ""
-        self.created: list[tuple[str, int]] = []
+        self.created: list[tuple[str, TemplateName]] = []
 
     def choose(self, number: int) -> None:
         self.numbers.append(number)
 
-    def create(self, name: str, template: int) -> None:
+    def create(self, name: str, template: TemplateName) -> None:
         if name == "taken":
             raise ValueError("There is a file taken.py already.")
         self.created.append((name, template))
@@ -64,66 +66,66 @@ def number_of(chosen: Chosen, name: str) -> int:
     return next(one.number for one in chosen.catalogue.view().entries if one.name == name)
 
 
-def sent(number: int, held: int = 0, press: int = 1) -> int:
-    """As ``wb.choose`` of the page sends a press on a row."""
-    return press * 10**8 + number * 8 + held
-
-
 def test_a_press_on_a_row_chooses_it_and_what_is_not_listed_chooses_nothing(
-    panels: Panels, chosen: Chosen, clock: Clock
+    panels: Panels, chosen: Chosen
 ) -> None:
     done: list[bool] = []
-    listed = TaskList(panels.server, chosen, lambda: done.append(True), clock)
+    listed = TaskList(panels.server, chosen, lambda: done.append(True))
     listed.draw()
     push = number_of(chosen, "push.py")
     assert f'data-row="{push}"' in panels.html("wb-tasks")
+    panels.visitors.do = listed.do
     for number in (0, push + 500, 10**6):
-        panels.claim("tasks", sent(number, press=number % 80 + 2))
-    panels.claim("tasks", sent(push, held=4, press=5))  # the second press of a double click
-    panels.settle()
-    assert chosen.numbers == [] and done == []
-    panels.claim("tasks", sent(push))
-    panels.settle()
+        panels.do(OpenListedTask(number=number))
+    assert chosen.numbers == [] and done == [] and len(panels.client.notices) == 3
+    panels.ask(OpenListedTask(number=push))
     assert chosen.numbers == [push] and done == [True]
 
 
-def test_the_search_leaves_what_has_all_words_and_can_be_cleared(
-    panels: Panels, chosen: Chosen, clock: Clock
-) -> None:
-    listed = TaskList(panels.server, chosen, clock=clock)
-    panels.set("Search", "PUSH .py")
-    clock.passes()
+def test_the_search_leaves_what_has_all_words_and_can_be_cleared(panels: Panels, chosen: Chosen) -> None:
+    listed = TaskList(panels.server, chosen)
+    panels.visitors.do = listed.do
+    panels.type("Search", "PUSH .py")
     listed.draw()
     html = panels.html("wb-tasks")
     assert 'data-words="PUSH .py"' in html and "push.py" in html and "pull.py" not in html
-    panels.set("Search", "nothing like it")
-    clock.passes()
+    panels.type("Search", "nothing like it")
     listed.draw()
     listed.draw()
     assert "Nothing in the list has" in panels.html("wb-tasks")
-    panels.press("clear")
-    clock.passes()
+    panels.ask(ClearTaskSearch())
     listed.draw()
-    assert "pull.py" in panels.html("wb-tasks") and panels.control("Search").value == ""
+    assert "pull.py" in panels.html("wb-tasks") and panels.typed("Search") == ""
 
 
-def test_a_new_task_is_asked_for_by_its_name_and_the_number_of_a_template(
-    panels: Panels, chosen: Chosen, clock: Clock
-) -> None:
+def test_a_new_task_is_asked_for_by_its_name_and_its_template(panels: Panels, chosen: Chosen) -> None:
     done: list[bool] = []
-    TaskList(panels.server, chosen, lambda: done.append(True), clock)
+    listed = TaskList(panels.server, chosen, lambda: done.append(True))
+    panels.visitors.do = listed.do
     panels.set("Name", "taken")
     panels.press(CREATE)
     assert panels.client.notices == ["There is a file taken.py already."]
     assert chosen.created == [] and done == []
     panels.set("Name", " stack_two ")
-    panels.set("Template", panels.control("Template").options[1])
+    assert list(panels.field("Template").options.values()) == [one.name for one in TEMPLATES]
+    panels.set("Template", next(one for one in panels.field("Template").options if "table" in one))
     panels.press(CREATE)
-    assert chosen.created == [("stack_two", 1)] and done == [True]
+    assert chosen.created == [("stack_two", "tabletop")] and done == [True]
+    listed.draw()
+    assert panels.typed("Name") == " stack_two " and panels.field("Template").value.startswith("tabletop: ")
+
+
+@pytest.mark.parametrize("name", ["x" * 201, "a\nb", "a\0b", "\u202eyp.kcats"])
+def test_a_name_that_no_file_can_have_is_refused(panels: Panels, chosen: Chosen, name: str) -> None:
+    listed = TaskList(panels.server, chosen)
+    panels.visitors.do = listed.do
+    panels.set("Name", name)
+    listed.draw()
+    assert len(panels.client.notices) == 1 and panels.typed("Name") == ""
 
 
 def html(view: CatalogueView, words: str = "", doing: str = "") -> str:
-    return tasks_html(view, words, doing, "numbers", "clear")
+    return tasks_html(view, words, doing)
 
 
 def test_names_are_escaped_and_what_is_gone_says_so() -> None:
@@ -141,21 +143,22 @@ def test_a_picture_or_the_reason_why_there_is_none_is_on_each_card() -> None:
     assert 'src="/task_pictures/Ycb-v1.jpg"' not in text
 
 
-def test_the_dialog_opens_once_chooses_and_goes(panels: Panels, chosen: Chosen, clock: Clock) -> None:
-    asking: list[bool] = []
-    dialog = OpenDialog(panels.server, chosen, asking.append, clock)
+def test_the_dialog_opens_once_chooses_and_goes(panels: Panels, chosen: Chosen) -> None:
+    dialog = OpenDialog(panels.server, chosen)
+    panels.visitors.do = dialog.do
     dialog.add_button()
     dialog.draw(None)
     panels.press(OPEN)
     dialog.draw(None)
-    assert "push.py" in panels.html("wb-tasks") and asking == [True]
+    assert "push.py" in panels.html("wb-tasks")
     push = number_of(chosen, "push.py")
-    panels.claim("tasks", sent(push))
-    panels.settle()
+    panels.ask(OpenListedTask(number=push))
     dialog.draw(None)
-    assert chosen.numbers == [push] and panels.html("wb-tasks") == "" and asking == [True, False]
-    dialog.open()
-    dialog.open()
+    assert chosen.numbers == [push] and panels.html("wb-tasks") == ""
+    panels.do(OpenListedTask(number=push))
+    assert chosen.numbers == [push], "it is closed"
+    panels.do(OpenTaskList())
+    panels.do(OpenTaskList())
     assert panels.html("wb-tasks") == "", "the key that opened it closes it"
 
 

@@ -16,6 +16,7 @@ from workbench.authoring.loading.copy_task import CannotCopy, NewNames, copied_t
 from workbench.authoring.loading.find_tasks import find_task_files, read_task_file
 from workbench.authoring.loading.library_names import is_library
 from workbench.authoring.loading.modules import read_exactly
+from workbench.commands.tasks import TemplateName
 from workbench.machine.files import create_file, read_regular_file, replace_file
 from workbench.machine.folders import example_tasks
 from workbench.machine.parse_python import parse_python
@@ -31,7 +32,7 @@ _WORD = re.compile(r"[A-Za-z0-9]+")
 class Template:
     """An example that a new task may begin from."""
 
-    name: str
+    name: TemplateName
     """What ``workbench new --from`` calls it."""
     example: str
     """Its file among the examples."""

@@ -150,7 +150,9 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
         requested, _ = with_given_actions(what)
         if recovered := recover_confined(what.out):
             err.print(f"{_episodes(len(recovered))} that an earlier recording left half written: recovered")
-        for notice in hidden_modules_text(what.task):
+        # Before the task is opened: an import that fails for it would be told without its reason.
+        told = hidden_modules_text(what.task)
+        for notice in told:
             warn(notice)
         if (left_alone := unused_gpu_text(what.options.backend)) is not None:
             warn(left_alone)
@@ -182,7 +184,7 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
                     print_finding,
                     executor,
                     name,
-                    warn,
+                    lambda notice: None if notice in told else warn(notice),
                 )
             record_bar.describe("recorded", len(recorded.written))
             status.end("stopped" if recorded.stopped else "done")

@@ -20,6 +20,7 @@ import sapien
 from mani_skill.agents import base_agent
 from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.controllers.base_controller import BaseController
+from mani_skill.agents.multi_agent import MultiAgent
 
 from workbench.core.broken_rule import in_brackets, place_of_class
 from workbench.core.error_notes import CoreRefusal, ErrorNote, Place, chain_of
@@ -62,6 +63,11 @@ def place_of_robot_file(cls: type) -> Place | None:
 def _note(error: BaseException) -> ErrorNote | None:
     frames = [frame for frame, _ in walk_tb(error.__traceback__)][::-1]
     robot = next((agent for frame in frames if (agent := _self(frame, BaseAgent)) is not None), None)
+    if isinstance(robot, MultiAgent) and not robot.agents:
+        # ManiSkill's own error is an index of its list of robots.
+        return ErrorNote(
+            'The task names no robot: give `robot_uids` a default in its __init__, such as "panda".'
+        )
     controller = next(
         (found for frame in frames if (found := _self(frame, BaseController)) is not None), None
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import os
+import re
 import select
 import socket
 import struct
@@ -326,8 +327,11 @@ def _array_description(dtype: np.dtype, shape: tuple[int, ...]) -> msgspec.msgpa
 @functools.lru_cache(1000)
 def _described(data: bytes) -> tuple[np.dtype, tuple[int, ...], int]:
     name, shape = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...]])
+    # Only as numpy writes them ("<f4"): it also reads records, and old aliases with a warning.
+    if re.fullmatch(rf"[<>|][{_NUMBERS}]\d+", name) is None:
+        _refuse_array()
     dtype = np.dtype(name)
-    if dtype.kind not in _NUMBERS or dtype.itemsize == 0 or min(shape, default=0) < 0:
+    if dtype.itemsize == 0 or min(shape, default=0) < 0:
         _refuse_array()
     return dtype, shape, dtype.itemsize * math.prod(shape)
 

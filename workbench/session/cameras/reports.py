@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.commands.cameras import MOST_MEASURED
 from workbench.core.camera_data import CameraInfo, CameraSettings, Picture, why_no_camera
 from workbench.core.cameras.conventions import compose
 from workbench.core.cameras.report import CameraReport, OfferedPlacement, SearchSpace, join_reports
@@ -25,8 +26,6 @@ FIRST_SEED = 10_000
 """The same seeds for every report, so that two can be compared; far from those that people start with."""
 MOST_ENVS = 16
 """In the background; for more seeds these are reset again."""
-MOST_SEEDS = 1000
-MOST_STEPS = 1000
 _REPORT_EVERY = 8
 """Steps between two partial reports."""
 
@@ -92,16 +91,16 @@ class CameraReports:
             cases: list[Case] = [(env, moment.of(env), None) for env in range(moment.num_envs)]
             self._measure_live("in all envs", camera, cases, len(cases))
         elif camera is not None and (load := self._load()) is not None:
-            self._measure_seeds(camera, load, min(seeds, MOST_SEEDS))
+            self._measure_seeds(camera, load, min(seeds, MOST_MEASURED))
 
-    def measure_steps(self, most: int = MOST_STEPS) -> None:
+    def measure_steps(self, most: int = MOST_MEASURED) -> None:
         """Measure the selected camera, as placed, over steps of the selected env's episode, with partial reports.
 
         Args:
             most: at most so many steps, evenly spread.
         """
         camera = self._selected_camera()
-        moments = self._past.episode_moments(min(max(1, most), MOST_STEPS))
+        moments = self._past.episode_moments(min(max(1, most), MOST_MEASURED))
         if camera is not None and moments:
             cases: list[Case] = [
                 (env, step.poses[env], MeasuredMoment(moment.serial, env, int(step.elapsed_steps[env])))

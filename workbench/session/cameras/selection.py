@@ -24,7 +24,7 @@ NEAREST_TARGET, FARTHEST_TARGET, USUAL = 0.1, 3.0, 1.0
 
 
 @dataclass(frozen=True)
-class Step:
+class PlacementChange:
     """One undoable change of one camera."""
 
     key: CameraKey
@@ -51,8 +51,8 @@ class Placements:
         """Settings of the loaded version."""
         self.placed: dict[CameraKey, CameraSettings] = {}
         """Settings of cameras that differ from the file; a direct change of this dict is no step of undo."""
-        self._done: list[Step] = []
-        self._undone: list[Step] = []
+        self._done: list[PlacementChange] = []
+        self._undone: list[PlacementChange] = []
 
     def copy(self) -> Placements:
         """The same placements and steps, independent of these."""
@@ -96,7 +96,7 @@ class Placements:
             before = last.before
             self._done.pop()
         label = label or _step_label(key, before, settings)
-        self._add_step(Step(key, before, settings, label, control, now))
+        self._add_step(PlacementChange(key, before, settings, label, control, now))
         self._put(key, settings)
         return True
 
@@ -106,11 +106,11 @@ class Placements:
         held[key] = replace(held[key], distance=distance)
         return held[key]
 
-    def _add_step(self, step: Step) -> None:
+    def _add_step(self, step: PlacementChange) -> None:
         self._done = [*self._done[-_MOST_STEPS + 1 :], step]
         self._undone.clear()
 
-    def undo(self) -> Step | None:
+    def undo(self) -> PlacementChange | None:
         """Undo a step; returns it, or None if there is none."""
         if not self._done:
             return None
@@ -119,7 +119,7 @@ class Placements:
         self._put(step.key, step.before)
         return step
 
-    def redo(self) -> Step | None:
+    def redo(self) -> PlacementChange | None:
         """Redo a step; returns it, or None if there is none."""
         if not self._undone:
             return None
@@ -150,7 +150,7 @@ class Placements:
             return False
         self.placed.pop(key, None)
         if differences(written, in_file):
-            self._add_step(Step(key, written, in_file, f"reverted the change of {key[1]}"))
+            self._add_step(PlacementChange(key, written, in_file, f"reverted the change of {key[1]}"))
         return True
 
     def rename(self, key: CameraKey, new: CameraKey) -> None:
@@ -188,7 +188,7 @@ class Placements:
                 del self.placed[key]
                 dropped.append(key)
                 label = f"reloaded {key[1]} from the file"
-                self._done.append(Step(key, placed, in_file[key], label))
+                self._done.append(PlacementChange(key, placed, in_file[key], label))
         for steps in (self._done, self._undone):
             steps[:] = [step for step in steps if step.key in in_file]
         return tuple(dropped)

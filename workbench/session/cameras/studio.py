@@ -16,7 +16,7 @@ from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.file_edits import FileEdits
 from workbench.session.cameras.reports import CameraReports
-from workbench.session.cameras.selection import KeptPlacements, Step, StudioCameras
+from workbench.session.cameras.selection import KeptPlacements, PlacementChange, StudioCameras
 from workbench.session.cameras.view import StudioView
 from workbench.session.history.history import ShownPast
 from workbench.session.process.askers import Asker, Background
@@ -112,7 +112,7 @@ class CameraStudio:
         """Redo the step that was undone last."""
         self._step(self._cameras.placements.redo)
 
-    def _step(self, move: Callable[[], Step | None]) -> None:
+    def _step(self, move: Callable[[], PlacementChange | None]) -> None:
         with self._lock:
             step = move()
             self._cameras.problem = ""

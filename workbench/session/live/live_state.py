@@ -78,6 +78,8 @@ class LiveState:
     tried_options: TaskOptions | None = None
     """Options that a person applied and that no load has taken or refused yet."""
     wants_play: bool = False
+    policy_failed: bool = False
+    """It ended the playing, and none has begun since. The problem itself may be gone: a save that a load follows clears it."""
     versions: list[tuple[int, TaskDescription]] = field(default_factory=list)
     """The versions that made the moments of `timeline`, oldest first, each with the serial of its first one."""
 
@@ -186,6 +188,7 @@ class LiveState:
             self.set(state="loading", activity=event.activity)
         elif isinstance(event, LoadFailed):
             self.set_problem(event.problem, event.at_run, event.spoiled)
+            self.policy_failed |= event.problem.stage == "policy"
             of_options = self._refuse_options(event.options)
             if not event.at_run:
                 self._remember(PastLoad(time.time(), None, event.problem.message, problem=event.problem))
@@ -223,6 +226,7 @@ class LiveState:
         elif isinstance(event, Inspection):
             self.set(inspection=event)
         elif isinstance(event, Status):
+            self.policy_failed &= not event.playing
             self.set(
                 playing=event.playing,
                 steps_per_second=event.steps_per_second,
@@ -415,13 +419,12 @@ class LiveState:
         return chosen.policy if chosen.action_source == "policy" else None
 
     def policy_saved(self) -> ReadPolicyAgain:
-        """Clear a problem of the policy; playing resumes if that problem had stopped it."""
+        """Clear a problem of the policy; playing resumes if one had stopped it."""
         problem = self.now.problem
-        policy_failed = problem is not None and problem.stage == "policy"
-        if policy_failed:
+        if problem is not None and problem.stage == "policy":
             self.set_problem(None)
             self._set_running()
-        return ReadPolicyAgain(play=policy_failed and self.wants_play)
+        return ReadPolicyAgain(play=self.policy_failed and self.wants_play)
 
     # --- reading -------------------------------------------------------------------------------------
 

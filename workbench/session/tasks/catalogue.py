@@ -13,12 +13,13 @@ from functools import cache
 from pathlib import Path
 
 from workbench.authoring.loading.find_tasks import FoundTasks, TaskFile, TaskFileReader, find_task_files
+from workbench.commands.run import MOST_ENVS
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import example_tasks
 from workbench.machine.parse_python import parse_python
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.text import short_line
-from workbench.session.tasks.recents import MOST_ENVS, RecentTask, RecentTasks
+from workbench.session.tasks.recents import RecentTask, RecentTasks
 from workbench.session.tasks.registered import RegisteredTasks, RegisteredView
 from workbench.session.tasks.typed import typed_path
 
@@ -110,6 +111,7 @@ class Catalogue:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._searching: threading.Thread | None = None
+        self._once_more = False
         self._numbers: dict[tuple[Section, str], int] = {}
         self._found: FoundTasks | None = None
         """None before the first search has ended."""
@@ -122,17 +124,12 @@ class Catalogue:
 
     def refresh(self) -> None:
         """Search the folder and look at the recent tasks again. Returns at once."""
-        self.registered.start()
-        with self._lock:
-            if self._closing.is_set() or (self._searching is not None and self._searching.is_alive()):
-                return
-            self._searching = threading.Thread(target=self._search, name="find-tasks", daemon=True)
-            self._searching.start()
+        self._begin_search(again=True)
 
     def follow(self) -> None:
-        """`refresh`, unless the last search has just ended. Call it while the list is in sight."""
+        """`refresh`, unless a search is under way or has just ended. Call it while the list is in sight."""
         if time.monotonic() >= self._search_again:
-            self.refresh()
+            self._begin_search(again=False)
 
     def view(self) -> CatalogueView:
         """The list; cheap while nothing changes."""
@@ -193,17 +190,37 @@ class Catalogue:
         if searching is not None:
             searching.join()
 
-    def _search(self) -> None:
-        found, began = FoundTasks(), time.monotonic()
-        try:
-            found = find_task_files(self.folder, self._closing.is_set, self._files.read)
-        except Exception as error:
-            report_failure("The folder could not be searched for tasks", error)
+    def _begin_search(self, again: bool) -> None:
+        """
+        Args:
+            again: Whether to search once more after a search that is under way: it may have passed by what has changed.
+        """
+        self.registered.start()
         with self._lock:
-            self._found, self._searching = found, None
-            self._changes += 1
-            took = time.monotonic() - began
-            self._search_again = time.monotonic() + max(SEARCH_SECONDS, took / SEARCH_SHARE)
+            if self._closing.is_set():
+                return
+            if self._searching is not None and self._searching.is_alive():
+                self._once_more |= again
+                return
+            self._searching = threading.Thread(target=self._search, name="find-tasks", daemon=True)
+            self._searching.start()
+
+    def _search(self) -> None:
+        while True:
+            found, began = FoundTasks(), time.monotonic()
+            try:
+                found = find_task_files(self.folder, self._closing.is_set, self._files.read)
+            except Exception as error:
+                report_failure("The folder could not be searched for tasks", error)
+            with self._lock:
+                self._found = found
+                self._changes += 1
+                took = time.monotonic() - began
+                self._search_again = time.monotonic() + max(SEARCH_SECONDS, took / SEARCH_SHARE)
+                if not self._once_more or self._closing.is_set():
+                    self._searching = None
+                    return
+                self._once_more = False
 
     # --- entries -------------------------------------------------------------------------------------
 

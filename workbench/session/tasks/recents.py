@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from workbench.authoring.loading.reference import file_and_class, named_file, split_reference
+from workbench.commands.run import MOST_ENVS
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import locked, read_private, state_folder, write_private
 
@@ -21,7 +22,6 @@ RECENT_FILE = "recent_tasks.json"
 MOST_KEPT = 20
 LONGEST = 4096
 """Characters of a reference."""
-MOST_ENVS = 4096
 LARGEST_KWARGS = 20_000
 """Bytes of the keyword arguments of one task."""
 

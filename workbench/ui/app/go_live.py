@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import viser
 
 from workbench.authoring.loading.reference import TaskName
+from workbench.commands.command import Command, Refused
+from workbench.commands.review import ChooseLiveCode, ChooseLiveEnvs, ReturnToFirstTask
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.from_recording import (
     CannotEnterRecording,
@@ -29,9 +31,12 @@ from workbench.session.live.session import Session
 from workbench.session.review.view import ReviewView
 from workbench.ui.live.banners import is_busy_for_long
 from workbench.ui.review.rescore import RECORDED, TODAYS
-from workbench.ui.widgets.inputs import tell_all
+from workbench.ui.widgets.fields import choice
+from workbench.ui.widgets.notices import tell_all
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render, sentence
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 if TYPE_CHECKING:
     from workbench.ui.app.workplace import Workplace
@@ -136,7 +141,7 @@ class GoLive:
             self._enter(there, way)
             return
         wanted = CodeToRun(reference_of(info), info, self.recorded_source, followed=not self.recorded_source)
-        # An answer may take long, and the page's buttons share few threads.
+        # An answer may take long, and what a page asks for next waits for the end of this.
         way.thread = threading.Thread(
             target=self._clear_and_go, args=(way, wanted), name="clear", daemon=True
         )
@@ -256,6 +261,8 @@ class GoLive:
 class GoLivePart(PagePart[ReviewView]):
     """Options of going live: which code, and into which envs."""
 
+    does = (ChooseLiveCode, ChooseLiveEnvs, ReturnToFirstTask)
+
     def __init__(self, server: viser.ViserServer, go_live: GoLive) -> None:
         self._go_live = go_live
         go_live.review_is_back()
@@ -264,31 +271,35 @@ class GoLivePart(PagePart[ReviewView]):
         gui = server.gui
         self._folder = gui.add_folder("Continue live", expand_by_default=False, visible=False)
         with self._folder:
-            self._code = gui.add_dropdown(
+            self._code = choice(
+                server,
                 "Code",
+                ChooseLiveCode,
+                "code",
                 (TODAYS, RECORDED),
-                initial_value=RECORDED if go_live.recorded_source else TODAYS,
+                TODAYS,
                 hint="The current code of the task, or the recorded code, opened from a temporary folder",
             )
             self._besides = gui.add_html("")
-            self._envs = gui.add_dropdown(
+            self._envs = choice(
+                server,
                 "Into",
+                ChooseLiveEnvs,
+                "envs",
                 (ONE, ALL),
-                initial_value=ALL if go_live.everywhere else ONE,
+                ONE,
                 hint="Which envs get the recorded state",
             )
-            self._home = gui.add_button(
-                "Back to the first task", icon=viser.Icon.ARROW_BACK_UP, visible=False
-            )
-        self._code.on_update(lambda _: self._chosen())
-        self._envs.on_update(lambda _: self._chosen())
-        self._home.on_click(lambda _: go_live.go_home())
+            self._home = gui.add_html("")
 
     def draw(self, view: ReviewView) -> None:
         self._go_live.change_pages_when_there()
         home = self._go_live.can_go_home()
         self._folder.visible = bool(view.opened) or home
-        self._home.visible = home
+        self._code.show(RECORDED if self._go_live.recorded_source else TODAYS)
+        self._envs.show(ALL if self._go_live.everywhere else ONE)
+        back = tool("Back to the first task", ReturnToFirstTask(), tone="main")
+        self._home.content = tools_html([back] if home else [])
         info = None if view.chosen is None else view.chosen.episode.info
         if self._about != (info and info.id, self._go_live.recorded_source):
             self._about = info and info.id, self._go_live.recorded_source
@@ -297,9 +308,16 @@ class GoLivePart(PagePart[ReviewView]):
                 words = side_files_text(info.source_file, info.side_files)
             self._besides.content = render("note", text=words) if words else ""
 
-    def _chosen(self) -> None:
-        self._go_live.recorded_source = self._code.value == RECORDED
-        self._go_live.everywhere = self._envs.value == ALL
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseLiveCode(code=code):
+                self._go_live.recorded_source = code == RECORDED
+            case ChooseLiveEnvs(envs=envs):
+                self._go_live.everywhere = envs == ALL
+            case ReturnToFirstTask():
+                if not self._go_live.can_go_home():
+                    raise Refused("No other task is open.")
+                self._go_live.go_home()
 
 
 def _end(session: Session, folder: Path | None) -> None:

@@ -7,13 +7,29 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import viser
 
 from workbench.authoring.loading.reference import named_file
-from workbench.jobs.task import ShownPictures
+from workbench.commands.cameras import ChoosePictures, SelectCamera
+from workbench.commands.command import Command
+from workbench.commands.envs import ToggleOnlySelected
+from workbench.commands.page import (
+    CloseDialog,
+    CloseHints,
+    FrameScene,
+    ShowRecordings,
+    ShowTab,
+    TellDrawnInSoftware,
+    TellOpenTab,
+    TellUnfolded,
+    ToggleTable,
+    ToggleTheme,
+)
+from workbench.commands.recording import ToggleRecording, ToggleSavePast
+from workbench.commands.run import Interrupt, ReloadFile, RestartWorker
+from workbench.machine.kept_choices import close_hints
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.app.marks import EPISODES, STUDIO, Marks
@@ -24,35 +40,66 @@ from workbench.ui.checks.panel import TAB as CHECKS
 from workbench.ui.checks.panel import ChecksPanel
 from workbench.ui.checks.solve_seeds import SolveSeedsPanel
 from workbench.ui.checks.step_profile import StepProfilePanel
-from workbench.ui.live.banners import INTERRUPT, NEW_WORKER, RELOAD, RESTART, Banner, BusyBanner
+from workbench.ui.live.banners import Banner, BusyBanner
+from workbench.ui.live.env_panel import TABLE as ENVS
 from workbench.ui.live.env_panel import EnvPanel
-from workbench.ui.live.episodes_panel import RECORD, SAVE, STOP, RecordPanel
+from workbench.ui.live.episodes_panel import RecordPanel
+from workbench.ui.live.inspect_panel import TAB as INSPECT
 from workbench.ui.live.inspect_panel import ForceArrows, InspectPanel
 from workbench.ui.live.log_panel import LogPanel
 from workbench.ui.live.rescored import PastRescorePanel, RescoredAbove
 from workbench.ui.live.reward import CurvesPanel, NumbersPanel
-from workbench.ui.live.run_panel import NEXT, PREVIOUS, RESET_ALL, RESET_THIS, STEP, RunPanel
+from workbench.ui.live.run_panel import RunPanel
 from workbench.ui.live.solve_panel import SolvePanel
 from workbench.ui.live.status_line import StatusLine
 from workbench.ui.live.task_commands import TaskCommands
-from workbench.ui.live.timeline import GO_ON, LIVE, UNDO, TimelinePanel
 from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
-from workbench.ui.live.version_panel import AS_NEEDED, VersionPanel
+from workbench.ui.live.timeline import TimelinePanel
+from workbench.ui.live.version_panel import VersionPanel
 from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
 from workbench.ui.scene.viewpoint import FOV, Stage, ViewPanel, Viewpoint, frame_all, frame_one
 from workbench.ui.tasks.env_options import EnvOptionsPanel
-from workbench.ui.tasks.task_list import OPEN, Chooser, OpenDialog
+from workbench.ui.tasks.task_list import Chooser, OpenDialog
 from workbench.ui.widgets.editor import editor_link
-from workbench.ui.widgets.hotkeys import Command, add_hints, register
-from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.fields import choice
+from workbench.ui.widgets.hotkeys import add_hints, key_rows, register
 from workbench.ui.widgets.open_tabs import OpenTabs
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor, Visitors
 
+DOES: frozenset[type[Command]] = frozenset(
+    {
+        ShowRecordings,
+        ShowTab,
+        TellOpenTab,
+        TellUnfolded,
+        TellDrawnInSoftware,
+        ToggleTable,
+        FrameScene,
+        ToggleTheme,
+        ToggleOnlySelected,
+        CloseHints,
+        ReloadFile,
+        Interrupt,
+        RestartWorker,
+        ToggleRecording,
+        ToggleSavePast,
+        ChoosePictures,
+        CloseDialog,
+        *CamerasPanel.does,
+    }
+)
+"""What the page itself does; the rest is done by its parts."""
 PANELS_EVERY = 0.06
 """Seconds between two drawings of the panels while the envs play, every second frame: faster, nobody reads numbers."""
+PICTURES_HINT = (
+    "Exact ones are SAPIEN's own; fast ones take a fraction of the time without a graphics card, of simplified meshes. "
+    "Auto: fast while something moves, exact when it stands still. What this page records is exact."
+)
 PANEL_WIDTH = 372
 ENVS_WIDTH = 520
 
@@ -66,12 +113,13 @@ class Page:
 
     Args:
         server: Of viser.
+        visitors: The open pages.
         session: The session.
         dark: The first theme.
         on_review: Called when a person wants to see the recordings.
         on_look: Called with the recording that a person wants to look at.
         stage: The 3-D view; None makes one.
-        commands: Further ones for the palette.
+        also: Further commands for the palette, which somebody else does.
         clock: Of all parts of the page.
         editor: Address of a line in the author's editor, as `parse_editor` gives it.
         chooser: Opens another task; None for a page that keeps its own.
@@ -80,17 +128,18 @@ class Page:
     def __init__(
         self,
         server: viser.ViserServer,
+        visitors: Visitors,
         session: Session,
         dark: bool = True,
         on_review: Callable[[], None] = lambda: None,
         on_look: Callable[[Path], None] = lambda path: None,
         stage: Stage | None = None,
-        commands: tuple[Command, ...] = (),
+        also: frozenset[type[Command]] = frozenset(),
         clock: Clock = time.monotonic,
         editor: str = "",
         chooser: Chooser | None = None,
     ) -> None:
-        self._server = server
+        self._server, self._visitors = server, visitors
         self._session = session
         self._clock = clock
         self._link = partial(editor_link, editor, known=session.versions.knows_file)
@@ -113,9 +162,10 @@ class Page:
         status = StatusLine(server, clock)
         # Not the path itself, which may be long.
         which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
-        self._open_tabs = OpenTabs(server, which)
-        marks = Marks(server, session, self._open_tabs, lambda: self._envs.select_first_flagged())
-        self._opening = None if chooser is None else OpenDialog(server, chooser, clock=clock)
+        self._open_tabs = OpenTabs(visitors)
+        server.gui.add_html(render("which", which=which, anew=False, says=True))
+        marks = Marks(server, session, self._open_tabs)
+        self._opening = None if chooser is None else OpenDialog(server, chooser)
         if self._opening is not None:
             self._opening.add_button()
         self._in_software = stage.in_software
@@ -123,16 +173,8 @@ class Page:
         run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
-        versions = session.versions
-        banner = Banner(
-            server,
-            versions.reload,
-            lambda: versions.reload("rebuilt"),
-            versions.restart_worker,
-            self._link,
-            self._is_own,
-        )
-        busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker, self._link)
+        banner = Banner(server, self._link, self._is_own)
+        busy_banner = BusyBanner(server, self._link)
         floating = self._envs, self._timeline, banner, busy_banner
         opening = () if self._opening is None else (self._opening,)
         self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
@@ -140,11 +182,11 @@ class Page:
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
         self._forces = ForceArrows(server)
-        commands = (*self._commands(), *commands)
-        register(server, commands)
-        self._parts.add(TaskCommands(server, session))
+        self._parts.add(TaskCommands(server, visitors, session))
+        kinds = DOES | self._parts.does | also
+        register(server, visitors, kinds, "live page")
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
-            server.gui.add_html(render("keys", commands=commands))
+            server.gui.add_html(render("keys", rows=key_rows(kinds)))
         server.scene.on_click()(self._on_scene_click)
 
     def _is_own(self, file: str) -> bool:
@@ -152,27 +194,20 @@ class Page:
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[SessionView]]]:
         """Returns the Run tab, which gets more content later, and the parts of all tabs."""
-        server, session, clock, on_review = self._server, self._session, self._clock, self._on_review
+        server, session, clock = self._server, self._session, self._clock
         tabs = server.gui.add_tab_group()
         run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
         with run_tab:
-            add_hints(server)
+            self._hints = add_hints(server)
             self._run = RunPanel(server, session)
             self._solve = SolvePanel(server, session, self._link)
             self._view_panel = ViewPanel(server, dark, self._view_choice)
             version = VersionPanel(server, session, self._link)
             options = EnvOptionsPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
-            self._degree = Control(
-                server.gui.add_dropdown(
-                    "Pictures",
-                    get_args(ShownPictures),
-                    initial_value="auto",
-                    hint="Exact ones are SAPIEN's own; fast ones take a fraction of the time without a graphics card, of "
-                    "simplified meshes. Auto: fast while something moves, exact when it stands still. What this page "
-                    "records is exact.",
-                ),
-                send=lambda degree: session.change(pictures=degree),
+            degrees = "auto", "exact", "fast"
+            self._degree = choice(
+                server, "Pictures", ChoosePictures, "pictures", degrees, "auto", hint=PICTURES_HINT
             )
             self._cameras = CamerasPanel(
                 server,
@@ -195,8 +230,7 @@ class Page:
             self._inspect = InspectPanel(server, session, clock)
         with tabs.add_tab(EPISODES, viser.Icon.MOVIE):
             self._record = RecordPanel(server, session)
-            review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS, color="gray")
-            review.on_click(lambda _: on_review())
+            server.gui.add_html(tools_html([tool("Review recordings", ShowRecordings())]))
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, session, checks_tab, self._link)
             seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
@@ -213,7 +247,6 @@ class Page:
             *reward,
             self._rescored,
         ]
-        self._open_tabs.are("Run", "Cameras", STUDIO, "Reward", "Inspect", EPISODES, CHECKS, "Log")
         return run_tab, [*parts, self._inspect, self._record, checks, seeds, profile, log]
 
     def _add_table_of_envs(self) -> None:
@@ -252,6 +285,65 @@ class Page:
         self._parts.draw(view)
         self._degree.show(view.settings.pictures)
         self._cameras.draw(view.shown_cameras)
+
+    # --- what a person does ----------------------------------------------------------------------
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        """Do what a page asks for. Raises `Refused`."""
+        session = self._session
+        match command:
+            case ShowRecordings():
+                self._on_review()
+            case ShowTab(tab=tab, fold=fold):
+                self._open_tabs.open(visitor, tab, fold)
+            case TellOpenTab(tab=tab):
+                self._open_tabs.said(visitor, tab)
+            case TellUnfolded(panel=panel):
+                self._unfolded(panel)
+            case TellDrawnInSoftware():
+                self._in_software.told_by(visitor)
+            case ToggleTable():
+                self._toggle_envs()
+            case FrameScene():
+                self.frame(session.view())
+            case ToggleTheme():
+                self._view_panel.toggle_dark()
+            case ToggleOnlySelected():
+                self._view_panel.toggle_only_selected()
+            case CloseHints():
+                self._hints.content = ""
+                close_hints()
+            case ReloadFile():
+                session.versions.reload()
+            case Interrupt():
+                session.interrupt()
+            case RestartWorker():
+                session.versions.restart_worker()
+            case ToggleRecording():
+                self._record.toggle()
+            case ToggleSavePast():
+                self._record.save()
+            case ChoosePictures(pictures=pictures):
+                session.change(pictures=pictures)
+            case SelectCamera():
+                self._parts.do(command, visitor)
+                self._open_tabs.open(visitor, STUDIO)
+            case CloseDialog():
+                if self._opening is not None:
+                    self._opening.close()
+            case _ if isinstance(command, CamerasPanel.does):
+                self._cameras.do(command, visitor)
+            case _:
+                self._parts.do(command, visitor)
+
+    def _unfolded(self, panel: str) -> None:
+        """A page shows this panel."""
+        if panel == ENVS:
+            self._envs.unfold()
+        elif panel == STUDIO:
+            self._studio.unfold()
+        elif panel == INSPECT:
+            self._inspect.unfold()
 
     def _toggle_envs(self) -> None:
         self._envs_open = not self._envs_open
@@ -350,60 +442,6 @@ class Page:
         env = env_under_ray(layout, *ray)
         if env is not None and env < view.task.num_envs:
             self._session.change(selected_env=env)
-
-    # --- keys ------------------------------------------------------------------------------------
-
-    def _commands(self) -> list[Command]:
-        session, run, timeline = self._session, self._run, self._timeline
-        rescored = self._rescored
-        # A letter alone shows something, plays or steps. What resets, rewinds, writes a file or ends what runs needs
-        # Shift: letters that are typed beside a field are pressed too.
-        opening = (
-            [] if self._opening is None else [Command(OPEN, self._opening.open, "O", "cmd/ctrl", (OPEN,))]
-        )
-        return [
-            *opening,
-            Command("Review recordings", self._on_review, "V", buttons=("Review recordings",)),
-            Command("Play or pause", run.toggle_play, "space", buttons=("Play", "Pause")),
-            Command("One step", session.step, "S", buttons=(STEP,)),
-            Command("Reset all envs", session.reset, "R", "shift", (RESET_ALL,)),
-            Command("Reset the selected env", run.reset_this, "S", "shift", (RESET_THIS,)),
-            Command("Undo the last reset or rewind", session.past.undo, "U", "shift", (UNDO,)),
-            *timeline.commands(),
-            Command("Go to the first moment", timeline.go_to_the_first, "home"),
-            Command("Go to live", timeline.go_live, "end", buttons=(LIVE,)),
-            Command(
-                "Continue from here, in the selected env",
-                timeline.continue_from_shown,
-                "G",
-                "shift",
-                (GO_ON,),
-            ),
-            Command("Next episode with a different result", lambda: rescored.go_to_difference(1), "J"),
-            Command(
-                "Previous episode with a different result",
-                lambda: rescored.go_to_difference(-1),
-                "J",
-                "shift",
-            ),
-            Command("Next env", lambda: run.select_neighbour(1), "N", buttons=(NEXT,)),
-            Command("Previous env", lambda: run.select_neighbour(-1), "P", buttons=(PREVIOUS,)),
-            Command("Open or close the table of envs", self._toggle_envs, "B"),
-            Command("Next env whose last episode failed", lambda: self._envs.select_next("failed"), "E"),
-            Command("Next flagged env", lambda: self._envs.select_next("flagged"), "E", "shift"),
-            Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
-            Command("Frame the scene", lambda: self.frame(session.view()), "F"),
-            Command("Start or stop recording", self._record.toggle, "C", "shift", (RECORD, STOP)),
-            Command("Save what I just saw", self._record.save, "K", "shift", (SAVE,)),
-            Command("Show the checks", lambda: self._open_tabs.open_everywhere(CHECKS), "W"),
-            Command("Reload the file", session.versions.reload, "L", buttons=(AS_NEEDED, RELOAD)),
-            Command("Interrupt the task", session.interrupt, "I", "shift", (INTERRUPT,)),
-            Command(
-                "Restart the worker", session.versions.restart_worker, "L", "shift", (RESTART, NEW_WORKER)
-            ),
-            Command("Switch between the dark and the light theme", self._view_panel.toggle_dark, "D"),
-            *self._studio.commands(),
-        ]
 
 
 def _shown_of(view: SessionView) -> tuple[object, object]:

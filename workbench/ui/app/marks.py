@@ -4,11 +4,16 @@ flagged envs."""
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 import viser
 
+from workbench.commands.cameras import PutMovedCamerasBack, ShowCameraChange
+from workbench.commands.checks import ShowChecks
+from workbench.commands.command import Command
+from workbench.commands.envs import ShowFirstFlagged
+from workbench.commands.page import ShowTab
+from workbench.commands.recording import StopRecording
 from workbench.core.camera_data import CameraKey
 from workbench.session.cameras.view import EditRequest
 from workbench.session.history.env_table import EnvRows
@@ -18,10 +23,10 @@ from workbench.ui.checks.panel import TAB as CHECKS
 from workbench.ui.checks.panel import findings_mark
 from workbench.ui.live.env_panel import first_flagged, mask
 from workbench.ui.live.episodes_panel import envs_in_words
-from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.open_tabs import OpenTabs
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import counted, render
+from workbench.ui.widgets.visitors import Visitor
 
 EPISODES, STUDIO = "Episodes", "Studio"
 
@@ -34,24 +39,26 @@ class Marks(PagePart[SessionView]):
         server: The page.
         session: The session.
         tabs: Opens the tab that a mark is about.
-        on_flagged: Called when the mark of flagged envs is pressed.
     """
 
     every = 0.25
 
-    def __init__(
-        self, server: viser.ViserServer, session: Session, tabs: OpenTabs, on_flagged: Callable[[], None]
-    ) -> None:
+    does = (StopRecording, PutMovedCamerasBack, ShowCameraChange, ShowChecks)
+
+    def __init__(self, server: viser.ViserServer, session: Session, tabs: OpenTabs) -> None:
         self._session, self._tabs = session, tabs
         self._html = server.gui.add_html("")
-        # At the end of the panel, after the tabs: everything after it is hidden.
-        presses = Presses(server)
-        self._stop = presses.id_of("stop recording", lambda _: session.stop_recording())
-        self._undo = presses.id_of("undo the camera's move", lambda _: self._put_back())
-        self._save = presses.id_of("save the camera's move", self._show_change)
-        self._findings = presses.id_of("open", lambda client: tabs.open(CHECKS, client))
-        self._flagged = presses.id_of("flagged", lambda _: on_flagged())
-        self._saving = presses.id_of("saving", lambda client: tabs.open(EPISODES, client))
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case StopRecording():
+                self._session.stop_recording()
+            case PutMovedCamerasBack():
+                self._put_back()
+            case ShowCameraChange():
+                self._show_change(visitor)
+            case ShowChecks():
+                self._tabs.open(visitor, CHECKS)
 
     def urgent(self, view: SessionView) -> object:
         recording = view.recording
@@ -70,26 +77,26 @@ class Marks(PagePart[SessionView]):
         flagged = None if rows is None else flagged_text(rows)
         self._html.content = render(
             "marks",
-            rec=recording_mark(view, self._stop),
-            moved=moved_mark(view, self._undo, self._save),
-            saving=self._saving if view.recording.saving.progress is not None else "",
+            rec=recording_mark(view),
+            moved=moved_mark(view),
+            saving=ShowTab(tab=EPISODES) if view.recording.saving.progress is not None else None,
             findings=findings_mark(view),
-            findings_press=self._findings,
-            flagged=flagged and {"text": flagged[0], "hint": flagged[1], "press": self._flagged},
+            checks=ShowChecks(),
+            flagged=flagged and {"text": flagged[0], "hint": flagged[1], "press": ShowFirstFlagged()},
         )
 
     def _put_back(self) -> None:
         for key in moved_cameras(self._session.view()):
             self._session.studio.back_to_file(key)
 
-    def _show_change(self, client: viser.ClientHandle | None) -> None:
+    def _show_change(self, visitor: Visitor) -> None:
         """Show how the file would change; nothing is written before that was read."""
         moved = moved_cameras(self._session.view())
         if not moved:
             return
         self._session.studio.select(moved[0])
         self._session.studio.file.plan(EditRequest("edit", moved[0]))
-        self._tabs.open(STUDIO, client)
+        self._tabs.open(visitor, STUDIO)
 
 
 def moved_cameras(view: SessionView) -> tuple[CameraKey, ...]:
@@ -97,7 +104,7 @@ def moved_cameras(view: SessionView) -> tuple[CameraKey, ...]:
     return tuple(camera.key for camera in view.studio.cameras if camera.moved)
 
 
-def moved_mark(view: SessionView, undo: str, save: str) -> dict[str, str] | None:
+def moved_mark(view: SessionView) -> dict[str, object] | None:
     """The mark of moved cameras; None if all are as in the file."""
     moved = [name for _, name in moved_cameras(view)]
     if not moved:
@@ -107,10 +114,16 @@ def moved_mark(view: SessionView, undo: str, save: str) -> dict[str, str] | None
     hint = (
         f"{names} {'is' if one else 'are'} not where the file says, in every env and in all that is recorded."
     )
-    return {"what": what, "names": names, "undo": undo, "save": save, "hint": hint}
+    return {
+        "what": what,
+        "names": names,
+        "undo": PutMovedCamerasBack(),
+        "save": ShowCameraChange(),
+        "hint": hint,
+    }
 
 
-def recording_mark(view: SessionView, stop: str) -> dict[str, object] | None:
+def recording_mark(view: SessionView) -> dict[str, object] | None:
     """The mark of a recording; None while none runs."""
     recording = view.recording
     if not recording.active:
@@ -129,7 +142,7 @@ def recording_mark(view: SessionView, stop: str) -> dict[str, object] | None:
         "all_wait": recording.waiting == len(recording.env_idx),
         "episodes": recording.episodes,
         "since": time.strftime("%H:%M", time.localtime(recording.since)),
-        "stop": stop,
+        "stop": StopRecording(),
         "hint": hint,
     }
 

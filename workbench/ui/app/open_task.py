@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from workbench.authoring.loading.find_tasks import is_below
 from workbench.authoring.loading.reference import TaskName, file_and_class
-from workbench.authoring.templates.new_task import TEMPLATES, write_new_task
+from workbench.authoring.templates.new_task import write_new_task
+from workbench.commands.tasks import TemplateName
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import example_tasks
 from workbench.machine.processes.watched_thread import watched_thread
@@ -17,7 +18,7 @@ from workbench.session.clearance import Clearances, NotCleared
 from workbench.session.live.session import KeptWork, Session
 from workbench.session.tasks.catalogue import Catalogue, Entry, Section
 from workbench.session.tasks.recents import RecentTasks, lasting
-from workbench.ui.widgets.inputs import tell_all
+from workbench.ui.widgets.notices import tell_all
 from workbench.ui.widgets.templates import sentence
 
 if TYPE_CHECKING:
@@ -82,9 +83,9 @@ class OpenTask:
             self._wish = entry
             self._wake.notify_all()
 
-    def create(self, name: str, template: int) -> None:
+    def create(self, name: str, template: TemplateName) -> None:
         """Write a new task into the folder of the list, and open it; see `Chooser.create`."""
-        made = write_new_task(name, TEMPLATES[template].name, self.catalogue.folder)
+        made = write_new_task(name, template, self.catalogue.folder)
         # Not by its number: a search that began before it was written may end now, and list it not.
         self._want(self.catalogue.add_file(made.file, made.env_id))
 

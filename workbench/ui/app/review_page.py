@@ -3,12 +3,27 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 import viser
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.library import OpenSideBySide, RescoreSelected
+from workbench.commands.page import (
+    CloseDialog,
+    FrameScene,
+    ShowLive,
+    ShowTab,
+    TellDrawnInSoftware,
+    TellUnfolded,
+    ToggleTable,
+    ToggleTheme,
+)
+from workbench.commands.review import RescoreChosen
+from workbench.commands.run import TogglePlay
+from workbench.commands.timeline import GoToFirst, GoToLast, Seek
 from workbench.core.camera_data import CameraKey, Picture
 from workbench.recording.library.library import Library
 from workbench.recording.sweeps import RESULTS
@@ -21,28 +36,22 @@ from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.library.listing import Action
 from workbench.ui.library.panel import LibraryPanel
 from workbench.ui.library.rows import OpenVersion
-from workbench.ui.live.timeline import (
-    LAST_EVENT,
-    LAST_STEP,
-    MOST_MARKS,
-    NEXT_EVENT,
-    NEXT_STEP,
-    TimeBar,
-    strip_values,
-)
+from workbench.ui.live.timeline import MOST_MARKS, TimeBar, strip_values, walk_tools
 from workbench.ui.review.compare import ReviewComparePanel
 from workbench.ui.review.curves import ReviewCurves, ReviewNumbers
-from workbench.ui.review.panel import GO_LIVE, ReviewPanel
+from workbench.ui.review.panel import ReviewPanel
 from workbench.ui.review.rescore import RescorePanel
 from workbench.ui.review.scene import ReviewIn3D, shown_together
 from workbench.ui.review.sweep import SweepPanel
 from workbench.ui.scene.viewpoint import ViewPanel
-from workbench.ui.tasks.task_list import OPEN, OpenDialog
-from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.hotkeys import Command, register
+from workbench.ui.tasks.task_list import OpenDialog
+from workbench.ui.widgets.hotkeys import key_rows, register
+from workbench.ui.widgets.open_tabs import OpenTabs
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
 from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 if TYPE_CHECKING:
     from workbench.ui.app.workplace import Workplace
@@ -62,6 +71,23 @@ NARROW = 700
 TOLD_WIDTH = 20.0
 """Seconds within which a page reports the new width of its view."""
 BACK = "Back to the live env"
+LIBRARY = "library"
+"""The panel, as a page tells that it was unfolded."""
+DOES: frozenset[type[Command]] = frozenset(
+    {
+        ShowLive,
+        ShowTab,
+        TellUnfolded,
+        TellDrawnInSoftware,
+        ToggleTable,
+        FrameScene,
+        ToggleTheme,
+        RescoreChosen,
+        CloseDialog,
+        *CamerasPanel.does,
+    }
+)
+"""What the page itself does; the rest is done by its parts."""
 
 
 class ReviewPage:
@@ -97,31 +123,28 @@ class ReviewPage:
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Recordings")
         self._status = server.gui.add_html("")
-        self._opening = OpenDialog(
-            server, place.open_task, lambda asking: self._library.leave_keys(asking), clock
-        )
+        self._opening = OpenDialog(server, place.open_task)
         self._opening.add_button()
-        server.gui.add_html(render("which", which="review", anew=place.wanted is not None, says=""))
+        self._open_tabs = OpenTabs(place.visitors)
+        server.gui.add_html(render("which", which="review", anew=place.wanted is not None, says=False))
         place.stage.in_software.ask()
         self._add_way_back()
         review_tab, in_tabs = self._add_tabs(dark)
-        self._timeline = ReviewTimeline(server, review, clock)
+        self._timeline = ReviewTimeline(server, review)
         self._in_3d = ReviewIn3D(server, review, place.stage)
         self._parts = Parts((self._panel, self._timeline, *in_tabs, self._opening), clock)
         if self._sweep is not None:
             self._parts.add(self._sweep)
-        commands = [*self._commands(), *place.commands, *self._library.commands()]
-        register(server, commands)
+        kinds = DOES | self._parts.does | place.does
+        register(
+            server, place.visitors, kinds if place.session is not None else kinds - {ShowLive}, "review page"
+        )
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
-            server.gui.add_html(render("keys", commands=commands))
+            server.gui.add_html(render("keys", rows=key_rows(kinds)))
 
     def _add_way_back(self) -> None:
         if self._place.session is not None:
-            go_back = self._server.gui.add_button(BACK, icon=viser.Icon.ARROW_BACK_UP, color="gray")
-            go_back.on_click(lambda _: self._go_back())
-
-    def _go_back(self) -> None:
-        self._place.pages.show("live")
+            self._server.gui.add_html(tools_html([tool(BACK, ShowLive())]))
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
         """Returns the Review tab, which gets more content later, and the parts of all tabs."""
@@ -137,7 +160,7 @@ class ReviewPage:
                 server, self._want, "This recording has no pictures.", clock=self._clock
             )
         with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
-            numbers, curves = ReviewNumbers(server), ReviewCurves(server, review.seek)
+            numbers, curves = ReviewNumbers(server), ReviewCurves(server)
         with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
             compare = ReviewComparePanel(server, review)
         share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
@@ -148,11 +171,20 @@ class ReviewPage:
         self._add_library(library)
         with share_tab:
             sharing = place.sharing
-            share = sharing.part(server, library, self._library, self._make_way, self._other_unfolded)
+            share = sharing.part(server, library, self._library, self._make_way)
         with review_tab:
             going = GoLivePart(server, go_live)
             self._view_panel = ViewPanel(server, dark, place.stage.choice)
-        return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
+        return review_tab, [
+            numbers,
+            curves,
+            compare,
+            self._library,
+            share,
+            going,
+            self._view_panel,
+            self._rescore,
+        ]
 
     def _running(self) -> OpenVersion | None:
         session = self._place.session
@@ -164,22 +196,21 @@ class ReviewPage:
         self._library_window = self._server.gui.add_panel(order=5.0)
         self._sweep = self._sweep_of(library)
         with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
-            self._library = LibraryPanel(self._server, library, self._review.open, self._clock, self._running)
-            Presses(self._server).when_unfolded(self._library_unfolded)
+            self._library = LibraryPanel(self._server, library, self._review.open, self._running)
+            self._server.gui.add_html(render("tell", command=TellUnfolded(panel=LIBRARY)))
         self._library.add_action(
             Action(
                 "Side by side",
+                OpenSideBySide(),
                 "Show them side by side (Shift+Enter)",
                 self._open_side_by_side,
                 MOST_OPEN,
-                "Open the selected recordings side by side",
-                "enter",
-                "shift",
             )
         )
         self._library.add_action(
             Action(
                 "Rescore",
+                RescoreSelected(),
                 "Run the current reward and evaluate over them (J)",
                 self._rescore.rescore_and_notify,
             )
@@ -187,7 +218,6 @@ class ReviewPage:
         self._library_window.dock_left()
         self._library_window.set_width(LIBRARY_WIDTH)
         self._library_open = True
-        self._place.dialog.tell(self._library.leave_keys)
         if self._had_opened:
             self._show_library(False)
 
@@ -252,8 +282,6 @@ class ReviewPage:
             "review_status",
             view=view,
             going=self._place.go_live.going(),
-            # `library_keys.js` disables these while the library is folded.
-            library_keys=" ".join(self._library.keys),
             outcome_text=outcome_text,
         )
         self._draw_cameras(view)
@@ -324,12 +352,11 @@ class ReviewPage:
                 self._other_folded = False
                 self._fold_other(False)
 
-    def _library_unfolded(self) -> None:
-        self._library_open = True
-        self._unfolded = "library", self._clock()
-
-    def _other_unfolded(self) -> None:
-        self._unfolded = "other", self._clock()
+    def _panel_unfolded(self, panel: str) -> None:
+        """A page shows this panel."""
+        if panel == LIBRARY:
+            self._library_open = True
+        self._unfolded = panel, self._clock()
 
     def _fold_what_crowds(self) -> None:
         """Fold the panel that was unfolded first, where library and rerun leave no room for the view.
@@ -342,7 +369,7 @@ class ReviewPage:
         self._unfolded = "", 0.0
         if self._clock() - since > TOLD_WIDTH or not self._library_open:
             return
-        if last == "library":
+        if last == LIBRARY:
             self._other_folded = True
             self._fold_other(True)
         else:
@@ -385,28 +412,36 @@ class ReviewPage:
             )
         )
 
-    # --- keys --------------------------------------------------------------------------------------
+    # --- what a person does ------------------------------------------------------------------------
 
-    def _commands(self) -> Sequence[Command]:
-        review, timeline = self._review, self._timeline
-        commands = [
-            Command(OPEN, self._opening.open, "O", "cmd/ctrl", (OPEN,)),
-            Command("Play or pause", review.toggle_play, "space", buttons=("Play", "Pause", PLAY, PAUSE)),
-            *timeline.commands(),
-            Command("Go to the first moment", review.to_first, "home", buttons=(FIRST,)),
-            Command("Go to the last moment", review.to_last, "end", buttons=(LAST,)),
-            Command("Next recording", lambda: self._panel.select_neighbour(1), "N"),
-            Command("Previous recording", lambda: self._panel.select_neighbour(-1), "P"),
-            Command("Overlaid or side by side", self._panel.toggle_arrangement, "O"),
-            Command("Frame the scene", self._in_3d.frame, "F"),
-            Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
-            Command("Switch between the dark and the light theme", self._view_panel.toggle_dark, "D"),
-            Command("Rescore the selected recordings, or the open ones", self._rescore_chosen, "J"),
-            Command("Continue live from here", self._panel.enter_recording, "G", "shift", (GO_LIVE,)),
-        ]
-        if self._place.session is not None:
-            commands.append(Command(BACK, self._go_back, "V", buttons=(BACK,)))
-        return commands
+    def do(self, command: Command, visitor: Visitor) -> None:
+        """Do what a page asks for. Raises `Refused`."""
+        match command:
+            case ShowLive():
+                if self._place.session is None:
+                    raise Refused("No task is open.")
+                self._place.pages.show("live")
+            case ShowTab(tab=tab, fold=fold):
+                self._open_tabs.open(visitor, tab, fold)
+            case TellUnfolded(panel=panel):
+                self._panel_unfolded(panel)
+            case TellDrawnInSoftware():
+                self._place.stage.in_software.told_by(visitor)
+            case ToggleTable():
+                self._show_library(not self._library_open)
+            case FrameScene():
+                self._in_3d.frame()
+            case ToggleTheme():
+                self._view_panel.toggle_dark()
+            case RescoreChosen():
+                self._rescore_chosen()
+            case CloseDialog():
+                if not self._opening.close():
+                    self._library.close()
+            case _ if isinstance(command, CamerasPanel.does):
+                self._cameras.do(command, visitor)
+            case _:
+                self._parts.do(command, visitor)
 
     def _rescore_chosen(self) -> None:
         opened = tuple(one.id for one in self._review.view().opened)
@@ -430,44 +465,37 @@ class ReviewTimeline(TimeBar[ReviewView]):
     Each of several recordings has its own line on the strip, placed as they are aligned.
     """
 
-    def __init__(self, server: viser.ViserServer, review: Review, clock: Clock = time.monotonic) -> None:
-        does = {
-            PLAY: review.toggle_play,
-            PAUSE: review.toggle_play,
-            FIRST: review.to_first,
-            LAST: review.to_last,
-        }
-        super().__init__(server, review, "step of the timeline", does, clock)
+    def __init__(self, server: viser.ViserServer, review: Review) -> None:
+        super().__init__(server, review, "step of the timeline", Seek, "step")
+        self._review = review
         self._drawn: tuple[object, ...] = ()
         self._fixed: dict[str, object] = {}
-        self._fixed_from = 0
-        """The position of the strip's left end, as it was drawn."""
+
+    def _to_first(self) -> None:
+        self._review.to_first()
+
+    def _to_last(self) -> None:
+        self._review.to_last()
 
     def draw(self, view: ReviewView) -> None:
-        if not self._draw_panel(bool(view.opened), view.position):
+        if not self._draw_panel(bool(view.opened)):
             return
-        self._set_ends(view.first, view.last)
-        self._slider.show(view.position)
-        self._walk.options = walk(view.playing)
+        self._show_slider(view.first, view.last, view.position)
+        back, forward = walk_tools()[:2], walk_tools()[2:]
+        play = tool(PAUSE if view.playing else PLAY, TogglePlay())
+        ends = tool(FIRST, GoToFirst()), tool(LAST, GoToLast())
+        self._walk.content = tools_html([ends[0], *back, play, *forward, ends[1]])
         wanted = (view.position, view.selected, view.opened_serial, view.anchors, view.align)
         if wanted == self._drawn:
             return
         # Only the cursor and the texts follow the position.
         if wanted[1:] != self._drawn[1:]:
-            self._fixed, self._fixed_from = fixed_values(view), view.first
+            self._fixed = fixed_values(view)
         self._drawn = wanted
         one, state = view.opened[view.selected], view.states[view.selected]
         self._strip.content = render(
-            "review_timeline", view=view, one=one, state=state, pick=self._pick, **self._fixed
+            "review_timeline", view=view, one=one, state=state, seek=lambda at: Seek(step=at), **self._fixed
         )
-
-    def _on_pick(self, offset: int) -> None:
-        self._seeks.seek(self._fixed_from + offset)
-
-
-def walk(playing: bool) -> tuple[str, ...]:
-    """The buttons under the strip."""
-    return (FIRST, LAST_EVENT, LAST_STEP, PAUSE if playing else PLAY, NEXT_STEP, NEXT_EVENT, LAST)
 
 
 def fixed_values(view: ReviewView) -> dict[str, object]:

@@ -7,12 +7,15 @@ import time
 from typing import TYPE_CHECKING
 
 import workbench
+from workbench.commands.command import Command, Refused
+from workbench.commands.page import ShowRecordings, TellDrawnInSoftware, ToggleTheme
 from workbench.ui.scene.viewpoint import BRAND
 from workbench.ui.tasks.task_list import TaskList
-from workbench.ui.widgets.hotkeys import Command, register
+from workbench.ui.widgets.hotkeys import register
 from workbench.ui.widgets.parts import Clock
 from workbench.ui.widgets.redraw_loop import RedrawLoop
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.visitors import Visitor
 
 if TYPE_CHECKING:
     from workbench.ui.app.workplace import Workplace
@@ -41,13 +44,25 @@ class StartPage:
         server.gui.set_panel_label("Workbench")
         self._apply_theme()
         server.gui.add_html(render("start_head", version=workbench.__version__))
-        self._list = TaskList(server, place.open_task, clock=clock)
-        commands = [
-            Command("Review recordings", lambda: place.pages.show("review")),
-            Command("Dark or light", self._toggle_dark),
-            *place.commands,
-        ]
-        register(server, commands)
+        self._list = TaskList(server, place.open_task)
+        self._place = place
+        kinds = frozenset({ShowRecordings, ToggleTheme, *TaskList.does}) | place.does
+        register(server, place.visitors, kinds, "start page")
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        """Do what a page asks for. Raises `Refused`."""
+        match command:
+            case ShowRecordings():
+                self._place.pages.show("review")
+            case ToggleTheme():
+                self.dark = not self.dark
+                self._apply_theme()
+            case _ if isinstance(command, TaskList.does):
+                self._list.do(command, visitor)
+            case TellDrawnInSoftware():
+                self._place.stage.in_software.told_by(visitor)
+            case _:
+                raise Refused(f"Not on this page: {command.help()}.")
 
     def start(self) -> None:
         """Draw it, then keep drawing it in a thread."""
@@ -67,10 +82,6 @@ class StartPage:
     def _wait(self, seen: int, timeout: float) -> int:
         self._resting.wait(min(timeout, LOOK))
         return seen + 1
-
-    def _toggle_dark(self) -> None:
-        self.dark = not self.dark
-        self._apply_theme()
 
     def _apply_theme(self) -> None:
         self._server.gui.configure_theme(

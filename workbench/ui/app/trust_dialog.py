@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import secrets
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
 
 import viser
 
+from workbench.commands.command import Refused
+from workbench.commands.page import AnswerTrust
 from workbench.session.clearance import FOLLOWED, Consent, TrustQuestion
 from workbench.ui.library.dialogs import Dialog
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import Tool, tools_html
 
 TITLE = "Run this code?"
 DO_NOT, ONCE, ALWAYS = (
@@ -28,14 +31,10 @@ _LOOK = 0.1
 @dataclass
 class _Pending:
     question: TrustQuestion
+    name: str = field(default_factory=lambda: secrets.token_urlsafe(12))
+    """Random: a page that was open before this program was started has no question of this name."""
     answered: threading.Event = field(default_factory=threading.Event)
     answer: Consent = Consent.NO
-
-    def take(self, answer: Consent) -> None:
-        """The first answer counts."""
-        if not self.answered.is_set():
-            self.answer = answer
-            self.answered.set()
 
 
 class TrustDialog:
@@ -50,18 +49,35 @@ class TrustDialog:
         self._waiting: list[_Pending] = []
         """The first is shown."""
         self._window: Dialog | None = None
-        self._escape: viser.CommandHandle | None = None
         self._closed = False
-        self._asking: Callable[[bool], None] = lambda asking: None
 
-    def tell(self, asking: Callable[[bool], None]) -> None:
-        """Call `asking` whenever a question opens or the last one closes: the library's keys are off meanwhile."""
+    def say_no(self) -> bool:
+        """Answer the question that is shown with a no; False if there is none."""
         with self._lock:
-            self._asking = asking
-            self._asking(bool(self._waiting))
+            if not self._waiting:
+                return False
+            self._take(Consent.NO)
+            return True
+
+    def answer(self, command: AnswerTrust) -> None:
+        """Answer the question that is shown. Raises `Refused` if it is another one, or answered already."""
+        with self._lock:
+            is_shown = self._waiting and self._waiting[0].name == command.question
+            if not is_shown or not self._take(Consent(command.answer)):
+                raise Refused("This question was answered or withdrawn before.")
+
+    def _take(self, answer: Consent) -> bool:
+        """Answer the first question; False if it is answered already."""
+        shown = self._waiting[0]
+        if shown.answered.is_set():
+            return False
+        shown.answer = answer
+        shown.answered.set()
+        return True
 
     def ask(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
-        """Show the question and wait for the answer. Never call it on viser's own threads.
+        """Show the question and wait for the answer. Never call it while a page's command is done: the answer, which that
+        page asks for next, would wait for its end.
 
         Args:
             stopped: called often; True withdraws the question.
@@ -80,7 +96,6 @@ class TrustDialog:
                 if self._waiting[0] is pending:
                     self._take_down()
                 self._waiting.remove(pending)
-                self._asking(bool(self._waiting))
 
     def close(self) -> None:
         """Withdraw every question."""
@@ -92,41 +107,29 @@ class TrustDialog:
             if self._window is not None and not self._window.modal.closed:
                 return
             pending = self._waiting[0]
-            question = pending.question
             gui = self._server.gui
             with self._server.atomic():
-                self._window = Dialog(self._server, TITLE, lambda: None)
+                self._window = Dialog(self._server, TITLE)
                 with self._window.modal:
-                    # The first button has the focus: Enter must not run anything.
-                    self._add_button(DO_NOT, None, viser.Icon.X, pending, Consent.NO)
-                    if question.more:
-                        label = f"Don't run the other {question.more} either"
-                        self._add_button(label, "gray", viser.Icon.X, pending, Consent.NONE)
-                    self._add_button(ONCE, "gray", viser.Icon.PLAYER_PLAY, pending, Consent.ONCE)
-                    self._add_button(ALWAYS, "gray", viser.Icon.SHIELD_CHECK, pending, Consent.ALWAYS)
+                    gui.add_html(buttons_html(pending.name, pending.question.more))
                     # After the buttons, so that nothing in it has the focus; page.css puts it above them.
-                    gui.add_html(question_html(question))
-                self._escape = gui.add_command(DO_NOT, hotkey="escape")
-                self._escape.on_trigger(lambda _: pending.take(Consent.NO))
-            self._asking(True)
-
-    def _add_button(
-        self,
-        label: str,
-        color: Literal["gray"] | None,
-        icon: viser.IconName,
-        pending: _Pending,
-        answer: Consent,
-    ) -> None:
-        button = self._server.gui.add_button(label, color=color, icon=icon)
-        button.on_click(lambda _: pending.take(answer))
+                    gui.add_html(question_html(pending.question))
 
     def _take_down(self) -> None:
-        window, escape = self._window, self._escape
-        self._window = self._escape = None
-        # False if a page switch has removed dialog and key.
-        if window is not None and window.close() and escape is not None:
-            escape.remove()
+        window, self._window = self._window, None
+        if window is not None:
+            window.close()
+
+
+def buttons_html(name: str, more: int) -> str:
+    """The answers to the question of this name, after which so many others come."""
+    # The first button has the focus: Enter must not run anything.
+    rows = [[Tool(DO_NOT, AnswerTrust(question=name, answer="no"), tone="main")]]
+    if more:
+        rows.append([Tool(f"Don't run the other {more} either", AnswerTrust(question=name, answer="none"))])
+    rows.append([Tool(ONCE, AnswerTrust(question=name, answer="once"))])
+    rows.append([Tool(ALWAYS, AnswerTrust(question=name, answer="always"))])
+    return tools_html(*rows)
 
 
 def question_html(question: TrustQuestion) -> str:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Literal
 import psutil
 import viser
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.page import AnswerTrust, CloseDialog, OpenHelp, RenewToken
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.watched_thread import watched_thread
 from workbench.recording.library.library import Library
@@ -36,7 +38,7 @@ from workbench.ui.scene.viewpoint import Stage
 from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.share.panel import Sharing
 from workbench.ui.tasks.task_list import PICTURES, picture_route
-from workbench.ui.widgets.hotkeys import Command
+from workbench.ui.widgets.visitors import PATH, Visitor, Visitors
 
 if TYPE_CHECKING:
     from workbench.ui.app.live_page import Page
@@ -47,8 +49,6 @@ ENOUGH_MEMORY = 4 << 30
 """Bytes that must be free for pictures of tasks to be drawn beside an open one."""
 
 Which = Literal["start", "live", "review"]
-HELP = Command("Help", lambda: None)
-"""The browser itself opens the page (``web_assets/help.js``)."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,11 @@ class Workplace:
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
         self._recovering: threading.Thread | None = None
-        self.commands: tuple[Command, ...] = (HELP,)
-        """In the palette of both pages; set before the first page is shown."""
+        self.renew_token: Callable[[], None] | None = None
+        """Set before the first page is shown, where there is a token."""
+        self.visitors = Visitors(self.server)
+        self.visitors.do = self._do
+        gated_server.add_channel(PATH, self.visitors.serve)
         self.session = session
         """Shown by the live page when it is next built."""
         self.home = session
@@ -137,6 +140,26 @@ class Workplace:
                     )
                     self._recovering.start()
             return self._shelf
+
+    @property
+    def does(self) -> frozenset[type[Command]]:
+        """What is done whichever page is shown."""
+        return frozenset({OpenHelp} if self.renew_token is None else {OpenHelp, RenewToken})
+
+    def _do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case OpenHelp():
+                pass  # The browser itself opens the page (``web_assets/help.js``).
+            case RenewToken():
+                if self.renew_token is None:
+                    raise Refused("This page asks for no token; there is none to renew.")
+                self.renew_token()
+            case AnswerTrust():
+                self.dialog.answer(command)
+            case CloseDialog() if self.dialog.say_no():
+                pass
+            case _:
+                self.pages.do(command, visitor)
 
     def _recover(self, shelf: Shelf) -> None:
         """Recover episodes of a writer that was killed."""
@@ -200,12 +223,13 @@ class Workplace:
         assert self.session is not None, "the live page is shown with its session"
         return Page(
             self.server,
+            self.visitors,
             self.session,
             dark,
             lambda: self.pages.show("review"),
             self.look_at,
             self.stage,
-            self.commands,
+            self.does,
             editor=self._editor,
             chooser=self.open_task,
         )
@@ -269,6 +293,13 @@ class Pages:
         """Sleep until no page is requested or being built; False after `timeout` seconds."""
         with self._wake:
             return self._wake.wait_for(lambda: self._wish is None and not self._building, timeout)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        """Let the page that is shown do it."""
+        page = self._page
+        if page is None:
+            raise Refused("Nothing is shown yet.")
+        page.do(command, visitor)
 
     def stop(self) -> None:
         """Stop redrawing the present page; it stays as it is until the server closes."""

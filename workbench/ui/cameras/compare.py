@@ -3,27 +3,41 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 import viser
 
+from workbench.commands.cameras import ChooseCompared, ComparePlacements, KeepPlacement, ReturnToKept
+from workbench.commands.command import Command, Refused
 from workbench.core.camera_data import CameraKey, CameraSettings, Picture
 from workbench.core.cameras.conventions import angle_between
 from workbench.session.cameras.view import StudioCamera
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.ui.cameras.pose_math import chosen_camera
+from workbench.ui.widgets.fields import choice
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import refusals_told
+from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
-FILE, BEFORE, KEPT = "as in the file", "as in the file before", "saved as A"
+Other = Literal["file", "before", "kept"]
+NAMES: dict[Other, str] = {"file": "as in the file", "before": "as in the file before", "kept": "saved as A"}
+OTHER_HINT = (
+    "The placement to compare with the camera's current one. The file before: as it was before the last change of this "
+    "camera that was saved."
+)
 LARGEST = 256
 """Pixels along the longer side of each picture."""
 
 
-class CameraCompare:
+class CameraCompare(PagePart[SessionView]):
     """The folder in the present container: the placement now, next to the file's or one that was kept as A."""
+
+    does = (ChooseCompared, KeepPlacement, ComparePlacements, ReturnToKept)
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
@@ -32,61 +46,48 @@ class CameraCompare:
         self._before: dict[CameraKey, CameraSettings] = {}
         """As the file placed it before the newest change of that."""
         self._asked: tuple[CameraKey, CameraSettings, CameraSettings, str] | None = None
+        self._other: Other = "file"
         with server.gui.add_folder("Compare", expand_by_default=False) as self.folder:
-            self._other = server.gui.add_dropdown(
-                "Now, with",
-                (FILE, BEFORE, KEPT),
-                hint="The placement to compare with the camera's current one. The file before: as it was before the "
-                "last change of this camera that was saved.",
+            options = {name: other for other, name in NAMES.items()}
+            self._others = choice(
+                server, "Now, with", ChooseCompared, "other", options, self._other, hint=OTHER_HINT
             )
-            self._keep = server.gui.add_button(
-                "Keep this placement as A",
-                icon=viser.Icon.PIN,
-                color="gray",
-                hint="To compare it later, or return to it.",
+            self._tools = server.gui.add_html("")
+            self._pair = JobResult(server)
+            self._return = server.gui.add_html(
+                tools_html([tool("Return to A", ReturnToKept())]), visible=False
             )
-            self._compare = server.gui.add_button(
-                "Show side by side", icon=viser.Icon.COLUMNS_2, color="gray"
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseCompared(other=other):
+                self._other = other
+            case KeepPlacement():
+                camera, now = chosen_camera(self._session)
+                self._kept[camera.key] = now
+                self._other = "kept"
+            case ComparePlacements():
+                self._compare()
+            case ReturnToKept():
+                camera, _ = chosen_camera(self._session)
+                self._session.studio.place(camera.key, self._kept_of(camera))
+
+    def _kept_of(self, camera: StudioCamera) -> CameraSettings:
+        if camera.key not in self._kept:
+            raise Refused(
+                "No placement of this camera is kept yet: click Keep this placement as A, then move the camera."
             )
-            self._pair = JobResult(server, session)
-            self._take = server.gui.add_button(
-                "Return to A", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
-            )
-        self._keep.on_click(lambda _: self._keep_now())
-        self._compare.on_click(self._ask)
-        self._take.on_click(lambda _: self._take_kept())
+        return self._kept[camera.key]
 
-    def _chosen(self) -> StudioCamera | None:
-        return self._session.view().studio.chosen
-
-    def _keep_now(self) -> None:
-        camera = self._chosen()
-        if camera is not None and camera.now is not None:
-            self._kept[camera.key] = camera.now
-            self._other.value = KEPT
-
-    def _take_kept(self) -> None:
-        camera = self._chosen()
-        if camera is not None and camera.key in self._kept:
-            self._session.studio.place(camera.key, self._kept[camera.key])
-
-    def _ask(self, event: viser.GuiEvent) -> None:
-        camera = self._chosen()
-        if camera is None or camera.now is None or camera.info.settings is None:
-            return
-        choice = self._other.value
-        with refusals_told(event.client):
-            if choice == KEPT and camera.key not in self._kept:
-                raise ValueError(
-                    "No placement of this camera is kept yet: click Keep this placement as A, then move the camera."
-                )
-            if choice == BEFORE and camera.key not in self._before:
-                raise ValueError("The file has placed this camera in one way since the page was opened.")
-            earlier = self._before if choice == BEFORE else self._kept
-            other = camera.info.settings if choice == FILE else earlier[camera.key]
-            self._asked = (camera.key, camera.now, other, choice)
-            self._pair.asked(self._session.view().studio.results.compared)
-            self._session.studio.reports.compare(other)
+    def _compare(self) -> None:
+        camera, now = chosen_camera(self._session)
+        in_file = camera.info.settings if self._other == "file" else self._before.get(camera.key)
+        other = self._kept_of(camera) if self._other == "kept" else in_file
+        if other is None:
+            raise Refused("The file has placed this camera in one way since the page was opened.")
+        self._asked = (camera.key, now, other, NAMES[self._other])
+        self._pair.asked(self._session.view().studio.results.compared)
+        self._session.studio.reports.compare(other)
 
     def _note_file(self, cameras: tuple[StudioCamera, ...]) -> None:
         for camera in cameras:
@@ -101,12 +102,16 @@ class CameraCompare:
         studio = view.studio
         camera = studio.chosen
         self._note_file(studio.cameras)
-        usable = camera is not None and camera.now is not None
-        for button in (self._keep, self._compare):
-            button.disabled = not usable
+        off = camera is None or camera.now is None
+        self._others.show(self._other)
+        self._tools.content = tools_html(
+            [
+                tool("Keep this placement as A", KeepPlacement(), off=off),
+                tool("Show side by side", ComparePlacements(), off=off),
+            ]
+        )
         kept = None if camera is None else self._kept.get(camera.key)
-        back = camera is not None and kept is not None and kept != camera.now
-        self._take.visible = back
+        self._return.visible = camera is not None and kept is not None and kept != camera.now
         both = studio.results.compared
         mine = camera is not None and both is not None and both[0].key == camera.key
         now = None if camera is None else camera.now

@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 import re
-from typing import Literal
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.cameras import (
+    ApplyCalibration,
+    ChooseCameraFile,
+    ChooseConvention,
+    ChooseDirection,
+    ChooseDownloaded,
+    ChooseUnits,
+    DownloadCamera,
+    Form,
+    PasteCalibration,
+)
+from workbench.commands.command import Command, Refused
 from workbench.core.cameras import conventions as frames
 from workbench.core.cameras.conventions import Convention, Direction
 from workbench.session.cameras.view import StudioCamera
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.server.control_values import limit_text
-from workbench.ui.widgets.inputs import refusals_told
+from workbench.ui.cameras.pose_math import chosen_camera
+from workbench.ui.widgets.fields import Field, choice
+from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
-Form = Literal["json", "opencv", "ros"]
 CONVENTIONS: dict[str, Convention] = {
     "OpenCV, ROS optical": "opencv",
     "OpenGL, Blender": "opengl",
@@ -34,115 +47,153 @@ DIRECTIONS: dict[str, Direction] = {
     "world to camera": "world_to_camera",
     "camera to world": "camera_to_world",
 }
-FORMS: dict[str, tuple[Form, str]] = {
-    "JSON": ("json", "json"),
-    "OpenCV YAML": ("opencv", "yaml"),
-    "ROS CameraInfo": ("ros", "yaml"),
-}
+FORMS: dict[str, Form] = {"JSON": "json", "OpenCV YAML": "opencv", "ROS CameraInfo": "ros"}
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
 """Metres in one of each: calibrations are often in the unit of the calibration board."""
-THIS, ALL = "this camera", "all cameras"
-LONGEST = 20_000
-"""Characters of a pasted calibration."""
+WHICH = {"this camera": False, "all cameras": True}
+CONVENTION_HINT = "The convention of the camera's own axes, for what is shown and what is pasted."
+DIRECTION_HINT = "OpenCV's extrinsic maps world to camera; a pose maps camera to world."
+CALIBRATION_HINT = (
+    "Paste a matrix of 4 x 4 or 3 x 4 numbers, our JSON, or an OpenCV YAML. It is read in the convention and direction "
+    "chosen above."
+)
+UNITS_HINT = "Units of what is pasted. What is shown or downloaded, and our own JSON, is in metres."
 
 
-class CameraExport:
+class CameraExport(PagePart[SessionView]):
     """The folder in the present container.
 
     A matrix of sixteen numbers does not tell its direction and the names of the camera's axes: both are chosen here, and
     hold for what is shown and for what is pasted.
     """
 
+    does = (
+        ChooseConvention,
+        ChooseDirection,
+        ChooseCameraFile,
+        ChooseDownloaded,
+        DownloadCamera,
+        PasteCalibration,
+        ChooseUnits,
+        ApplyCalibration,
+    )
+
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._drawn: object = None
-        with server.gui.add_folder("Matrices and files", expand_by_default=False) as self.folder:
-            self._convention = server.gui.add_dropdown(
+        self._convention: Convention = "opencv"
+        self._direction: Direction = "world_to_camera"
+        self._form: Form = "json"
+        self._every = False
+        self._text, self._units = "", "metres"
+        gui = server.gui
+        with gui.add_folder("Matrices and files", expand_by_default=False) as self.folder:
+            self._conventions = choice(
+                server,
                 "Convention",
-                tuple(CONVENTIONS),
-                hint="The convention of the camera's own axes, for what is shown and what is pasted.",
+                ChooseConvention,
+                "convention",
+                CONVENTIONS,
+                self._convention,
+                hint=CONVENTION_HINT,
             )
-            self._direction = server.gui.add_dropdown(
+            self._directions = choice(
+                server,
                 "Direction",
-                tuple(DIRECTIONS),
-                hint="OpenCV's extrinsic maps world to camera; a pose maps camera to world.",
+                ChooseDirection,
+                "direction",
+                DIRECTIONS,
+                self._direction,
+                hint=DIRECTION_HINT,
             )
-            self._html = server.gui.add_html("")
-            self._form = server.gui.add_dropdown("File", tuple(FORMS))
-            self._which = server.gui.add_dropdown("Of", (THIS, ALL))
-            self._download = server.gui.add_button("Download", icon=viser.Icon.DOWNLOAD, color="gray")
-            self._text = server.gui.add_text(
+            self._html = gui.add_html("")
+            self._forms = choice(server, "File", ChooseCameraFile, "form", FORMS, self._form)
+            self._which = choice(server, "Of", ChooseDownloaded, "every", WHICH, self._every)
+            self._download = gui.add_html("")
+            self._pasted = Field(
+                server,
                 "Calibration",
-                "",
-                multiline=True,
-                hint="Paste a matrix of 4 x 4 or 3 x 4 numbers, our JSON, or an OpenCV YAML. It is read in the "
-                "convention and direction chosen above.",
+                PasteCalibration,
+                "text",
+                hint=CALIBRATION_HINT,
+                longest=100_000,
+                lines=4,
             )
-            limit_text(self._text, LONGEST)
-            self._unit = server.gui.add_dropdown(
-                "Units",
-                tuple(UNITS),
-                hint="Units of what is pasted. What is shown or downloaded, and our own JSON, is in metres.",
+            self._in_units = choice(
+                server, "Units", ChooseUnits, "units", tuple(UNITS), self._units, hint=UNITS_HINT
             )
-            self._import = server.gui.add_button(
-                "Apply to the camera", icon=viser.Icon.FILE_IMPORT, color="gray"
-            )
-        self._download.on_click(self._on_download)
-        self._import.on_click(self._on_import)
+            self._apply = gui.add_html("")
 
-    def _choices(self) -> tuple[Convention, Direction]:
-        return CONVENTIONS[self._convention.value], DIRECTIONS[self._direction.value]
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseConvention(convention=convention):
+                self._convention = convention
+            case ChooseDirection(direction=direction):
+                self._direction = direction
+            case ChooseCameraFile(form=form):
+                self._form = form
+            case ChooseDownloaded(every=every):
+                self._every = every
+            case DownloadCamera():
+                self._send_file(visitor.client)
+            case PasteCalibration(text=text):
+                self._text = text
+            case ChooseUnits(units=units):
+                self._units = units
+            case ApplyCalibration():
+                self._place_by_text(visitor.client)
 
-    def _on_download(self, event: viser.GuiEvent) -> None:
-        view = self._session.view()
-        camera = view.studio.chosen
-        if event.client is None or camera is None:
-            return
-        with refusals_told(event.client):
-            form, suffix = FORMS[self._form.value]
-            every = self._which.value == ALL
-            keys = tuple(c.key for c in view.studio.cameras) if every else (camera.key,)
-            text = self._session.studio.export(keys, form)
-            name = file_name("cameras" if every else camera.key[1], form, suffix)
-            event.client.send_file_download(name, text.encode("utf-8"), save_immediately=True)
+    def _send_file(self, client: viser.ClientHandle) -> None:
+        camera, _ = chosen_camera(self._session)
+        cameras = self._session.view().studio.cameras if self._every else (camera,)
+        try:
+            text = self._session.studio.export(tuple(one.key for one in cameras), self._form)
+        except ValueError as reason:
+            raise Refused(str(reason)) from None
+        name = file_name("cameras" if self._every else camera.key[1], self._form)
+        client.send_file_download(name, text.encode("utf-8"), save_immediately=True)
 
-    def _on_import(self, event: viser.GuiEvent) -> None:
-        camera = self._session.view().studio.chosen
-        if event.client is None or camera is None:
-            return
-        with refusals_told(event.client, "Not placed"):
-            text = self._text.value
-            if not text.strip():
-                raise ValueError(
-                    "Paste a calibration into the field first: a matrix, our JSON, or an OpenCV YAML."
-                )
-            convention, direction = self._choices()
-            metres = UNITS[self._unit.value]
-            self._session.studio.import_pose(camera.key, text, direction, convention, metres)
-            event.client.add_notification(
-                "Placed",
-                "The pose was applied. The lens, if the text has one, was not: its matrix goes into Lens and image.",
-                color="green",
-                auto_close_seconds=8.0,
+    def _place_by_text(self, client: viser.ClientHandle) -> None:
+        camera, _ = chosen_camera(self._session)
+        if not self._text.strip():
+            raise Refused("Paste a calibration into the field first: a matrix, our JSON, or an OpenCV YAML.")
+        metres = UNITS[self._units]
+        try:
+            self._session.studio.import_pose(
+                camera.key, self._text, self._direction, self._convention, metres
             )
+        except ValueError as reason:
+            raise Refused(str(reason)) from None
+        client.add_notification(
+            "Placed",
+            "The pose was applied. The lens, if the text has one, was not: its matrix goes into Lens and image.",
+            color="green",
+            auto_close_seconds=8.0,
+        )
 
     def draw(self, view: SessionView) -> None:
         camera = view.studio.chosen
-        idle = camera is None or camera.now is None
-        for button in (self._download, self._import):
-            button.disabled = idle
-        convention, direction = self._choices()
+        off = camera is None or camera.now is None
+        self._conventions.show(self._convention)
+        self._directions.show(self._direction)
+        self._forms.show(self._form)
+        self._which.show(self._every)
+        self._pasted.show(self._text)
+        self._in_units.show(self._units)
+        self._download.content = tools_html([tool("Download", DownloadCamera(), off=off)])
+        self._apply.content = tools_html([tool("Apply to the camera", ApplyCalibration(), off=off)])
         mount = None if camera is None or camera.mount_pose is None else camera.mount_pose.tobytes()
-        wanted = (convention, direction, None if camera is None else (camera.key, camera.now), mount)
+        shown = None if camera is None else (camera.key, camera.now)
+        wanted = (self._convention, self._direction, shown, mount)
         if wanted != self._drawn:
             self._drawn = wanted
-            self._html.content = matrices_html(camera, convention, direction)
+            self._html.content = matrices_html(camera, self._convention, self._direction)
 
 
-def file_name(name: str, form: Form, suffix: str) -> str:
+def file_name(name: str, form: Form) -> str:
     """A name for the download, with only letters, digits, - and _ of the camera's name."""
-    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "camera"
-    return f"{plain[:60]}{'' if form == 'json' else f'_{form}'}.{suffix}"
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "camera"
+    return f"{plain}.json" if form == "json" else f"{plain}_{form}.yaml"
 
 
 def matrices_html(camera: StudioCamera | None, convention: Convention, direction: Direction) -> str:

@@ -7,10 +7,32 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import get_args
 
 import viser
 
+from workbench.commands.cameras import (
+    Angle,
+    Axis,
+    ChooseLensForm,
+    ChooseRotationForm,
+    ChooseShader,
+    LensForm,
+    RotationForm,
+    SetCameraAngle,
+    SetCameraForward,
+    SetCameraPosition,
+    SetCameraQuaternion,
+    SetCameraTarget,
+    SetCameraUp,
+    SetFieldOfView,
+    SetFieldOfViewInRadians,
+    SetFocalLength,
+    SetNearOrFar,
+    SetOpticalCentre,
+    SetPictureSize,
+)
+from workbench.commands.command import Command
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.conventions import (
     axes_of,
@@ -28,25 +50,20 @@ from workbench.core.cameras.conventions import (
     with_pose,
 )
 from workbench.session.cameras.view import StudioCamera
-from workbench.ui.cameras.pose_math import FARTHEST, Floats, Frame, Placing, kept_where_equal, rounded
-from workbench.ui.server.control_values import limit_text
-from workbench.ui.widgets.inputs import Control
+from workbench.ui.cameras.pose_math import Floats, Frame, Placing, rounded
+from workbench.ui.widgets.fields import Field, by_name, choice
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.visitors import Visitor
 
-TYPED = 0.3
-"""Seconds without another number until the last is taken: a person may hold down the arrows next to a field."""
-RPY, WXYZ, AXES = "roll, pitch, yaw", "quaternion wxyz", "forward and up"
+RPY, WXYZ, AXES = ROTATIONS = get_args(RotationForm)
+FOV, INTRINSIC = LENSES = get_args(LensForm)
+XYZ, ANGLES = get_args(Axis), get_args(Angle)
 UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
 """Digits of the shown numbers."""
-FOV, INTRINSIC = "field of view", "intrinsic matrix"
 GOES_ALONG = "The target moves with the position. To keep it fixed, set Handles to eye and target."
 STAYS = "Each moves alone: the camera keeps looking at its target."
 SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
 """The shader packs of ManiSkill 3."""
-SMALLEST, LARGEST = 8, 4096
-"""Pixels of a picture's side."""
-
-Numbers = tuple[float, ...]
 
 
 class CameraNumbers:
@@ -61,188 +78,129 @@ class CameraNumbers:
         look_at: whether eye and target are placed separately, instead of a pose.
     """
 
+    does = (
+        SetCameraPosition,
+        SetCameraTarget,
+        ChooseRotationForm,
+        SetCameraAngle,
+        SetCameraQuaternion,
+        SetCameraForward,
+        SetCameraUp,
+        ChooseLensForm,
+        SetFieldOfView,
+        SetFieldOfViewInRadians,
+        SetFocalLength,
+        SetOpticalCentre,
+        SetPictureSize,
+        SetNearOrFar,
+        ChooseShader,
+    )
+
     def __init__(self, server: viser.ViserServer, placing: Placing, look_at: Callable[[], bool]) -> None:
-        self._placing, self._look_at, self._gui = placing, look_at, server.gui
-        with self._gui.add_folder("Pose") as where:
-            # Hides the arrows of the fields below: three numbers with four digits do not fit next to them.
-            self._gui.add_html(render("tight"))
+        self._server, self._placing, self._look_at = server, placing, look_at
+        self._rotation: RotationForm = RPY
+        self._shaders = SHADERS
+        with server.gui.add_folder("Pose") as where:
             self._build_points()
             self._build_orientation()
-        with self._gui.add_folder("Lens and image", expand_by_default=False) as lens:
-            self._gui.add_html(render("tight"))
+        with server.gui.add_folder("Lens and image", expand_by_default=False) as lens:
             self._build_lens()
             self._build_picture()
         self._folders = where, lens
 
-    def _field(
-        self,
-        label: str,
-        read: Callable[[CameraSettings], Sequence[float] | Floats],
-        write: Callable[[CameraSettings, Numbers, Frame], CameraSettings],
-        count: int = 3,
-        *,
-        digits: int = 4,
-        step: float = 0.01,
-        low: float = -FARTHEST,
-        high: float = FARTHEST,
-        hint: str,
-    ) -> Control[Any, Any]:
-        """A field of one to three numbers.
-
-        Args:
-            read: the numbers of a camera.
-            write: the camera with other numbers; raises ValueError with a sentence.
-        """
-
-        def each(number: float) -> Any:
-            return number if count == 1 else (number,) * count
-
-        def send(typed: Any) -> None:
-            numbers = (typed,) if count == 1 else typed
-
-            def change(now: CameraSettings, frame: Frame) -> CameraSettings:
-                # A field of whole numbers rounds nothing.
-                return write(now, kept_where_equal(read(now), numbers, digits or 9), frame)
-
-            self._placing.change(label, change)
-
-        def shown(now: CameraSettings) -> Any:
-            numbers = rounded(read(now), digits)
-            return numbers[0] if count == 1 else numbers
-
-        add: Any = (self._gui.add_number, self._gui.add_vector2, self._gui.add_vector3)[count - 1]
-        handle = add(label, each(max(low, 0.0)), min=each(low), max=each(high), step=step, hint=hint)
-        # Digits that are shown and can be typed; viser would take them from the step.
-        handle.precision = digits
-        return Control(handle, send, shown=shown, settle=TYPED)
+    def _row(
+        self, label: str, kind: type[Command], parts: Sequence[str], hint: str, step: float = 0.01
+    ) -> Field:
+        """A field of several numbers; `parts` are what the command's `of` can be."""
+        given = [{"of": part} for part in parts]
+        return Field(self._server, label, kind, "to", [0.0] * len(parts), given=given, hint=hint, step=step)
 
     def _build_points(self) -> None:
-        self._position = self._field(
-            "Position",
-            lambda s: s.position,
-            self._at,
-            hint="Position of the eye, in metres. The up and down keys change a number by a centimetre.",
-        )
-        self._target = self._field(
-            "Looks at",
-            target_of,
-            lambda s, target, frame: frame.turned_to(s, target),
-            hint="A point on the line of sight, in metres: the camera stays where it is and turns towards it.",
-        )
-        self._about = self._gui.add_html("")
+        self._points = {
+            separately: (
+                self._row(
+                    at,
+                    SetCameraPosition,
+                    XYZ,
+                    "Position of the eye, in metres. The up and down keys change a number by a centimetre.",
+                ),
+                self._row(
+                    to,
+                    SetCameraTarget,
+                    XYZ,
+                    "A point on the line of sight, in metres: the camera stays where it is and turns towards it.",
+                ),
+            )
+            for separately, at, to in ((False, "Position", "Looks at"), (True, "Eye", "Target"))
+        }
+        """By whether eye and target are placed separately."""
+        self._about = self._server.gui.add_html("")
 
     def _build_orientation(self) -> None:
-        self._orientation = self._gui.add_dropdown(
-            "Rotation", (RPY, WXYZ, AXES), initial_value=RPY, hint="How its rotation is written below."
+        self._form = choice(
+            self._server,
+            "Rotation",
+            ChooseRotationForm,
+            "form",
+            ROTATIONS,
+            RPY,
+            hint="How its rotation is written below.",
         )
-        self._rpy = self._field(
+        self._rpy = self._row(
             "Degrees",
-            _angles,
-            lambda s, angles, _: _turned(s, quaternion_from_rpy(*angles)),
-            digits=DEGREES,
-            step=1.0,
-            hint="R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF and ROS. Yaw turns it to the left, a positive pitch "
+            SetCameraAngle,
+            ANGLES,
+            "R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF and ROS. Yaw turns it to the left, a positive pitch "
             "looks down, roll turns it clockwise.",
+            step=1.0,
         )
-        self._wxyz: Control[Any, Any] = Control(
-            self._gui.add_text("w x y z", "", hint="As in sapien.Pose(q=...), w first. It is normalised."),
-            read=_read_quaternion,
-            send=lambda q: self._placing.change("quaternion", lambda s, _: _turned(s, q)),
-            shown=lambda s: " ".join(f"{n:.{QUATERNION}f}" for n in rounded(s.quaternion, QUATERNION)),
-            settle=0.8,
+        self._wxyz = Field(
+            self._server,
+            "w x y z",
+            SetCameraQuaternion,
+            "wxyz",
+            hint="As in sapien.Pose(q=...), w first. It is normalised.",
+            longest=200,
         )
-        limit_text(self._wxyz.handle, 200)
-        self._forward = self._field(
-            "Forward",
-            lambda s: axes_of(s.quaternion)[0],
-            lambda s, forward, _: _turned(s, quaternion_from_axes(forward, axes_of(s.quaternion)[2])),
-            step=0.1,
-            hint="The line of sight: ManiSkill's x axis of a camera.",
+        self._forward = self._row(
+            "Forward", SetCameraForward, XYZ, "The line of sight: ManiSkill's x axis of a camera.", step=0.1
         )
-        self._up = self._field(
-            "Up",
-            lambda s: axes_of(s.quaternion)[2],
-            lambda s, up, _: _turned(s, quaternion_from_axes(axes_of(s.quaternion)[0], up)),
-            step=0.1,
-            hint="The top of the picture: ManiSkill's z axis of a camera.",
+        self._up = self._row(
+            "Up", SetCameraUp, XYZ, "The top of the picture: ManiSkill's z axis of a camera.", step=0.1
         )
-        self._left = self._gui.add_html("")
+        self._left = self._server.gui.add_html("")
 
     def _build_lens(self) -> None:
-        self._lens: Control[Any, Any] = Control(
-            self._gui.add_dropdown("Lens as", (FOV, INTRINSIC), initial_value=FOV),
-            send=lambda said: self._placing.change("lens", lambda s, _: _with_lens(s, said)),
-            shown=lambda s: FOV if s.intrinsic is None else INTRINSIC,
-        )
         vertical = "The vertical field of view, in degrees."
-        self._degrees = self._field(
-            "Vertical fov",
-            lambda s: [math.degrees(_fov(s))],
-            lambda s, typed, _: _with_fov(s, math.radians(typed[0])),
-            1,
-            digits=DEGREES,
+        self._lens = choice(self._server, "Lens as", ChooseLensForm, "form", LENSES, FOV)
+        self._degrees = Field(self._server, "Vertical fov", SetFieldOfView, "degrees", hint=vertical)
+        self._radians = Field(
+            self._server, "Radians", SetFieldOfViewInRadians, "radians", hint=vertical, step=0.01
+        )
+        self._focal = self._row("fx, fy", SetFocalLength, ("fx", "fy"), "Pixels.", step=1.0)
+        self._centre = self._row(
+            "cx, cy",
+            SetOpticalCentre,
+            ("cx", "cy"),
+            "Pixels from the picture's upper left corner to the optical axis.",
             step=1.0,
-            low=1.0,
-            high=175.0,
-            hint=vertical,
-        )
-        self._radians = self._field(
-            "Radians",
-            lambda s: [_fov(s)],
-            lambda s, typed, _: _with_fov(s, typed[0]),
-            1,
-            low=0.02,
-            high=3.05,
-            hint=vertical,
-        )
-        self._focal, self._centre = (
-            self._field(
-                label,
-                lambda s, column=column: intrinsic_of(s)[[0, 1], column],
-                partial(_with_intrinsic, column),
-                2,
-                digits=PIXELS,
-                step=1.0,
-                low=low,
-                high=1e5,
-                hint=hint,
-            )
-            for label, column, low, hint in (
-                ("fx, fy", [0, 1], 1.0, "Pixels."),
-                ("cx, cy", [2, 2], -1e5, "Pixels from the picture's upper left corner to the optical axis."),
-            )
         )
 
     def _build_picture(self) -> None:
-        self._size = self._field(
-            "Width, height",
-            lambda s: (s.width, s.height),
-            _with_size,
-            2,
-            digits=0,
-            step=1.0,
-            low=SMALLEST,
-            high=LARGEST,
-            hint="Pixels of the picture.",
+        self._size = self._row(
+            "Width, height", SetPictureSize, ("width", "height"), "Pixels of the picture.", step=1.0
         )
-        self._range = self._field(
-            "Near, far",
-            lambda s: (s.near, s.far),
-            _with_range,
-            2,
-            low=1e-4,
-            high=1e4,
-            hint="Metres. What is nearer or farther is not drawn.",
+        self._range = self._row(
+            "Near, far", SetNearOrFar, ("near", "far"), "Metres. What is nearer or farther is not drawn."
         )
-        self._shader: Control[Any, Any] = Control(
-            self._gui.add_dropdown(
-                "Shader",
-                SHADERS,
-                initial_value="minimal",
-                hint="minimal is what ManiSkill trains with; the rt shaders trace rays, slowly.",
-            ),
-            send=lambda name: self._placing.change("shader", lambda s, _: replace(s, shader_pack=name)),
-            shown=lambda s: s.shader_pack,
+        self._shader = choice(
+            self._server,
+            "Shader",
+            ChooseShader,
+            "shader",
+            SHADERS,
+            "minimal",
+            hint="minimal is what ManiSkill trains with; the rt shaders trace rays, slowly.",
         )
 
     def draw(self, camera: StudioCamera | None) -> None:
@@ -251,32 +209,89 @@ class CameraNumbers:
             folder.visible = camera is not None
         if camera is None or camera.now is None:
             return
-        now, alone, said = camera.now, self._look_at(), self._orientation.value
+        now, alone, said = camera.now, self._look_at(), self._rotation
+        forward, left, up = axes_of(now.quaternion)
         by_matrix = now.intrinsic is not None
-        self._position.handle.label = "Eye" if alone else "Position"
-        self._target.handle.label = "Target" if alone else "Looks at"
+        for separately, (position, target) in self._points.items():
+            position.visible = target.visible = separately == alone
+            position.show(rounded(now.position, UNIT))
+            target.show(rounded(target_of(now), UNIT))
         self._about.content = render("aside", text=STAYS if alone else GOES_ALONG)
-        self._left.visible = said == AXES
+        self._form.show(said)
+        self._rpy.visible = said == RPY
+        self._rpy.show(rounded(_angles(now), DEGREES))
+        self._wxyz.visible = said == WXYZ
+        self._wxyz.show(" ".join(f"{n:.{QUATERNION}f}" for n in rounded(now.quaternion, QUATERNION)))
+        self._forward.visible = self._up.visible = self._left.visible = said == AXES
+        self._forward.show(rounded(forward, UNIT))
+        self._up.show(rounded(up, UNIT))
         if said == AXES:
-            left = ", ".join(f"{n:.{UNIT}f}" for n in rounded(axes_of(now.quaternion)[1], UNIT))
-            self._left.content = render("note", text=f"Left: {left}")
-        if now.shader_pack not in self._shader.handle.options:
+            text = ", ".join(f"{n:.{UNIT}f}" for n in rounded(left, UNIT))
+            self._left.content = render("note", text=f"Left: {text}")
+        self._lens.show(INTRINSIC if by_matrix else FOV)
+        self._degrees.visible = self._radians.visible = not by_matrix
+        self._degrees.show(round(math.degrees(_fov(now)), DEGREES))
+        self._radians.show(round(_fov(now), UNIT))
+        self._focal.visible = self._centre.visible = by_matrix
+        k = intrinsic_of(now)
+        self._focal.show(rounded((k[0, 0], k[1, 1]), PIXELS))
+        self._centre.show(rounded((k[0, 2], k[1, 2]), PIXELS))
+        self._size.show((now.width, now.height))
+        self._range.show(rounded((now.near, now.far), UNIT))
+        if now.shader_pack not in self._shaders:
             # A task may have a shader pack of its own.
-            self._shader.handle.options = (*SHADERS, now.shader_pack)
-        for control, shown in (
-            *((each, True) for each in (self._position, self._target)),
-            (self._rpy, said == RPY),
-            (self._wxyz, said == WXYZ),
-            *((each, said == AXES) for each in (self._forward, self._up)),
-            *((each, not by_matrix) for each in (self._degrees, self._radians)),
-            *((each, by_matrix) for each in (self._focal, self._centre)),
-            *((each, True) for each in (self._lens, self._size, self._range, self._shader)),
-        ):
-            control.handle.visible = shown
-            if shown:
-                control.show(now)
+            self._shaders = (*SHADERS, now.shader_pack)
+        self._shader.show(now.shader_pack, options=by_name(self._shaders))
 
-    def _at(self, settings: CameraSettings, position: Numbers, frame: Frame) -> CameraSettings:
+    def do(self, command: Command, visitor: Visitor) -> None:
+        if isinstance(command, ChooseRotationForm):
+            self._rotation = command.form
+        else:
+            self._placing.change(type(command), partial(self._changed, command))
+
+    def _changed(self, command: Command, now: CameraSettings, frame: Frame) -> CameraSettings:
+        """The camera as this command has it. Raises ValueError with a sentence."""
+        forward, _, up = axes_of(now.quaternion)
+        match command:
+            case SetCameraPosition(of=axis, to=metres):
+                return self._at(now, _with_part(now.position, XYZ, axis, metres), frame)
+            case SetCameraTarget(of=axis, to=metres):
+                return frame.turned_to(now, _with_part(target_of(now), XYZ, axis, metres))
+            case SetCameraAngle(of=angle, to=degrees):
+                return _turned(now, quaternion_from_rpy(*_with_part(_angles(now), ANGLES, angle, degrees)))
+            case SetCameraQuaternion(wxyz=text):
+                return _turned(now, _read_quaternion(text))
+            case SetCameraForward(of=axis, to=to):
+                return _turned(now, quaternion_from_axes(_with_part(forward, XYZ, axis, to), up))
+            case SetCameraUp(of=axis, to=to):
+                return _turned(now, quaternion_from_axes(forward, _with_part(up, XYZ, axis, to)))
+            case ChooseLensForm(form=form):
+                return _with_lens(now, form)
+            case SetFieldOfView(degrees=degrees):
+                return _with_fov(now, math.radians(degrees))
+            case SetFieldOfViewInRadians(radians=radians):
+                return _with_fov(now, radians)
+            case SetFocalLength(of=of, to=pixels):
+                at = 0 if of == "fx" else 1
+                return _with_intrinsic(now, at, at, pixels)
+            case SetOpticalCentre(of=of, to=pixels):
+                return _with_intrinsic(now, 0 if of == "cx" else 1, 2, pixels)
+            case SetPictureSize(of=of, to=pixels):
+                return _with_size(now, replace(now, **{of: pixels}))
+            case SetNearOrFar(of=of, to=metres):
+                planes = replace(now, **{of: metres})
+                if planes.near >= planes.far:
+                    raise ValueError("Near must be less than far.")
+                return planes
+            case ChooseShader(shader=shader):
+                if shader not in self._shaders:
+                    raise ValueError(
+                        f"There is no shader pack {shader!r}: they are {', '.join(self._shaders)}."
+                    )
+                return replace(now, shader_pack=shader)
+        raise AssertionError(command)
+
+    def _at(self, settings: CameraSettings, position: Sequence[float], frame: Frame) -> CameraSettings:
         moved = replace(settings, position=triple(position))
         if self._look_at() and moved != settings:
             return frame.turned_to(moved, target_of(settings))
@@ -284,6 +299,13 @@ class CameraNumbers:
 
 
 # --- typed numbers to settings of a camera -----------------------------------------------------------
+
+
+def _with_part(
+    numbers: Sequence[float] | Floats, parts: Sequence[str], of: str, to: float
+) -> tuple[float, ...]:
+    """These numbers with another one for one of their parts; the others stay to the last digit."""
+    return tuple(to if part == of else float(n) for part, n in zip(parts, numbers, strict=True))
 
 
 def _fov(settings: CameraSettings) -> float:
@@ -294,36 +316,24 @@ def _with_fov(settings: CameraSettings, fov: float) -> CameraSettings:
     return settings if settings.fov is None else replace(settings, fov=fov)
 
 
-def _with_lens(settings: CameraSettings, said: str) -> CameraSettings:
+def _with_lens(settings: CameraSettings, said: LensForm) -> CameraSettings:
     if said == FOV:
         return replace(settings, fov=_fov(settings), intrinsic=None)
     return replace(settings, fov=None, intrinsic=matrix3(intrinsic_of(settings)))
 
 
-def _with_intrinsic(
-    columns: list[int], settings: CameraSettings, typed: Numbers, frame: Frame
-) -> CameraSettings:
+def _with_intrinsic(settings: CameraSettings, row: int, column: int, pixels: float) -> CameraSettings:
     k = intrinsic_of(settings)
-    k[[0, 1], columns] = typed
+    k[row, column] = pixels
     return settings if settings.intrinsic is None else replace(settings, intrinsic=matrix3(k))
 
 
-def _with_size(settings: CameraSettings, typed: Numbers, frame: Frame) -> CameraSettings:
-    if any(n % 1 for n in typed):
-        raise ValueError("A number of pixels is a whole number.")
-    width, height = map(int, typed)
-    sized = replace(settings, width=width, height=height)
+def _with_size(settings: CameraSettings, sized: CameraSettings) -> CameraSettings:
     if settings.intrinsic is None:
         return sized
     # In pixels of the new size, so that the picture stays the same.
-    k = scaled_intrinsic(settings.intrinsic, (settings.width, settings.height), (width, height))
-    return replace(sized, intrinsic=matrix3(k))
-
-
-def _with_range(settings: CameraSettings, typed: Numbers, frame: Frame) -> CameraSettings:
-    if typed[0] >= typed[1]:
-        raise ValueError("Near must be less than far.")
-    return replace(settings, near=typed[0], far=typed[1])
+    sizes = (settings.width, settings.height), (sized.width, sized.height)
+    return replace(sized, intrinsic=matrix3(scaled_intrinsic(settings.intrinsic, *sizes)))
 
 
 def _angles(settings: CameraSettings) -> list[float]:

@@ -29,7 +29,7 @@ from workbench.ui.cameras.pose_math import (
 )
 from workbench.ui.scene.env_grid import line_set
 from workbench.ui.scene.viewpoint import USUAL_ASPECT
-from workbench.ui.widgets.inputs import refusals_told
+from workbench.ui.widgets.notices import refusals_told
 
 LEFT_ALONE = 60.0
 """Seconds without a movement until a gizmo that was never released (its page was closed) is free again."""

@@ -11,6 +11,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.cameras import PickPixel, ShowFrustums, ShowPictures
+from workbench.commands.command import Command, Refused
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
 from workbench.machine.text import listed
 from workbench.session.cameras.studio import PREVIEW_MODALITIES
@@ -19,7 +21,7 @@ from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView, ShownCameras
 from workbench.session.protocol.messages import CameraRequest
 from workbench.ui.scene.env_grid import line_set, view_label
-from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.fields import Field, tick
 from workbench.ui.widgets.images import (
     COLOUR,
     MODALITIES,
@@ -31,6 +33,7 @@ from workbench.ui.widgets.images import (
 )
 from workbench.ui.widgets.parts import Clock, DrawDue
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.visitors import Visitor
 
 PICTURE_PERIOD = 1 / 15
 """Seconds between two pictures of one camera. A picture that is replaced before the browser has loaded it is never seen
@@ -53,10 +56,9 @@ class CameraImage:
         self,
         server: viser.ViserServer,
         container: viser.GuiFolderHandle,
-        order: float | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
-        self._server, self._container, self._order, self._clock = server, container, order, clock
+        self._server, self._container, self._clock = server, container, clock
         self._handle: viser.GuiImageHandle | None = None
         self._drawn_at = -math.inf
         self._whole: tuple[str, NDArray[np.uint8]] | None = None
@@ -87,9 +89,7 @@ class CameraImage:
     def _send(self, kind: str, pixels: NDArray[np.uint8]) -> None:
         if self._handle is None:
             with self._container:
-                self._handle = self._server.gui.add_image(
-                    pixels, format=image_format(kind), jpeg_quality=80, order=self._order
-                )
+                self._handle = self._server.gui.add_image(pixels, format=image_format(kind), jpeg_quality=80)
             return
         self._handle.format, self._handle.image, self._handle.visible = image_format(kind), pixels, True
 
@@ -97,7 +97,7 @@ class CameraImage:
 @dataclass
 class _Camera:
     info: CameraInfo
-    ticks: dict[str, viser.GuiCheckboxHandle]
+    ticks: dict[str, Field]
     captions: dict[str, viser.GuiHtmlHandle]
     folder: viser.GuiFolderHandle
     facts: viser.GuiHtmlHandle
@@ -112,12 +112,9 @@ class _Camera:
     hidden: tuple[str, ...] = ()
     """What the task hides from it."""
 
-    def wanted(self) -> tuple[str, ...]:
-        return tuple(modality for modality, tick in self.ticks.items() if tick.value)
-
 
 class CamerasPanel:
-    """One folder for each camera, with a check box for each modality.
+    """One folder for each camera, with a tick for each modality.
 
     A picture costs 50 to 100 ms without a GPU, and viser does not tell which tab is open: so only what is ticked is
     rendered.
@@ -128,6 +125,8 @@ class CamerasPanel:
         studio_shows: The modality that the Studio shows of the camera that is being placed.
     """
 
+    does = (ShowFrustums, ShowPictures)
+
     def __init__(
         self,
         server: viser.ViserServer,
@@ -136,27 +135,35 @@ class CamerasPanel:
         studio_shows: Callable[[], str] = lambda: COLOUR,
         clock: Clock = time.monotonic,
     ) -> None:
+        self.show_frustums = True
         self._no_camera, self._studio_shows = no_camera, studio_shows
         self._server, self._ask_for, self._clock = server, ask, clock
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
-        self._remembered: dict[tuple[CameraKind, str, str], bool] = {}
+        self._ticked: dict[tuple[CameraKind, str, str], bool] = {}
+        """Of each modality of each camera, also of those that are gone and may come back."""
         self._cameras_serial = -1
         self._due = DrawDue(PICTURE_PERIOD, clock)
         self._asked: tuple[CameraRequest, ...] | None = None
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task has loaded."))
-        self._frustums = server.gui.add_checkbox(
-            "Show in 3D view",
-            True,
-            visible=False,
-            hint="Draw these cameras, with their pictures, in the 3D view.",
-        )
+        hint = "Draw these cameras, with their pictures, in the 3D view."
+        self._frustums = tick(server, "Show in 3D view", ShowFrustums, "on", True, hint=hint)
+        self._frustums.visible = False
         self._folder = server.gui.add_folder(None)
 
-    @property
-    def show_frustums(self) -> bool:
-        return self._frustums.value
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ShowFrustums(on=on):
+                self.show_frustums = on
+            case ShowPictures(kind=kind, name=name, modality=modality, on=on):
+                if (kind, name, modality) not in self._ticked:
+                    raise Refused(f"No camera {name} gives {modality}.")
+                self._ticked[kind, name, modality] = on
 
     def draw(self, seen: ShownCameras | None) -> None:
+        self._frustums.show(self.show_frustums)
+        for key, camera in self._cameras.items():
+            for modality, field in camera.ticks.items():
+                field.show(self._ticked[(*key, modality)])
         if seen is None:
             return
         if seen.cameras_serial != self._cameras_serial:
@@ -174,8 +181,9 @@ class CamerasPanel:
             if picture is None or picture.env != seen.env:
                 continue
             # Not again for an equal drawing: the browser would decode the picture again.
-            if camera.drawn is None or camera.drawn[0] is not picture or camera.drawn[1] != camera.wanted():
-                camera.drawn = (picture, camera.wanted())
+            wanted = self._wanted(camera)
+            if camera.drawn is None or camera.drawn[0] is not picture or camera.drawn[1] != wanted:
+                camera.drawn = (picture, wanted)
                 self._draw_camera(camera, picture, seen)
 
     def shown_pictures(self, seen: ShownCameras) -> dict[tuple[CameraKind, str], Picture]:
@@ -185,14 +193,11 @@ class CamerasPanel:
             for key, picture in seen.pictures.items()
             if picture.env == seen.env
             and key in self._cameras
-            and (key == seen.placed or self._cameras[key].wanted())
+            and (key == seen.placed or self._wanted(self._cameras[key]))
         }
 
     def _build(self, seen: ShownCameras) -> None:
         """Make one folder for each camera; a camera that is still there keeps its folder and ticks."""
-        for key, camera in self._cameras.items():
-            for modality, tick in camera.ticks.items():
-                self._remembered[(*key, modality)] = tick.value
         before, self._cameras = self._cameras, {}
         stay = {(c.kind, c.name): modalities_of(c) for c in seen.cameras} if seen.can_render else {}
         for key in [key for key, camera in before.items() if stay.get(key) != tuple(camera.ticks)]:
@@ -228,15 +233,17 @@ class CamerasPanel:
 
     def _build_camera(self, info: CameraInfo, first: bool) -> _Camera:
         gui = self._server.gui
-        folder = gui.add_folder(f"{info.name} · {KIND_NAMES[info.kind]}")
+        folder = gui.add_folder(full_name(info.key))
         ticks, captions, images = {}, {}, {}
         with folder:
-            about = gui.add_html("", order=1.0)
-            for order, modality in enumerate(modalities_of(info)):
-                on = self._remembered.get((info.kind, info.name, modality), first and modality == "rgb")
-                ticks[modality] = gui.add_checkbox(modality, on, order=10.0 * order + 10)
-                images[modality] = CameraImage(self._server, folder, 10.0 * order + 11, self._clock)
-                captions[modality] = gui.add_html("", order=10.0 * order + 12)
+            about = gui.add_html("")
+            for modality in modalities_of(info):
+                given = {"kind": info.kind, "name": info.name, "modality": modality}
+                on = self._ticked.setdefault((*info.key, modality), first and modality == "rgb")
+                ticks[modality] = tick(self._server, modality, ShowPictures, "on", on, given=given)
+                # The picture is made when it comes, and is above its caption.
+                images[modality] = CameraImage(self._server, gui.add_folder(None), self._clock)
+                captions[modality] = gui.add_html("")
         camera = _Camera(info, ticks, captions, folder, about, images)
         about.content = facts(camera)
         return camera
@@ -251,14 +258,19 @@ class CamerasPanel:
             self._asked = wanted
             self._ask_for(wanted)
         for camera in self._cameras.values():
-            for modality, tick in camera.ticks.items():
-                shown = tick.value and not camera.failed
+            ticked = self._wanted(camera)
+            for modality in camera.ticks:
+                shown = modality in ticked and not camera.failed
                 camera.captions[modality].visible = shown
                 camera.images[modality].show(shown)
 
+    def _wanted(self, camera: _Camera) -> tuple[str, ...]:
+        """The ticked modalities."""
+        return tuple(modality for modality in camera.ticks if self._ticked[(*camera.info.key, modality)])
+
     def _wanted_of(self, key: CameraKey, camera: _Camera, seen: ShownCameras) -> tuple[str, ...]:
         """The ticked modalities; for a camera that is being placed also what the Studio shows, in full size."""
-        wanted = camera.wanted()
+        wanted = self._wanted(camera)
         if seen.preview or key != seen.placed:
             return wanted
         return tuple(m for m in modalities_of(camera.info) if m in (COLOUR, self._studio_shows(), *wanted))
@@ -278,7 +290,7 @@ class CamerasPanel:
     def _draw_camera(self, camera: _Camera, picture: Picture, seen: ShownCameras) -> None:
         if picture.depth is not None:
             camera.depth_span = depth_span(camera.depth_span, picture)
-        for modality in camera.wanted():
+        for modality in self._wanted(camera):
             coloured = in_colours(picture, modality, seen.segmentation, camera.depth_span)
             if coloured is None:
                 continue
@@ -357,6 +369,12 @@ class StudioPicture:
         self._picture.draw(kind, pixels)
 
 
+def full_name(key: CameraKey) -> str:
+    """A camera's name as the page shows it."""
+    kind, name = key
+    return f"{name} · {KIND_NAMES[kind]}"
+
+
 def modalities_of(info: CameraInfo) -> tuple[str, ...]:
     """The modalities that can be shown, in the page's order."""
     return tuple(modality for modality in MODALITIES if modality in info.modalities)
@@ -390,16 +408,11 @@ class CameraPick:
     page.css). Make it in the container of the picture, directly after it.
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session, presses: Presses) -> None:
-        """
-        Args:
-            presses: of the tab or of a folder with a label; without a label it hides what comes after it.
-        """
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._drawn: object = None
         # After a picture that is added to the container later.
         self._pane = server.gui.add_html("", order=1e5, visible=False)
         self._found = server.gui.add_html("", order=1e5 + 1, visible=False)
-        self._press = presses.place_id("picture", session.studio.reports.pick)
         self._cross = line_set(server, "/picked/cross", MARK_COLOUR, 3.0)
         self._label = view_label(server, "/picked/label", "bottom-left")
 
@@ -419,7 +432,7 @@ class CameraPick:
         if camera is None or not shown or (size, picked) == self._drawn:
             return
         self._drawn = (size, picked)
-        self._pane.content = pane_html(camera, picked, self._press)
+        self._pane.content = pane_html(camera, picked)
         if picked is not None:
             self._found.content = render("camera_found", picked=picked)
 
@@ -448,9 +461,9 @@ def picked_here(view: SessionView) -> PickedPixel | None:
     return picked
 
 
-def pane_html(camera: StudioCamera, picked: PickedPixel | None, press: str) -> str:
+def pane_html(camera: StudioCamera, picked: PickedPixel | None) -> str:
     width, height = _size(camera)
-    return render("camera_pane", press=press, aspect=f"{width / height:.6f}", picked=picked)
+    return render("camera_pane", pick=PickPixel(x=0.0, y=0.0), aspect=f"{width / height:.6f}", picked=picked)
 
 
 def _size(camera: StudioCamera) -> tuple[int, int]:

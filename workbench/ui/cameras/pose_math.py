@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from viser.transforms import SO3
 
+from workbench.commands.cameras import FARTHEST
+from workbench.commands.command import Refused
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.core.cameras.conventions import (
     LookAt,
@@ -166,19 +168,6 @@ def picture_corners(settings: CameraSettings, pose: ArrayLike, depth: float) -> 
     return p[:3] + depth * (forward - right[:, None] * left - down[:, None] * up)
 
 
-def kept_where_equal(
-    exact: Sequence[float] | Floats, typed: Sequence[float], digits: int
-) -> tuple[float, ...]:
-    """The typed numbers, but the exact number where the typed one equals it rounded.
-
-    A field of three sends all three: without this, typing x would round y and z to the shown digits.
-    """
-    return tuple(
-        float(e) if round(float(e), digits) == round(float(t), digits) else float(t)
-        for e, t in zip(exact, typed, strict=True)
-    )
-
-
 def rounded(numbers: ArrayLike, digits: int) -> tuple[float, ...]:
     """Numbers for a field, without negative zeros."""
     return tuple(round(float(n), digits) + 0.0 for n in np.asarray(numbers, np.float64))
@@ -194,8 +183,6 @@ def _in_steps(rotation: Floats, step: float) -> Floats:
 
 PAUSE = 1.2
 """Seconds. Movements by the same control with shorter pauses are one step of undo."""
-FARTHEST = 1000.0
-"""Most metres from the origin."""
 
 
 class Placing:
@@ -217,11 +204,11 @@ class Placing:
         """The camera to place, its present settings and their frame.
 
         Raises:
-            ValueError: there is none.
+            Refused: there is none.
         """
         camera = self.camera
         if camera is None or camera.now is None:
-            raise ValueError("Choose a camera that can be placed first.")
+            raise Refused("Choose a camera that can be placed first.")
         return camera, camera.now, self.frame(camera)
 
     def frame(self, camera: StudioCamera) -> Frame:
@@ -231,17 +218,36 @@ class Placing:
         """Place it live; `control` and `pause` as in `CameraStudio.place`.
 
         Raises:
-            ValueError: it is too far away for any task.
+            Refused: it is too far away for any task.
         """
         if not all(abs(x) <= FARTHEST for x in settings.position):
-            raise ValueError(f"A camera must be within {FARTHEST:g} m of the origin.")
+            raise Refused(f"A camera must be within {FARTHEST:g} m of the origin.")
         self._session.studio.place(key, settings, control, pause)
 
     def change(self, control: object, change: Callable[[CameraSettings, Frame], CameraSettings]) -> None:
         """Apply `change` to the chosen camera; `control` as in `place`.
 
+        Args:
+            change: raises ValueError with a sentence where the camera cannot be so.
+
         Raises:
-            ValueError: no camera is chosen, or it cannot be placed so.
+            Refused: no camera is chosen, or it cannot be placed so.
         """
         camera, now, frame = self.require()
-        self.place(camera.key, change(now, frame), control)
+        try:
+            changed = change(now, frame)
+        except ValueError as error:
+            raise Refused(str(error)) from None
+        self.place(camera.key, changed, control)
+
+
+def chosen_camera(session: Session) -> tuple[StudioCamera, CameraSettings]:
+    """The chosen camera and its present settings.
+
+    Raises:
+        Refused: none is chosen, or it cannot be placed.
+    """
+    camera = session.view().studio.chosen
+    if camera is None or camera.now is None:
+        raise Refused("Choose a camera that can be placed first.")
+    return camera, camera.now

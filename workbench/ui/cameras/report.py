@@ -4,89 +4,122 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import viser
 
+from workbench.commands.cameras import (
+    ChooseMeasured,
+    ChooseMeasuredResets,
+    ChooseMeasuredSteps,
+    DrawSheet,
+    MeasureChosenCamera,
+    Measured,
+    ShowMeasuredMoment,
+    StopMeasuring,
+    UseSuggestedPlane,
+)
+from workbench.commands.command import Command, Refused
+from workbench.commands.envs import SelectEnv
 from workbench.core.camera_data import Picture
 from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, size_text
-from workbench.session.cameras.reports import MOST_SEEDS, MOST_STEPS
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.fields import Field, choice
 from workbench.ui.widgets.images import data_address
+from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import counted, render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
-AS_THEY_ARE, STEPS, FRESH = "all envs now", "this env's episode so far", "fresh resets"
-OVERS = (AS_THEY_ARE, STEPS, FRESH)
+OVERS: dict[str, Measured] = {
+    "all envs now": "envs",
+    "this env's episode so far": "steps",
+    "fresh resets": "resets",
+}
+OVER_HINT = (
+    "All envs at the shown moment; the selected env's episode, step by step; or freshly reset envs with other seeds, in "
+    "another process."
+)
+STEPS_HINT = "The most steps of the episode to measure, evenly spaced: each takes a few pictures."
 MOST_PICTURES = 64
 """Pictures on the sheet, worst first."""
 THUMBNAIL = 128
 """Pixels along the longer side of a picture on the sheet."""
 
 
-class CameraReportPanel:
+class CameraReportPanel(PagePart[SessionView]):
     """The folder in the present container."""
+
+    does = (
+        ChooseMeasured,
+        ChooseMeasuredSteps,
+        ChooseMeasuredResets,
+        MeasureChosenCamera,
+        DrawSheet,
+        StopMeasuring,
+        ShowMeasuredMoment,
+        UseSuggestedPlane,
+    )
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        with server.gui.add_folder("Measure", expand_by_default=False) as self.folder:
-            self._over = server.gui.add_dropdown(
-                "Over",
-                OVERS,
-                hint="All envs at the shown moment; the selected env's episode, step by step; or freshly reset "
-                "envs with other seeds, in another process.",
+        self._over: Measured = "envs"
+        self._steps, self._resets = 50, 32
+        gui = server.gui
+        with gui.add_folder("Measure", expand_by_default=False) as self.folder:
+            self._overs = choice(server, "Over", ChooseMeasured, "over", OVERS, self._over, hint=OVER_HINT)
+            self._most_steps = Field(
+                server, "Steps", ChooseMeasuredSteps, "steps", self._steps, hint=STEPS_HINT
             )
-            self._steps = server.gui.add_number(
-                "Steps",
-                50,
-                min=1,
-                max=MOST_STEPS,
-                step=1,
-                visible=False,
-                hint="The most steps of the episode to measure, evenly spaced: each takes a few pictures.",
-            )
-            self._resets = server.gui.add_number(
+            self._fresh = Field(
+                server,
                 "Resets",
-                32,
-                min=1,
-                max=MOST_SEEDS,
-                step=1,
-                visible=False,
+                ChooseMeasuredResets,
+                "resets",
+                self._resets,
                 hint="How many, each with its own seed.",
             )
-            self._measure = server.gui.add_button(
-                "Measure this camera", icon=viser.Icon.CHECKLIST, color="gray"
-            )
-            self._report = JobResult(server, session)
-            self._sheet = server.gui.add_button(
-                "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"
-            )
-            self._pictures = JobResult(server, session)
-            self._presses = Presses(server)
-        self._measure.on_click(lambda _: self._ask())
-        self._sheet.on_click(lambda _: self._ask_for_sheet())
+            gui.add_html(tools_html([tool("Measure this camera", MeasureChosenCamera())]))
+            self._report = JobResult(server)
+            gui.add_html(tools_html([tool("Pictures of all envs", DrawSheet())]))
+            self._pictures = JobResult(server)
 
     # --- requests ------------------------------------------------------------------------------------
 
-    def _ask(self) -> None:
-        self._report.asked(self._session.view().studio.results.report)
-        over = self._over.value
-        if over == STEPS:
-            self._session.studio.reports.measure_steps(self._steps.value)
-        else:
-            self._session.studio.reports.measure(self._resets.value if over == FRESH else 0)
-
-    def _ask_for_sheet(self) -> None:
-        self._pictures.asked(self._session.view().studio.results.sheet)
-        self._session.studio.reports.make_sheet()
+    def do(self, command: Command, visitor: Visitor) -> None:
+        studio, reports = self._session.view().studio, self._session.studio.reports
+        match command:
+            case ChooseMeasured(over=over):
+                self._over = over
+            case ChooseMeasuredSteps(steps=steps):
+                self._steps = steps
+            case ChooseMeasuredResets(resets=resets):
+                self._resets = resets
+            case MeasureChosenCamera() | DrawSheet() if studio.chosen is None:
+                raise Refused("Choose the camera first.")
+            case MeasureChosenCamera():
+                self._report.asked(studio.results.report)
+                if self._over == "steps":
+                    reports.measure_steps(self._steps)
+                else:
+                    reports.measure(self._resets if self._over == "resets" else 0)
+            case DrawSheet():
+                self._pictures.asked(studio.results.sheet)
+                reports.make_sheet()
+            case StopMeasuring():
+                reports.stop()
+            case ShowMeasuredMoment(number=number):
+                self._show_moment(number)
+            case UseSuggestedPlane(plane=plane):
+                self._use(plane)
 
     def _show_moment(self, position: int) -> None:
         moments = self._session.view().studio.results.report_moments
-        if position < len(moments):
+        if 0 <= position < len(moments):
             self._session.show(moments[position].env, moments[position].serial)
 
     def _use(self, plane: str) -> None:
@@ -104,8 +137,11 @@ class CameraReportPanel:
     def draw(self, view: SessionView) -> None:
         studio = view.studio
         camera = studio.chosen
-        self._resets.visible = self._over.value == FRESH
-        self._steps.visible = self._over.value == STEPS
+        self._overs.show(self._over)
+        self._most_steps.show(self._steps)
+        self._most_steps.visible = self._over == "steps"
+        self._fresh.show(self._resets)
+        self._fresh.visible = self._over == "resets"
         self._draw_report(studio, camera)
         self._draw_sheet(view, camera)
 
@@ -126,23 +162,23 @@ class CameraReportPanel:
         moments = [
             {
                 "words": f"step {moment.step}",
-                "press": self._presses.id_of(("moment", i), lambda _, i=i: self._show_moment(i)),
+                "press": ShowMeasuredMoment(number=i),
             }
             for i, moment in enumerate(results.report_moments)
         ]
         planes = []
-        for name, now, better in (
+        suggested: tuple[tuple[Literal["near", "far"], float, float | None], ...] = (
             ("near", lens.near, depth.suggested_near),
             ("far", lens.far, depth.suggested_far),
-        ):
+        )
+        for name, now, better in suggested:
             fits = better is None or abs(better / now - 1) < 0.02
-            press = self._presses.id_of(name, lambda _, plane=name: self._use(plane))
             planes.append(
                 {
                     "name": name,
                     "now": metres(now),
                     "better": "" if fits or better is None else metres(better),
-                    "press": "" if studio.placeable is None else press,
+                    "press": None if studio.placeable is None else UseSuggestedPlane(plane=name),
                 }
             )
         count = len(report.envs)
@@ -199,7 +235,7 @@ class CameraReportPanel:
                 else env_words(report, places[picture.env]),
                 "picture": data_address(picture.rgb, THUMBNAIL),
                 "selected": picture.env == selected,
-                "press": self._presses.id_of(("env", picture.env), lambda _, env=picture.env: self._go(env)),
+                "press": SelectEnv(env=picture.env),
             }
             for picture in sheet[:MOST_PICTURES]
             if picture.rgb is not None
@@ -208,11 +244,6 @@ class CameraReportPanel:
         if len(sheet) > MOST_PICTURES:
             note = f"{MOST_PICTURES} of {len(sheet)}; {note}"
         return render("camera_sheet", cells=cells, note=note, new=new)
-
-    def _go(self, env: int) -> None:
-        task = self._session.view().task
-        if task is not None and env < task.num_envs:  # a version with fewer envs may have been loaded since
-            self._session.change(selected_env=env)
 
 
 # --- a report as text, rows and bars: pure functions -------------------------------------------------

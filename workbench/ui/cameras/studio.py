@@ -4,16 +4,41 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import PurePath
-from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
-from viser._messages import HotkeyKey  # the type of add_command's argument (viser 1.1.1)
 
+from workbench.commands.cameras import (
+    ChooseAxes,
+    ChooseCamera,
+    ChooseHandles,
+    ChooseSnap,
+    MoveCameraBack,
+    MoveCameraDown,
+    MoveCameraForward,
+    MoveCameraLeft,
+    MoveCameraRight,
+    MoveCameraToView,
+    MoveCameraUp,
+    PickPixel,
+    RedoCamera,
+    ResetCamera,
+    ScalePreview,
+    SelectCamera,
+    ShowModality,
+    ShowOneEnv,
+    ToggleLookThrough,
+    TurnCameraDown,
+    TurnCameraLeft,
+    TurnCameraRight,
+    TurnCameraUp,
+    UndoCamera,
+)
+from workbench.commands.command import Command, Refused
+from workbench.commands.page import TellUnfolded
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.core.cameras.conventions import target_of
 from workbench.session.cameras.view import StudioCamera, StudioView
@@ -24,25 +49,43 @@ from workbench.ui.cameras.export import CameraExport
 from workbench.ui.cameras.fields import CameraNumbers
 from workbench.ui.cameras.frustums import PlacedFrustum
 from workbench.ui.cameras.gizmo import CameraGizmo, LookThrough
-from workbench.ui.cameras.panel import KIND_NAMES, CameraPick, StudioPicture
+from workbench.ui.cameras.panel import CameraPick, StudioPicture, full_name
 from workbench.ui.cameras.pose_math import Floats, Frame, Placing, Snap, nudged, panned
 from workbench.ui.cameras.report import CameraReportPanel
 from workbench.ui.cameras.suggest import CameraSuggest
 from workbench.ui.cameras.write_to_file import WriteToFile
 from workbench.ui.scene.viewpoint import ViewPanel
-from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.hotkeys import Command
-from workbench.ui.widgets.inputs import Control, refusals_told
-from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.fields import by_name, choice
+from workbench.ui.widgets.hotkeys import with_key
+from workbench.ui.widgets.parts import Clock, PagePart, Parts
 from workbench.ui.widgets.templates import render, sentence
+from workbench.ui.widgets.tools import Label, Tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 NO_CAMERA = "none"
 SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
 SCALES = {"full": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
+TAB = "Studio"
 STEP = 0.01
 """Metres by which a key moves the camera."""
 TURN = 1.0
 """Degrees by which a key turns it."""
+MOVES: dict[type[Command], tuple[float, float, float]] = {
+    MoveCameraLeft: (0, STEP, 0),
+    MoveCameraRight: (0, -STEP, 0),
+    MoveCameraUp: (0, 0, STEP),
+    MoveCameraDown: (0, 0, -STEP),
+    MoveCameraForward: (STEP, 0, 0),
+    MoveCameraBack: (-STEP, 0, 0),
+}
+"""Forward, left and up in the camera's own frame."""
+TURNS: dict[type[Command], tuple[float, float]] = {
+    TurnCameraLeft: (TURN, 0),
+    TurnCameraRight: (-TURN, 0),
+    TurnCameraUp: (0, TURN),
+    TurnCameraDown: (0, -TURN),
+}
+"""Left and up."""
 VIEW = "Envs in the 3D view (O). With one alone the handles are large."
 HANDLES = (
     "pose: move or rotate the camera; its target moves with it.\n"
@@ -57,23 +100,32 @@ VARIES = (
 IN_ITS_EYE = "You are at its position. Move the view to see its handles."
 
 
-@dataclass(frozen=True)
-class Toggle:
-    """A row of buttons of which one is on."""
-
-    label: str
-    hint: str
-    choices: dict[str, Any]
-    now: object
-    choose: Callable[[Any], None]
-
-
 class StudioPanel(PagePart[SessionView]):
     """The tab. Only the chosen camera has gizmos and numbers; it is chosen here or by a press on its frustum.
 
     From the top: the button that shows the change of the file; the picture, by which every movement is checked; what is
     used all the time (look through it, undo); the pose; the lens, folded.
     """
+
+    does = (
+        SelectCamera,
+        ChooseCamera,
+        UndoCamera,
+        RedoCamera,
+        *MOVES,
+        *TURNS,
+        ToggleLookThrough,
+        MoveCameraToView,
+        ResetCamera,
+        ChooseHandles,
+        ChooseAxes,
+        ChooseSnap,
+        ShowOneEnv,
+        ShowModality,
+        ScalePreview,
+        PickPixel,
+        *CameraNumbers.does,
+    )
 
     def __init__(
         self,
@@ -90,21 +142,13 @@ class StudioPanel(PagePart[SessionView]):
         self._pages = pages
         self._server, self._session, self._view_panel = server, session, view_panel
         self._placing = Placing(session)
-        self._keys: tuple[CameraKey, ...] = ()
-        self._names: dict[str, CameraKey | None] = {NO_CAMERA: None}
         self._in_its_eye = False
         self._is_empty = False
         """No camera is chosen, and everything below the choice is hidden."""
-        self._look_at, self._own_axes, self._snap = False, False, Snap()
+        self._look_at, self._own_axes, self._snap = False, False, "none"
         gui = server.gui
-        choices: tuple[str, ...] = (NO_CAMERA,)
         above = gui.add_folder(None)
-        self._choice: Control[Any, Any] = Control(
-            gui.add_dropdown("Camera", choices, initial_value=NO_CAMERA, visible=False),
-            read=lambda name: self._names.get(name),
-            send=session.studio.select,
-            shown=self._name_of,
-        )
+        self._choice = choice(server, "Camera", ChooseCamera, "name", (NO_CAMERA,), NO_CAMERA)
         self._note = gui.add_html(render("note", text="Cameras appear when the task has loaded."))
         self._picture = StudioPicture(server, session, clock)
         self._facts = gui.add_html("", visible=False)
@@ -112,20 +156,21 @@ class StudioPanel(PagePart[SessionView]):
         self._look = LookThrough(server, self._placing)
         self._handles = gui.add_html("", visible=False)
         self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
-        self._writing = WriteToFile(server, session, self._placing, self._new_from_viewer, above)
-        verdict, compare = CameraReportPanel(server, session), CameraCompare(server, session)
+        self._writing = WriteToFile(server, session, self._new_from_viewer, above)
+        report, compare = CameraReportPanel(server, session), CameraCompare(server, session)
         self._suggest = CameraSuggest(server, session)
-        self._folders = verdict, compare, self._suggest, CameraExport(server, session)
-        self._presses = Presses(server)
-        self._presses.when_unfolded(self._on_opened)
+        self._folders = report, compare, self._suggest, CameraExport(server, session)
+        self._inner: Parts[SessionView] = Parts((self._writing, *self._folders))
+        self.does = (*StudioPanel.does, *self._inner.does)
+        gui.add_html(render("tell", command=TellUnfolded(panel=TAB)))
         self._was_opened = False
         with self._picture.folder:
-            self._pick = CameraPick(server, session, self._presses)
+            self._pick = CameraPick(server, session)
         self._gizmos: dict[int, CameraGizmo] = {}
         """The handles in the view of each page that has this tab open, by client id. On another tab a drag that is meant for
         the view would move the camera."""
 
-    def _on_opened(self) -> None:
+    def unfold(self) -> None:
         """The tab was opened, perhaps before the task was loaded."""
         self._was_opened = True
         self._choose_first(self._session.view())
@@ -147,9 +192,6 @@ class StudioPanel(PagePart[SessionView]):
     def looks_through(self) -> bool:
         """Whether a page looks through the chosen camera."""
         return self._look.any
-
-    def _name_of(self, key: CameraKey | None) -> str | None:
-        return next((name for name, known in self._names.items() if known == key), NO_CAMERA)
 
     # --- in the view -------------------------------------------------------------------------------------
 
@@ -186,7 +228,7 @@ class StudioPanel(PagePart[SessionView]):
                 self._gizmos[page] = CameraGizmo(
                     clients[page],
                     self._placing,
-                    snap=lambda: self._snap,
+                    snap=lambda: SNAPS[self._snap],
                     own_axes=lambda: self._own_axes,
                     look_at=lambda: self._look_at,
                 )
@@ -205,7 +247,7 @@ class StudioPanel(PagePart[SessionView]):
         studio = view.studio
         self._choose_first(view)
         self._draw_choice(view)
-        self._writing.draw(studio)
+        self._writing.draw(view)
         chosen, camera = studio.chosen, studio.placeable
         if chosen is None and self._is_empty:
             return
@@ -229,17 +271,12 @@ class StudioPanel(PagePart[SessionView]):
 
     def _draw_choice(self, view: SessionView) -> None:
         studio = view.studio
-        keys = tuple(camera.key for camera in studio.cameras)
-        if keys != self._keys:
-            self._keys = keys
-            self._names = {
-                NO_CAMERA: None,
-                **{f"{name} · {KIND_NAMES[kind]}": (kind, name) for kind, name in keys},
-            }
-            self._choice.handle.options = tuple(self._names)
-        self._choice.show(studio.selected)
-        self._choice.handle.visible = bool(keys)
-        if not keys:
+        names, chosen = [full_name(camera.key) for camera in studio.cameras], studio.chosen
+        self._choice.visible = bool(names)
+        self._choice.show(
+            NO_CAMERA if chosen is None else full_name(chosen.key), options=by_name((NO_CAMERA, *names))
+        )
+        if not names:
             text = (
                 "This task has no camera yet. Add a sensor below."
                 if view.task is not None
@@ -270,40 +307,19 @@ class StudioPanel(PagePart[SessionView]):
         )
 
     def _tools_of(self, camera: StudioCamera, studio: StudioView) -> str:
-        actions = self._session.studio
         looks = self._look.any
-        rows = [
+        file = "Restore the placement in the file." if camera.moved else "It matches the file."
+        return tools_html(
             [
-                self._tool(
-                    "Back to my view" if looks else "Look through", "", "look", self._look.toggle, on=looks
-                ),
-                self._tool("Move to my view", "", "put", self._put),
+                Tool("Back to my view" if looks else "Look through", ToggleLookThrough(), on=looks),
+                Tool("Move to my view", MoveCameraToView()),
             ],
             [
-                self._tool(
-                    "Undo",
-                    f"Undo: {studio.undo} (Ctrl+Z)" if studio.undo else "There is nothing to undo.",
-                    "undo",
-                    lambda _: actions.undo(),
-                    off=studio.undo is None,
-                ),
-                self._tool(
-                    "Redo",
-                    f"Redo: {studio.redo} (Ctrl+Shift+Z)" if studio.redo else "There is nothing to redo.",
-                    "redo",
-                    lambda _: actions.redo(),
-                    off=studio.redo is None,
-                ),
-                self._tool(
-                    "Reset to file",
-                    "Restore the placement in the file." if camera.moved else "It matches the file.",
-                    "back",
-                    lambda _: self._back_to_file(),
-                    off=not camera.moved,
-                ),
+                _step_tool("Undo", UndoCamera(), studio.undo),
+                _step_tool("Redo", RedoCamera(), studio.redo),
+                Tool("Reset to file", ResetCamera(), file, off=not camera.moved),
             ],
-        ]
-        return render("studio_tools", rows=rows)
+        )
 
     def _handles_of(self, scale: float, several: bool) -> str:
         """Buttons for the gizmos (pose or eye and target, axes, steps) and for the picture (modality, size).
@@ -311,118 +327,132 @@ class StudioPanel(PagePart[SessionView]):
         Args:
             several: there is more than one env. Among many the handles are a small knot.
         """
-        kinds = {kind: kind for kind in self._picture.kinds}
-        show = self._view_panel
-        choices = {"all envs": False, "this env": True}
-        envs = Toggle("View", VIEW, choices, show.only_selected, show.show_only_selected)
-        toggles = (
-            *((envs,) if several else ()),
-            Toggle(
+        one = self._view_panel.only_selected
+        rows = [
+            _choice(
+                "View",
+                VIEW,
+                {"all envs": ShowOneEnv(one=False), "this env": ShowOneEnv(one=True)},
+                ShowOneEnv(one=one),
+            ),
+            _choice(
                 "Handles",
                 HANDLES,
-                {"pose": False, "eye and target": True},
-                self._look_at,
-                self._set_look_at,
+                {"pose": ChooseHandles(look_at=False), "eye and target": ChooseHandles(look_at=True)},
+                ChooseHandles(look_at=self._look_at),
             ),
-            Toggle("Axes", AXES, {"world": False, "camera": True}, self._own_axes, self._set_own_axes),
-            Toggle("Snap", SNAP, SNAPS, self._snap, self._set_snap),
-            Toggle(
-                "Shows", "What the picture above shows.", kinds, self._picture.shows, self._picture.show_kind
+            _choice(
+                "Axes",
+                AXES,
+                {"world": ChooseAxes(own=False), "camera": ChooseAxes(own=True)},
+                ChooseAxes(own=self._own_axes),
+                off=self._look_at,
             ),
-            Toggle("Size", SIZE, SCALES, scale, self._session.studio.set_preview_scale),
-        )
-        rows = [
-            [
-                {"label": one.label, "hint": one.hint},
-                *(
-                    self._tool(
-                        name,
-                        "",
-                        f"{one.label} {name}",
-                        lambda _, one=one, value=value: one.choose(value),
-                        one.now == value,
-                        one.label == "Axes" and self._look_at,
-                        style="pill",
-                    )
-                    for name, value in one.choices.items()
-                ),
-            ]
-            for one in toggles
+            _choice(
+                "Snap", SNAP, {name: ChooseSnap(snap=name) for name in SNAPS}, ChooseSnap(snap=self._snap)
+            ),
+            _choice(
+                "Shows",
+                "What the picture above shows.",
+                {kind: ShowModality(kind=kind) for kind in self._picture.kinds},
+                ShowModality(kind=self._picture.shows),
+            ),
+            _choice(
+                "Size",
+                SIZE,
+                {name: ScalePreview(scale=size) for name, size in SCALES.items()},
+                ScalePreview(scale=scale),
+            ),
         ]
-        return render("studio_tools", rows=rows)
+        return tools_html(*(rows if several else rows[1:]))
 
-    def _set_look_at(self, on: bool) -> None:
-        self._look_at = on
+    # --- what a person does ------------------------------------------------------------------------------
 
-    def _set_own_axes(self, on: bool) -> None:
-        self._own_axes = on
+    def do(self, command: Command, visitor: Visitor) -> None:
+        studio = self._session.studio
+        match command:
+            case SelectCamera(kind=kind, name=name):
+                studio.select((kind, name))
+            case ChooseCamera(name=name):
+                studio.select(self._key_of(name))
+            case UndoCamera():
+                studio.undo()
+            case RedoCamera():
+                studio.redo()
+            case ToggleLookThrough():
+                self._look.toggle(visitor.client)
+            case MoveCameraToView():
+                self._placing.change(None, partial(self._look.settings_from, visitor.client))
+            case ResetCamera():
+                if (key := self._session.view().studio.selected) is not None:
+                    studio.back_to_file(key)
+            case ChooseHandles(look_at=look_at):
+                self._look_at = look_at
+            case ChooseAxes(own=own):
+                self._own_axes = own
+            case ChooseSnap(snap=name):
+                if name not in SNAPS:
+                    raise Refused(f"There is no snap {name!r}: they are {', '.join(SNAPS)}.")
+                self._snap = name
+            case ShowOneEnv(one=one):
+                self._view_panel.show_only_selected(one)
+            case ShowModality(kind=kind):
+                self._picture.show_kind(kind)
+            case ScalePreview(scale=scale):
+                studio.set_preview_scale(scale)
+            case PickPixel(x=x, y=y):
+                studio.reports.pick(x, y)
+            case _ if isinstance(command, CameraNumbers.does):
+                self._numbers.do(command, visitor)
+            case _ if type(command) in self._inner.does:
+                self._inner.do(command, visitor)
+            case _:
+                self._by_key(command)
 
-    def _set_snap(self, snap: Snap) -> None:
-        self._snap = snap
-
-    def _tool(
-        self,
-        name: str,
-        hint: str,
-        key: str,
-        pressed: Callable[[viser.ClientHandle | None], None],
-        on: bool = False,
-        off: bool = False,
-        style: str = "button",
-    ) -> dict[str, object]:
-        press = self._presses.id_of(key, pressed)
-        return {"name": name, "hint": hint, "on": on, "press": "" if off else press, "style": style}
-
-    # --- presses -----------------------------------------------------------------------------------------
-
-    def _back_to_file(self) -> None:
-        key = self._session.view().studio.selected
-        if key is not None:
-            self._session.studio.back_to_file(key)
-
-    def _put(self, client: viser.ClientHandle | None) -> None:
-        if client is None:
-            return
-        with refusals_told(client):
-            self._placing.change(None, partial(self._look.settings_from, client))
+    def _key_of(self, name: str) -> CameraKey | None:
+        keys = {full_name(camera.key): camera.key for camera in self._session.view().studio.cameras}
+        if name != NO_CAMERA and name not in keys:
+            raise Refused(f"There is no camera {name}.")
+        return keys.get(name)
 
     def _new_from_viewer(self, client: viser.ClientHandle, settings: CameraSettings) -> CameraSettings:
         return self._look.settings_from(client, settings, Frame(None, self._placing.offset))
 
-    def commands(self) -> list[Command]:
-        """Commands with keys. The arrow keys alone belong to the timeline."""
-        return [
-            Command("Undo the last camera change", self._session.studio.undo, "Z", "cmd/ctrl"),
-            Command("Redo the camera change", self._session.studio.redo, "Z", "cmd/ctrl+shift"),
-            self._moves("left", "arrowleft", (0, STEP, 0)),
-            self._moves("right", "arrowright", (0, -STEP, 0)),
-            self._moves("up", "arrowup", (0, 0, STEP)),
-            self._moves("down", "arrowdown", (0, 0, -STEP)),
-            self._moves("forward", "pageup", (STEP, 0, 0)),
-            self._moves("back", "pagedown", (-STEP, 0, 0)),
-            self._turns("left", "arrowleft", TURN, 0),
-            self._turns("right", "arrowright", -TURN, 0),
-            self._turns("up", "arrowup", 0, TURN),
-            self._turns("down", "arrowdown", 0, -TURN),
-        ]
+    def _by_key(self, command: Command) -> None:
+        """Move the camera by a key. The arrow keys alone belong to the timeline."""
+        # Not from another tab: nothing there shows that a camera moves.
+        if self._placing.camera is None or not self._pages():
+            raise Refused("Choose a camera in the Studio first.")
+        if (step := MOVES.get(type(command))) is not None:
+            self._move(partial(nudged, step=step), "key")
+        else:
+            left, up = TURNS[type(command)]
+            self._move(partial(panned, left=left, up=up), "turning key")
 
-    def _moves(self, name: str, key: HotkeyKey, step: tuple[float, float, float]) -> Command:
-        move = partial(self._by_key, partial(nudged, step=step), "key")
-        return Command(f"Move the chosen camera {name}", move, key, "alt")
-
-    def _turns(self, name: str, key: HotkeyKey, left: float, up: float) -> Command:
-        turn = partial(self._by_key, partial(panned, left=left, up=up), "turning key")
-        return Command(f"Rotate the chosen camera {name}", turn, key, "alt+shift")
-
-    def _by_key(self, move: Callable[[Floats], Floats], control: str) -> None:
+    def _move(self, move: Callable[[Floats], Floats], control: str) -> None:
         def change(now: CameraSettings, frame: Frame) -> CameraSettings:
             moved = frame.from_view(now, move(frame.to_view(now)))
             keeps_target = self._look_at and moved.position != now.position
             return frame.turned_to(moved, target_of(now)) if keeps_target else moved
 
-        # Not from another tab: nothing there shows that a camera moves.
-        if self._placing.camera is not None and self._pages():
-            self._placing.change(control, change)
+        self._placing.change(control, change)
+
+
+def _step_tool(name: str, command: Command, step: str | None) -> Tool:
+    hint = f"{name}: {step}" if step else f"There is nothing to {name.lower()}."
+    return Tool(name, command, with_key(type(command), hint), off=step is None)
+
+
+def _choice(
+    label: str, hint: str, commands: dict[str, Command], now: Command, off: bool = False
+) -> list[Tool | Label]:
+    """A label and buttons of which one is on.
+
+    Args:
+        now: the command of the one that is on.
+    """
+    tools = [Tool(name, one, " ", on=one == now, off=off, style="pill") for name, one in commands.items()]
+    return [Label(label, hint), *tools]
 
 
 def _placed(camera: StudioCamera) -> CameraSettings:

@@ -8,6 +8,16 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.cameras import (
+    ChooseSearchResets,
+    SearchPlacements,
+    SetSearchBox,
+    ShowSearchBox,
+    ToggleAllLinks,
+    ToggleWantedObject,
+    UsePlacement,
+)
+from workbench.commands.command import Command, Refused
 from workbench.core.camera_data import CameraKey, CameraKind, CameraSettings
 from workbench.core.cameras.conventions import rotation_matrix, triple
 from workbench.core.cameras.report import OfferedPlacement
@@ -15,13 +25,15 @@ from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.view import StudioCamera
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.cameras.pose_math import FARTHEST
+from workbench.ui.cameras.pose_math import chosen_camera
 from workbench.ui.scene.env_grid import box_corners, line_set
-from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.fields import Field, tick
 from workbench.ui.widgets.images import data_address
-from workbench.ui.widgets.inputs import refusals_told
+from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.progress import JobResult
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 ROOM, ROOM_ON_MOUNT = 0.3, 0.1
 """Metres from the eye to each side of the first box; less for a camera on a body, which has to carry it."""
@@ -29,13 +41,16 @@ MOST_LINKS = 12
 """An articulation with more links offers none of them alone."""
 OF_THE_ROBOT = 4
 """Links of a robot that are offered at first, its hand's; the others on demand."""
-MOST_RESETS = 256
 LARGEST = 160
 ALIKE = 0.995
 """Scores of at least this are shown as 1.00."""
 BOX_COLOUR = (230, 73, 128)
 
+RESETS_HINT = "Freshly reset envs in which each placement is measured; at most the number of envs."
+LOW_HINT = "Lowest corner of the box that the camera may be placed in, in metres."
+
 Corner = tuple[float, float, float]
+Box = tuple[Corner, Corner]
 
 
 @dataclass(frozen=True)
@@ -50,96 +65,120 @@ class VisibleObject:
     """The robot that it is a link of; empty for the task's objects."""
 
 
-class CameraSuggest:
+class CameraSuggest(PagePart[SessionView]):
     """The folder in the present container, and the box of the bounds in the 3D view.
 
     The bounds are two corners of a box in the env's frame, or in that of the body that carries the camera. They are a
     box around the eye that follows the camera until a person writes into them.
     """
 
+    does = (
+        ToggleWantedObject,
+        ToggleAllLinks,
+        SetSearchBox,
+        ShowSearchBox,
+        ChooseSearchResets,
+        SearchPlacements,
+        UsePlacement,
+    )
+
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._chosen: set[str] | None = None
-        self._choices: tuple[VisibleObject, ...] = ()
-        self._all_links = False
-        self._of: CameraKey | None = None
-        self._touched = False
+        self._wanted: dict[CameraKey, frozenset[str]] = {}
+        """Names of the objects that must be visible, of cameras for which they were chosen."""
+        self._boxes: dict[CameraKey, Box] = {}
+        """The bounds, of cameras for which they were written."""
+        self._all_links, self._draws_box, self._resets = False, False, 8
         self._drawn_names: object = None
-        with server.gui.add_folder("Suggest a placement", expand_by_default=False) as self.folder:
-            self._mounted = server.gui.add_html("", visible=False)
-            self._objects = server.gui.add_html("")
-            self._low, self._high = (
-                server.gui.add_vector3(
-                    label,
-                    np.zeros(3),
-                    min=np.full(3, -FARTHEST),
-                    max=np.full(3, FARTHEST),
-                    step=0.05,
-                    hint=hint,
-                )
-                for label, hint in (
-                    (
-                        "Search box from",
-                        "Lowest corner of the box that the camera may be placed in, in metres.",
-                    ),
-                    ("Search box to", "Highest corner of that box, metres."),
-                )
+        gui = server.gui
+        with gui.add_folder("Suggest a placement", expand_by_default=False) as self.folder:
+            self._mounted = gui.add_html("", visible=False)
+            self._objects = gui.add_html("")
+            self._low = self._corner_field(server, "Search box from", "from", LOW_HINT)
+            self._high = self._corner_field(
+                server, "Search box to", "to", "Highest corner of that box, metres."
             )
-            self._show_box = server.gui.add_checkbox(
-                "Draw this box", False, hint="In the 3D view, in the selected env."
+            self._box_tick = tick(
+                server,
+                "Draw this box",
+                ShowSearchBox,
+                "on",
+                self._draws_box,
+                hint="In the 3D view, in the selected env.",
             )
-            self._resets = server.gui.add_number(
-                "Resets",
-                8,
-                min=1,
-                max=MOST_RESETS,
-                step=1,
-                hint="Freshly reset envs in which each placement is measured; at most the number of envs.",
+            self._seeds = Field(
+                server, "Resets", ChooseSearchResets, "resets", self._resets, hint=RESETS_HINT
             )
-            self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH, color="gray")
-            self._offers = JobResult(server, session)
-            self._presses = Presses(server)
-        self._search.on_click(self._ask)
-        for corner in (self._low, self._high):
-            corner.on_update(self._on_touch)
+            self._search = gui.add_html("")
+            self._offers = JobResult(server)
         self._box = line_set(server, "/bounds of the eye", BOX_COLOUR, 2.0)
+
+    def _corner_field(self, server: viser.ViserServer, label: str, corner: str, hint: str) -> Field:
+        given = [{"corner": corner, "axis": axis} for axis in range(3)]
+        return Field(
+            server, label, SetSearchBox, "metres", (0.0, 0.0, 0.0), given=given, hint=hint, step=0.05
+        )
 
     # --- requests ------------------------------------------------------------------------------------
 
-    def _on_touch(self, event: viser.GuiEvent) -> None:
-        if event.client is not None:
-            self._touched = True
-            self._show_box.value = True
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ToggleWantedObject(name=name):
+                view = self._session.view()
+                camera, _ = chosen_camera(self._session)
+                self._wanted[camera.key] = self._wanted_of(camera.key, choices_in(view)) ^ {name}
+            case ToggleAllLinks():
+                self._all_links = not self._all_links
+            case SetSearchBox(corner=corner, axis=axis, metres=metres):
+                camera, now = chosen_camera(self._session)
+                low, high = map(list, self._box_of(camera, now))
+                (low if corner == "from" else high)[axis] = metres
+                self._boxes[camera.key] = triple(low), triple(high)
+                self._draws_box = True
+            case ShowSearchBox(on=on):
+                self._draws_box = on
+            case ChooseSearchResets(resets=resets):
+                self._resets = resets
+            case SearchPlacements():
+                self._search_placements()
+            case UsePlacement(number=number):
+                self._session.studio.take_suggestion(number)
 
-    def _toggle(self, name: str) -> None:
-        self._chosen = self._now_chosen() ^ {name}
+    def _search_placements(self) -> None:
+        view = self._session.view()
+        camera, now = chosen_camera(self._session)
+        choices = choices_in(view)
+        chosen = self._wanted_of(camera.key, choices)
+        wanted = tuple(choice.name for choice in choices if choice.name in chosen)
+        if not wanted:
+            raise Refused("Choose at least one object that must be visible.")
+        self._offers.asked(view.studio.results.suggestions)
+        low, high = ordered(self._box_of(camera, now))
+        self._session.studio.reports.suggest(wanted, low, high, self._resets)
 
-    def _toggle_links(self) -> None:
-        self._all_links = not self._all_links
+    def _wanted_of(self, key: CameraKey | None, choices: tuple[VisibleObject, ...]) -> frozenset[str]:
+        by_default = frozenset(choice.name for choice in choices if choice.first)
+        return by_default if key is None else self._wanted.get(key, by_default)
 
-    def _now_chosen(self) -> set[str]:
-        return {c.name for c in self._choices if c.first} if self._chosen is None else set(self._chosen)
-
-    def _bounds(self) -> tuple[Corner, Corner]:
-        corners = self._low.value, self._high.value
-        return triple(np.minimum(*corners)), triple(np.maximum(*corners))
-
-    def _ask(self, event: viser.GuiEvent) -> None:
-        chosen = self._now_chosen()
-        wanted = tuple(choice.name for choice in self._choices if choice.name in chosen)
-        with refusals_told(event.client):
-            if not wanted:
-                raise ValueError("Choose at least one object that must be visible.")
-            self._offers.asked(self._session.view().studio.results.suggestions)
-            self._session.studio.reports.suggest(wanted, *self._bounds(), self._resets.value)
+    def _box_of(self, camera: StudioCamera, now: CameraSettings) -> Box:
+        """As it was written, or else around the eye."""
+        room = ROOM if camera.info.mount is None else ROOM_ON_MOUNT
+        low, high = (np.round(np.add(now.position, by), 2) for by in (-room, room))
+        return self._boxes.get(camera.key, (triple(low), triple(high)))
 
     # --- drawing -------------------------------------------------------------------------------------
 
     def draw(self, view: SessionView) -> None:
         studio, camera = view.studio, view.studio.chosen
-        self._search.disabled = studio.placeable is None
+        search = tool("Search", SearchPlacements(), off=studio.placeable is None)
+        self._search.content = tools_html([search])
+        self._seeds.show(self._resets)
+        self._box_tick.show(self._draws_box)
         self._draw_mounted(camera)
-        self._draw_bounds(camera)
+        if camera is not None and camera.now is not None:
+            low, high = self._box_of(camera, camera.now)
+            self._low.show(low)
+            self._high.show(high)
         self._draw_names(view)
         now = None if camera is None else camera.now
         offered = studio.results.suggestions if studio.results.suggestions_of == studio.selected else ()
@@ -152,40 +191,27 @@ class CameraSuggest:
             text = f"Mounted on {mount}: the box is in that body's frame, as it is after a reset."
             self._mounted.content = render("note", text=text)
 
-    def _draw_bounds(self, camera: StudioCamera | None) -> None:
-        if camera is None or camera.now is None:
-            return
-        if camera.key != self._of:
-            self._of, self._touched, self._chosen = camera.key, False, None
-        if self._touched:
-            return
-        room = ROOM if camera.info.mount is None else ROOM_ON_MOUNT
-        for handle, sign in ((self._low, -1), (self._high, 1)):
-            x, y, z = (round(number + sign * room, 2) for number in camera.now.position)
-            handle.value = (x, y, z)
-
     def _draw_names(self, view: SessionView) -> None:
-        key = view.studio.selected
-        self._choices = () if view.task is None or key is None else choices_of(view.task, key[0])
-        chosen = frozenset(self._now_chosen())
-        drawn = (self._choices, chosen, self._all_links)
+        choices = choices_in(view)
+        chosen = self._wanted_of(view.studio.selected, choices)
+        drawn = (choices, chosen, self._all_links)
         if drawn == self._drawn_names:
             return
         self._drawn_names = drawn
-        links = [choice for choice in self._choices if choice.robot]
+        links = [choice for choice in choices if choice.robot]
         few = [c for i, c in enumerate(links) if i < OF_THE_ROBOT or self._all_links or c.name in chosen]
         self._objects.content = render(
             "camera_objects",
-            objects=[self._pill(choice, chosen) for choice in self._choices if not choice.robot],
+            objects=[self._pill(choice, chosen) for choice in choices if not choice.robot],
             links=[self._pill(choice, chosen) for choice in few],
             rest=len(links) - len(few),
             fewer=self._all_links and len(links) > OF_THE_ROBOT,
-            more=self._presses.id_of("links", lambda _: self._toggle_links()),
+            more=ToggleAllLinks(),
         )
 
     def _pill(self, choice: VisibleObject, chosen: frozenset[str]) -> dict[str, object]:
         name = choice.name
-        press = self._presses.id_of(("object", name), lambda _: self._toggle(name))
+        press = ToggleWantedObject(name=name)
         return {"name": choice.label, "title": name, "on": name in chosen, "press": press}
 
     def _offers_html(
@@ -202,9 +228,7 @@ class CameraSuggest:
                     "taken": now is not None
                     and (offer.settings.position, offer.settings.quaternion)
                     == (now.position, now.quaternion),
-                    "press": self._presses.id_of(
-                        ("take", i), lambda _, i=i: self._session.studio.take_suggestion(i)
-                    ),
+                    "press": UsePlacement(number=i),
                 }
                 for i, offer in enumerate(offered)
             ],
@@ -218,14 +242,25 @@ class CameraSuggest:
         """
         camera = view.studio.chosen
         nowhere = camera is None or (camera.info.mount is not None and camera.mount_pose is None)
-        if not self._show_box.value or nowhere or camera is None:
+        if not self._draws_box or nowhere or camera is None or camera.now is None:
             self._box.draw()
             return
-        edges = box_edges(*self._bounds())
+        edges = box_edges(*ordered(self._box_of(camera, camera.now)))
         if camera.mount_pose is not None:
             mount = camera.mount_pose.astype(np.float64)
             edges = (edges @ rotation_matrix(mount[3:]).T + mount[:3]).astype(np.float32)
         self._box.draw(edges + offset)
+
+
+def ordered(box: Box) -> Box:
+    """Its lowest and its highest corner."""
+    return triple(np.minimum(*box)), triple(np.maximum(*box))
+
+
+def choices_in(view: SessionView) -> tuple[VisibleObject, ...]:
+    """What the chosen camera can be asked to see."""
+    key = view.studio.selected
+    return () if view.task is None or key is None else choices_of(view.task, key[0])
 
 
 def choices_of(task: TaskDescription, kind: CameraKind) -> tuple[VisibleObject, ...]:

@@ -7,24 +7,40 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import PurePath
+from pathlib import Path, PurePath
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.cameras import (
+    LONGEST_CAMERA_NAME,
+    AddCamera,
+    CopyTask,
+    DropCameraChange,
+    DuplicateCamera,
+    NameCamera,
+    PlanCameraChange,
+    RemoveCamera,
+    RenameCamera,
+    RevertCameraChange,
+    SaveCameraChange,
+)
+from workbench.commands.command import Command, Refused
 from workbench.core.camera_data import CameraKind, CameraSettings
 from workbench.core.cameras.conventions import axes_of, intrinsic_of, pose_of, vertical_fov
 from workbench.session.cameras.file_edits import IN_FILE
 from workbench.session.cameras.view import EditRequest, EditState, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.cameras.pose_math import Placing, rounded
-from workbench.ui.server.control_values import limit_text
-from workbench.ui.server.viser_private import element_id
+from workbench.ui.cameras.pose_math import rounded
+from workbench.ui.widgets.fields import Field
 from workbench.ui.widgets.images import data_address
+from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.progress import NewResult
-from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.templates import render, sentence
+from workbench.ui.widgets.tools import Tool, tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 LEAVE, CLOSE = "Discard the change", "Close"
 MOODS = {"checked": "good", "undone": "plain", "refused": "warn", "mismatch": "bad"}
@@ -34,28 +50,16 @@ NOTHING = EditState()
 class CameraChange:
     """The diff of a change with its buttons, and what came of it, in the present container.
 
-    The tab has one at each of the two places where changes are asked for; the new one is scrolled into view.
+    The tab has one at each of the two places where changes are asked for; the buttons of a new one are scrolled into view.
+
+    Args:
+        folder: For a copy of the task.
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        gui = server.gui
+    def __init__(self, server: viser.ViserServer, folder: Path) -> None:
         self.arrival = NewResult()
-        self._text = gui.add_html("", visible=False)
-        self._write = gui.add_button("Save", icon=viser.Icon.DEVICE_FLOPPY, visible=False)
-        self._undo = gui.add_button(
-            "Revert in the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
-        )
-        self._copy = gui.add_button(
-            "Copy the task to my folder",
-            icon=viser.Icon.COPY,
-            visible=False,
-            hint=f"A file of your own in {session.studio.file.folder}, under a free name; the page opens it.",
-        )
-        self._drop = gui.add_button(LEAVE, color="gray", visible=False)
-        self._write.on_click(lambda _: session.studio.file.write())
-        self._undo.on_click(lambda _: session.studio.file.undo_write())
-        self._copy.on_click(lambda _: session.studio.file.copy_task())
-        self._drop.on_click(lambda _: session.studio.file.drop_plan())
+        self._html = server.gui.add_html("", visible=False)
+        self._folder = folder
         self._drawn: tuple[EditState, bool, bool] | None = None
 
     def draw(self, edit_state: EditState, stale: bool) -> None:
@@ -65,14 +69,7 @@ class CameraChange:
             stale: the camera was moved since the change was planned.
         """
         stage = edit_state.stage
-        self._text.visible = stage != "none" or bool(edit_state.message)
-        self._copy.visible = edit_state.can_copy
-        self._write.visible = stage == "planned" and not stale
-        self._drop.visible = stage not in ("none", "written")
-        self._undo.visible = stage in IN_FILE
-        name = "" if edit_state.edit is None else edit_state.edit.names
-        self._drop.label = LEAVE if stage == "planned" else CLOSE
-        self._write.label = f"Save to {name}" if name else "Save"
+        self._html.visible = stage != "none" or bool(edit_state.message)
         drawn = None if self._drawn is None else self._drawn[0]
         if (
             drawn is not None
@@ -85,19 +82,37 @@ class CameraChange:
         new = self.arrival.just_came(edit_state if stage != "none" else None)
         if self._drawn is None or self._drawn[0] is not edit_state or self._drawn[1:] != (stale, new):
             self._drawn = edit_state, stale, new
-            self._text.content = edit_html(edit_state, stale, element_id(self._drop) if new else "")
+            self._html.content = edit_html(edit_state, stale, self._folder, new)
 
 
-def edit_html(edit_state: EditState, stale: bool, scroll_to: str = "") -> str:
+def tools_of(edit_state: EditState, stale: bool, folder: Path) -> list[Tool]:
+    """What can be done with a change; `stale` and `folder` as in `CameraChange`."""
+    stage, tools = edit_state.stage, []
+    if stage == "planned" and not stale:
+        name = "" if edit_state.edit is None else edit_state.edit.names
+        tools.append(tool(f"Save to {name}" if name else "Save", SaveCameraChange(), tone="main"))
+    if stage in IN_FILE:
+        tools.append(tool("Revert in the file", RevertCameraChange()))
+    if edit_state.can_copy:
+        hint = f"A file of your own in {folder}, under a free name; the page opens it."
+        tools.append(Tool("Copy the task to my folder", CopyTask(), hint, tone="main"))
+    if stage not in ("none", "written"):
+        tools.append(tool(LEAVE if stage == "planned" else CLOSE, DropCameraChange()))
+    return tools
+
+
+def edit_html(edit_state: EditState, stale: bool, folder: Path, new: bool = False) -> str:
     """The stage of a change, as HTML.
 
     Args:
-        scroll_to: id of the element to scroll into view.
+        folder: For a copy of the task.
+        new: Scroll its buttons into view.
     """
     edit, planned = edit_state.edit, edit_state.stage == "planned"
     seen = edit_state.picture.rgb if planned and edit_state.picture is not None else None
     files = [] if edit is None or edit_state.stage == "undone" else edit.changes
     settings = None if edit_state.request is None else edit_state.request.settings
+    tools = tools_of(edit_state, stale, folder)
     return render(
         "camera_writing",
         message="The camera has moved since: show the change again." if stale else edit_state.message,
@@ -109,7 +124,8 @@ def edit_html(edit_state: EditState, stale: bool, scroll_to: str = "") -> str:
         folded=edit_state.stage in IN_FILE,
         notes=() if edit is None or edit_state.stage == "undone" else edit.notes,
         snippet=edit_state.snippet,
-        scroll_to=scroll_to,
+        rows=[tools] if tools else [],
+        new=new,
     )
 
 
@@ -125,13 +141,17 @@ def diff_lines(diff: str) -> list[tuple[str, str]]:
     return [(kind, line if kind == "at" else line[:1] + " " + line[1 + indent :]) for kind, line in lines]
 
 
-DUPLICATE, RENAME, REMOVE = "Duplicate", "Rename", "Remove"
-ADD_SENSOR, ADD_HUMAN = "Add sensor", "Add human view"
+WITH_CHOSEN = (
+    tool("Duplicate", DuplicateCamera()),
+    tool("Rename", RenameCamera()),
+    tool("Remove", RemoveCamera()),
+)
+ADD = tool("Add sensor", AddCamera(kind="sensor")), tool("Add human view", AddCamera(kind="human"))
+NAME_HINT = "Letters, digits, - and _. A new camera gets a name if this is empty."
 WHERE = (
     "A new sensor looks at the task's objects from where you look; a human view is placed at your viewpoint. Its picture "
     "follows in a moment, before anything is saved."
 )
-LONGEST_NAME = 64
 NEW = CameraSettings(
     position=(0.0, 0.0, 0.0),
     quaternion=(1.0, 0.0, 0.0, 0.0),
@@ -151,7 +171,7 @@ PREVIEW = 256
 FromViewer = Callable[[viser.ClientHandle, CameraSettings], CameraSettings]
 
 
-class WriteToFile:
+class WriteToFile(PagePart[SessionView]):
     """The button that writes the chosen camera's placement, and the folder to add, copy, rename and remove cameras.
 
     Args:
@@ -159,106 +179,116 @@ class WriteToFile:
         from_viewer: these settings at a page's viewpoint, in the env's frame.
     """
 
+    does = (
+        PlanCameraChange,
+        SaveCameraChange,
+        RevertCameraChange,
+        CopyTask,
+        DropCameraChange,
+        NameCamera,
+        AddCamera,
+        DuplicateCamera,
+        RenameCamera,
+        RemoveCamera,
+    )
+
     def __init__(
         self,
         server: viser.ViserServer,
         session: Session,
-        placing: Placing,
         from_viewer: FromViewer,
         above: viser.GuiFolderHandle,
     ) -> None:
-        self._session, self._placing, self._from_viewer = session, placing, from_viewer
-        gui = server.gui
+        self._session, self._from_viewer = session, from_viewer
+        gui, folder = server.gui, session.studio.file.folder
+        self._name = ""
         self._named: EditState | None = None
         """The last change after which the field for a name was emptied."""
         with above:
-            # Disabled, not hidden: coming with the first movement it would push the controls below away.
-            self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
-            self._change = CameraChange(server, session)
+            self._plan = gui.add_html("", visible=False)
+            self._change = CameraChange(server, folder)
         with gui.add_folder("Add, copy, rename, remove", expand_by_default=False):
-            self._name = gui.add_text(
-                "New name",
-                "",
-                hint="Letters, digits, - and _. A new camera gets a name if this is empty.",
+            self._typed = Field(
+                server, "New name", NameCamera, "name", hint=NAME_HINT, longest=LONGEST_CAMERA_NAME
             )
-            limit_text(self._name, LONGEST_NAME)
-            self._with_chosen = gui.add_button_group("", (DUPLICATE, RENAME, REMOVE), visible=False)
-            add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
-            self._why_not = gui.add_html("", visible=False)
+            self._members = gui.add_html("")
             gui.add_html(render("aside", text=WHERE))
-            self._member_change = CameraChange(server, session)
-        self._plan.on_click(lambda _: self._plan_write())
-        self._with_chosen.on_click(self._on_member)
-        add.on_click(self._on_member)
+            self._member_change = CameraChange(server, folder)
 
     # --- requests --------------------------------------------------------------------------------------
 
-    def _plan_write(self) -> None:
-        camera = self._placing.camera
-        if camera is not None:
-            self._ask(EditRequest("edit", camera.key))
+    def do(self, command: Command, visitor: Visitor) -> None:
+        studio, file = self._session.view().studio, self._session.studio.file
+        match command:
+            case SaveCameraChange():
+                if studio.edit_state.stage != "planned" or is_stale(studio):
+                    raise Refused("Show the change first: only what you have read is saved.")
+                file.write()
+            case RevertCameraChange():
+                file.undo_write()
+            case CopyTask():
+                file.copy_task()
+            case DropCameraChange():
+                file.drop_plan()
+            case NameCamera(name=name):
+                self._name = name
+            case AddCamera(kind=kind):
+                self._add(kind, visitor.client)
+            case _ if studio.chosen is None:
+                raise Refused("Choose the camera first.")
+            case PlanCameraChange() if studio.chosen.refused:
+                raise Refused(sentence(studio.chosen.refused))
+            case PlanCameraChange():
+                self._ask(EditRequest("edit", studio.chosen.key))
+            case DuplicateCamera():
+                kind, like = studio.chosen.key
+                name = self._checked_name(studio, kind, like)
+                self._ask(EditRequest("duplicate", studio.chosen.key, name=name))
+            case RenameCamera():
+                name = self._checked_name(studio, studio.chosen.key[0], "")
+                self._ask(EditRequest("rename", studio.chosen.key, name=name))
+            case RemoveCamera():
+                self._ask(EditRequest("remove", studio.chosen.key))
 
     def _ask(self, request: EditRequest) -> None:
         """Ask for a plan. Notes the place first: the answer may come at once."""
-        self._say("")
         change = self._change if request.what == "edit" else self._member_change
         change.arrival.asked(self._session.view().studio.edit_state)
         self._session.studio.file.plan(request)
 
-    def _on_member(self, event: viser.GuiEvent) -> None:
-        try:
-            self._plan_member(event.target.value, event.client)
-        except ValueError as error:
-            self._say(str(error))
-
-    def _say(self, why_not: str) -> None:
-        """Show a refusal next to the buttons."""
-        self._why_not.visible = bool(why_not)
-        self._why_not.content = render("warning", text=why_not) if why_not else ""
-
-    def _plan_member(self, what: object, client: viser.ClientHandle | None) -> None:
+    def _add(self, kind: CameraKind, client: viser.ClientHandle) -> None:
         view = self._session.view()
-        chosen = view.studio.chosen
-        if what in (ADD_SENSOR, ADD_HUMAN) and client is not None:
-            kind = "sensor" if what == ADD_SENSOR else "human"
-            key = (kind, self._checked_name(view.studio, kind, NEW_NAMES[kind]))
-            settings, words = self._from_viewer(client, lens_of_siblings(view.studio, kind)), ""
-            names, places = objects_in(view)
-            if kind == "sensor":
-                settings, words = first_place(settings, names, places)
-            settings = replace(settings, distance=distance_to(settings, places))
-            self._ask(EditRequest("add", key, settings, about=words))
-        elif chosen is None:
-            raise ValueError("Choose the camera first.")
-        elif what == REMOVE:
-            self._ask(EditRequest("remove", chosen.key))
-        elif what in (DUPLICATE, RENAME):
-            name = self._checked_name(view.studio, chosen.key[0], chosen.key[1] if what == DUPLICATE else "")
-            change = "duplicate" if what == DUPLICATE else "rename"
-            self._ask(EditRequest(change, chosen.key, name=name))
+        key = (kind, self._checked_name(view.studio, kind, NEW_NAMES[kind]))
+        settings, words = self._from_viewer(client, lens_of_siblings(view.studio, kind)), ""
+        names, places = objects_in(view)
+        if kind == "sensor":
+            settings, words = first_place(settings, names, places)
+        settings = replace(settings, distance=distance_to(settings, places))
+        self._ask(EditRequest("add", key, settings, about=words))
 
     def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
         """The typed name, or a free one like `like`.
 
         Raises:
-            ValueError: neither is possible.
+            Refused: neither is possible.
         """
-        name = self._name.value.strip()
+        name = self._name.strip()
         if not name and like:
             return free_name(view, kind, like)
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", name):
-            raise ValueError(
+            raise Refused(
                 "Type a new name first: letters, digits, - and _."
                 if not name
                 else "A name has letters, digits, - and _."
             )
         if any(camera.key == (kind, name) for camera in view.cameras):
-            raise ValueError(f"There is a camera {name} already.")
+            raise Refused(f"There is a camera {name} already.")
         return name
 
     # --- drawing ---------------------------------------------------------------------------------------
 
-    def draw(self, studio: StudioView) -> None:
+    def draw(self, view: SessionView) -> None:
+        studio = view.studio
         chosen, edit_state = studio.chosen, studio.edit_state
         stale = is_stale(studio)
         can_place = chosen is not None and not chosen.refused
@@ -266,14 +296,16 @@ class WriteToFile:
         # Hidden while "Save" is shown: a second press must not write a diff that was not read.
         can_plan = can_place and (edit_state.stage != "planned" or stale or of_members)
         wants_plan = can_plan and chosen is not None and chosen.moved and edit_state.stage != "written"
-        self._plan.visible = can_plan
-        self._plan.disabled = not wants_plan
+        # Greyed, not hidden: coming with the first movement it would push the controls below away.
+        plan = tool("Show the change", PlanCameraChange(), off=not wants_plan, tone="main")
+        self._plan.visible, self._plan.content = can_plan, tools_html([plan])
         for change, here in ((self._change, not of_members), (self._member_change, of_members)):
             change.draw(edit_state if here else NOTHING, stale and here)
         if edit_state.stage == "checked" and of_members and edit_state is not self._named:
             self._named = edit_state
-            self._name.value = ""  # it is taken now
-        self._with_chosen.visible = chosen is not None
+            self._name = ""  # it is taken now
+        self._typed.show(self._name)
+        self._members.content = tools_html([] if chosen is None else WITH_CHOSEN, ADD)
 
 
 def is_stale(studio: StudioView) -> bool:

@@ -9,21 +9,27 @@ import viser
 
 from workbench.checks.comments import Comment, comments_without_effect
 from workbench.checks.rules import RULES
+from workbench.commands.checks import CheckAfterSave, CheckNow, StopChecks, ToggleRule
+from workbench.commands.command import Command
 from workbench.machine.kept_choices import keep_check_after_save
 from workbench.session.checks.checks import RUNNING, ChecksView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.checks.findings import MOST_SHOWN, Card, cards, count, summary, undecided, without_finding
 from workbench.ui.server.viser_private import set_tab_label
-from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.editor import LinkTo, no_links
-from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.fields import tick
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import place, render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 TAB = "Checks"
 CHECK_NOW, STOP_CHECKS = "Check now", "Stop checking"
 AFTER_SAVE = "After each save"
+AFTER_SAVE_HINT = (
+    "Check each version that loads. In a process of its own at low priority: playing goes first."
+)
 REST = "rest"
 """Key of the fold of rules without a finding."""
 
@@ -39,6 +45,7 @@ class ChecksPanel(PagePart[SessionView]):
     """
 
     every = 0.25
+    does = (CheckNow, StopChecks, CheckAfterSave, ToggleRule)
 
     def __init__(
         self, server: viser.ViserServer, session: Session, tab: viser.GuiTabHandle, link: LinkTo = no_links
@@ -47,22 +54,9 @@ class ChecksPanel(PagePart[SessionView]):
         self._open: set[str] = set()
         """Ids of rules, and `REST`, that are folded out."""
         self._status = server.gui.add_html("")
-        self._now = server.gui.add_button(CHECK_NOW, icon=viser.Icon.CHECKLIST)
-        self._stop = server.gui.add_button(
-            STOP_CHECKS, icon=viser.Icon.PLAYER_STOP, color="gray", visible=False
-        )
-        self._after_save = Control(
-            server.gui.add_checkbox(
-                AFTER_SAVE,
-                True,
-                hint="Check each version that loads. In a process of its own at low priority: playing goes first.",
-            ),
-            send=self._check_after_save,
-        )
+        self._tools = server.gui.add_html("")
+        self._after_save = tick(server, AFTER_SAVE, CheckAfterSave, "on", True, hint=AFTER_SAVE_HINT)
         self._list = server.gui.add_html("", visible=False)
-        self._presses = Presses(server)
-        self._now.on_click(lambda _: session.check_now())
-        self._stop.on_click(lambda _: session.checks.stop())
 
     def key(self, view: SessionView) -> object:
         checks = view.checks
@@ -74,23 +68,35 @@ class ChecksPanel(PagePart[SessionView]):
         found = cards(checks, view.played)
         set_tab_label(self._tab, f"{TAB} {count(found)}" if found else TAB)
         self._status.content = status_html(checks, found, self._link)
-        self._stop.visible = checks.state in RUNNING
-        self._now.visible = checks.state not in RUNNING and view.task is not None
+        running = checks.state in RUNNING
+        pressed = tool(STOP_CHECKS, StopChecks()) if running else tool(CHECK_NOW, CheckNow(), tone="main")
+        self._tools.content = tools_html([pressed] if running or view.task is not None else [])
         self._after_save.show(checks.after_each_save)
         more = 0 if view.rules is None else view.rules.more
         comments = _comments(view)
         self._list.visible = bool(found or checks.results or comments)
-        self._list.content = list_html(checks, found, more, self._open, self._press, self._link, comments)
+        self._list.content = list_html(checks, found, more, self._open, _toggle, self._link, comments)
 
-    def _press(self, key: str) -> str:
-        """The id of the button that folds a part out and in."""
-        return self._presses.id_of(("fold", key), lambda _: self._open.symmetric_difference_update({key}))
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case CheckNow():
+                self._session.check_now()
+            case StopChecks():
+                self._session.checks.stop()
+            case CheckAfterSave(on=on):
+                self._check_after_save(on)
+            case ToggleRule(rule=rule):
+                self._open.symmetric_difference_update({rule})
 
     def _check_after_save(self, wanted: bool) -> None:
         keep_check_after_save(wanted)
         self._session.checks.check_after_each_save(wanted)
         if wanted and self._session.checks.view.state == "none":
             self._session.check_now()
+
+
+def _toggle(rule: str) -> ToggleRule:
+    return ToggleRule(rule=rule)
 
 
 @dataclass(frozen=True)
@@ -137,7 +143,7 @@ def list_html(
     found: list[Card],
     more: int,
     opened: set[str],
-    press: Callable[[str], str],
+    toggle: Callable[[str], Command],
     link: LinkTo = no_links,
     comments: Sequence[Comment] = (),
 ) -> str:
@@ -146,10 +152,17 @@ def list_html(
     Args:
         more: breaches seen while playing at lines that are not listed.
         opened: what is folded out.
-        press: the id of the button that folds a part.
+        toggle: the command that folds a part out and in.
         comments: those that were to silence a rule and silence none.
     """
-    known = {"found": found, "more": more, "opened": opened, "id_of": press, "link": link, "most": MOST_SHOWN}
+    known = {
+        "found": found,
+        "more": more,
+        "opened": opened,
+        "toggle": toggle,
+        "link": link,
+        "most": MOST_SHOWN,
+    }
     rest = without_finding(checks, found)
     failed = [result for result in rest if result.state == "failed"]
     kept = [result.rule for result in rest if result.state == "kept"]

@@ -8,6 +8,8 @@ from pathlib import Path
 import viser
 
 from workbench.checks.rules import RULES
+from workbench.commands.checks import ChooseSeeds, ShowSolved, SolveSeeds, StopSolving, ToggleVerdict
+from workbench.commands.command import Command
 from workbench.core.rules import Finding
 from workbench.planning.report import SolveReport
 from workbench.planning.verdicts import ENOUGH_SEEDS
@@ -17,14 +19,16 @@ from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.checks.findings import Card, Row
 from workbench.ui.checks.panel import list_html
-from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.editor import LinkTo, no_links
+from workbench.ui.widgets.fields import Field
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 TITLE = "Solve many seeds"
 SOLVE, STOP_SOLVING = "Solve", "Stop solving"
-MOST_SEEDS = 256
+HINT = f"From 0 on. That no rule is broken says something from {ENOUGH_SEEDS} seeds on."
 
 
 class SolveSeedsPanel(PagePart[SessionView]):
@@ -38,6 +42,7 @@ class SolveSeedsPanel(PagePart[SessionView]):
     """
 
     every = 0.25
+    does = (ChooseSeeds, SolveSeeds, StopSolving, ToggleVerdict, ShowSolved)
 
     def __init__(
         self,
@@ -49,54 +54,42 @@ class SolveSeedsPanel(PagePart[SessionView]):
         self._session, self._on_look, self._link = session, on_look, link
         self._open: set[str] = set()
         """Ids of rules that are folded out."""
-        self._presses = Presses(server)
         # Who comes back from a recording finds the rows that led there.
         before = session.seeds_solver.view
+        self._count = before.total or ENOUGH_SEEDS
         with server.gui.add_folder(TITLE, expand_by_default=before.state != "none"):
-            self._seeds = server.gui.add_number(
-                "Seeds",
-                before.total or ENOUGH_SEEDS,
-                min=1,
-                max=MOST_SEEDS,
-                step=1,
-                hint=f"From 0 on. That no rule is broken says something from {ENOUGH_SEEDS} seeds on.",
-            )
-            self._start = server.gui.add_button(
-                SOLVE,
-                icon=viser.Icon.TARGET,
-                color="gray",
-                hint="Solves the file as it is saved, as workbench solve does, with the sliders of the Run tab.",
-            )
-            self._stop = server.gui.add_button(
-                STOP_SOLVING, icon=viser.Icon.PLAYER_STOP, color="gray", visible=False
-            )
+            self._seeds = Field(server, "Seeds", ChooseSeeds, "seeds", str(self._count), hint=HINT)
+            self._tools = server.gui.add_html("")
             self._html = server.gui.add_html("")
             self._list = server.gui.add_html("", visible=False)
-        self._start.on_click(lambda _: session.solve_seeds(int(self._seeds.value)))
-        self._stop.on_click(lambda _: session.seeds_solver.stop())
 
     def key(self, view: SessionView) -> object:
-        return view.seeds.serial, view.task_serial, tuple(sorted(self._open))
+        return view.seeds.serial, view.task_serial, self._count, tuple(sorted(self._open))
 
     def draw(self, view: SessionView) -> None:
         seeds = view.seeds
         running = seeds.state in RUNNING
-        self._start.visible = not running and view.task is not None
-        self._stop.visible = running
-        self._seeds.disabled = running
-        self._html.content = seeds_html(seeds, self._look, self._link)
+        pressed = tool(STOP_SOLVING, StopSolving()) if running else tool(SOLVE, SolveSeeds())
+        self._tools.content = tools_html([pressed] if running or view.task is not None else [])
+        self._seeds.show(str(self._count), off=running)
+        self._html.content = seeds_html(seeds, self._link)
         found = [] if seeds.report is None else verdict_cards(seeds.report, seeds.stale)
         self._list.visible = bool(found)
         if found:
-            self._list.content = list_html(ChecksView(), found, 0, self._open, self._press, self._link)
+            self._list.content = list_html(ChecksView(), found, 0, self._open, _toggle, self._link)
 
-    def _press(self, rule: str) -> str:
-        """The id of the button that folds a rule's page out and in."""
-        return self._presses.id_of(("fold", rule), lambda _: self._open.symmetric_difference_update({rule}))
-
-    def _look(self, seed: int) -> str:
-        """The id of the button that opens a seed's recording in the review."""
-        return self._presses.id_of(("look", seed), lambda _: self._look_at(seed))
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseSeeds(seeds=seeds):
+                self._count = seeds
+            case SolveSeeds():
+                self._session.solve_seeds(self._count)
+            case StopSolving():
+                self._session.seeds_solver.stop()
+            case ToggleVerdict(rule=rule):
+                self._open.symmetric_difference_update({rule})
+            case ShowSolved(seed=seed):
+                self._look_at(seed)
 
     def _look_at(self, seed: int) -> None:
         report = self._session.seeds_solver.view.report
@@ -117,11 +110,12 @@ def verdict_cards(report: SolveReport, old: bool = False) -> list[Card]:
     return cards
 
 
-def seeds_html(seeds: SeedsView, id_of: Callable[[int], str], link: LinkTo = no_links) -> str:
-    """How far it is, and a row for each seed.
+def _toggle(rule: str) -> ToggleVerdict:
+    return ToggleVerdict(rule=rule)
 
-    Args:
-        id_of: the id of the button that opens a seed's recording.
-    """
+
+def seeds_html(seeds: SeedsView, link: LinkTo = no_links) -> str:
+    """How far it is, and a row for each seed, which opens its recording in the review."""
     running = seeds.state in RUNNING
-    return render("solve_seeds", seeds=seeds, running=running, id_of=id_of, link=link)
+    show = lambda seed: ShowSolved(seed=seed)  # noqa: E731
+    return render("solve_seeds", seeds=seeds, running=running, show=show, link=link)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import viser
 
+from workbench.commands.checks import StopProfile, TimeStep
+from workbench.commands.command import Command
 from workbench.session.checks.profile import ProfileView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 TITLE = "Where does a step go"
 PROFILE, STOP_PROFILE = "Time a step", "Stop timing"
@@ -28,31 +32,29 @@ class StepProfilePanel(PagePart[SessionView]):
     """
 
     every = 0.25
+    does = (TimeStep, StopProfile)
 
     def __init__(self, server: viser.ViserServer, session: Session, link: LinkTo = no_links) -> None:
-        self._link = link
+        self._session, self._link = session, link
         with server.gui.add_folder(TITLE, expand_by_default=False):
-            self._start = server.gui.add_button(
-                PROFILE,
-                icon=viser.Icon.CLOCK,
-                color="gray",
-                hint="Times each hook and line over some hundred control steps, in a process of its own.",
-            )
-            self._stop = server.gui.add_button(
-                STOP_PROFILE, icon=viser.Icon.PLAYER_STOP, color="gray", visible=False
-            )
+            self._tools = server.gui.add_html("")
             self._html = server.gui.add_html("")
-        self._start.on_click(lambda _: session.profile_step())
-        self._stop.on_click(lambda _: session.profiler.stop())
 
     def key(self, view: SessionView) -> object:
         return view.profile.serial, view.task_serial
 
     def draw(self, view: SessionView) -> None:
         running = view.profile.state == "running"
-        self._start.visible = not running and view.task is not None
-        self._stop.visible = running
+        pressed = tool(STOP_PROFILE, StopProfile()) if running else tool(PROFILE, TimeStep())
+        self._tools.content = tools_html([pressed] if running or view.task is not None else [])
         self._html.content = profile_html(view.profile, self._link)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case TimeStep():
+                self._session.profile_step()
+            case StopProfile():
+                self._session.profiler.stop()
 
 
 def profile_html(shown: ProfileView, link: LinkTo = no_links) -> str:

@@ -7,11 +7,14 @@ from collections.abc import Callable, Sequence
 
 import viser
 
+from workbench.commands.page import AnswerDialog, CloseDialog, TypeAnswer
 from workbench.recording.episode.row import LONGEST_NOTE, LibraryRow, clean_tags
 from workbench.recording.library.library import Library, LibraryError
 from workbench.ui.library.rows import in_words
-from workbench.ui.widgets.inputs import tell_all
+from workbench.ui.widgets.fields import Field
+from workbench.ui.widgets.notices import tell_all
 from workbench.ui.widgets.templates import counted, render, size
+from workbench.ui.widgets.tools import Tool, tools_html
 
 MOST_NAMES = 6
 
@@ -19,9 +22,10 @@ MOST_NAMES = 6
 class Dialog:
     """One modal window with a question, open on all pages until it is answered or closed."""
 
-    def __init__(self, server: viser.ViserServer, title: str, closed: Callable[[], None]) -> None:
+    def __init__(self, server: viser.ViserServer, title: str) -> None:
         self.modal = server.gui.add_modal(title)
-        self._closed = closed
+        with self.modal:
+            server.gui.add_html(render("context", context="dialog"))
         self._lock = threading.Lock()
 
     def close(self) -> bool:
@@ -30,7 +34,6 @@ class Dialog:
             if self.modal.closed:
                 return False
             self.modal.close()
-        self._closed()
         return True
 
 
@@ -43,21 +46,19 @@ class LibraryEdits:
 
     A dialog over the page, since a form in the scrolled table would be out of sight. It acts on the recordings that it
     was opened for, not on those selected by the time of the answer.
-
-    Args:
-        asking: called with True when a dialog opens and False when it closes.
     """
 
-    def __init__(self, server: viser.ViserServer, library: Library, asking: Callable[[bool], None]) -> None:
-        self._server, self._library, self._asking = server, library, asking
+    def __init__(self, server: viser.ViserServer, library: Library) -> None:
+        self._server, self._library = server, library
         self._lock = threading.RLock()
         self._question: Dialog | None = None
+        self._typed = ""
+        self._answered: Callable[[str], object] = lambda typed: None
 
-    def close(self) -> None:
-        """Close the dialog, if there is one."""
+    def close(self) -> bool:
+        """Close the dialog; False if there is none."""
         with self._lock:
-            if self._question is not None:
-                self._question.close()
+            return self._question is not None and self._question.close()
 
     def ask_tags(self, ids: tuple[str, ...]) -> None:
         rows = self._rows(ids)
@@ -131,39 +132,42 @@ class LibraryEdits:
 
         Args:
             do: label of the button that accepts.
-            answered: gets the typed text, as the page sent it, on a thread of viser's.
+            answered: gets the typed text, as the page sent it, on any thread.
             value: text of the input line, in which Enter accepts too. None: no input, and the accept button is red.
         """
         gui, names = self._server.gui, [row.name for row in rows]
         shown = names if len(names) <= MOST_NAMES else names[: MOST_NAMES - 1]
         with self._lock:
             self.close()
-            self._asking(True)
-            self._question = question = Dialog(self._server, title, lambda: self._asking(False))
+            self._question = question = Dialog(self._server, title)
+        self._typed, self._answered = value or "", answered
         with question.modal:
             more = len(names) - len(shown)
             gui.add_html(render("library_question", question=asked, names=shown, more=more, answer=explained))
-            form = None if value is None else gui.add_form(None)
-            if form is None:
-                yes = gui.add_button(do, color="red", icon=viser.Icon.TRASH)
-            else:
-                with form:
-                    field = gui.add_text("", value or "")
-                yes = gui.add_button(do, icon=viser.Icon.CHECK)
-            cancel = gui.add_button("Cancel", color="gray")
+            if value is not None:
+                Field(
+                    self._server,
+                    "",
+                    TypeAnswer,
+                    "text",
+                    value,
+                    live=True,
+                    enter=AnswerDialog(),
+                    longest=LONGEST_NOTE,
+                )
+            tone = "danger" if value is None else "main"
+            gui.add_html(tools_html([Tool(do, AnswerDialog(), tone=tone), Tool("Cancel", CloseDialog())]))
 
-        def answer(_event: object) -> None:
-            typed = "" if form is None else field.value
-            if question.close():
-                answered(typed)
+    def type(self, text: str) -> None:
+        """What is typed into the question so far."""
+        self._typed = text
 
-        def give_up(_event: object) -> None:
-            question.close()
-
-        if form is not None:
-            form.on_submit(answer)
-        yes.on_click(answer)
-        cancel.on_click(give_up)
+    def answer(self) -> None:
+        """Do what the question asks; only the first answer counts."""
+        with self._lock:
+            typed, answered = self._typed, self._answered
+        if self.close():
+            answered(typed)
 
     def _rows(self, ids: Sequence[str]) -> list[LibraryRow]:
         rows = (self._library.row(id) for id in ids)

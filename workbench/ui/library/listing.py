@@ -6,13 +6,11 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
-
+from workbench.commands.command import Command
 from workbench.recording.episode.row import LibraryRow
 from workbench.recording.library.library import Library, LibraryView
 from workbench.ui.library.rows import Column, Outcome, begins_descending, chosen, ordered
-from workbench.ui.widgets.click_targets import Paged
-from workbench.ui.widgets.hotkeys import Command
+from workbench.ui.widgets.paged import Paged
 
 MOST_ROWS = 50
 """Rows of one page of the table."""
@@ -163,36 +161,15 @@ class LibraryList:
 
 @dataclass(frozen=True)
 class Action:
-    """Something to do with the selected recordings: a button, and a command with a key."""
+    """Something to do with the selected recordings."""
 
     label: str
+    command: Command
     hint: str
     run: Callable[[tuple[str, ...]], None]
     most: int | None = None
     """Most recordings at once."""
-    named: str = ""
-    """Label of its command; empty: a button only."""
-    key: HotkeyKey | None = None
-    modifier: KeyModifier | None = None
     reads: bool = True
     """Whether it reads the recordings; False for what also applies to files that cannot be read."""
     salvages: bool = False
     """Whether it takes what is left of a damaged recording."""
-
-
-def walking(listed: LibraryList) -> list[Command]:
-    """Commands that move through the table and select in it."""
-
-    def move(by: int, held: int = 0) -> Callable[[], None]:
-        return lambda: listed.move(by, held)
-
-    return [
-        Command("Next recording in the table", move(1), "arrowdown"),
-        Command("Previous recording in the table", move(-1), "arrowup"),
-        Command("Also select the next recording", move(1, RANGE), "arrowdown", "shift"),
-        Command("Also select the previous recording", move(-1, RANGE), "arrowup", "shift"),
-        Command("Next page of recordings", lambda: listed.pages.turn(1), "pagedown"),
-        Command("Previous page of recordings", lambda: listed.pages.turn(-1), "pageup"),
-        Command("Select or deselect this recording", listed.toggle_cursor, "X"),
-        Command("Select all listed recordings", listed.select_all, "A", "cmd/ctrl"),
-    ]

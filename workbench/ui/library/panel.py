@@ -7,15 +7,39 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
-from functools import partial
 
 import viser
 
+from workbench.commands.command import Command
+from workbench.commands.library import (
+    AlsoNextRow,
+    AlsoPreviousRow,
+    ClearRowFilter,
+    DeleteSelected,
+    EmptyTrash,
+    FilterRows,
+    FilterTask,
+    LookForRows,
+    NextRow,
+    NextRows,
+    NoteSelected,
+    OpenRow,
+    OpenSelected,
+    PressRow,
+    PreviousRow,
+    PreviousRows,
+    SelectAllRows,
+    SelectNoRows,
+    SortRows,
+    TagSelected,
+    ToggleRow,
+    UndoDelete,
+)
+from workbench.commands.page import AnswerDialog, TypeAnswer
 from workbench.recording.episode.row import LibraryRow
 from workbench.recording.library.library import Library, LibraryView
 from workbench.ui.library.dialogs import LibraryEdits
-from workbench.ui.library.listing import RANGE, TOGGLE, Action, LibraryList, walking
+from workbench.ui.library.listing import RANGE, TOGGLE, Action, LibraryList
 from workbench.ui.library.rows import (
     COLUMNS,
     HINTS,
@@ -30,22 +54,42 @@ from workbench.ui.library.rows import (
     job_text,
     none_like_that,
 )
-from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.hotkeys import Command
+from workbench.ui.widgets.fields import Field, choice
 from workbench.ui.widgets.images import address_of_jpeg
-from workbench.ui.widgets.inputs import Control, tell_all
-from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.notices import tell_all
+from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.visitors import Visitor
 
 MOST_JOBS = 6
 """Jobs that are shown at once."""
 MOST_OPEN = 4
 """Recordings that a review shows at once."""
-TYPING = 0.2
-"""Seconds without a keystroke after which the search runs."""
 ALL_TASKS = "all tasks"
-OPEN = 4
-"""Bit of ``choosable.html`` for the second press of a double click, next to `TOGGLE` and `RANGE`."""
+HELD = {"": 0, "ctrl": TOGGLE, "shift": RANGE, "ctrl+shift": TOGGLE | RANGE}
+LIST = (
+    PressRow,
+    OpenRow,
+    NextRow,
+    PreviousRow,
+    AlsoNextRow,
+    AlsoPreviousRow,
+    NextRows,
+    PreviousRows,
+    ToggleRow,
+    SelectAllRows,
+    SelectNoRows,
+    UndoDelete,
+    EmptyTrash,
+    SortRows,
+    FilterRows,
+    FilterTask,
+    LookForRows,
+    ClearRowFilter,
+    TypeAnswer,
+    AnswerDialog,
+)
+"""What the list itself does."""
 
 
 class LibraryPanel(PagePart[object]):
@@ -65,69 +109,49 @@ class LibraryPanel(PagePart[object]):
         server: viser.ViserServer,
         library: Library,
         on_open: Callable[[tuple[str, ...]], None],
-        clock: Clock = time.monotonic,
         running: Callable[[], OpenVersion | None] = lambda: None,
     ) -> None:
         self._server, self._library, self._running = server, library, running
         self._folder = os.fsencode(library.folder).decode(errors="replace")
         self._list = LibraryList(library)
-        self._edits = LibraryEdits(server, library, self.leave_keys)
+        self._edits = LibraryEdits(server, library)
         self._lock = threading.RLock()
         self._actions = [
             Action(
                 "Open",
+                OpenSelected(),
                 "Open it in the review (Enter, or double-click)",
                 on_open,
                 MOST_OPEN,
-                "Open the selected recordings",
-                "enter",
                 salvages=True,
             ),
-            Action(
-                "Tag",
-                "Add or remove tags (T)",
-                self._edits.ask_tags,
-                reads=False,
-                named="Tag the selected recordings",
-                key="T",
-            ),
-            Action(
-                "Note",
-                "Edit its note (Shift+T)",
-                self._edits.ask_note,
-                reads=False,
-                named="Edit the note of the selected recordings",
-                key="T",
-                modifier="shift",
-            ),
+            Action("Tag", TagSelected(), "Add or remove tags (T)", self._edits.ask_tags, reads=False),
+            Action("Note", NoteSelected(), "Edit its note (Shift+T)", self._edits.ask_note, reads=False),
             Action(
                 "Delete",
+                DeleteSelected(),
                 "Move its files to the trash (Delete)",
                 self._edits.ask_delete,
                 reads=False,
-                named="Delete the selected recordings",
-                key="delete",
             ),
         ]
+        server.gui.add_html(render("context", context="library"))
         self._jobs = server.gui.add_html("", visible=False)
         self._filters = server.gui.add_html("")
-        self._find = Control(
-            server.gui.add_text(
-                "Find",
-                "",
-                hint="Words to find in task, tags, note, name or version; seed:3 for a seed",
-            ),
-            send=lambda words: self._list.look_for(words, self._list.task),
-            settle=TYPING,
-            clock=clock,
+        self._find = Field(
+            server,
+            "Find",
+            LookForRows,
+            "words",
+            hint="Words to find in task, tags, note, name or version; seed:3 for a seed",
+            live=True,
         )
-        self._tasks: viser.GuiDropdownHandle = server.gui.add_dropdown("Task", (ALL_TASKS,), visible=False)
+        self._tasks = choice(server, "Task", FilterTask, "task", {ALL_TASKS: None}, None)
+        self._tasks.visible = False
         self._tools = server.gui.add_html("")
         self._marks = server.gui.add_html("")
         self._table = server.gui.add_html("")
         self._trash = server.gui.add_html("")
-        self._presses = Presses(server)
-        self._numbers = self._presses.number_id("rows", self._on_row)
 
         self._number_of: dict[str, int] = {}
         """Number of each recording's row, from 1 on, in the order in which they came."""
@@ -136,13 +160,6 @@ class LibraryPanel(PagePart[object]):
         self._filters_drawn: object = None
         """What the filters were counted for: with thousands of rows counting takes long."""
         self._table_drawn: object = None
-
-        self._keys: list[viser.CommandHandle] = []
-        self._escapes: list[viser.CommandHandle] = []
-        self.keys: tuple[str, ...] = ()
-        """Combinations of the commands that need the table to be visible."""
-        self._asking = False
-        self._tasks.on_update(lambda _: self._on_task())
 
     # --- for the page that has it ----------------------------------------------------------------------
 
@@ -159,47 +176,62 @@ class LibraryPanel(PagePart[object]):
         with self._lock:
             self._actions.append(action)
 
-    def leave_keys(self, asking: bool) -> None:
-        """Disable the keys while a dialog is open, of the library or of another part."""
-        # viser's keys act before a focused button: Enter on Cancel would open a recording.
-        self._asking = asking
-        for key in self._keys:
-            key.disabled = asking
-        self._can_escape()
+    @property
+    def does(self) -> tuple[type[Command], ...]:  # type: ignore[override]
+        """What it can be asked for; the actions are those that there are by now."""
+        return (*LIST, *(type(action.command) for action in self._actions))
 
     def close(self) -> None:
-        """Close the dialog, if there is one. Called when the page goes, and its keys with it."""
+        """Close the dialog, if there is one. Called when the page goes."""
         self._edits.close()
-        self._keys, self._escapes = [], []
 
-    def commands(self) -> list[Command]:
-        """Commands of the table; register them after the last `add_action`."""
-        commands = [
-            *walking(self._list),
-            *(
-                Command(action.named, partial(self._run, action), action.key, action.modifier)
-                for action in self._actions
-                if action.named
-            ),
-            Command("Undo the last deletion", self._edits.undo_delete, "Z"),
-        ]
-        self.keys = tuple(command.combination for command in commands)
-        commands = [replace(command, registered=self._keys.append) for command in commands]
-        escape = Command("Cancel, or show all recordings again", self._escape, "escape")
-        return [*commands, replace(escape, registered=self._escapes.append)]
-
-    def _escape(self) -> None:
-        if self._asking:
-            self._edits.close()
-        else:
-            self._clear_filter()
-
-    def _can_escape(self) -> None:
-        """Enable Escape while a dialog is open or a filter is set."""
+    def do(self, command: Command, visitor: Visitor) -> None:
         listed = self._list
-        of_use = self._asking or bool(listed.words or listed.task) or listed.outcome != "all"
-        for handle in self._escapes:
-            handle.disabled = not of_use
+        match command:
+            case PressRow(id=id, held=held):
+                listed.press(id, HELD[held])
+            case OpenRow(id=id):
+                if listed.press(id):
+                    self._run(self._actions[0])
+            case NextRow():
+                listed.move(1)
+            case PreviousRow():
+                listed.move(-1)
+            case AlsoNextRow():
+                listed.move(1, RANGE)
+            case AlsoPreviousRow():
+                listed.move(-1, RANGE)
+            case NextRows():
+                listed.pages.turn(1)
+            case PreviousRows():
+                listed.pages.turn(-1)
+            case ToggleRow():
+                listed.toggle_cursor()
+            case SelectAllRows():
+                listed.select_all()
+            case SelectNoRows():
+                self.select(())
+            case UndoDelete():
+                self._edits.undo_delete()
+            case EmptyTrash():
+                self._edits.ask_empty()
+            case SortRows(column=column):
+                listed.sort_by(column)
+            case FilterRows(outcome=outcome):
+                listed.choose(outcome)
+            case LookForRows(words=words):
+                listed.look_for(words, listed.task)
+            case TypeAnswer(text=text):
+                self._edits.type(text)
+            case AnswerDialog():
+                self._edits.answer()
+            case FilterTask(task=task):
+                listed.look_for(listed.words, task)
+            case ClearRowFilter():
+                listed.choose("all")
+                listed.look_for("", None)
+            case _:
+                self._run(next(action for action in self._actions if type(action.command) is type(command)))
 
     # --- drawing ---------------------------------------------------------------------------------------
 
@@ -213,14 +245,12 @@ class LibraryPanel(PagePart[object]):
             if wanted == self._drawn:
                 return
             self._drawn = wanted
-            self._can_escape()
             page = self._list.page(view)
             self._draw_filters(view)
             self._draw_table(view, page)
             self._draw_tools(view)
             self._draw_marks(page)
-            empty = self._press("empty", self._edits.ask_empty)
-            self._trash.content = render("library_trash", trash=view.trash, empty=empty)
+            self._trash.content = render("library_trash", trash=view.trash, empty=EmptyTrash())
 
     def _draw_jobs(self, view: LibraryView) -> None:
         """How far the jobs are that record into the folder, each with what failed."""
@@ -242,13 +272,11 @@ class LibraryPanel(PagePart[object]):
         if wanted == self._filters_drawn:
             return
         self._filters_drawn = wanted
-        tasks = tuple(sorted({row.task for row in view.rows if row.task}))
-        if self._tasks.options != (ALL_TASKS, *tasks):
-            listed.look_for(listed.words, listed.task)  # its task may have gone
-            self._tasks.options = (ALL_TASKS, *tasks)
-            self._tasks.value = ALL_TASKS if listed.task is None else listed.task
+        tasks = sorted({row.task for row in view.rows if row.task})
+        listed.look_for(listed.words, listed.task)  # its task may have gone
+        self._tasks.show(listed.task, options={ALL_TASKS: None, **{task: task for task in tasks}})
         self._tasks.visible = len(tasks) > 1
-        self._find.handle.visible = bool(view.rows)
+        self._find.visible = bool(view.rows)
         others = chosen(view.rows, listed.words, "all", listed.task)
         counts = {
             outcome: count_recordings(row for row in others if has_outcome(row, outcome)) for outcome in MEANS
@@ -265,9 +293,7 @@ class LibraryPanel(PagePart[object]):
                     if outcome == "all" and counts["all"] < everything
                     else counts[outcome],
                     "on": outcome == listed.outcome,
-                    "press": self._press(
-                        ("outcome", outcome), lambda outcome=outcome: listed.choose(outcome)
-                    ),
+                    "press": FilterRows(outcome=outcome),
                 }
                 for outcome, means in MEANS.items()
                 if outcome != "broken" or counts["broken"] or listed.outcome == "broken"
@@ -294,10 +320,12 @@ class LibraryPanel(PagePart[object]):
         pictures = self._library.thumbnails([row.id for row in page])
         self._table.content = render(
             "library",
-            numbers=self._numbers,
             some=bool(view.rows),
             none_so=self._none_so(view),
-            clear=self._press("clear", self._clear_filter),
+            clear=ClearRowFilter(),
+            press_row=lambda id: PressRow(id=id),
+            also=lambda id: PressRow(id=id, held="ctrl"),
+            open_row=lambda id: OpenRow(id=id),
             head=[self._head(column) for column in COLUMNS],
             second=[self._head(column) for column in SECOND_LINE],
             rows=[
@@ -321,14 +349,13 @@ class LibraryPanel(PagePart[object]):
             "a task or with workbench record, appear here."
         )
 
-    def _head(self, column: Column) -> dict[str, str]:
+    def _head(self, column: Column) -> dict[str, object]:
         listed = self._list
         arrow = "" if column != listed.column else " ↓" if listed.descending else " ↑"
-        press = self._press(("sort", column), lambda: listed.sort_by(column))
         return {
             "name": column,
             "arrow": arrow,
-            "press": press,
+            "press": SortRows(column=column),
             "hint": f"{HINTS[column]}. Click to sort",
         }
 
@@ -346,18 +373,16 @@ class LibraryPanel(PagePart[object]):
                     "hint": f"At most {action.most} at once"
                     if action.most is not None and count > action.most
                     else action.hint,
-                    "press": self._press(("action", k), lambda k=k: self._run(self._actions[k]))
-                    if 0 < count <= (action.most or count)
-                    else "",
+                    "press": action.command if 0 < count <= (action.most or count) else None,
                 }
-                for k, action in enumerate(self._actions)
+                for action in self._actions
             ],
             summary=f"{count} selected" if count else "Click a row to select it" if rows else "",
             count=len(rows),
-            select_all=self._press(("select", "all"), listed.select_all) if count < len(rows) else "",
-            select_none=self._press(("select", "none"), lambda: self.select(())) if count else "",
-            undo=self._press("undo", self._edits.undo_delete) if view.trash.files else "",
-            pages=listed.pages.shown(self._press),
+            select_all=SelectAllRows() if count < len(rows) else None,
+            select_none=SelectNoRows() if count else None,
+            undo=UndoDelete() if view.trash.files else None,
+            pages=listed.pages.shown(lambda by: NextRows() if by > 0 else PreviousRows()),
         )
 
     def _draw_marks(self, page: Sequence[LibraryRow]) -> None:
@@ -368,26 +393,6 @@ class LibraryPanel(PagePart[object]):
 
     def _number(self, id: str) -> int:
         return self._number_of.setdefault(id, len(self._number_of) + 1)
-
-    # --- presses and inputs ------------------------------------------------------------------------------
-
-    def _press(self, key: object, do: Callable[[], None]) -> str:
-        return self._presses.id_of(("library", key), lambda _client: do())
-
-    def _on_row(self, sent: int) -> None:
-        number, held = divmod(sent, 8)
-        with self._lock:
-            id = next(iter(list(self._number_of)[max(0, number - 1) : number]), "")
-        if self._list.press(id, held & (TOGGLE | RANGE)) and held & OPEN:
-            self._run(self._actions[0])
-
-    def _on_task(self) -> None:
-        self._list.look_for(self._list.words, self._tasks.value)
-
-    def _clear_filter(self) -> None:
-        self._find.handle.value, self._tasks.value = "", ALL_TASKS
-        self._list.choose("all")
-        self._list.look_for("", None)
 
     # --- actions on the selected recordings ----------------------------------------------------------------
 

@@ -9,12 +9,16 @@ import viser
 
 from workbench.authoring.problem import Problem
 from workbench.authoring.templates.new_task import CannotBegin, fill_blank_file, is_blank
+from workbench.commands.command import Command, Refused
+from workbench.commands.run import FillEmptyFile, Interrupt, RebuildScene, ReloadFile, RestartWorker
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
 from workbench.ui.live.timeline import GAP, step_in_words
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import Tool, tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 WIDEST, BUSY_WIDEST = 520, 460
 """Pixels. The style sheet makes them as narrow as the view: they must not cover the controls, with which the last good
@@ -23,6 +27,10 @@ version is still used."""
 FILL = "Write the minimal task into it"
 RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Restart the worker"
 REBUILD = "Rebuild the scene"
+REBUILD_HINT = (
+    "Where the new code needs what building the scene makes, such as a body or an attribute of _load_scene: a patch keeps "
+    "the old scene. The moment is restored."
+)
 _MAY_BE_OLD = ("reset", "step", "evaluate", "reward", "observation", "returns")
 """Stages that use what the scene's building made: a patch keeps it, and may lack what the new code expects of it."""
 SHOWN_AFTER = 4.0
@@ -64,19 +72,15 @@ class Banner(PagePart[SessionView]):
 
     Args:
         server: The page.
-        reload: Asks the session to load the file again.
-        rebuild: Likewise, with a scene built anew.
-        restart: Asks the session for a new worker process.
         link: Links the line in the file.
         is_own: Whether a file may be written into: the task's, and named by a person, not by a recording.
     """
 
+    does = (FillEmptyFile,)
+
     def __init__(
         self,
         server: viser.ViserServer,
-        reload: Callable[[], None],
-        rebuild: Callable[[], None],
-        restart: Callable[[], None],
         link: LinkTo = no_links,
         is_own: Callable[[str], bool] = lambda file: False,
     ) -> None:
@@ -88,25 +92,9 @@ class Banner(PagePart[SessionView]):
             self._html = server.gui.add_html("")
             # An element of its own: what it says changes, and the other must not be written again.
             self._kept = server.gui.add_html("")
-            self._fill = server.gui.add_button(FILL, icon=viser.Icon.FILE_PLUS, visible=False)
-            self._reload = server.gui.add_button(RELOAD, icon=viser.Icon.REFRESH, color="gray")
-            self._rebuild = server.gui.add_button(
-                REBUILD,
-                icon=viser.Icon.CUBE,
-                color="gray",
-                visible=False,
-                hint="Where the new code needs what building the scene makes, such as a body or an attribute of "
-                "_load_scene: a patch keeps the old scene. The moment is restored.",
-            )
-            self._restart = server.gui.add_button(
-                "Restart the worker", icon=viser.Icon.POWER, color="gray", visible=False
-            )
+            self._tools = server.gui.add_html("")
         # At the right edge of the view: on the left are viser's own notifications.
         self._panel.float(x=-GAP, y=GAP, width=WIDEST)
-        self._fill.on_click(self._on_fill)
-        self._reload.on_click(lambda _: reload())
-        self._rebuild.on_click(lambda _: rebuild())
-        self._restart.on_click(lambda _: restart())
         self._drawn: int | None = None
         """Serial of the problem."""
 
@@ -115,30 +103,35 @@ class Banner(PagePart[SessionView]):
         if problem is None or is_busy_for_long(view):
             if self._panel.visible:
                 self._panel.visible = False
-            self._drawn = None
+            self._drawn = self._blank = None
             return
-        stopped = _stopped(view)
-        self._restart.visible = stopped
-        self._rebuild.visible = view.task is not None and not stopped and problem.stage in _MAY_BE_OLD
         # Written once for each problem: a new text would close an open traceback.
         if view.problem_serial != self._drawn:
             self._drawn = view.problem_serial
             file = Path(problem.file) if problem.file and self._is_own(problem.file) else None
             self._blank = file if view.task is None and file is not None and is_blank(file) else None
-            self._fill.visible = self._blank is not None
             self._html.content = banner_html(problem, view, self._link)
             self._panel.visible = True
             self._panel.expand()
         self._kept.content = kept_html(view)
+        stopped = _stopped(view)
+        may_be_old = view.task is not None and not stopped and problem.stage in _MAY_BE_OLD
+        self._tools.content = tools_html(
+            [tool(FILL, FillEmptyFile(), tone="main")] if self._blank is not None else [],
+            [
+                tool(RELOAD, ReloadFile()),
+                *([Tool(REBUILD, RebuildScene(), REBUILD_HINT)] if may_be_old else []),
+                *([tool(NEW_WORKER, RestartWorker())] if stopped else []),
+            ],
+        )
 
-    def _on_fill(self, event: viser.GuiEvent) -> None:
+    def do(self, command: Command, visitor: Visitor) -> None:
         if self._blank is None:
-            return
+            raise Refused("No empty file is open.")
         try:
             fill_blank_file(self._blank)
         except CannotBegin as error:
-            if event.client is not None:
-                event.client.add_notification("Nothing was written", str(error), color="orange")
+            raise Refused(str(error)) from None
 
 
 def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) -> str:
@@ -202,22 +195,17 @@ class BusyBanner(PagePart[SessionView]):
 
     Args:
         server: The page.
-        interrupt: Asks the session to interrupt the author's code.
-        restart: Asks the session for another worker process.
         link: Links the line in the file.
     """
 
-    def __init__(self, server: viser.ViserServer, interrupt, restart, link: LinkTo = no_links) -> None:
+    def __init__(self, server: viser.ViserServer, link: LinkTo = no_links) -> None:
         self._link = link
         self._panel = server.gui.add_panel(visible=False, order=-11.0)
         with self._panel.add_tab("Busy", viser.Icon.HOURGLASS):
             self._html = server.gui.add_html("")
             self._traceback = server.gui.add_html("", visible=False)
-            self._interrupt = server.gui.add_button(INTERRUPT, icon=viser.Icon.HAND_STOP)
-            self._restart = server.gui.add_button(RESTART, icon=viser.Icon.POWER, color="gray")
+            self._tools = server.gui.add_html("")
         self._panel.float(x=-GAP, y=GAP, width=BUSY_WIDEST)
-        self._interrupt.on_click(lambda _: interrupt())
-        self._restart.on_click(lambda _: restart())
 
     def draw(self, view: SessionView) -> None:
         busy = view.busy
@@ -232,7 +220,8 @@ class BusyBanner(PagePart[SessionView]):
         self._traceback.content = trace
         self._traceback.visible = bool(trace)
         can_interrupt = not busy.ignores_interrupt and not busy.drawing
-        self._interrupt.visible = can_interrupt
+        interrupt = [tool(INTERRUPT, Interrupt(), tone="main")] if can_interrupt else []
+        self._tools.content = tools_html([*interrupt, tool(RESTART, RestartWorker())])
         if not self._panel.visible:
             self._panel.visible = True
             self._panel.expand()

@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.envs import (
+    FilterEnvs,
+    NextFailedEnv,
+    NextFlaggedEnv,
+    ShowEnvAtEvent,
+    ShowFirstFlagged,
+    SortEnvs,
+    ToggleEnvEntries,
+    ToggleEnvEntry,
+    TurnEnvs,
+)
+from workbench.commands.page import TellUnfolded
 from workbench.machine.text import number_text
 from workbench.session.history.env_table import EnvRows, Outcome
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.live.timeline import polylines
-from workbench.ui.widgets.click_targets import Paged, Presses
+from workbench.ui.widgets.paged import Paged
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.visitors import Visitor
 
 Filter = Literal["all", "failed", "running", "flagged"]
 FILTERS: dict[Filter, tuple[str, str, str]] = {
@@ -40,6 +53,8 @@ FILTERS: dict[Filter, tuple[str, str, str]] = {
 }
 """Label of the button, hint, and text of an empty table. "last failed", not "failed": a running env may have failed
 before, and "failed 16" next to "running 16" confuses."""
+TABLE = "envs"
+"""The panel, as a page tells that it was unfolded."""
 MOST_ENTRIES = 6
 """Columns of bool entries at first; with more a row is wider than the view. The others can be chosen."""
 POINTS = 40
@@ -237,10 +252,22 @@ class EnvPanel(MomentPart):
     While it is folded in every page only a new task is drawn: 64 rows were half of what the panels took while a task played.
     """
 
+    does = (
+        ShowEnvAtEvent,
+        ShowFirstFlagged,
+        NextFailedEnv,
+        NextFlaggedEnv,
+        SortEnvs,
+        FilterEnvs,
+        ToggleEnvEntries,
+        ToggleEnvEntry,
+        TurnEnvs,
+    )
+
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._handle = server.gui.add_html("")
-        self._presses = Presses(server)
+        server.gui.add_html(render("tell", command=TellUnfolded(panel=TABLE)))
         self._column, self._descending = "env", False
         self._filter: Filter = "all"
         self._pages = Paged(MOST_ROWS)
@@ -253,7 +280,31 @@ class EnvPanel(MomentPart):
         self._is_unfolded = False
         self._drawn_task = -1
         """`SessionView.task_serial` when it was drawn last."""
-        self._presses.when_unfolded(self.unfold)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ShowEnvAtEvent(env=env):
+                self._choose_env(env)
+            case ShowFirstFlagged():
+                self._select_first_flagged()
+            case NextFailedEnv():
+                self._select_next("failed")
+            case NextFlaggedEnv():
+                self._select_next("flagged")
+            case SortEnvs(column=column):
+                self._descending = not self._descending if column == self._column else False
+                self._column = column
+                self._pages.go_to(0)
+            case FilterEnvs(which=which):
+                self._filter = which
+                self._pages.go_to(0)
+            case ToggleEnvEntries():
+                self._choosing = not self._choosing
+            case ToggleEnvEntry(name=name):
+                self._toggle_entry(name)
+            case TurnEnvs(by=by):
+                self._pages.turn(by)
+        self._pressed += 1
 
     def unfold(self) -> None:
         """Draw it from now on: a page shows it. Until `fold`, as no page tells that it folds it by itself."""
@@ -292,20 +343,20 @@ class EnvPanel(MomentPart):
                     "hint": means,
                     "count": int(np.count_nonzero(mask(rows, name))),
                     "on": name == self._filter,
-                    "press": self._press(("filter", name), lambda name=name: self._choose_filter(name)),
+                    "press": FilterEnvs(which=name),
                 }
                 for name, (shown_as, means, _) in FILTERS.items()
             ],
-            choose=self._press(("choose",), self._toggle_choosing) if rows.first_true else "",
+            choose=ToggleEnvEntries() if rows.first_true else None,
             entries=self._entries(rows) if self._choosing else (),
             choosing=self._choosing,
-            pages=self._pages.shown(self._press),
+            pages=self._pages.shown(lambda by: TurnEnvs(by=by)),
             head=self._head(rows),
             rows=[
                 {
                     "cells": row,
                     "selected": row["env"] == selected,
-                    "press": self._press(("env", row["env"]), partial(self._choose_env, row["env"])),
+                    "press": ShowEnvAtEvent(env=row["env"]),
                 }
                 for row in make_rows(rows, shown, self._chosen)
             ],
@@ -323,11 +374,10 @@ class EnvPanel(MomentPart):
                 if self._descending
                 else "\N{NO-BREAK SPACE}↑"
             )
-            press = self._press(("sort", column), lambda: self._choose_column(column))
             return {
                 "name": name,
                 "arrow": arrow,
-                "press": press,
+                "press": SortEnvs(column=column),
                 "hint": hint,
                 "gives_way": ranks.get(column),
             }
@@ -338,7 +388,7 @@ class EnvPanel(MomentPart):
         plain: dict[str, object] = {
             "name": "reward",
             "arrow": "",
-            "press": "",
+            "press": None,
             "hint": "Over the episode; all rows on one scale",
             "gives_way": ranks[REWARD_CURVE],
         }
@@ -352,55 +402,35 @@ class EnvPanel(MomentPart):
             {
                 "name": name,
                 "on": name in shown,
-                "press": self._press(("entry", name), partial(self._toggle_entry, name)),
+                "press": ToggleEnvEntry(name=name),
             }
             for name in bool_entries(rows)
         ]
 
-    # --- presses -----------------------------------------------------------------------------------
-
-    def _press(self, key: Hashable, do: Callable[[], None]) -> str:
-        def pressed(client: viser.ClientHandle | None) -> None:
-            do()
-            self._pressed += 1
-
-        return self._presses.id_of(key, pressed)
+    # --- what a person does ------------------------------------------------------------------------
 
     def _choose_env(self, env: int) -> None:
         rows = self._session.env_rows()
-        if rows is None or env >= rows.num_envs:
-            return  # a version with fewer envs was loaded since the table was drawn
-        self._pressed += 1
+        if rows is None or not 0 <= env < rows.num_envs:
+            raise Refused(f"There is no env {env}.")
         self._session.change(selected_env=env)
         step = moment_of(rows, env)
         if step is not None:
             self._session.past.seek_step(env, step)
-
-    def _choose_column(self, column: str) -> None:
-        self._descending = not self._descending if column == self._column else False
-        self._column = column
-        self._pages.go_to(0)
-
-    def _toggle_choosing(self) -> None:
-        self._choosing = not self._choosing
 
     def _toggle_entry(self, name: str) -> None:
         rows = self._session.env_rows()
         if rows is not None:
             self._chosen[name] = name not in entry_names(rows, self._chosen)
 
-    def _choose_filter(self, wanted: Filter) -> None:
-        self._filter = wanted
-        self._pages.go_to(0)
-
-    def select_first_flagged(self) -> None:
+    def _select_first_flagged(self) -> None:
         """Select the first flagged env, at its first outlier."""
         rows = self._session.env_rows()
         env = None if rows is None else first_flagged(rows)
         if env is not None:
             self._choose_env(env)
 
-    def select_next(self, wanted: Filter) -> None:
+    def _select_next(self, wanted: Filter) -> None:
         """Select the next env, by number and wrapping around, that passes a filter, if any does."""
         rows = self._session.env_rows()
         if rows is None:

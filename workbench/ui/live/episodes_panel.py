@@ -3,17 +3,33 @@
 from __future__ import annotations
 
 import shlex
+from typing import Literal
 
 import viser
 
+from workbench.commands.command import Command
+from workbench.commands.recording import (
+    ChooseRecordedEnvs,
+    RecordNextEpisode,
+    SavePreviousEpisode,
+    ToggleRecording,
+    ToggleSavePast,
+)
 from workbench.recording.reader.reading import recovered_text
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.record.live import RecordingStatus
 from workbench.ui.live.moment import MomentPart
+from workbench.ui.widgets.fields import choice
+from workbench.ui.widgets.hotkeys import with_key
 from workbench.ui.widgets.templates import counted, render
+from workbench.ui.widgets.tools import Tool, tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
+ENVS = {THIS_ENV: "selected", ALL_ENVS: "all"}
+RECORD_HINT = "Reset and record every episode until it is stopped"
+SAVE_HINT = "Record after the fact: the episode at the shown moment"
 RECORD, NEXT, SAVE = "Record", "Record the next episode", "Save what I just saw"
 SAVE_BEFORE = "Save the previous episode"
 STOP, STOP_WAITING, STOP_SAVING = "Stop recording", "Stop waiting", "Stop saving"
@@ -26,43 +42,29 @@ class RecordPanel(MomentPart):
     reset; *Save what I just saw* makes a recording of the past.
     """
 
+    does = (RecordNextEpisode, SavePreviousEpisode, ChooseRecordedEnvs)
+
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._button = server.gui.add_button(
-            RECORD,
-            icon=viser.Icon.PLAYER_RECORD,
-            hint="Reset and record every episode until it is stopped (Shift+C)",
-        )
-        self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
-        self._next = server.gui.add_button(
-            NEXT,
-            icon=viser.Icon.PLAYER_TRACK_NEXT,
-            color="gray",
-            hint="Wait for the next reset and record that one episode",
-        )
-        self._save = server.gui.add_button(
-            SAVE,
-            icon=viser.Icon.HISTORY,
-            color="gray",
-            hint="Record after the fact: the episode at the shown moment (Shift+K)",
-        )
-        self._before = server.gui.add_button(
-            SAVE_BEFORE,
-            icon=viser.Icon.PLAYER_TRACK_PREV,
-            color="gray",
-            visible=False,
-            hint="The episode before the shown one",
-        )
+        self._chosen: Literal["selected", "all"] = "selected"
+        self._record = server.gui.add_html("")
+        self._which = choice(server, "Envs", ChooseRecordedEnvs, "envs", ENVS, self._chosen)
+        self._others = server.gui.add_html("")
         self._about = server.gui.add_html("")
         self._status = server.gui.add_html("")
-        self._button.on_click(lambda _: self.toggle())
-        self._next.on_click(lambda _: session.start_recording(self._envs, next_episode=True))
-        self._save.on_click(lambda _: self.save())
-        self._before.on_click(lambda _: session.save_past(self._envs, before=True))
 
     @property
     def _envs(self) -> tuple[int, ...] | None:
-        return None if self._which.value == ALL_ENVS else (self._session.view().selected_env,)
+        return None if self._chosen == "all" else (self._session.view().selected_env,)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case RecordNextEpisode():
+                self._session.start_recording(self._envs, next_episode=True)
+            case SavePreviousEpisode():
+                self._session.save_past(self._envs, before=True)
+            case ChooseRecordedEnvs(envs=envs):
+                self._chosen = envs
 
     def toggle(self) -> None:
         """Start or stop recording."""
@@ -79,30 +81,35 @@ class RecordPanel(MomentPart):
             self._session.save_past(self._envs)
 
     def key(self, view: SessionView) -> object:
-        return view.recording, view.timeline, view.step_serial
+        return view.recording, view.timeline, view.step_serial, self._chosen
 
     def urgent(self, view: SessionView) -> object:
         recording = view.recording
         stand = recording.active, recording.waiting, recording.saving.progress is None
-        return super().urgent(view), self._which.value, *stand, view.timeline.moments == 0
+        return super().urgent(view), self._chosen, *stand, view.timeline.moments == 0
 
     def draw(self, view: SessionView) -> None:
         recording, saving = view.recording, view.recording.saving.progress is not None
         waits = recording.active and recording.waiting == len(recording.env_idx)
-        self._button.label = STOP_WAITING if waits else STOP if recording.active else RECORD
-        self._button.icon = viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD
-        self._save.label = STOP_SAVING if saving else SAVE
-        self._save.icon = viser.Icon.PLAYER_STOP if saving else viser.Icon.HISTORY
         can_record = view.task is not None and view.state != "stopped"
-        self._button.disabled = not can_record and not recording.active
-        # Disabled, not hidden: the next button would move under the pointer.
-        self._next.disabled = not can_record or recording.active
-        self._save.disabled = view.timeline.moments == 0 and not saving
-        self._which.disabled = not can_record
+        record = STOP_WAITING if waits else STOP if recording.active else RECORD
+        off = not can_record and not recording.active
+        hint = with_key(ToggleRecording, RECORD_HINT)
+        self._record.content = tools_html([Tool(record, ToggleRecording(), hint, off=off, tone="main")])
+        self._which.show(self._chosen, off=not can_record)
         self._which.visible = view.task is None or view.task.num_envs > 1
-        about = what_saving_means(view, self._which.value == ALL_ENVS)
+        # Off, not left out: the next button would move under the pointer.
+        following = tool(NEXT, RecordNextEpisode(), off=not can_record or recording.active)
+        save = Tool(
+            STOP_SAVING if saving else SAVE,
+            ToggleSavePast(),
+            with_key(ToggleSavePast, SAVE_HINT),
+            off=view.timeline.moments == 0 and not saving,
+        )
+        before = [tool(SAVE_BEFORE, SavePreviousEpisode())] if has_one_before(view) and not saving else []
+        self._others.content = tools_html([following], [save], before)
+        about = what_saving_means(view, self._chosen == "all")
         self._about.content = render("note", text=about) if about and not saving else ""
-        self._before.visible = has_one_before(view) and not saving
         self._status.content = recording_html(recording)
 
 

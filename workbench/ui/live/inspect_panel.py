@@ -12,15 +12,20 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.command import Command
+from workbench.commands.page import TellUnfolded
+from workbench.commands.run import ChooseInspected, ShowForces
 from workbench.core.capture.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section
 from workbench.machine.text import number_text
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.scene.env_grid import InView
-from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.fields import choice, tick
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.visitors import Visitor
 
+TAB = "Inspect"
 NEAR_A_LIMIT = 0.02
 """Part of a joint's range."""
 
@@ -150,23 +155,31 @@ class InspectPanel(PagePart[SessionView]):
     the last has come, at most five times a second: a busy worker gets no queue of questions.
     """
 
+    does = (ChooseInspected, ShowForces)
+
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._session, self._clock = session, clock
-        self._show = server.gui.add_dropdown(
+        self._chosen, self._shows_forces = JOINTS, False
+        self._show = choice(
+            server,
             "Show",
+            ChooseInspected,
+            "what",
             tuple(CHOICES),
-            initial_value=JOINTS,
+            JOINTS,
             hint="Read from the selected env, five times a second.",
         )
-        self._forces = server.gui.add_checkbox(
+        self._forces = tick(
+            server,
             "Force arrows",
+            ShowForces,
+            "on",
             False,
             hint="Draw the contact forces of the selected env as arrows in the 3D view.",
         )
         self._handle = server.gui.add_html("")
         self._opened = False
-        Presses(server).when_unfolded(self._open)
-        self._show.on_update(lambda _: self._open())
+        server.gui.add_html(render("tell", command=TellUnfolded(panel=TAB)))
         self._asked: tuple[object, ...] | None = None
         self._asked_at = -math.inf
         self._had: Inspection | None = None
@@ -175,25 +188,36 @@ class InspectPanel(PagePart[SessionView]):
         self._due = DrawDue(READ_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
-        choice = self._show.value
-        self._ask(view, choice)
+        chosen = self._chosen
+        self._show.show(chosen)
+        self._forces.show(self._shows_forces)
+        self._ask(view, chosen)
         self._take(view)
         no_step = self._no_step_yet(view)
-        wanted = (choice, view.task_serial, view.selected_env, id(self._now), no_step)
-        if choice == POSES:
+        wanted = (chosen, view.task_serial, view.selected_env, id(self._now), no_step)
+        if chosen == POSES:
             wanted = (*wanted, view.step_serial)
-        if not self._due.is_due(wanted, urgent=choice):
+        if not self._due.is_due(wanted, urgent=chosen):
             return
-        self._handle.content = inspect_html(choice, view, self._now, self._before, no_step)
+        self._handle.content = inspect_html(chosen, view, self._now, self._before, no_step)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseInspected(what=what):
+                self._chosen = what
+                self.unfold()
+            case ShowForces(on=on):
+                self._shows_forces = on
 
     def forces(self, view: SessionView) -> Inspection | None:
         """The reading whose contacts the 3-D view shows; None while the past is shown: contacts are read live only."""
         here = self._now is not None and self._now.env == view.selected_env
         known = view.timeline.shown is None and not self._no_step_yet(view)
-        shown = self._forces.value and here and known
+        shown = self._shows_forces and here and known
         return self._now if shown else None
 
-    def _open(self) -> None:
+    def unfold(self) -> None:
+        """A page has opened the tab."""
         self._opened = True
 
     def _no_step_yet(self, view: SessionView) -> bool:
@@ -204,12 +228,12 @@ class InspectPanel(PagePart[SessionView]):
         lived = self._session.past.segment() if view.timeline.shown is None else None
         return lived is not None and lived[0] == lived[1]
 
-    def _ask(self, view: SessionView, choice: str) -> None:
-        chosen: tuple[Section | None, ...] = (
-            CHOICES[choice] if self._opened else None,
-            "contacts" if self._forces.value else None,
+    def _ask(self, view: SessionView, chosen: str) -> None:
+        needed: tuple[Section | None, ...] = (
+            CHOICES[chosen] if self._opened else None,
+            "contacts" if self._shows_forces else None,
         )
-        sections: tuple[Section, ...] = tuple(section for section in SECTIONS if section in chosen)
+        sections: tuple[Section, ...] = tuple(section for section in SECTIONS if section in needed)
         wanted = (view.task_serial, view.step_serial, view.selected_env, sections)
         if not sections or view.task is None or wanted == self._asked:
             return

@@ -12,13 +12,17 @@ from rich.color_triplet import ColorTriplet
 from rich.style import Style
 from rich.terminal_theme import TerminalTheme
 
+from workbench.commands.command import Command
+from workbench.commands.run import ClearLog, FilterLog, PauseLog
 from workbench.session.live.view import SessionView
 from workbench.session.process.captured_output import PLAIN, SWITCHES, Printed, Run
 from workbench.session.process.memory_limit import format_size
 from workbench.session.process.supervisor import Vitals
-from workbench.ui.server.control_values import limit_text
+from workbench.ui.widgets.fields import Field, tick
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 Rgb = tuple[int, int, int]
 LIGHT_PAGE: Rgb = (241, 243, 245)
@@ -125,40 +129,53 @@ class LogPanel(PagePart[SessionView]):
     """
 
     every = 0.3
+    does = (FilterLog, PauseLog, ClearLog)
 
     def __init__(self, server: viser.ViserServer, clear: Callable[[], None]) -> None:
-        self._filter = server.gui.add_text(
+        self._wanted, self._held = "", False
+        self._clear = clear
+        self._filter = Field(
+            server,
             "Filter",
-            "",
+            FilterLog,
+            "text",
             hint="Only lines that contain this; stderr: or stdout: before it selects one stream.",
+            live=True,
+            longest=LONGEST_FILTER,
         )
-        limit_text(self._filter, LONGEST_FILTER)
-        self._hold = server.gui.add_checkbox("Pause", False, hint="New lines wait while you read.")
+        self._hold = tick(server, "Pause", PauseLog, "on", False, hint="New lines wait while you read.")
         self._html = server.gui.add_html("")
-        self._clear = server.gui.add_button("Clear", icon=viser.Icon.ERASER, color="gray")
+        self._tools = server.gui.add_html("")
         self._vitals = server.gui.add_html("")
-        self._clear.on_click(lambda _: self._on_clear(clear))
         self._cleared = 0
         self._drawn: object = None
         """Filter and number of clears when it was drawn; a change is drawn even while it is held."""
 
     def key(self, view: SessionView) -> object:
-        return view.printed.serial, self._hold.value, self._filter.value, self._cleared, view.vitals
+        return view.printed.serial, self._held, self._wanted, self._cleared, view.vitals
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case FilterLog(text=text):
+                self._wanted = text
+            case PauseLog(on=on):
+                self._held = on
+            case ClearLog():
+                self._clear()
+                self._cleared += 1
 
     def draw(self, view: SessionView) -> None:
         self._vitals.content = vitals_html(view.vitals)
         # An empty log needs no controls. One that is held needs them as soon as there are lines: to be let go.
-        for control in (self._filter, self._hold, self._clear):
-            control.visible = bool(view.printed.lines or view.printed.dropped)
-        wanted = self._filter.value.strip()
-        if self._hold.value and self._drawn == (wanted, self._cleared):
+        some = bool(view.printed.lines or view.printed.dropped)
+        self._filter.visible = self._hold.visible = some
+        self._hold.show(self._held)
+        self._tools.content = tools_html([tool("Clear", ClearLog())] if some else [])
+        wanted = self._wanted.strip()
+        if self._held and self._drawn == (wanted, self._cleared):
             return
         self._drawn = wanted, self._cleared
         self._html.content = log_html(view.printed, wanted)
-
-    def _on_clear(self, clear: Callable[[], None]) -> None:
-        clear()
-        self._cleared += 1
 
 
 def log_html(printed: Printed, wanted: str) -> str:

@@ -9,32 +9,42 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.timeline import ChooseRescoredCurve, NextDifference, PreviousDifference
 from workbench.jobs.rescore.verdict import Verdict, by_change
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
+from workbench.ui.widgets.fields import by_name, choice
 from workbench.ui.widgets.line_chart import part_round
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.rescored import RescoredPanel
 from workbench.ui.widgets.templates import counted, render
+from workbench.ui.widgets.visitors import Visitor
 
 TITLE = "History, rescored"
 
 
 class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
+    does = (*RescoredPanel.does, ChooseRescoredCurve, NextDifference, PreviousDifference)
+
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         super().__init__(server, "env")
         self._session = session
         self._add_status("Stop rescoring", session.rescorer.stop)
-        names: tuple[str, ...] = ("reward",)
-        self._name: viser.GuiDropdownHandle = server.gui.add_dropdown(
+        self._name = "reward"
+        self._curve = choice(
+            server,
             "Curve",
-            names,
-            visible=False,
+            ChooseRescoredCurve,
+            "curve",
+            (self._name,),
+            self._name,
             hint="Which number is plotted, as recorded and with the new code",
         )
+        self._curve.visible = False
         self._add_chart()
         self._add_list()
         self._verdicts: Sequence[Verdict[PastRun]] = ()
@@ -44,7 +54,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
 
     def key(self, view: SessionView) -> object:
         past = view.timeline
-        chosen = self._name.value, self._pages.first
+        chosen = self._name, self._pages.first
         return view.rescored.serial, view.selected_env, past.shown, past.first, *chosen
 
     def draw(self, view: SessionView) -> None:
@@ -60,19 +70,21 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
         self._draw_curve(rescored, view)
 
     def _draw_curve(self, rescored: RescoreView, view: SessionView) -> None:
-        names, env = rescored.names, view.selected_env
-        if names and self._name.options != names:
-            self._name.options = names
-        name = self._name.value
+        names, env = rescored.names or (self._name,), view.selected_env
+        name = self._name if self._name in names else names[0]
+        self._curve.show(name, options=by_name(names))
         differs = bool(self._listed or rescored.differing_names)
         curve = self._session.rescorer.curve(name, env) if differs else None
-        self._name.visible = curve is not None
+        self._curve.visible = curve is not None
         if curve is None:
             self._chart.hide()
         else:
             self._draw_chart(f"{name} of env {env}, before and now", *chart_data(curve, view.timeline.shown))
 
     # --- the list ------------------------------------------------------------------------------------
+
+    def _key_of(self, verdict: Verdict[PastRun]) -> str:
+        return "{} {}".format(*_place(verdict))
 
     def _of_row(self, verdict: Verdict[PastRun]) -> dict[str, Any]:
         env, at = place = _place(verdict)
@@ -91,7 +103,20 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
         else:
             self._session.change(selected_env=env)
 
-    def go_to_difference(self, by: int) -> None:
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseRescoredCurve(curve=curve):
+                if curve not in self._session.view().rescored.names:
+                    raise Refused("There is no such curve.")
+                self._name = curve
+            case NextDifference():
+                self._go_to_difference(1)
+            case PreviousDifference():
+                self._go_to_difference(-1)
+            case _:
+                super().do(command, visitor)
+
+    def _go_to_difference(self, by: int) -> None:
         """Show the next (1) or previous (-1) moment of the list, wrapping around."""
         listed = self._listed
         if not listed:

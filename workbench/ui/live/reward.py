@@ -9,14 +9,17 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.command import Command, name_of
+from workbench.commands.run import ToggleCurve
+from workbench.commands.timeline import SeekOnCurve
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.machine.text import mean_text, nonfinite_text, number_text
 from workbench.session.history.curves import PREFIX, REWARD, SUCCESS, Column, Curves, Group, columns_of
 from workbench.session.live.view import SessionView
 from workbench.ui.live.moment import MomentPart
-from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.line_chart import YES_OR_NO, ChartLine, LineChart
 from workbench.ui.widgets.templates import render, short_text
+from workbench.ui.widgets.visitors import Visitor
 
 HEIGHT, TALL = 150, 170
 """Pixels of a chart with one entry, and of one with many lines."""
@@ -49,6 +52,8 @@ class CurvesPanel(MomentPart):
         seek: Shows the moment after a control step.
     """
 
+    does = (ToggleCurve, SeekOnCurve)
+
     def __init__(self, server: viser.ViserServer, seek: Callable[[int], None] = lambda tick: None) -> None:
         self._server, self._seek = server, seek
         gui = server.gui
@@ -63,7 +68,6 @@ class CurvesPanel(MomentPart):
         self._task = ""
         self._asked: int | None = None
         """The step that was pressed last."""
-        self._presses = Presses(server)
         self._hint = gui.add_html("", visible=False)
         self._lost = gui.add_html("", visible=False)
         self._empty = gui.add_html(render("note", text="Curves appear after the second step."))
@@ -105,9 +109,9 @@ class CurvesPanel(MomentPart):
         self._turned += 1
 
     def _draw_choice(self, entries: Sequence[Entry], chosen: Sequence[Entry]) -> None:
-        def press(entry: Entry) -> str:
+        def press(entry: Entry) -> ToggleCurve:
             group, name = entry
-            return self._presses.id_of((group.value, name), lambda _: self._toggle(entry))
+            return ToggleCurve(group=group.value, name=name)
 
         names = {
             Group.REWARD: "reward",
@@ -116,7 +120,7 @@ class CurvesPanel(MomentPart):
             Group.JOINT: "joints",
         }
         groups = [(names[group], [entry for entry in entries if entry[0] is group]) for group in Group]
-        self._choice.content = render("curve_choice", groups=groups, chosen=chosen, press_id=press)
+        self._choice.content = render("curve_choice", groups=groups, chosen=chosen, toggle=press)
 
     # --- charts --------------------------------------------------------------------------------------
 
@@ -190,9 +194,8 @@ class CurvesPanel(MomentPart):
         self._lost.content, self._lost.visible = render("warning", text=lost), bool(lost)
         past, asked = view.timeline, self._asked
         gone = asked is not None and past.shown is not None and past.shown == past.first and asked < past.tick
-        pressed = self._presses.number_id("step of a curve", self._go_to)
         self._hint.content = render(
-            "curve_hint", seek=pressed, first=0, gone=asked if gone else None, kept=past.tick
+            "curve_hint", curve=name_of(SeekOnCurve), gone=asked if gone else None, kept=past.tick
         )
         dense = curves is not None and view.task is not None and "dense" in view.task.reward_mode
         terms = curves is not None and any(column.group is Group.TERM for column in curves.columns)
@@ -200,9 +203,13 @@ class CurvesPanel(MomentPart):
         text = no_curve_text(curves.no_curve) if curves is not None and curves.no_curve else text
         self._about_terms.content, self._about_terms.visible = render("note", text=text), bool(text)
 
-    def _go_to(self, tick: int) -> None:
-        self._asked = tick
-        self._seek(tick)
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ToggleCurve(group=group, name=name):
+                self._toggle((Group(group), name))
+            case SeekOnCurve(step=step):
+                self._asked = step
+                self._seek(step)
 
 
 def entry_of(column: Column) -> Entry:

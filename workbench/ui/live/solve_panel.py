@@ -4,14 +4,30 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
 
+import msgspec
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.run import UseControlMode
+from workbench.commands.solve import (
+    LONGEST_HORIZON,
+    ChooseMethod,
+    ChoosePlannedEnvs,
+    FollowBody,
+    LookAtRollout,
+    SaveSolved,
+    SetHorizon,
+    SetNoise,
+    SetPlanEvery,
+    SetRollouts,
+    SetTemperature,
+    ShowRollouts,
+)
 from workbench.machine.text import number_text, rate_text
-from workbench.planning.options import Method, PlanOptions
+from workbench.planning.options import PlanOptions
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.session import Session
 from workbench.session.live.solver import SolveView
@@ -19,28 +35,26 @@ from workbench.session.live.view import SessionView
 from workbench.session.protocol.questions import PlannedEnv
 from workbench.ui.scene.rollout_traces import RolloutTraces
 from workbench.ui.widgets.editor import LinkTo, no_links
-from workbench.ui.widgets.inputs import Control, tell_all
+from workbench.ui.widgets.fields import choice, slider, tick
 from workbench.ui.widgets.line_chart import ChartLine, LineChart, part_round
+from workbench.ui.widgets.notices import tell_all
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import Tool, tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs, in turn"
-METHODS: dict[str, Method] = {
-    "MPPI": "mppi",
-    "predictive sampling": "predictive",
-    "CEM": "cem",
-}
+PLANNED_ENVS = {THIS_ENV: "selected", ALL_ENVS: "all"}
+METHODS = {"MPPI": "mppi", "predictive sampling": "predictive", "CEM": "cem"}
 SAVE_SOLVED = "Save the solved episode"
 TOOL = "the robot's tool"
 BETTER_MODE = "pd_ee_delta_pose"
 USE_MODE = "Plan in end-effector control (resets the envs)"
-MOST_ROLLOUTS, LONGEST_HORIZON = 256, 3.0
+USE_MODE_HINT = "Makes the envs anew with this control mode, in which plans are found soonest"
 MOST_TOLD = 4
 """Solved envs that are named."""
 CHART_HEIGHT = 150
 PREDICTED, ACHIEVED = "#228be6", "#f08c00"
-SETTLE = 0.5
-"""Seconds: other rollouts are other envs, which are not built for each place of a slider that is passed."""
 
 
 class SolvePanel(PagePart[SessionView]):
@@ -52,118 +66,157 @@ class SolvePanel(PagePart[SessionView]):
         link: Links the lines of the author's files.
     """
 
+    does = (
+        SaveSolved,
+        ChoosePlannedEnvs,
+        ChooseMethod,
+        SetRollouts,
+        SetHorizon,
+        SetNoise,
+        SetTemperature,
+        SetPlanEvery,
+        ShowRollouts,
+        FollowBody,
+        LookAtRollout,
+    )
+
     def __init__(self, server: viser.ViserServer, session: Session, link: LinkTo = no_links) -> None:
         self._server, self._session, self._link = server, session, link
         gui = server.gui
         self._traces = RolloutTraces(server)
         self._told: tuple[tuple[int, int], ...] = ()
+        self._shows_rollouts = True
+        self._place = 0
+        """Of the rollout that is looked at, among those that are drawn."""
         self._folder = gui.add_folder("Solve", visible=False)
         with self._folder:
             self._status = gui.add_html("")
-            self._save = gui.add_button(
-                SAVE_SOLVED,
-                icon=viser.Icon.DEVICE_FLOPPY,
-                visible=False,
-                hint="Into the recordings, like any other episode: from there it can be exported as a demonstration",
-            )
-            self._saving = gui.add_html("", visible=False)
-            self._mode = gui.add_button(
-                USE_MODE,
-                color="gray",
-                visible=False,
-                hint="Makes the envs anew with this control mode, in which plans are found soonest",
-            )
-            self._envs = Control(
-                gui.add_dropdown("Plan for", (THIS_ENV, ALL_ENVS), hint="The others hold still."),
-                send=lambda which: session.change(solve_all=which == ALL_ENVS),
-                shown=lambda every: ALL_ENVS if every else THIS_ENV,
-            )
-            self._method = Control(
-                gui.add_dropdown(
-                    "Method",
-                    tuple(METHODS),
-                    hint="What becomes the plan. MPPI: the mean of all rollouts, weighted by what they earned. Predictive "
-                    "sampling: the best one. CEM: the mean of the best tenth.",
-                ),
-                read=lambda name: METHODS[name],
-                send=lambda method: self._plan_with(method=method),
-                shown=lambda method: next(name for name, known in METHODS.items() if known == method),
-            )
-            self._rollouts = self._slider(
-                "Rollouts",
-                "rollouts",
-                8,
-                MOST_ROLLOUTS,
-                8,
-                "Candidates that are tried at a time, each in its env.",
-            )
-            self._horizon = self._slider(
-                "Horizon", "horizon", 0.1, LONGEST_HORIZON, 0.05, "Seconds that a plan looks ahead."
-            )
-            self._noise = self._slider(
-                "Noise",
-                "noise",
-                0.05,
-                2.0,
-                0.05,
-                "Of candidates around the plan, of half the range of each action.",
-            )
-            self._temperature = self._slider(
-                "Temperature", "temperature", 0.01, 2.0, 0.01, "The lower, the more the best rollouts count."
-            )
-            self._every = self._slider(
-                "Plan every", "every", 1, 10, 1, "Control steps that are taken before the next plan."
-            )
-            self._shows = gui.add_checkbox(
-                "Show rollouts",
-                True,
-                hint="What was tried, as lines in the 3-D view: each is the way that a body takes in one rollout. The best is "
-                "bright.",
-            )
-            add_dropdown: Any = gui.add_dropdown  # viser infers the type of the options from the first
-            self._traced = Control(
-                add_dropdown(
-                    "Lines follow", (TOOL,), hint="The body whose ways are drawn, from the next plan on."
-                ),
-                send=lambda name: session.change(traced="" if name == TOOL else name),
-            )
-            self._look_at = gui.add_slider(
-                "Look at",
-                min=1,
-                max=2,
-                step=1,
-                initial_value=1,
-                visible=False,
-                hint="A rollout of the last plan, from the best to the worst.",
-            )
-            self._looked_at = gui.add_html("", visible=False)
+            self._save = gui.add_html("")
+            self._saving = gui.add_html("")
+            self._mode = gui.add_html("")
+            self._build_settings()
+            self._build_rollouts()
             self._chart = LineChart(server, self._folder, CHART_HEIGHT)
-        self._save.on_click(lambda _: self._save_solved())
-        self._mode.on_click(lambda _: self._use_mode())
 
-    def _slider(
-        self, label: str, name: str, low: float, high: float, step: float, hint: str
-    ) -> Control[Any, float]:
-        return Control(
-            self._server.gui.add_slider(label, min=low, max=high, step=step, initial_value=low, hint=hint),
-            send=lambda value: self._plan_with(**{name: value}),
-            settle=SETTLE,
+    def _build_settings(self) -> None:
+        server = self._server
+        self._envs = choice(
+            server,
+            "Plan for",
+            ChoosePlannedEnvs,
+            "envs",
+            PLANNED_ENVS,
+            "selected",
+            hint="The others hold still.",
         )
+        self._method = choice(
+            server,
+            "Method",
+            ChooseMethod,
+            "method",
+            METHODS,
+            "mppi",
+            hint="What becomes the plan. MPPI: the mean of all rollouts, weighted by what they earned. Predictive "
+            "sampling: the best one. CEM: the mean of the best tenth.",
+        )
+        self._rollouts = slider(
+            server,
+            "Rollouts",
+            SetRollouts,
+            "rollouts",
+            step=8,
+            hint="Candidates that are tried at a time, each in its env.",
+        )
+        self._horizon = slider(
+            server,
+            "Horizon",
+            SetHorizon,
+            "horizon",
+            step=0.05,
+            hint="Seconds that a plan looks ahead.",
+        )
+        self._noise = slider(
+            server,
+            "Noise",
+            SetNoise,
+            "noise",
+            step=0.05,
+            hint="Of candidates around the plan, of half the range of each action.",
+        )
+        self._temperature = slider(
+            server,
+            "Temperature",
+            SetTemperature,
+            "temperature",
+            step=0.01,
+            hint="The lower, the more the best rollouts count.",
+        )
+        self._every = slider(
+            server,
+            "Plan every",
+            SetPlanEvery,
+            "every",
+            hint="Control steps that are taken before the next plan.",
+        )
+
+    def _build_rollouts(self) -> None:
+        server = self._server
+        self._shows = tick(
+            server,
+            "Show rollouts",
+            ShowRollouts,
+            "on",
+            True,
+            hint="What was tried, as lines in the 3-D view: each is the way that a body takes in one rollout. The best is "
+            "bright.",
+        )
+        self._traced = choice(
+            server,
+            "Lines follow",
+            FollowBody,
+            "body",
+            {TOOL: ""},
+            "",
+            hint="The body whose ways are drawn, from the next plan on.",
+        )
+        self._look_at = slider(
+            server,
+            "Look at",
+            LookAtRollout,
+            "number",
+            (1, 2),
+            hint="A rollout of the last plan, from the best to the worst.",
+        )
+        self._look_at.visible = False
+        self._looked_at = server.gui.add_html("", visible=False)
 
     # --- what a person does ----------------------------------------------------------------------
 
-    def _plan_with(self, **changes: Any) -> None:
-        self._session.change(plan=replace(self._session.view().settings.plan, **changes))
-
-    def _save_solved(self) -> None:
-        # At once: the episode is in the history, and it may take a second until its first moment is saved.
-        self._save.disabled, self._saving.visible = True, True
-        self._saving.content = render("note", text="saving")
+    def do(self, command: Command, visitor: Visitor) -> None:
         view = self._session.view()
-        self._session.save_past(tuple(env for env, _ in view.solve.solved) or (view.selected_env,))
-
-    def _use_mode(self) -> None:
-        self._session.versions.use_control_mode(BETTER_MODE)
+        match command:
+            case SaveSolved():
+                if view.recording.saving.progress is not None:
+                    raise Refused("An episode is being saved.")
+                if not view.solve.solved:
+                    raise Refused("No episode is solved.")
+                self._session.save_past(tuple(env for env, _ in view.solve.solved))
+            case ChoosePlannedEnvs(envs=envs):
+                self._session.change(solve_all=envs == "all")
+            case (
+                ChooseMethod() | SetRollouts() | SetHorizon() | SetNoise() | SetTemperature() | SetPlanEvery()
+            ):
+                self._session.change(plan=replace(view.settings.plan, **msgspec.structs.asdict(command)))
+            case ShowRollouts(on=on):
+                self._shows_rollouts = on
+            case FollowBody(body=body):
+                if body and body not in movable_bodies(view):
+                    raise Refused("There is no such body that moves.")
+                self._session.change(traced=body)
+            case LookAtRollout(number=number):
+                if view.solve.plan is None or number > len(view.solve.plan.drawn):
+                    raise Refused("There is no such rollout.")
+                self._place = number - 1
 
     # --- drawing ---------------------------------------------------------------------------------
 
@@ -176,23 +229,22 @@ class SolvePanel(PagePart[SessionView]):
             self._told = solve.solved
             return
         plan = view.settings.plan
-        saving = view.recording.saving
         self._status.content = solve_html(solve, self._session.env_rows(), view.selected_env, self._link)
-        self._save.visible = bool(solve.solved) and not view.playing
-        self._save.disabled = saving.progress is not None
-        self._saving.visible = self._save.visible and (self._save.disabled or bool(saving.message))
-        self._saving.content = render("saving", saving=saving)
-        self._mode.visible = offers_better_mode(view)
-        self._envs.handle.visible = task.num_envs > 1
-        self._envs.show(view.settings.solve_all)
+        self._draw_saving(view)
+        better = Tool(USE_MODE, UseControlMode(mode=BETTER_MODE), USE_MODE_HINT)
+        self._mode.content = tools_html([better] if offers_better_mode(view) else [])
+        self._envs.visible = task.num_envs > 1
+        self._envs.show("all" if view.settings.solve_all else "selected")
         self._method.show(plan.method)
         self._rollouts.show(plan.rollouts)
         has_success = view.step is None or "success" in view.step.evaluate
-        self._horizon.show(min(horizon_seconds(plan, task.control_dt, has_success), LONGEST_HORIZON))
+        seconds = horizon_seconds(plan, task.control_dt, has_success)
+        self._horizon.show(round(min(seconds, LONGEST_HORIZON), 2))
         self._noise.show(plan.noise)
         self._temperature.show(plan.temperature)
-        self._temperature.handle.visible = plan.method == "mppi"
+        self._temperature.visible = plan.method == "mppi"
         self._every.show(plan.every)
+        self._shows.show(self._shows_rollouts)
         self._draw_traced(view)
         self._draw_looked_at(view)
         self._draw_chart(solve)
@@ -205,32 +257,38 @@ class SolvePanel(PagePart[SessionView]):
             offset: (3,) of the selected env on the grid.
         """
         plan = view.solve.plan
-        there = view.settings.action_source == "solve" and self._shows.value and view.timeline.shown is None
-        chosen = 0 if view.playing else int(self._look_at.value) - 1
-        self._traces.draw(plan.paths if plan is not None and there else None, offset, chosen)
+        there = (
+            view.settings.action_source == "solve" and self._shows_rollouts and view.timeline.shown is None
+        )
+        if plan is None or not there:
+            self._traces.draw(None, offset, 0)
+        else:
+            self._traces.draw(plan.paths, offset, 0 if view.playing else self._place_in(plan))
+
+    def _place_in(self, plan: PlannedEnv) -> int:
+        """The best one where this plan has fewer."""
+        return self._place if self._place < len(plan.drawn) else 0
+
+    def _draw_saving(self, view: SessionView) -> None:
+        saving = view.recording.saving
+        offered = bool(view.solve.solved) and not view.playing
+        save = tool(SAVE_SOLVED, SaveSolved(), off=saving.progress is not None, tone="main")
+        self._save.content = tools_html([save] if offered else [])
+        self._saving.content = render("saving", saving=saving) if offered else ""
 
     def _draw_traced(self, view: SessionView) -> None:
-        assert view.task is not None
-        geometry, handle = view.task.geometry, self._traced.handle
-        movable = (
-            name
-            for name, kind in zip(geometry.body_names, geometry.body_kinds, strict=True)
-            if kind in ("link", "dynamic")
-        )
-        options = (TOOL, *movable)
-        if handle.options != options:
-            handle.options = options
-        self._traced.show(view.settings.traced if view.settings.traced in options else TOOL)
+        options = {TOOL: "", **{name: name for name in movable_bodies(view)}}
+        traced = view.settings.traced
+        self._traced.show(traced if traced in options.values() else "", options=options)
 
     def _draw_looked_at(self, view: SessionView) -> None:
         plan = view.solve.plan
-        looks = plan is not None and len(plan.drawn) > 1 and not view.playing and self._shows.value
+        looks = plan is not None and len(plan.drawn) > 1 and not view.playing and self._shows_rollouts
         self._look_at.visible = self._looked_at.visible = looks
         if looks and plan is not None:
-            self._look_at.max = len(plan.drawn)
-            if self._look_at.value > len(plan.drawn):
-                self._look_at.value = 1
-            self._looked_at.content = render("note", text=in_words(plan, int(self._look_at.value) - 1))
+            place = self._place_in(plan)
+            self._look_at.show(place + 1, bounds=(1, len(plan.drawn)))
+            self._looked_at.content = render("note", text=in_words(plan, place))
 
     def _draw_chart(self, solve: SolveView) -> None:
         there = part_round(len(solve.predicted), None)
@@ -255,6 +313,15 @@ class SolvePanel(PagePart[SessionView]):
 def horizon_seconds(plan: PlanOptions, control_dt: float, has_success: bool = True) -> float:
     """The horizon that a plan has, the usual one too."""
     return plan.steps(control_dt, has_success) * control_dt
+
+
+def movable_bodies(view: SessionView) -> list[str]:
+    """Names of the bodies that can have a way."""
+    if view.task is None:
+        return []
+    geometry = view.task.geometry
+    kinds = zip(geometry.body_names, geometry.body_kinds, strict=True)
+    return [name for name, kind in kinds if kind in ("link", "dynamic")]
 
 
 def offers_better_mode(view: SessionView) -> bool:

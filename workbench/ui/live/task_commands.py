@@ -1,4 +1,4 @@
-"""Commands of the palette that the open task has: its envs, cameras and control modes by name."""
+"""Entries of the palette that the open task has: its envs, cameras and control modes by name."""
 
 from __future__ import annotations
 
@@ -6,22 +6,34 @@ import json
 
 import viser
 
+from workbench.commands.cameras import SelectCamera
+from workbench.commands.command import Command
+from workbench.commands.envs import SelectEnv
+from workbench.commands.run import UseControlMode
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.widgets.hotkeys import Command, add
+from workbench.ui.widgets.hotkeys import add
 from workbench.ui.widgets.parts import PagePart
+from workbench.ui.widgets.visitors import Visitor, Visitors
 
 MAX_ENVS = 256
-"""Envs that are commands; more would make every page wait for them."""
+"""Envs that are entries; more would make every page wait for them."""
 STUDIO = "Studio"
 
 
 class TaskCommands(PagePart[SessionView]):
     """Make it in no container, after the commands of the page: the palette lists them in the order of making."""
 
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._server, self._session = server, session
+    does = (UseControlMode,)
+
+    def __init__(self, server: viser.ViserServer, visitors: Visitors, session: Session) -> None:
+        self._server, self._visitors, self._session = server, visitors, session
         self._handles: list[viser.CommandHandle] = []
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case UseControlMode(mode=mode):
+                self._session.versions.use_control_mode(mode)
 
     def key(self, view: SessionView) -> object:
         if view.task is None:
@@ -36,34 +48,32 @@ class TaskCommands(PagePart[SessionView]):
     def draw(self, view: SessionView) -> None:
         for handle in self._handles:
             handle.remove()
-        self._handles = [add(self._server, command) for command in self._commands(view)]
+        self._handles = [
+            add(self._server, self._visitors, label, command, about)
+            for label, command, about in _entries(view)
+        ]
 
-    def _commands(self, view: SessionView) -> list[Command]:
-        task = view.task
-        if task is None:
-            return []
-        envs = [
-            Command(f"Env {env}", lambda env=env: self._session.change(selected_env=env))
-            for env in range(min(task.num_envs, MAX_ENVS))
-        ]
-        cameras = [
-            Command(
-                f"Camera {camera.name}",
-                lambda key=camera.key: self._session.studio.select(key),
-                about=f"in {STUDIO}",
-                tab=STUDIO,
-            )
-            for camera in task.cameras
-        ]
-        modes = [
-            Command(
+
+def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
+    """Label, command, and what is below the label."""
+    task = view.task
+    if task is None:
+        return []
+    return [
+        *((f"Env {env}", SelectEnv(env=env), "") for env in range(min(task.num_envs, MAX_ENVS))),
+        *(
+            (f"Camera {one.name}", SelectCamera(kind=one.kind, name=one.name), f"in {STUDIO}")
+            for one in task.cameras
+        ),
+        *(
+            (
                 f"Control mode {mode}",
-                lambda mode=mode: self._session.versions.use_control_mode(mode),
-                about="in effect" if mode == task.control_mode else "makes the envs again",
+                UseControlMode(mode=mode),
+                "in effect" if mode == task.control_mode else "makes the envs again",
             )
             for mode in _modes(view)
-        ]
-        return [*envs, *cameras, *modes]
+        ),
+    ]
 
 
 def _modes(view: SessionView) -> list[str]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Sequence
-from functools import partial
+from collections.abc import Collection, Sequence
 from itertools import groupby
 from typing import Any, Protocol, TypeVar
 
@@ -13,18 +12,31 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.command import Command
+from workbench.commands.timeline import (
+    ContinueFromHere,
+    GoToFirst,
+    GoToLast,
+    NextEvent,
+    PreviousEvent,
+    Seek,
+    SeekBack,
+    StepBack,
+    StepForward,
+    UndoReset,
+    ZoomTimeline,
+)
 from workbench.machine.text import number_text
 from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.live.session import Session
-from workbench.session.live.timeline import Scope, Strip, TimelineView
+from workbench.session.live.timeline import Strip, TimelineView
 from workbench.session.live.view import SessionView
 from workbench.ui.live.moment import MomentPart
-from workbench.ui.server.control_values import name_control
-from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.hotkeys import Command
-from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.fields import slider
 from workbench.ui.widgets.parts import Clock, PagePart
 from workbench.ui.widgets.templates import counted, render
+from workbench.ui.widgets.tools import Tool, tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 GAP = 12
 """Pixels between floating panels and the view's edges; the same in ``view_width.js``."""
@@ -37,11 +49,9 @@ STANDS_STILL = 0.35
 """Seconds at one moment until its pictures are drawn; with less, every drag would draw some."""
 LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
 EPISODE, EVERYTHING = "this episode", "all episodes"
-SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
 GO_ON = "Continue from here"
 UNDO = "undo"
 """Start of the undo button's label; what is undone follows."""
-WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE, EPISODE)
 View = TypeVar("View", contravariant=True)
 
 
@@ -59,83 +69,63 @@ class TimeBar(PagePart[View]):
     Args:
         seeks: What slider, buttons and arrow keys move.
         name: Of the slider.
-        does: Actions of further buttons, by the start of their label.
+        kind: The command that the slider's value goes into, in its field `field`.
     """
 
+    does: tuple[type[Command], ...] = (
+        StepBack,
+        StepForward,
+        PreviousEvent,
+        NextEvent,
+        Seek,
+        GoToFirst,
+        GoToLast,
+    )
+
     def __init__(
-        self,
-        server: viser.ViserServer,
-        seeks: Seeks,
-        name: str,
-        does: dict[str, Callable[[], None]],
-        clock: Clock,
+        self, server: viser.ViserServer, seeks: Seeks, name: str, kind: type[Command], field: str
     ) -> None:
         self._seeks = seeks
-        steps = {LAST_STEP: -1, NEXT_STEP: 1}
-        events = {LAST_EVENT: -1, NEXT_EVENT: 1}
-        self._does = {
-            **{label: partial(seeks.seek_by, by) for label, by in steps.items()},
-            **{label: partial(seeks.seek_event, by) for label, by in events.items()},
-            **does,
-        }
         gui = server.gui
         self._panel = gui.add_panel(visible=False, order=10.0)
         with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
-            self._slider: Control[viser.GuiSliderHandle[int], int] = Control(
-                gui.add_slider("", min=-1, max=0, step=1, initial_value=0), self._on_slider, clock=clock
-            )
-            name_control(self._slider.handle, name)
+            self._slider = slider(server, name, kind, field, (-1, 0))
             self._strip = gui.add_html("")
             self._add_rows(gui)
-            self._walk: viser.GuiButtonGroupHandle = gui.add_button_group("", tuple(self._does))
-            name_control(self._walk, "step to take")
-            self._pick = Presses(server).number_id("place on the strip", self._on_pick)
-            """Id of the input that gets what of the strip is pressed, counted from its left end."""
-        self._walk.on_click(lambda event: self._on_walk(event.target.value))
+            self._walk = gui.add_html("")
         # Across the bottom of the view: viser docks panels at the sides only.
         self._panel.float(x=GAP, y=-GAP, width=WIDEST)
-        self._shown: int | None = None
         self._folded = False
-        self._before_slider: int | None = None
-        """The place that was shown before the slider was last moved."""
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
         """Add rows between the strip and the buttons."""
 
-    def commands(self) -> list[Command]:
-        """Commands of the arrow keys."""
-        return [
-            Command("One step back", lambda: self._step_by(-1), "arrowleft", buttons=(LAST_STEP,)),
-            Command("One step forward", lambda: self._step_by(1), "arrowright", buttons=(NEXT_STEP,)),
-            Command("Previous event", lambda: self._to_event(-1), "arrowleft", "shift", (LAST_EVENT,)),
-            Command("Next event", lambda: self._to_event(1), "arrowright", "shift", (NEXT_EVENT,)),
-        ]
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case StepBack():
+                self._seeks.seek_by(-1)
+            case StepForward():
+                self._seeks.seek_by(1)
+            case PreviousEvent():
+                self._seeks.seek_event(-1)
+            case NextEvent():
+                self._seeks.seek_event(1)
+            case Seek(step=step):
+                self._seek(step)
+            case GoToFirst():
+                self._to_first()
+            case GoToLast():
+                self._to_last()
 
-    def _step_by(self, steps: int) -> None:
-        """An arrow key."""
-        if not Control.took_the_key():
-            self._seeks.seek_by(steps)
+    def _seek(self, step: int) -> None:
+        """Show the moment after this control step."""
+        self._seeks.seek(step)
 
-    def _to_event(self, direction: int) -> None:
-        """An arrow key with shift; undoes the move of a slider that has the focus."""
-        if Control.took_the_key():
-            self._seeks.seek(self._before_slider)
-        self._seeks.seek_event(direction)
-
-    def _on_slider(self, value: int) -> None:
-        self._before_slider = self._shown
-        self._seek(value)
-
-    def _seek(self, value: int) -> None:
-        """Show what lies at this value of the slider."""
-        self._seeks.seek(value)
-
-    def _on_pick(self, offset: int) -> None:
-        """The strip was pressed, so far from its left end."""
+    def _to_first(self) -> None:
         raise NotImplementedError
 
-    def _on_walk(self, name: str) -> None:
-        next(does for label, does in self._does.items() if name.startswith(label))()
+    def _to_last(self) -> None:
+        raise NotImplementedError
 
     def fold(self, wanted: bool) -> None:
         """Fold it to a bar, where it would cover what is looked at, or unfold what this has folded."""
@@ -143,15 +133,13 @@ class TimeBar(PagePart[View]):
             self._folded = wanted
             (self._panel.minimize if wanted else self._panel.expand)()
 
-    def _draw_panel(self, there: bool, shown: int | None) -> bool:
+    def _draw_panel(self, there: bool) -> bool:
         self._panel.visible = there
-        self._shown = shown
         return there
 
-    def _set_ends(self, low: int, high: int) -> None:
-        handle = self._slider.handle
-        # Never an empty range: the browser divides by it. Disabled, not hidden: the panel would grow at the first step.
-        handle.min, handle.max, handle.disabled = min(low, high - 1), high, low >= high
+    def _show_slider(self, low: int, high: int, value: int) -> None:
+        # Never an empty range. Off, not hidden: the panel would grow at the first step.
+        self._slider.show(value, bounds=(min(low, high - 1), high), off=low >= high)
 
 
 class TimelinePanel(TimeBar[SessionView], MomentPart):
@@ -160,17 +148,14 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     memory; the worker draws pictures only after a while at one moment.
     """
 
+    does = (*TimeBar.does, SeekBack, ZoomTimeline, UndoReset, ContinueFromHere)
+
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
-        zooms = {EPISODE: partial(self._zoom, True), EVERYTHING: partial(self._zoom, False)}
-        does = {LIVE: self.go_live, **zooms, UNDO: session.past.undo}
-        super().__init__(server, session.past, "step of the past", does, clock)
+        super().__init__(server, session.past, "step of the past", SeekBack, "steps")
         self._session, self._clock = session, clock
-        self._travel.on_click(lambda event: self._on_travel(event.target.value))
         self._episode_only = False
         self._range = (0, 0)
         """Ticks of the slider's ends."""
-        self._strip_from = 0
-        """Tick of the strip's left end, as it was drawn."""
         self._newest = 0
         """The tick that the slider shows as 0."""
         self._range_at = -math.inf
@@ -182,40 +167,41 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         # One of these two is shown, and they have the same height: a panel that grows is moved up a moment later, its
         # last row is cut off until then, and a second press on "step" would hit another button.
         self._hint = gui.add_html("")
-        self._travel = gui.add_button_group("", (GO_ON,), visible=False)
-        name_control(self._travel, "way to continue")
+        self._travel = gui.add_html("", visible=False)
 
-    # --- buttons and keys --------------------------------------------------------------------------
+    # --- what a person does ------------------------------------------------------------------------
 
-    def go_live(self) -> None:
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case SeekBack(steps=steps):
+                self._seek_back(steps)
+            case ZoomTimeline(episode_only=wanted):
+                self._episode_only, self._range_at = wanted, -math.inf
+            case UndoReset():
+                self._session.past.undo()
+            case ContinueFromHere(scope=scope):
+                self._session.past.continue_from_shown(scope)
+            case _:
+                super().do(command, visitor)
+
+    def _to_last(self) -> None:
         self._session.past.seek(None)
 
-    def go_to_the_first(self) -> None:
+    def _to_first(self) -> None:
         """Go to the left end of the slider, where a slider with the focus goes too."""
         if self._episode_only:
             self._session.past.seek_tick(self._range[0], in_episode=True)
         else:
             self._session.past.seek(0)
 
-    def continue_from_shown(self) -> None:
-        self._session.past.continue_from_shown("this")
-
-    def _seek(self, value: int) -> None:
-        if value == 0:
+    def _seek_back(self, steps: int) -> None:
+        if steps == 0:
             self._session.past.seek(None)
         else:
-            self._session.past.seek_tick(self._newest + value, self._episode_only)
+            self._seek(self._newest + steps)
 
-    def _on_pick(self, offset: int) -> None:
-        self._session.past.seek_tick(self._strip_from + offset, self._episode_only)
-
-    def _zoom(self, episode_only: bool) -> None:
-        self._episode_only, self._range_at = episode_only, -math.inf
-
-    def _on_travel(self, name: str) -> None:
-        for scope, label in zip(SCOPES, self._travel.options, strict=False):
-            if label == name:
-                self._session.past.continue_from_shown(scope)
+    def _seek(self, step: int) -> None:
+        self._session.past.seek_tick(step, self._episode_only)
 
     # --- drawing -----------------------------------------------------------------------------------
 
@@ -224,7 +210,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
 
     def draw(self, view: SessionView) -> None:
         there = view.task is not None and view.timeline.moments > 0
-        if self._draw_panel(there, view.timeline.shown):
+        if self._draw_panel(there):
             self._draw_slider(view)
             self._draw_buttons(view)
             self._draw_strip(view)
@@ -238,17 +224,26 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             episode = self._session.past.episode() if self._episode_only else None
             self._range = (past.first_tick, past.last_tick) if episode is None else episode
             self._newest = past.last_tick
-            self._set_ends(*(tick - self._newest for tick in self._range))
-        self._slider.show(0 if past.shown is None else past.tick - self._newest)
+        low, high = (tick - self._newest for tick in self._range)
+        self._show_slider(low, high, 0 if past.shown is None else past.tick - self._newest)
 
     def _draw_buttons(self, view: SessionView) -> None:
         past = view.timeline
-        # viser's buttons of a group cannot be disabled, so those that would do nothing are left out.
-        undo = () if past.undo is None else (f"{UNDO} {past.undo}",)
-        self._walk.options = (*WALK[:-1], EVERYTHING if self._episode_only else EPISODE, *undo)
-        travel = continue_labels(view) if past.can_continue else ()
+        zoom = (
+            (EVERYTHING, ZoomTimeline(episode_only=False))
+            if self._episode_only
+            else (EPISODE, ZoomTimeline(episode_only=True))
+        )
+        walk = [
+            *walk_tools(),
+            tool(LIVE, GoToLast(), off=past.shown is None),
+            Tool(zoom[0], zoom[1], zoom[1].help()),
+            tool(f"{UNDO} {past.undo or ''}".strip(), UndoReset(), off=past.undo is None),
+        ]
+        self._walk.content = tools_html(walk)
+        travel = continue_tools(view) if past.can_continue else []
         if travel:
-            self._travel.options = travel
+            self._travel.content = tools_html(travel)
         not_carried = "; ".join(past.not_carried)
         hint = render("timeline_hint", live=past.shown is None, not_carried=not_carried, arrived=past.arrived)
         self._hint.content = hint
@@ -263,8 +258,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         low, high = self._range
         strip = self._session.past.strip(low, high)
         if strip is not None:
-            self._strip_from = strip.low
-            self._strip.content = strip_html(strip, view, self._pick)
+            self._strip.content = strip_html(strip, view)
 
     def _ask_for_pictures(self, view: SessionView) -> None:
         at = (view.timeline.shown, view.selected_env)
@@ -274,12 +268,29 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             self._session.past.draw()
 
 
-def continue_labels(view: SessionView) -> tuple[str, ...]:
-    """Labels of the go-on buttons, in the order of `SCOPES`."""
+def walk_tools() -> list[Tool]:
+    """One step or event back or forward."""
+    kinds = {
+        LAST_EVENT: PreviousEvent(),
+        LAST_STEP: StepBack(),
+        NEXT_STEP: StepForward(),
+        NEXT_EVENT: NextEvent(),
+    }
+    return [tool(name, command) for name, command in kinds.items()]
+
+
+def continue_tools(view: SessionView) -> list[Tool]:
+    """The go-on buttons."""
     if view.task is None or view.task.num_envs == 1:
-        return (GO_ON,)
+        return [tool(GO_ON, ContinueFromHere())]
     env = f"env {view.selected_env}"
-    return (f"{GO_ON}: {env}", "all envs", f"{env} into all envs")
+    return [
+        tool(f"{GO_ON}: {env}", ContinueFromHere()),
+        Tool("all envs", ContinueFromHere(scope="all"), "Each from its own moment"),
+        Tool(
+            f"{env} into all envs", ContinueFromHere(scope="into all"), "All envs from the moment of this one"
+        ),
+    ]
 
 
 POINTS = 240
@@ -348,12 +359,8 @@ def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
     return [(tick, FLAGS[flag], name) for tick, flag, name in marks.values()]
 
 
-def strip_html(strip: Strip, view: SessionView, pick: str = "") -> str:
-    """The strip of one env with its shown moment.
-
-    Args:
-        pick: id of the input that gets the tick of a press.
-    """
+def strip_html(strip: Strip, view: SessionView) -> str:
+    """The strip of one env with its shown moment."""
     has_reward = view.task is None or view.task.reward_mode != "none"
     # ManiSkill's reward is 0 where a task has none.
     reward = strip.reward if has_reward else np.full_like(strip.reward, np.nan)
@@ -361,7 +368,7 @@ def strip_html(strip: Strip, view: SessionView, pick: str = "") -> str:
     return render(
         "timeline",
         strip=strip,
-        pick=pick,
+        seek=lambda at: Seek(step=at),
         past=view.timeline,
         marks=marks,
         ago=ago_in_words(view.timeline),

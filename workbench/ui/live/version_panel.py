@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import viser
 
 from workbench.authoring.problem import Problem
+from workbench.commands.command import Command, Refused
+from workbench.commands.run import ChooseClass, RebuildScene, ReloadCameras, ReloadCode, ReloadFile
 from workbench.session.live.session import Session
 from workbench.session.live.view import PastLoad, SessionView
-from workbench.session.protocol.messages import LoadLevel, ReloadReport
+from workbench.session.protocol.messages import ReloadReport
 from workbench.ui.widgets.editor import LinkTo, no_links
-from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.fields import by_name, choice
+from workbench.ui.widgets.hotkeys import with_key
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import Tool, tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
-AS_NEEDED, REBUILT, PATCHED, CAMERAS = (
-    "Reload",
-    "Rebuild the scene",
-    "Only reload code",
-    "Only reload cameras",
-)
-LEVELS: dict[str, LoadLevel] = {
-    AS_NEEDED: "auto",
-    REBUILT: "rebuilt",
-    PATCHED: "patched",
-    CAMERAS: "cameras",
-}
 LAST_LOADS = "Last reloads"
 MOST_SHOWN = 8
 """Items not carried over that are named; the rest is counted."""
@@ -40,27 +32,17 @@ class VersionPanel(PagePart[SessionView]):
     only the reward was patched, looks for a bug that is not there.
     """
 
+    does = (ChooseClass, RebuildScene, ReloadCode, ReloadCameras)
+
     def __init__(self, server: viser.ViserServer, session: Session, link: LinkTo = no_links) -> None:
         self._session, self._link = session, link
-        self._names: tuple[str, ...] = ("",)
-        # viser's annotations infer the option type from the first options.
-        add_dropdown: Any = server.gui.add_dropdown
         with server.gui.add_folder("Code version"):
-            self._task = Control(
-                add_dropdown("Task", self._names, visible=False, hint="The file has several tasks."),
-                send=session.versions.choose_class,
+            self._task = choice(
+                server, "Task", ChooseClass, "name", (), "", hint="The file has several tasks."
             )
+            self._task.visible = False
             self._html = server.gui.add_html("")
-            rows = (
-                ((AS_NEEDED, REBUILT), "As little as is safe; or the scene too, with the moment restored."),
-                (
-                    (PATCHED, CAMERAS),
-                    "Also where that was not found safe: old and new code may then be mixed. With the cameras, the code too.",
-                ),
-            )
-            self._again = [server.gui.add_button_group("", names, hint=hint) for names, hint in rows]
-            for row in self._again:
-                row.on_click(lambda event: self._load(event.target.value))
+            self._again = server.gui.add_html("")
             self._loads_folder = server.gui.add_folder(LAST_LOADS, expand_by_default=False, visible=False)
             with self._loads_folder:
                 self._loads = server.gui.add_html("")
@@ -79,16 +61,15 @@ class VersionPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         task = view.task
-        can_load = view.state != "stopped"
-        for row in self._again:
-            row.visible = can_load
-        if len(view.choices) > 1:
-            # Sorted, so that the order does not depend on the shown one.
-            if tuple(sorted(view.choices)) != self._names:
-                self._names = tuple(sorted(view.choices))
-                self._task.handle.options = self._names
-            self._task.show(view.choices[0])
-        self._task.handle.visible = len(view.choices) > 1
+        least = Tool("Reload", ReloadFile(), with_key(ReloadFile, "As little as is safe"))
+        again = (
+            [least, tool("Rebuild the scene", RebuildScene())],
+            [tool("Only reload code", ReloadCode()), tool("Only reload cameras", ReloadCameras())],
+        )
+        self._again.content = tools_html(*again if view.state != "stopped" else ())
+        self._task.visible = len(view.choices) > 1
+        # Sorted, so that the order does not depend on the shown one.
+        self._task.show(next(iter(view.choices), ""), options=by_name(sorted(view.choices)))
         notices = () if task is None else task.notices
         refused = view.refused if view.state not in ("starting", "loading") else None
         self._html.content = version_html(
@@ -103,8 +84,19 @@ class VersionPanel(PagePart[SessionView]):
         self._loads_folder.visible = len(view.loads) > 1
         self._loads.content = loads_html(view.loads, self._link)
 
-    def _load(self, value: str) -> None:
-        self._session.versions.reload(LEVELS[value])
+    def do(self, command: Command, visitor: Visitor) -> None:
+        versions = self._session.versions
+        match command:
+            case ChooseClass(name=name):
+                if name not in self._session.view().choices:
+                    raise Refused("The file has no such task.")
+                versions.choose_class(name)
+            case RebuildScene():
+                versions.reload("rebuilt")
+            case ReloadCode():
+                versions.reload("patched")
+            case ReloadCameras():
+                versions.reload("cameras")
 
 
 def version_html(

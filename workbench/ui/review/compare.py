@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import viser
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.review import ChooseTolerance, CompareWith, SwapWithFirst
+from workbench.commands.timeline import Seek
 from workbench.machine.text import length
 from workbench.recording.episode.episode import NO_SEED
 from workbench.session.history.curves import PREFIX
@@ -16,9 +19,11 @@ from workbench.session.review.compare import (
 )
 from workbench.session.review.review import Review
 from workbench.session.review.view import Opened, ReviewView
-from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.fields import choice
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import letter, render
+from workbench.ui.widgets.tools import Tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 TOLERANCE_NAMES = {length(way): way for way in TOLERANCES}
 MOST_ROWS = 30
@@ -27,61 +32,50 @@ MOST_ROWS = 30
 class ReviewComparePanel(PagePart[ReviewView]):
     """Compares the first recording with another; a row goes to the first state at which its entry differs."""
 
+    does = (CompareWith, SwapWithFirst, ChooseTolerance)
+
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
-        gui = server.gui
-        self._other: viser.GuiDropdownHandle = gui.add_dropdown(
-            "A against", ("B",), initial_value="B", visible=False
-        )
-        self._swap = gui.add_button(
-            "Swap",
-            icon=viser.Icon.ARROWS_EXCHANGE,
-            color="gray",
-            visible=False,
-            hint="Makes the other recording A",
-        )
-        self._swap.on_click(lambda _: self._change_places())
-        self._tolerance = gui.add_dropdown(
+        self._wish, self._metres = 1, USUAL_TOLERANCE
+        """The recording that was chosen last, kept while fewer are open, and the tolerance."""
+        self._other = choice(server, "A against", CompareWith, "index", {"B": 1}, 1)
+        self._swap = server.gui.add_html("")
+        self._tolerance = choice(
+            server,
             "Tolerance",
-            tuple(TOLERANCE_NAMES),
-            initial_value=length(USUAL_TOLERANCE),
-            visible=False,
+            ChooseTolerance,
+            "metres",
+            TOLERANCE_NAMES,
+            USUAL_TOLERANCE,
             hint="How far apart a body must be to count as different.",
         )
-        self._html = gui.add_html("")
-        self._presses = Presses(server)
+        self._html = server.gui.add_html("")
         self._differing: list[FirstDifference] = []
         """By row of the table."""
 
     def key(self, view: ReviewView) -> object:
-        return view.opened_serial, len(view.opened), view.anchors, self._other.value, self._tolerance.value
+        return view.opened_serial, len(view.opened), view.anchors, self._wish, self._metres
 
     def draw(self, view: ReviewView) -> None:
         several = len(view.opened) > 1
-        letters = tuple(letter(index) for index in range(1, len(view.opened)))
-        if several and self._other.options != letters:
-            self._other.options = letters
-        self._other.visible = len(letters) > 1
+        other = self._wish if self._wish < len(view.opened) else 1
+        self._other.visible = len(view.opened) > 2
+        self._other.show(other, options={letter(index): index for index in range(1, len(view.opened))})
         self._tolerance.visible = several
-        self._swap.visible = several
-        label = f"Swap A and {self._other.value}" if len(letters) > 1 else "Swap A and B"
-        self._swap.label = label
+        self._tolerance.show(self._metres)
+        swap = Tool(f"Swap A and {letter(other)}", SwapWithFirst(index=other), "Makes the other recording A")
+        self._swap.content = tools_html([swap] if several else [])
         if not several:
             self._html.content = render("note", text="Open two recordings to see where they diverge.")
             return
-        other = 1 + letters.index(self._other.value)
-        tolerance = TOLERANCE_NAMES[self._tolerance.value]
         a, b = view.opened[0], view.opened[other]
-        found = difference(a.episode, b.episode, (view.anchors[0], view.anchors[other]), tolerance)
+        found = difference(a.episode, b.episode, (view.anchors[0], view.anchors[other]), self._metres)
         self._html.content = self._content(a, b, other, found, view)
 
     def _content(self, a: Opened, b: Opened, other: int, found: Difference, view: ReviewView) -> str:
         differences = [*([found.bodies] if found.bodies else []), *found.numbers]
         self._differing = [p for p in differences if p.position is not None]
-        presses = [
-            self._presses.id_of(number, lambda _, number=number: self._go(number))
-            for number in range(len(self._differing[:MOST_ROWS]))
-        ]
+        presses = [Seek(step=p.position) for p in self._differing[:MOST_ROWS] if p.position is not None]
         one_sided = [f"{p.name} ({p.values})" for p in differences if p.position is None and p.values]
         return render(
             "review_compare",
@@ -102,16 +96,17 @@ class ReviewComparePanel(PagePart[ReviewView]):
             prefix=PREFIX,
         )
 
-    def _change_places(self) -> None:
-        count = len(self._review.view().opened)
-        letters = [letter(index) for index in range(count)]
-        if self._other.value in letters[1:]:
-            self._review.swap(0, letters.index(self._other.value))
-
-    def _go(self, number: int) -> None:
-        place = self._differing[number].position if number < len(self._differing) else None
-        if place is not None:
-            self._review.seek(place)
+    def do(self, command: Command, visitor: Visitor) -> None:
+        opened = len(self._review.view().opened)
+        match command:
+            case CompareWith(index=index) | SwapWithFirst(index=index) if index >= opened:
+                raise Refused("It is not open any more.")
+            case CompareWith(index=index):
+                self._wish = index
+            case SwapWithFirst(index=index):
+                self._review.swap(0, index)
+            case ChooseTolerance(metres=metres):
+                self._metres = metres
 
 
 def headline(found: Difference) -> str:

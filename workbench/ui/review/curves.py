@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +10,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.command import Command, Refused, name_of
+from workbench.commands.review import ChooseReviewCurve
+from workbench.commands.timeline import Seek
 from workbench.core.env.step_result import StepResult
 from workbench.recording.episode.episode import Episode
 from workbench.session.history.curves import spans_of
@@ -17,10 +20,11 @@ from workbench.session.review.view import ACTION, REWARD, TERMS, ReviewView, col
 from workbench.ui.live.reward import COLOURS as LINE_COLOURS
 from workbench.ui.live.reward import NumberRow, number_rows
 from workbench.ui.review.scene import shown_together
-from workbench.ui.widgets.click_targets import Presses
+from workbench.ui.widgets.fields import by_name, choice
 from workbench.ui.widgets.line_chart import ChartLine, LineChart, span_of
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import colour, letter, render
+from workbench.ui.widgets.visitors import Visitor
 
 CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
 """Heights in pixels, from the top."""
@@ -65,23 +69,11 @@ class ReviewCurves(PagePart[ReviewView]):
     """
 
     every = 0.15
+    does = (ChooseReviewCurve,)
 
-    def __init__(
-        self, server: viser.ViserServer, seek: Callable[[int], None] = lambda position: None
-    ) -> None:
-        """
-        Args:
-            seek: shows a position.
-        """
-        self._first = 0
-        """The first position of the charts."""
-        pressed = Presses(server).number_id("position of a curve", lambda offset: seek(self._first + offset))
-        self._pressed = pressed
+    def __init__(self, server: viser.ViserServer) -> None:
         folder = server.gui.add_folder(None)
-        self._entry: viser.GuiDropdownHandle = server.gui.add_dropdown(
-            "Also", ("-",), initial_value="-", visible=False
-        )
-        self._entry.on_update(lambda _: self._choose())
+        self._entry = choice(server, "Also", ChooseReviewCurve, "curve", (), "")
         self._charts = {
             name: LineChart(server, folder, height, order)
             for order, (name, height) in enumerate(CHARTS.items(), start=1)
@@ -90,7 +82,7 @@ class ReviewCurves(PagePart[ReviewView]):
         self._lines_drawn: object = None
         self._found: dict[str, dict[str, Lines]] = {}
         self._offered: dict[str, tuple[str, str]] = {}
-        """Option of the dropdown to entry and line; the line is empty where the entry has one."""
+        """What can be chosen, to entry and line; the line is empty where the entry has one."""
         self._wish = ""
         """The entry that was chosen last, kept while recordings without it are open."""
 
@@ -102,12 +94,11 @@ class ReviewCurves(PagePart[ReviewView]):
         # By id: a recording that gets its scene later stays the same recording.
         self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
         shown = shown_together(view)
-        self._first = view.first
         self._hint.visible = bool(shown)
-        self._hint.content = render("curve_hint", seek=self._pressed, first=view.first, gone=None, kept=0)
-        self._offer(view, shown)
+        self._hint.content = render("curve_hint", curve=name_of(Seek), gone=None, kept=0)
+        also = self._offer(view, shown)
         self._draw_entry("reward", REWARD, view, shown)
-        self._draw_entry("also", self._entry.value if self._entry.visible else "", view, shown)
+        self._draw_entry("also", also, view, shown)
         lines = (view.opened_serial, view.selected, view.anchors, len(view.opened))
         if lines != self._lines_drawn:
             # They do not follow the position, and a chart that is sent again is drawn again.
@@ -117,10 +108,15 @@ class ReviewCurves(PagePart[ReviewView]):
 
     # --- charts --------------------------------------------------------------------------------------
 
-    def _choose(self) -> None:
-        self._wish = self._entry.value
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseReviewCurve(curve=curve):
+                if curve not in self._offered:
+                    raise Refused("The open recordings have no such entry.")
+                self._wish = curve
 
-    def _offer(self, view: ReviewView, shown: Sequence[int]) -> None:
+    def _offer(self, view: ReviewView, shown: Sequence[int]) -> str:
+        """Which entry is chosen; empty if there is none."""
         found = [self._found[view.opened[index].id] for index in shown]
         self._offered = {
             name if len(lines) == 1 else f"{name}: {line}": (name, "" if len(lines) == 1 else line)
@@ -132,12 +128,11 @@ class ReviewCurves(PagePart[ReviewView]):
         for entries in found:
             for group in (TERMS, ACTION):
                 self._offered |= {f"{group}: {line}": (group, line) for line in entries.get(group, {})}
-        options = tuple(self._offered)
-        self._entry.visible = bool(options)
-        if options and options != self._entry.options:
-            wish = self._wish if self._wish in options else "success" if "success" in options else options[0]
-            self._entry.options = options
-            self._entry.value = wish
+        wishes = self._wish, "success", *self._offered
+        chosen = next((one for one in wishes if one in self._offered), "")
+        self._entry.visible = bool(chosen)
+        self._entry.show(chosen, options=by_name(tuple(self._offered)))
+        return chosen
 
     def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
         """One entry of all compared recordings."""

@@ -8,15 +8,32 @@ from collections.abc import Callable
 
 import viser
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.review import (
+    AlignRecordings,
+    ArrangeRecordings,
+    ChoosePlaybackSpeed,
+    CloseRecording,
+    ContinueLive,
+    LoopPlayback,
+    NextRecording,
+    OpenAgain,
+    PreviousRecording,
+    SelectRecording,
+    ToggleOverlaid,
+)
+from workbench.commands.run import TogglePlay
 from workbench.core.camera_data import moved_cameras_text
 from workbench.jobs.from_recording import ChangesOnDisk, recorded_version
 from workbench.recording.episode.episode import acted_by_text
 from workbench.session.review.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review.view import Opened, ReviewView, outcome_text
-from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.inputs import Control
+from workbench.ui.widgets.fields import by_name, choice, tick
+from workbench.ui.widgets.hotkeys import with_key
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import letter, render
+from workbench.ui.widgets.tools import Tool, tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 MOST_OF_CODE = 200_000
 """Characters of one file."""
@@ -24,6 +41,7 @@ SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 GHOSTS, GRID = "overlaid", "side by side"
 TRY_AGAIN = "Try again"
 GO_LIVE, STAY = "Continue live from here", "Stay here"
+GO_LIVE_HINT = "Restores the shown state in the live env, with the current code"
 
 
 class ReviewPanel(PagePart[ReviewView]):
@@ -37,6 +55,21 @@ class ReviewPanel(PagePart[ReviewView]):
         going: What is waited for on the way to the live env.
     """
 
+    does = (
+        TogglePlay,
+        NextRecording,
+        PreviousRecording,
+        SelectRecording,
+        CloseRecording,
+        ChoosePlaybackSpeed,
+        LoopPlayback,
+        OpenAgain,
+        ArrangeRecordings,
+        ToggleOverlaid,
+        AlignRecordings,
+        ContinueLive,
+    )
+
     def __init__(
         self,
         server: viser.ViserServer,
@@ -46,47 +79,20 @@ class ReviewPanel(PagePart[ReviewView]):
     ) -> None:
         self._review, self._on_go_live, self._going = review, on_go_live, going
         gui = server.gui
-        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, visible=False)
-        self._play.on_click(lambda _: review.toggle_play())
-        self._live = gui.add_button(
-            GO_LIVE,
-            icon=viser.Icon.PLAYER_TRACK_NEXT,
-            color="gray",
-            visible=False,
-            hint="Restores the shown state in the live env, with the current code (Shift+G).",
-        )
-        self._live.on_click(lambda _: self.enter_recording())
-        self._speed = Control(
-            gui.add_dropdown("Speed", tuple(SPEED_NAMES), initial_value="1 ×", visible=False),
-            read=lambda value: SPEED_NAMES[value],
-            send=review.set_speed,
-            shown=lambda speed: next((n for n, known in SPEED_NAMES.items() if known == speed), "1 ×"),
-        )
-        self._loop = Control(
-            gui.add_checkbox("Loop", False, visible=False),
-            send=review.set_loop,
-        )
+        self._arranged = GHOSTS
+        self._tools = gui.add_html("")
+        self._speed = choice(server, "Speed", ChoosePlaybackSpeed, "speed", SPEED_NAMES, 1.0)
+        self._loop = tick(server, "Loop", LoopPlayback, "on", False)
         self._problems = gui.add_html("")
-        self._again = gui.add_button(
-            TRY_AGAIN,
-            icon=viser.Icon.REFRESH,
-            color="gray",
-            visible=False,
-            hint="Reads once more what could not be opened: it may only have taken too long",
-        )
-        self._again.on_click(lambda _: review.open_again())
+        self._again = gui.add_html("")
         self._list = gui.add_html("")
-        self._arrange = gui.add_dropdown(
-            "Layout", (GHOSTS, GRID), initial_value=GHOSTS, visible=False, hint="The O key switches."
+        self._arrange = choice(
+            server, "Layout", ArrangeRecordings, "layout", (GHOSTS, GRID), GHOSTS, hint="The O key switches."
         )
-        align: viser.GuiDropdownHandle = gui.add_dropdown(
-            "Align at", ("start",), initial_value="start", visible=False
-        )
-        self._align = Control(align, send=review.align)
+        self._align = choice(server, "Align at", AlignRecordings, "at", ("start",), "start")
         self._unaligned_note = gui.add_html("")
         self._facts = gui.add_html("")
         self._changes = ChangesOnDisk()
-        self._presses = Presses(server)
         self._listed: object = None
         """What the list was drawn for."""
         self._facts_of: tuple[Opened, str] | None = None
@@ -95,20 +101,53 @@ class ReviewPanel(PagePart[ReviewView]):
     @property
     def ghosts(self) -> bool:
         """Whether the recordings are drawn over each other: chosen, and few enough."""
-        return self._arrange.value == GHOSTS and len(self._review.view().opened) <= MOST_COMPARED
+        return self._arranged == GHOSTS and len(self._review.view().opened) <= MOST_COMPARED
 
-    def toggle_arrangement(self) -> None:
-        self._arrange.value = GRID if self._arrange.value == GHOSTS else GHOSTS
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case TogglePlay():
+                self._review.toggle_play()
+            case NextRecording():
+                self._select_neighbour(1)
+            case PreviousRecording():
+                self._select_neighbour(-1)
+            case SelectRecording(id=id):
+                self._review.select(self._index_of(id))
+            case CloseRecording(id=id):
+                self._review.close_one(self._index_of(id))
+            case ChoosePlaybackSpeed(speed=speed):
+                self._review.set_speed(speed)
+            case LoopPlayback(on=on):
+                self._review.set_loop(on)
+            case OpenAgain():
+                self._review.open_again()
+            case ArrangeRecordings(layout=layout):
+                self._arranged = layout
+            case ToggleOverlaid():
+                self._arranged = GRID if self._arranged == GHOSTS else GHOSTS
+            case AlignRecordings(at=at):
+                try:
+                    self._review.align(at)
+                except ValueError as error:
+                    raise Refused(str(error)) from None
+            case ContinueLive():
+                self._enter_recording()
+
+    def _index_of(self, id: str) -> int:
+        for index, one in enumerate(self._review.view().opened):
+            if one.id == id:
+                return index
+        raise Refused("It is not open any more.")
 
     def lay_side_by_side(self) -> None:
-        self._arrange.value = GRID
+        self._arranged = GRID
 
-    def enter_recording(self) -> None:
+    def _enter_recording(self) -> None:
         view = self._review.view()
         if view.chosen is not None:
             self._on_go_live(view.chosen.id, view.states[view.selected])
 
-    def select_neighbour(self, step: int) -> None:
+    def _select_neighbour(self, step: int) -> None:
         """Select the next (1) or previous (-1) open recording, wrapping around."""
         view = self._review.view()
         if view.opened:
@@ -116,28 +155,26 @@ class ReviewPanel(PagePart[ReviewView]):
 
     def draw(self, view: ReviewView) -> None:
         there = bool(view.opened)
-        for handle in (self._play, self._live, self._speed.handle, self._loop.handle):
-            handle.visible = there
+        self._speed.visible = self._loop.visible = there
         live = GO_LIVE if len(view.opened) < 2 else f"{GO_LIVE} ({letter(view.selected)})"
         live = STAY if self._going() else live
-        self._live.label = live
-        label = "Pause" if view.playing else "Play"
-        self._play.label = label
-        self._play.icon = viser.Icon.PLAYER_PAUSE if view.playing else viser.Icon.PLAYER_PLAY
+        play = tool("Pause" if view.playing else "Play", TogglePlay(), tone="main")
+        go_live = Tool(live, ContinueLive(), with_key(ContinueLive, GO_LIVE_HINT))
+        self._tools.content = tools_html([play], [go_live]) if there else ""
         self._speed.show(view.speed)
         self._loop.show(view.loop)
         self._problems.content = render("review_problems", problems=view.problems, loading=view.loading)
-        self._again.visible = bool(view.not_opened) and not view.loading
+        again = bool(view.not_opened) and not view.loading
+        self._again.content = tools_html([tool(TRY_AGAIN, OpenAgain())] if again else [])
         listed = (view.opened, view.selected, bool(view.loading))
         if self._listed != listed:
             # Not at every position: with many recordings it would be most of a frame's cost.
             self._listed = listed
             self._list.content = self._list_html(view)
         self._arrange.visible = 1 < len(view.opened) <= MOST_COMPARED
-        self._align.handle.visible = len(view.opened) > 1 and len(view.alignments) > 1
-        if self._align.handle.options != view.alignments:
-            self._align.handle.options = view.alignments
-        self._align.show(view.align)
+        self._arrange.show(self._arranged)
+        self._align.visible = len(view.opened) > 1 and len(view.alignments) > 1
+        self._align.show(view.align, options=by_name(view.alignments))
         unaligned = unaligned_text(view)
         self._unaligned_note.content = render("note", text=unaligned) if unaligned else ""
         facts_of = view.chosen and (view.chosen, self._changes.of(view.chosen.episode.info))
@@ -148,13 +185,7 @@ class ReviewPanel(PagePart[ReviewView]):
     def _list_html(self, view: ReviewView) -> str:
         if not view.opened and view.loading:
             return ""
-        presses = [
-            (
-                self._presses.id_of(("select", index), lambda _, index=index: self._review.select(index)),
-                self._presses.id_of(("close", index), lambda _, index=index: self._review.close_one(index)),
-            )
-            for index in range(len(view.opened))
-        ]
+        presses = [(SelectRecording(id=one.id), CloseRecording(id=one.id)) for one in view.opened]
         return render("review_opened", view=view, presses=presses, outcome_text=outcome_text)
 
 

@@ -11,6 +11,8 @@ import numpy as np
 import viser
 
 from workbench.authoring.loading.reference import RecordedTask, named_file
+from workbench.commands.command import Command, Refused
+from workbench.commands.review import ChooseRescoreCode, RescoreOpen, RestoreRecordedStates
 from workbench.jobs.from_recording import class_in, recorded_version, reference_of
 from workbench.jobs.rescore.verdict import Verdict, by_change
 from workbench.recording.episode.episode import EpisodeInfo
@@ -21,10 +23,13 @@ from workbench.session.rescore.background import RUNNING
 from workbench.session.rescore.recordings import Rescorer
 from workbench.session.review.review import Review
 from workbench.session.review.view import ReviewView
-from workbench.ui.widgets.inputs import tell_all
+from workbench.ui.widgets.fields import by_name, choice, tick
 from workbench.ui.widgets.line_chart import part_round
+from workbench.ui.widgets.notices import tell_all
 from workbench.ui.widgets.rescored import RescoredPanel
 from workbench.ui.widgets.templates import counted, render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 TODAYS, RECORDED = "today's", "as recorded"
 MOST_NAMED = 3
@@ -113,6 +118,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         known: Further task files that the server knows.
     """
 
+    does = (*RescoredPanel.does, RescoreOpen, ChooseRescoreCode, RestoreRecordedStates)
     advice = verdict_text.PUT_IN
 
     def __init__(
@@ -128,25 +134,27 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         self._rescorer, self._review = rescorer, review
         self._library, self._choices, self._known = library, choices, known
         gui = server.gui
-        self._begin = gui.add_button("Rescore the open recordings", icon=viser.Icon.GAVEL, visible=False)
-        self._begin.on_click(lambda _: self.rescore([one.id for one in review.view().opened]))
-        self._codes = codes_for((), ())
+        self._begin = gui.add_html("")
+        self._codes = codes_for((), known())
         self._codes_of: object = None
-        labels = tuple(code.label for code in self._codes)
-        self._code: viser.GuiDropdownHandle = gui.add_dropdown(
+        self._code = choice(
+            server,
             "Code",
-            labels,
-            initial_value=RECORDED if choices.code.recorded else TODAYS,
+            ChooseRescoreCode,
+            "code",
+            [code.label for code in self._codes],
+            TODAYS,
             hint="The current code of the task, the recorded code, or a task file that is open here",
         )
-        self._code.on_update(lambda _: self._chosen())
         self._told = gui.add_html("")
-        self._states = gui.add_checkbox(
+        self._states = tick(
+            server,
             "Recorded states",
+            RestoreRecordedStates,
+            "on",
             choices.use_env_states,
             hint="Restore the recorded state after every step, so that nothing drifts",
         )
-        self._states.on_update(lambda _: self._chosen())
         self._add_status("Stop", rescorer.rescoring.stop)
         self._add_list()
         self._add_chart()
@@ -166,48 +174,64 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         files = episode_files(self._library, ids)
         self._selected = None
         self._pages.go_to(0)
+        code = self._chosen()
         self._rescorer.start(
             files,
-            file=self._choices.code.file,
-            recorded_source=self._choices.code.recorded,
+            file=code.file,
+            recorded_source=code.recorded,
             use_env_states=self._choices.use_env_states,
         )
 
-    def _chosen(self) -> None:
-        self._choices.code = next(code for code in self._codes if code.label == self._code.value)
-        self._choices.use_env_states = self._states.value
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case RescoreOpen():
+                self.rescore([one.id for one in self._review.view().opened])
+            case ChooseRescoreCode(code=label):
+                code = next((code for code in self._codes if code.label == label), None)
+                if code is None:
+                    raise Refused("This code is not among those that can be chosen.")
+                self._choices.code = code
+            case RestoreRecordedStates(on=on):
+                self._choices.use_env_states = on
+            case _:
+                super().do(command, visitor)
+
+    def _chosen(self) -> Code:
+        """What is not among the choices any more does not rescore, unseen."""
+        return next((code for code in self._codes if code == self._choices.code), self._codes[0])
 
     # --- drawing -----------------------------------------------------------------------------------
 
     def key(self, view: ReviewView) -> object:
         at = self._rescorer.rescoring.view.serial, view.opened_serial, view.selected
-        return *at, self._pages.first, self._selected, self._codes_are_of(view)
+        chosen = self._choices.code, self._choices.use_env_states
+        return *at, self._pages.first, self._selected, self._codes_are_of(view), chosen
 
     def _codes_are_of(self, view: ReviewView) -> object:
         """What the choices of code depend on."""
-        return tuple(one.id for one in view.opened), tuple(self._known()), self._choices.code
+        return tuple(one.id for one in view.opened), tuple(self._known())
 
     def draw(self, view: ReviewView) -> None:
         self._draw_codes(view)
         told = self._rescorer.rescoring.view
-        self._begin.visible = bool(view.opened) and told.state not in RUNNING
+        can_begin = bool(view.opened) and told.state not in RUNNING
+        begin = tool("Rescore the open recordings", RescoreOpen(), tone="main")
+        self._begin.content = tools_html([begin] if can_begin else [])
+        self._states.show(self._choices.use_env_states)
         self._draw_status(told, idle=IDLE)
         self._draw_list(by_change(told.verdicts))
         self._draw_curve()
 
     def _draw_codes(self, view: ReviewView) -> None:
-        if self._codes_of == (wanted := self._codes_are_of(view)):
-            return
-        self._codes_of = wanted
-        self._codes = codes_for([one.episode.info for one in view.opened], self._known())
-        # What is not among the choices any more does not rescore, unseen.
-        chosen = next((code for code in self._codes if code == self._choices.code), self._codes[0])
-        self._choices.code = chosen
-        labels = tuple(code.label for code in self._codes)
-        if self._code.options != labels:
-            self._code.options = labels
-        self._code.value = chosen.label
+        if self._codes_of != (wanted := self._codes_are_of(view)):
+            self._codes_of = wanted
+            self._codes = codes_for([one.episode.info for one in view.opened], self._known())
+        chosen = self._chosen()
+        self._code.show(chosen.label, options=by_name([code.label for code in self._codes]))
         self._told.content = render("note", text=chosen.told)
+
+    def _key_of(self, verdict: Verdict[Source]) -> str:
+        return verdict.of.id
 
     def _of_row(self, verdict: Verdict[Source]) -> dict[str, Any]:
         at = verdict.first_difference

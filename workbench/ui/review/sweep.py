@@ -14,15 +14,25 @@ from typing import Any
 
 import viser
 
+from workbench.commands.command import Command
+from workbench.commands.review import (
+    ClearSweepFilter,
+    FilterSweep,
+    OpenSweepEpisode,
+    ShowSweepPoint,
+    SortSweep,
+    TurnSweep,
+)
 from workbench.machine.processes.watched_thread import watched_thread
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import read_sweep
 from workbench.recording.sweeps import RESULTS, PointSummary, SweepEpisode, SweepResults, value_text
 from workbench.session.review.view import ReviewView
-from workbench.ui.widgets.click_targets import Paged, Presses
+from workbench.ui.widgets.paged import Paged
 from workbench.ui.widgets.parts import Clock, PagePart
 from workbench.ui.widgets.templates import render, short_text
+from workbench.ui.widgets.visitors import Visitor
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +44,7 @@ MOST_AXES = 9
 MOST_TICKS = 8
 """Labels of an axis."""
 MOST_PRESSED = 64
-"""Lines that can be pressed, each by a hidden button."""
+"""Lines that can be pressed."""
 MOST_SHOWN = 5
 """Best episodes of a point, and worst ones."""
 WIDTH, TOP, BOTTOM, SIDE = 500, 34, 196, 34
@@ -168,6 +178,7 @@ class SweepPanel(PagePart[ReviewView]):
     """
 
     every = 0.25
+    does = (ShowSweepPoint, SortSweep, FilterSweep, ClearSweepFilter, TurnSweep, OpenSweepEpisode)
 
     def __init__(
         self,
@@ -182,7 +193,6 @@ class SweepPanel(PagePart[ReviewView]):
         self._plot = server.gui.add_html("")
         self._table = server.gui.add_html("")
         self._episodes = server.gui.add_html("")
-        self._presses = Presses(server)
         self._lock = threading.RLock()
         self._results: SweepResults | None = None
         self._summaries: list[PointSummary] = []
@@ -293,9 +303,9 @@ class SweepPanel(PagePart[ReviewView]):
                     "part": round(100 * (rate or 0.0)),
                     "chosen": one.index == self._chosen,
                     "failed": not one.episodes,
-                    "press": self._press(("point", one.index), lambda one=one: self._choose(one.index))
+                    "press": ShowSweepPoint(index=one.index)
                     if kept and len(self._summaries) <= MOST_PRESSED
-                    else "",
+                    else None,
                     "about": _about(one),
                 }
             )
@@ -311,11 +321,7 @@ class SweepPanel(PagePart[ReviewView]):
                         {
                             "label": label,
                             "y": y,
-                            "press": self._press(
-                                ("only", axis.name, text), lambda a=axis.name, t=text: self._filter(a, t)
-                            )
-                            if text
-                            else "",
+                            "press": FilterSweep(name=axis.name, value=text) if text else None,
                             "on": text in self.shown.only.get(axis.name, ()) and bool(text),
                         }
                         for label, y, text in axis.ticks
@@ -328,7 +334,7 @@ class SweepPanel(PagePart[ReviewView]):
             width=WIDTH,
             top=TOP,
             bottom=BOTTOM,
-            clear=self._press("clear", self._clear) if any(self.shown.only.values()) else "",
+            clear=ClearSweepFilter() if any(self.shown.only.values()) else None,
         )
 
     def _table_html(self, results: SweepResults, kept: Sequence[PointSummary]) -> str:
@@ -352,7 +358,7 @@ class SweepPanel(PagePart[ReviewView]):
         for one in [ordered[k] for k in places]:
             rows.append(
                 {
-                    "press": self._press(("point", one.index), lambda one=one: self._choose(one.index)),
+                    "press": ShowSweepPoint(index=one.index),
                     "chosen": one.index == self._chosen,
                     "values": [value_text(one.values[name]) for name in results.names],
                     "cells": [*_result_cells(one), *(_shown(one.means.get(name)) for name in terms)],
@@ -364,12 +370,14 @@ class SweepPanel(PagePart[ReviewView]):
             {
                 "name": title,
                 "arrow": "" if column != self.shown.column else " ↓" if self.shown.descending else " ↑",
-                "press": self._press(("sort", column), lambda column=column: self._sort(column)),
+                "press": SortSweep(column=column),
                 "set": column.startswith("set "),
             }
             for column, (_, title) in columns.items()
         ]
-        return render("sweep_table", head=head, rows=rows, pages=self._pages.shown(self._press))
+        return render(
+            "sweep_table", head=head, rows=rows, pages=self._pages.shown(lambda by: TurnSweep(by=by))
+        )
 
     def _episodes_html(self, results: SweepResults, chosen: PointSummary, view: ReviewView) -> str:
         rows = [row for row in results.episodes if row.point == chosen.index]
@@ -398,9 +406,7 @@ class SweepPanel(PagePart[ReviewView]):
         # Only what the library itself has found can be opened: a path of the table names a row of it, and no file.
         id = ids.get(str(self._library.folder / row.recording)) if row.recording else None
         return {
-            "press": ""
-            if id is None
-            else self._press(("open", row.point, row.seed), lambda: self._on_open((id,))),
+            "press": None if id is None else OpenSweepEpisode(id=id),
             "opened": id is not None and id in opened,
             "seed": row.seed,
             "success": {None: "", True: f"solved at {row.solved_at}", False: "not solved"}[row.success],
@@ -410,16 +416,23 @@ class SweepPanel(PagePart[ReviewView]):
 
     # --- presses ---------------------------------------------------------------------------------------
 
-    def _press(self, key: object, do: Callable[[], None]) -> str:
-        def guarded(_client: object) -> None:
-            with self._lock:
-                do()
-                self._serial += 1
-
-        return self._presses.id_of(("sweep", key), guarded)
-
-    def _choose(self, index: int) -> None:
-        self.shown.chosen = index
+    def do(self, command: Command, visitor: Visitor) -> None:
+        with self._lock:
+            match command:
+                case ShowSweepPoint(index=index):
+                    self.shown.chosen = index
+                case SortSweep(column=column):
+                    self._sort(column)
+                case FilterSweep(name=name, value=value):
+                    self._filter(name, value)
+                case ClearSweepFilter():
+                    self.shown.only.clear()
+                    self._pages.go_to(0)
+                case TurnSweep(by=by):
+                    self._pages.turn(by)
+                case OpenSweepEpisode(id=id):
+                    self._on_open((id,))
+            self._serial += 1
 
     def _sort(self, column: str) -> None:
         same = column == self.shown.column
@@ -434,10 +447,6 @@ class SweepPanel(PagePart[ReviewView]):
         if kept and self._chosen not in kept:
             # They are the best first.
             self.shown.chosen = kept[0]
-
-    def _clear(self) -> None:
-        self.shown.only.clear()
-        self._pages.go_to(0)
 
 
 def _part(count: int | None, total: int) -> float:

@@ -10,14 +10,16 @@ from dataclasses import replace
 import numpy as np
 import viser
 
+from workbench.commands.page import TellDrawnInSoftware
 from workbench.core.scene.mesh_levels import from_afar
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import EnvLayout
 from workbench.ui.scene.pixels import NEAREST, Eye, eyes_of
-from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.parts import Clock
+from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.visitors import Visitor
 
 TOLERANCE = 0.75
 """Pixels within which 99 % of a surface stay. With 1.5 a white part comes through the black one around it."""
@@ -54,11 +56,11 @@ class InSoftware:
 
     def ask(self) -> None:
         """Let the pages tell (``drawn_in_software.js``). Call it in the main panel of each new page."""
-        Presses(self._server).when_drawn_in_software(self._told_by)
+        self._server.gui.add_html(render("tell", command=TellDrawnInSoftware(), only="drawn-in-software"))
 
-    def _told_by(self, client: viser.ClientHandle | None) -> None:
-        if client is not None:
-            self._told.add(client.client_id)
+    def told_by(self, visitor: Visitor) -> None:
+        """A page says that it draws its view in software."""
+        self._told.add(visitor.client.client_id)
 
     @property
     def all_pages(self) -> bool:

@@ -11,14 +11,20 @@ import viser
 from numpy.typing import NDArray
 from viser.transforms import SO3
 
+from workbench.commands.command import Command
+from workbench.commands.envs import ShowEnvs
+from workbench.commands.page import ChooseDetail, ChooseTheme
 from workbench.core.camera_data import Picture
 from workbench.session.live.view import SessionView
+from workbench.session.review.view import ReviewView
 from workbench.ui.scene.bodies import NAMES as BODIES
 from workbench.ui.scene.bodies import Looks, SceneView
 from workbench.ui.scene.env_grid import EnvLayout, box_corners
 from workbench.ui.scene.in_software import InSoftware
 from workbench.ui.server.viser_private import remove_nodes_but
+from workbench.ui.widgets.fields import choice
 from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.visitors import Visitor
 
 FOV = 0.75
 """Vertical, radians. viser's own 75 degrees distorts the edges of a grid."""
@@ -285,55 +291,65 @@ class ViewChoice:
     detail: str = "normal"
 
 
-class ViewPanel(PagePart[SessionView]):
+class ViewPanel(PagePart[SessionView | ReviewView]):
+    does = (ShowEnvs, ChooseDetail, ChooseTheme)
+
     def __init__(
-        self, server: viser.ViserServer, dark: bool = True, choice: ViewChoice | None = None
+        self, server: viser.ViserServer, dark: bool = True, chosen: ViewChoice | None = None
     ) -> None:
-        self._server = server
-        self._choice = choice = choice or ViewChoice()
+        self._server, self.dark = server, dark
+        self._choice = chosen = chosen or ViewChoice()
         with server.gui.add_folder("View"):
-            self._show = server.gui.add_dropdown("Show", (ALL, ONE), initial_value=choice.show, visible=False)
-            self._detail = server.gui.add_dropdown(
+            self._show = choice(server, "Show", ShowEnvs, "which", (ALL, ONE), chosen.show)
+            self._show.visible = False
+            self._detail = choice(
+                server,
                 "Detail",
+                ChooseDetail,
+                "detail",
                 tuple(DETAILS),
-                initial_value=choice.detail,
+                chosen.detail,
                 hint="How finely shapes are drawn. Choose coarse if the view is slow.",
             )
-            self._theme = server.gui.add_dropdown(
-                "Theme", (DARK, LIGHT), initial_value=DARK if dark else LIGHT
+            self._theme = choice(
+                server, "Theme", ChooseTheme, "theme", (DARK, LIGHT), DARK if dark else LIGHT
             )
-        self._show.on_update(lambda _: self._remember())
-        self._detail.on_update(lambda _: self._remember())
-        self._theme.on_update(lambda _: self._apply_theme())
         self._apply_theme()
-
-    def _remember(self) -> None:
-        self._choice.show, self._choice.detail = self._show.value, self._detail.value
 
     @property
     def only_selected(self) -> bool:
-        return self._show.value == ONE
-
-    @property
-    def dark(self) -> bool:
-        return self._theme.value != LIGHT
+        return self._choice.show == ONE
 
     @property
     def looks(self) -> Looks:
-        return Looks(DETAILS[self._detail.value], self.dark)
+        return Looks(DETAILS[self._choice.detail], self.dark)
 
     def show_only_selected(self, only: bool) -> None:
-        self._show.value = ONE if only else ALL
+        self._choice.show = ONE if only else ALL
 
     def toggle_only_selected(self) -> None:
         self.show_only_selected(not self.only_selected)
 
     def toggle_dark(self) -> None:
-        self._theme.value = LIGHT if self._theme.value == DARK else DARK
+        self.dark = not self.dark
+        self._apply_theme()
 
-    def draw(self, view: SessionView) -> None:
-        several = view.task is not None and view.task.num_envs > 1
+    def draw(self, view: SessionView | ReviewView) -> None:
+        several = isinstance(view, SessionView) and view.task is not None and view.task.num_envs > 1
         self._show.visible = several
+        self._show.show(self._choice.show)
+        self._detail.show(self._choice.detail)
+        self._theme.show(DARK if self.dark else LIGHT)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ShowEnvs(which=which):
+                self._choice.show = which
+            case ChooseDetail(detail=detail):
+                self._choice.detail = detail
+            case ChooseTheme(theme=theme):
+                self.dark = theme == DARK
+                self._apply_theme()
 
     def _apply_theme(self) -> None:
         self._server.gui.configure_theme(

@@ -38,8 +38,7 @@ class ClientMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_f
     """One of the kinds below, with the fields of viser's message of that name.
 
     A frame is decoded straight into its structure and refused at the first byte that does not fit, so that megabytes
-    of nested lists never become millions of Python objects on the event loop. The value of a control stays undecoded
-    (`GuiUpdateMessage.updates`): its type depends on the control (`control_values`).
+    of nested lists never become millions of Python objects on the event loop.
     """
 
     def check(self) -> None:
@@ -51,19 +50,6 @@ class ClientMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_f
 
 class CommandTriggerMessage(ClientMessage):
     uuid: Uuid
-
-
-class GuiFormDirtyMessage(ClientMessage):
-    uuid: Uuid
-
-
-class GuiFormSubmitMessage(ClientMessage):
-    uuid: Uuid
-
-
-class GuiUpdateMessage(ClientMessage):
-    uuid: Uuid
-    updates: Annotated[dict[str, msgspec.Raw], msgspec.Meta(max_length=16)]
 
 
 class ScenePointerMessage(ClientMessage):
@@ -120,9 +106,6 @@ class ViewerCameraMessage(ClientMessage):
             raise ImpossibleValue("a size that no page has")
 
 
-Value = bool | int | float | str | list[bool | int | float | str]
-"""Anything that a control may hold, before it is checked."""
-
 KINDS: dict[str, type[ClientMessage]] = {kind.__name__: kind for kind in ClientMessage.__subclasses__()}
 
 
@@ -132,7 +115,6 @@ class _Any(msgspec.Struct):
 
 _kind_decoder = msgspec.msgpack.Decoder(_Any)
 _decoders = {name: msgspec.msgpack.Decoder(kind) for name, kind in KINDS.items()}
-_value_decoder = msgspec.msgpack.Decoder(Value)
 
 
 def _decoded(decoder: msgspec.msgpack.Decoder[T], raw: bytes | msgspec.Raw, problem: ValueError) -> T:
@@ -166,15 +148,6 @@ def read_message(raw: bytes, kind: str) -> ClientMessage:
     message = _decoded(_decoders[kind], raw, MalformedMessage(f"wrong fields in {kind}"))
     message.check()
     return message
-
-
-def read_value(raw: msgspec.Raw) -> Value:
-    """The value that a page sends for a control, not yet checked against it.
-
-    Raises:
-        ValueError: It is nested, bytes, or of a type that no control holds.
-    """
-    return _decoded(_value_decoder, raw, ValueError("That is not a valid value."))
 
 
 def _check_numbers(*numbers: float) -> None:

@@ -124,6 +124,10 @@ class GatedServer:
             raise ValueError(f"There is a route for {prefix} already.")
         self._routes[prefix] = (handler, dict(headers or {}))
 
+    def add_channel(self, path: str, serve: viser_private.Serve) -> None:
+        """Talk with pages that open a WebSocket at this path, behind the same checks."""
+        self._gated.channels[path] = serve
+
     @property
     def url(self) -> str:
         """The address to open, with the token."""

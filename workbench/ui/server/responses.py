@@ -33,19 +33,14 @@ SCRIPTS = (
     "needs_webgl.js",
     "let_in.js",
     "typed_ahead.js",
-    "typed_first.js",
-    "pressed.js",
+    "input.js",
+    "into_sight.js",
     "folds.js",
     "curve_clicks.js",
-    "keys.js",
-    "pressed_by_key.js",
     "view_stays.js",
-    "library_keys.js",
     "view_width.js",
     "envs_width.js",
-    "unfolded.js",
-    "typed_numbers.js",
-    "key_help.js",
+    "key_list.js",
     "drawn_in_software.js",
     "tab_title.js",
     "task_list.js",
@@ -236,7 +231,7 @@ HANDLERS = (
     "wb.follow(this)",
     "wb.openTab(this)",
 )
-"""Every handler in ``web_assets/panels``, defined in ``web_assets/pressed.js``."""
+"""Every handler in ``web_assets/panels``, defined in ``web_assets/into_sight.js``."""
 
 
 def hash_of(script: str) -> str:

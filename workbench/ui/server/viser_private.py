@@ -11,20 +11,17 @@ import threading
 import time
 import traceback
 import warnings
-import zipfile
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import rich
 import viser
 import viser._gui_api
 import viser._gui_handles
-import viser._icons
 import viser._messages
 import viser._threadpool_exceptions
 import viser.infra
@@ -44,6 +41,8 @@ from workbench.ui.server.page_guard import PageGuard
 from workbench.ui.server.strangers import Connection, RareLog, Strangers, close_when_stalled
 
 Hook = Callable[[ServerConnection, Request], Response | None]
+Serve = Callable[[ServerConnection], Awaitable[None]]
+"""Talks with one page until it leaves."""
 AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 
 PAGES = {
@@ -89,13 +88,10 @@ PRIVATE_NAMES = (
 PRIVATE_ATTRIBUTES = (
     "_websock_server",
     "_websock_server._incoming_handlers",
-    "_websock_server._live_connections",
     "_websock_server._server_thread",
     "_websock_server._broadcast_buffer.message_counter",
     "_websock_server._broadcast_buffer.generator_cursors",
-    "_connected_clients",
     "gui._container_handle_from_uuid",
-    "gui._gui_input_handle_from_uuid",
     "scene._handle_from_node_name",
 )
 """Attributes of a `viser.ViserServer` that this module relies on."""
@@ -110,26 +106,6 @@ warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarn
 
 # Any: viser does not export these names.
 infra: Any = viser.infra._infra
-
-
-def element_id(handle: viser.GuiInputHandle | viser.GuiButtonHandle) -> str:
-    """The control's id in the page; for a button or a number also the ``id`` of its element (viser's ``Button.tsx``,
-    ``NumberInput.tsx``)."""
-    return handle._impl.uuid
-
-
-@cache
-def read_icons_once() -> None:
-    """Let viser read a page's icons in a moment. Of each it reads an archive's list of thousands, 15 ms of the processor, and it keeps the
-    last 32; a page of ours has more, and this was most of what making one took."""
-    places: tuple[Any, ...] = viser._gui_api, viser._gui_handles
-    archive = Path(viser._icons.__file__).parent / "_icons" / "tabler-icons.zip"
-    # A later viser may have none of this. Then it reads as it likes.
-    if archive.is_file() and all(hasattr(place, "svg_from_icon") for place in places):
-        icons = zipfile.ZipFile(archive)
-        read = cache(lambda name: icons.read(f"{name}.svg").decode())
-        for place in places:
-            place.svg_from_icon = read
 
 
 def set_tab_label(tab: viser.GuiTabHandle, label: str) -> None:
@@ -232,66 +208,25 @@ def _moved(what: str) -> ServerError:
     )
 
 
-@dataclass
-class ViserPage:
-    """viser's side of one connection: a `page_guard.ServedPage`."""
-
-    connection: ServerConnection
-    served: list[viser.ViserServer]
-    """The server, once it is made."""
-
-    def control(self, uuid: str) -> Any | None:
-        for gui in self._guis():
-            control = gui._gui_input_handle_from_uuid.get(uuid)
-            if control is not None:
-                return control
-        return None
-
-    def has_form(self, uuid: str) -> bool:
-        forms = (gui._container_handle_from_uuid.get(uuid) for gui in self._guis())
-        return any(isinstance(form, viser.GuiFormHandle) for form in forms)
-
-    def is_from_server(self, kind: str) -> bool:
-        known = getattr(viser._messages, kind, None)
-        return isinstance(known, type) and issubclass(known, viser._messages.Message)
-
-    def show_again(self, control: Any) -> None:
-        client = self._client()
-        if client is not None and not control._impl.is_button:
-            update = viser._messages.GuiUpdateMessage(control._impl.uuid, {"value": control.value})
-            client._websock_connection.queue_message(update)
-
-    def tell(self, sentence: str) -> None:
-        client = self._client()
-        if client is not None:
-            client.add_notification("Not possible", sentence, color="orange", auto_close_seconds=6.0)
-
-    def _client(self) -> viser.ClientHandle | None:
-        for server in self.served:
-            for number, connection in list(server._websock_server._live_connections.items()):
-                if connection is self.connection:
-                    return server._connected_clients.get(number)
-        return None
-
-    def _guis(self) -> Iterator[viser.GuiApi]:
-        for server in self.served:
-            yield server.gui
-        client = self._client()
-        if client is not None:
-            yield client.gui
+def _is_of_viser(kind: str) -> bool:
+    """Whether viser has a message of this kind."""
+    known = getattr(viser._messages, kind, None)
+    return isinstance(known, type) and issubclass(known, viser._messages.Message)
 
 
-def _watched(
-    handler: Callable[[ServerConnection], Awaitable[None]], served: list[viser.ViserServer], told: RareLog
-) -> Callable[[ServerConnection], Awaitable[None]]:
+def _watched(handler: Serve, channels: dict[str, Serve], told: RareLog) -> Serve:
     async def watched(connection: ServerConnection) -> None:
+        request = connection.request
+        if request is not None and (ours := channels.get(urlsplit(request.path).path)) is not None:
+            await ours(connection)
+            return
         if connection.subprotocol != f"viser-v{viser.__version__}":
             # viser prints the client's version and sends it back, of any length.
             told.happened("version", "Refused a page that another version of viser has served: reload it.")
             await connection.close(1002, f"Version mismatch. Server: {viser.__version__}")
             return
         receive = connection.recv
-        guard = PageGuard(ViserPage(connection, served), told)
+        guard = PageGuard(_is_of_viser, told)
 
         async def receive_checked() -> object:
             while True:
@@ -314,7 +249,6 @@ def _watched(
             connection.close_timeout = STOP_SECONDS
             await connection.close(1008, "malformed message")
         finally:
-            guard.close()
             listening.cancel()
 
     return watched
@@ -371,6 +305,8 @@ class GatedViser:
 
     server: viser.ViserServer
     _serving: websockets.asyncio.server.serve
+    channels: dict[str, Serve]
+    """WebSockets of ours, by path."""
     _closing: set[asyncio.Task[None]] = field(default_factory=set)
 
     def close_pages(self, reason: str) -> None:
@@ -446,17 +382,14 @@ def make_viser(
     if missing:
         listening.close()
         raise _moved("viser no longer has " + ", ".join(missing))
-    read_icons_once()
     _terminal.install()
     _terminal.told = told
     real_serve = websockets.asyncio.server.serve
     serving: list[websockets.asyncio.server.serve] = []
-    served: list[viser.ViserServer] = []
+    channels: dict[str, Serve] = {}
     strangers = Strangers(told)
 
-    def serve(
-        handler: Callable[[ServerConnection], Awaitable[None]], host: str, port: int, **options: Any
-    ) -> websockets.asyncio.server.serve:
+    def serve(handler: Serve, host: str, port: int, **options: Any) -> websockets.asyncio.server.serve:
         # Without viser's host and port: it would silently bind another port if this one were taken, or the one of the
         # environment (_VISER_PORT_OVERRIDE).
         options.update(
@@ -469,7 +402,7 @@ def make_viser(
             unix=listening.family == socket.AF_UNIX,
             logger=_quiet_logger(),
         )
-        made = real_serve(_watched(handler, served, told), sock=listening, **options)
+        made = real_serve(_watched(handler, channels, told), sock=listening, **options)
         serving.append(made)
         return made
 
@@ -493,13 +426,12 @@ def make_viser(
         raise _moved(
             "viser did not start its server the known way" if not missing else f"viser has no {missing}"
         )
-    served.append(server)
     for name in REFUSED_FROM_CLIENTS:
         server._websock_server.unregister_handler(getattr(viser._messages, name))
     with unchanged_environment():
         # For its first picture viser imports OpenCV, which adds the current folder to where all children look for libraries.
         server.gui.add_image(np.zeros((1, 1, 3), np.uint8)).remove()
-    return GatedViser(server, serving[0])
+    return GatedViser(server, serving[0], channels)
 
 
 _WEBSOCKETS_LOG = "workbench.door.websockets"

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL.PngImagePlugin import PngInfo
 
+from workbench.commands.share import What
 from workbench.core.camera_data import moved_cameras_text
 from workbench.jobs.pool.deal import Deal, ItemQueue, PoolError, Work
 from workbench.jobs.pool.processes import Processes
@@ -46,7 +46,6 @@ from workbench.recording.reader.scan import SUFFIXES
 from workbench.ui.share.scene_html import seconds_a_step, write_scene_html
 from workbench.ui.widgets.templates import counted, sentence
 
-What = Literal["film", "scene", "page", "sheet", "zip", "lerobot", "maniskill"]
 MOST_SAID = 5
 """Sentences about recordings that the page shows."""
 EVERY_CAMERA = ""

@@ -12,6 +12,19 @@ from typing import Any
 
 import viser
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.share import (
+    LONGEST_INSTRUCTION,
+    ChooseFilmed,
+    ChooseMade,
+    ChooseShared,
+    MakeShared,
+    StopMaking,
+    TakeOnlyCompatible,
+    TakeOnlySuccesses,
+    TypeInstruction,
+    What,
+)
 from workbench.core.cameras.conventions import triple
 from workbench.recording.episode.row import LibraryRow, Source
 from workbench.recording.films import FilmEye, cameras_by_name
@@ -27,13 +40,15 @@ from workbench.ui.share.make import (
     MakeRequest,
     Making,
     MakingView,
-    What,
     file_name,
     zip_name,
 )
 from workbench.ui.share.rerun_view import RerunPages, RerunView
+from workbench.ui.widgets.fields import Field, choice, tick
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import counted, render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 WHAT: dict[str, What] = {
     "Video of a camera (mp4)": "film",
@@ -48,7 +63,12 @@ WHEN = "\u2039date and time\u203a"
 DATASETS: tuple[What, ...] = ("lerobot", "maniskill")
 """One of all recordings, kept in the folder of recordings."""
 ALL_CAMERAS = "every camera"
-SELECTED, OPENED = "the selected recordings", "the open recordings"
+SHARED = {"the selected recordings": False, "the open recordings": True}
+SUCCESSES_HINT = "Leave out recordings that reach success at no step"
+FITTING_HINT = (
+    "Leave out recordings that cannot be read, or lack what the first one has; the result names them"
+)
+TASK_HINT = "In words, for policies that take a language instruction; empty: the task's id"
 MOST_SHOWN = 6
 """Results in the list; the newest."""
 MOST_NAMED = 5
@@ -70,6 +90,19 @@ class Chosen:
     """How many of them reach success at some step; None where it is not known of each."""
 
 
+@dataclass(frozen=True)
+class ShareChoices:
+    """What a person chose."""
+
+    opened: bool = False
+    """The open recordings instead of the selected ones."""
+    what: What = "film"
+    camera: str = EVERY_CAMERA
+    only_successes: bool = True
+    only_fitting: bool = True
+    words: str = ""
+
+
 class SharePanel:
     """The controls in the present container.
 
@@ -80,97 +113,123 @@ class SharePanel:
         folder: Datasets go into ``datasets`` below it.
     """
 
+    does = (
+        ChooseShared,
+        ChooseMade,
+        ChooseFilmed,
+        TakeOnlySuccesses,
+        TakeOnlyCompatible,
+        TypeInstruction,
+        MakeShared,
+        StopMaking,
+    )
+
     def __init__(self, server: viser.ViserServer, offers: Downloads, making: Making, folder: Path) -> None:
         self._offers, self._making, self._folder = offers, making, folder
-        self._chosen = Chosen()
+        self._chosen, self._choices = Chosen(), ShareChoices()
         self._drawn: object = None
-        self._of = server.gui.add_dropdown(
-            "Share", (SELECTED, OPENED), initial_value=SELECTED, visible=False, hint="Stays as you choose it"
+        gui, first = server.gui, self._choices
+        self._shared = choice(
+            server, "Share", ChooseShared, "opened", SHARED, first.opened, hint="Stays as you choose it"
         )
-        self._about = server.gui.add_html("")
-        self._what = server.gui.add_dropdown("Make", tuple(WHAT))
-        self._camera = server.gui.add_dropdown("Camera", _names(()))
-        self._successes = server.gui.add_checkbox(
-            "Only successes", True, hint="Leave out recordings that reach success at no step"
+        self._about = gui.add_html("")
+        self._whats = choice(server, "Make", ChooseMade, "what", WHAT, first.what)
+        self._cameras = choice(server, "Camera", ChooseFilmed, "camera", _names(()), first.camera)
+        self._successes = tick(
+            server, "Only successes", TakeOnlySuccesses, "on", first.only_successes, hint=SUCCESSES_HINT
         )
-        self._fitting = server.gui.add_checkbox(
-            "Only compatible ones",
-            True,
-            hint="Leave out recordings that cannot be read, or lack what the first one has; the result names them",
+        self._fitting = tick(
+            server, "Only compatible ones", TakeOnlyCompatible, "on", first.only_fitting, hint=FITTING_HINT
         )
-        self._task = server.gui.add_text(
-            "Task", "", hint="In words, for policies that take a language instruction; empty: the task's id"
+        self._task = Field(
+            server, "Task", TypeInstruction, "words", hint=TASK_HINT, longest=LONGEST_INSTRUCTION
         )
-        self._will = server.gui.add_html("")
-        self._make = server.gui.add_button("Make", icon=viser.Icon.SPARKLES)
-        self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
-        self._made = server.gui.add_html("")
-        self._wants_successes = True
-        """As a person ticked it, while there is a success to choose."""
-        self._successes.on_update(self._on_successes)
-        self._make.on_click(lambda event: self._start(event.client))
-        self._stop.on_click(lambda _: self._making.stop())
+        self._will = gui.add_html("")
+        self._tools = gui.add_html("")
+        self._made = gui.add_html("")
 
-    def _on_successes(self, event: viser.GuiEvent) -> None:
-        if event.client is not None and not self._successes.disabled:
-            self._wants_successes = self._successes.value
+    def takes_opened(self, both: bool) -> bool:
+        """Whether the person chose the open recordings instead of the selected ones; `both`: there are both."""
+        self._shared.visible = both
+        return both and self._choices.opened
 
-    def takes_opened(self, choice: bool) -> bool:
-        """Whether the person chose the open recordings instead of the selected ones; `choice`: there are both."""
-        self._of.visible = choice
-        return choice and self._of.value == OPENED
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseShared(opened=opened):
+                self._choices = replace(self._choices, opened=opened)
+            case ChooseMade(what=what):
+                self._choices = replace(self._choices, what=what)
+            case ChooseFilmed(camera=camera):
+                self._choices = replace(self._choices, camera=camera)
+            case TakeOnlySuccesses(on=on):
+                self._choices = replace(self._choices, only_successes=on)
+            case TakeOnlyCompatible(on=on):
+                self._choices = replace(self._choices, only_fitting=on)
+            case TypeInstruction(words=words):
+                self._choices = replace(self._choices, words=words)
+            case MakeShared():
+                self._start(visitor.client)
+            case StopMaking():
+                self._making.stop()
 
     def draw(self, chosen: Chosen) -> None:
         self._chosen = chosen
-        view = self._making.view()
-        what = WHAT[self._what.value]
-        camera = self._camera.value
-        now = (chosen, view, what, camera, self._wants_successes)
+        view, choices = self._making.view(), self._choices
+        now = (chosen, view, choices)
         if now == self._drawn:
             return
         self._drawn = now
+        what, is_dataset = choices.what, choices.what in DATASETS
         names = [source.stem for source in chosen.sources]
         files = list(zip(short_names(names), names))
         self._about.content = render("share_about", files=files, most=MOST_NAMED, selected=chosen.selected)
-        options = _names(chosen.cameras)
-        if self._camera.options != options:
-            self._camera.options = options
-        self._camera.visible = what == "film" and len(options) > 2
-        self._successes.visible = what in DATASETS
-        self._successes.disabled = chosen.successes == 0
-        self._successes.value = self._wants_successes and chosen.successes != 0
-        self._fitting.visible = what in DATASETS and len(names) > 1
+        self._shared.show(choices.opened)
+        self._whats.show(what)
+        self._cameras.show(self._camera(), options=_names(chosen.cameras))
+        self._cameras.visible = what == "film" and len(chosen.cameras) > 1
+        self._successes.show(self._only_successes(), off=chosen.successes == 0)
+        self._successes.visible = is_dataset
+        self._fitting.show(choices.only_fitting)
+        self._fitting.visible = is_dataset and len(names) > 1
+        self._task.show(choices.words)
         self._task.visible = what == "lerobot"
-        self._make.visible = not view.running
-        self._stop.visible = view.running
-        self._make.disabled = not chosen.sources
-        will = None if view.running or not names else self._will_make(what, camera)
+        make = tool("Make", MakeShared(), off=not chosen.sources, tone="main")
+        self._tools.content = tools_html([tool("Stop", StopMaking()) if view.running else make])
+        will = None if view.running or not names else self._will_make()
         self._will.content = "" if will is None else render("share_will", **will, most=MOST_NAMED)
         self._made.content = self._html(view)
 
-    def _will_make(self, what: What, camera: str) -> dict[str, Any]:
-        return will_make(what, self._chosen, camera, self._folder, self._successes.value)
+    def _camera(self) -> str:
+        """As chosen, if there is one of this name."""
+        return self._choices.camera if self._choices.camera in self._chosen.cameras else EVERY_CAMERA
 
-    def _start(self, client: viser.ClientHandle | None) -> None:
-        chosen, what = self._chosen, WHAT[self._what.value]
+    def _only_successes(self) -> bool:
+        """As chosen, unless none of them reaches success."""
+        return self._choices.only_successes and self._chosen.successes != 0
+
+    def _will_make(self) -> dict[str, Any]:
+        what, camera = self._choices.what, self._camera()
+        return will_make(what, self._chosen, camera, self._folder, self._only_successes())
+
+    def _start(self, client: viser.ClientHandle) -> None:
+        chosen, choices = self._chosen, self._choices
         if not chosen.sources:
-            return
-        wanted = MakeRequest(what, chosen.sources, Path(), eye=_eye_of(client) if chosen.in_view else None)
-        if what in DATASETS:
+            raise Refused("Select recordings in the library, or open one, first.")
+        eye = _eye_of(client) if chosen.in_view else None
+        wanted = MakeRequest(choices.what, chosen.sources, Path(), eye=eye)
+        if choices.what in DATASETS:
             now = datetime.datetime.now()
-            words = self._task.value.strip()[:400]
             export = ExportOptions(
-                only_successes=self._successes.value,
-                only_fitting=self._fitting.value,
-                instruction=words or None,
+                only_successes=self._only_successes(),
+                only_fitting=choices.only_fitting,
+                instruction=choices.words.strip() or None,
             )
-            folder = self._folder / "datasets" / dataset_name(what, f"{now:%Y-%m-%dT%H-%M-%S}")
+            folder = self._folder / "datasets" / dataset_name(choices.what, f"{now:%Y-%m-%dT%H-%M-%S}")
             self._making.start(replace(wanted, folder=folder, export=export))
             return
-        camera = self._camera.value if self._camera.value in chosen.cameras else EVERY_CAMERA
         # A new folder each time: a file of the same name may exist from before.
         folder = Path(tempfile.mkdtemp(dir=self._making.scratch()))
-        self._making.start(replace(wanted, folder=folder, camera=camera))
+        self._making.start(replace(wanted, folder=folder, camera=self._camera()))
 
     def _html(self, view: MakingView) -> str:
         made = [(one, self._links(one)) for one in view.made[:MOST_SHOWN]]
@@ -236,13 +295,13 @@ def short_names(names: Sequence[str]) -> list[str]:
     return short if len(set(short)) == len(short) else list(names)
 
 
-def _names(cameras: tuple[str, ...]) -> tuple[str, ...]:
-    return (ALL_CAMERAS, *cameras)
+def _names(cameras: tuple[str, ...]) -> dict[str, str]:
+    return {ALL_CAMERAS: EVERY_CAMERA, **{camera: camera for camera in cameras}}
 
 
-def _eye_of(client: viser.ClientHandle | None) -> FilmEye | None:
+def _eye_of(client: viser.ClientHandle) -> FilmEye | None:
     """The page's viewpoint."""
-    if client is None or client.camera.image_width == 0:
+    if client.camera.image_width == 0:
         return None
     camera = client.camera
     return FilmEye(
@@ -264,12 +323,11 @@ class Sharing:
         library: Library,
         table: LibraryPanel,
         make_way: Callable[[Callable[[bool], None]], int],
-        unfolded: Callable[[], None],
     ) -> SharePart:
-        """The Share tab, in the present container; `make_way` and `unfolded` as `RerunView` has them."""
+        """The Share tab, in the present container; `make_way` as `RerunView` has it."""
         share = SharePanel(server, self._offers, self._making, library.folder)
         server.gui.add_divider()
-        return SharePart(library, table, share, RerunView(server, self._rerun, make_way, unfolded))
+        return SharePart(library, table, share, RerunView(server, self._rerun, make_way))
 
     def close(self) -> None:
         """Stop the present work and delete the downloads."""
@@ -279,8 +337,14 @@ class Sharing:
 class SharePart(PagePart[ReviewView]):
     """The Share tab of a review page."""
 
+    does = (*SharePanel.does, *RerunView.does)
+
     def __init__(self, library: Library, table: LibraryPanel, share: SharePanel, rerun: RerunView) -> None:
         self._library, self._table, self._share, self._rerun = library, table, share, rerun
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        owner = self._rerun if isinstance(command, RerunView.does) else self._share
+        owner.do(command, visitor)
 
     def draw(self, view: ReviewView) -> None:
         opened = {one.id: one.episode for one in view.opened}

@@ -14,13 +14,17 @@ from types import MappingProxyType
 
 import viser
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.page import TellUnfolded
+from workbench.commands.share import CloseRerun, OpenInRerun
 from workbench.machine.folders import web_assets_folder
 from workbench.recording.reader.reading import read_rerun_info
 from workbench.recording.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, viewer_file, viewer_is_cached
 from workbench.ui.server.file_response import Downloads, FileReply
 from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.widgets.click_targets import Presses
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +35,7 @@ SETTLES = 0.3
 Moments = Mapping[Path, int]
 """The step at which each recording is looked at."""
 
+PANEL = "rerun"
 _SHOW = "/rerun/show/"
 _BLUEPRINT = ".rbl"
 _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
@@ -134,17 +139,17 @@ class RerunView:
         pages: Where rerun is served.
         make_way: Called before the panel opens, to make room for it, with a function that folds and unfolds it;
             returns the pixels between the other panels.
-        unfolded: Called when a page shows the panel.
     """
+
+    does = (OpenInRerun, CloseRerun)
 
     def __init__(
         self,
         server: viser.ViserServer,
         pages: RerunPages,
         make_way: Callable[[Callable[[bool], None]], int] = lambda fold: 0,
-        unfolded: Callable[[], None] = lambda: None,
     ) -> None:
-        self._server, self._pages, self._make_way, self._unfolded = server, pages, make_way, unfolded
+        self._server, self._pages, self._make_way = server, pages, make_way
         self._paths: tuple[Path, ...] = ()
         self._moments: Moments = {}
         self._chosen = 0
@@ -156,11 +161,20 @@ class RerunView:
         self._width = LEAST
         self._asked_at: float | None = None
         """When a page last requested the panel's content, if the panel has got no width since."""
-        self._button = server.gui.add_button(
-            "Open in rerun", icon=viser.Icon.APP_WINDOW, color="gray", disabled=True
-        )
+        self._button = server.gui.add_html("")
         self._words = server.gui.add_html("")
-        self._button.on_click(lambda _: self.open())
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case OpenInRerun() if not self._paths:
+                raise Refused("Select recordings that have a .rrd file first.")
+            case OpenInRerun() if viewer_is_cached():
+                self.open()
+            case OpenInRerun():
+                # The page's next commands must not wait for the unpacking.
+                threading.Thread(target=self.open, daemon=True).start()
+            case CloseRerun():
+                self.close()
 
     def draw(
         self, paths: Sequence[Path], chosen: int | None = None, moments: Moments = MappingProxyType({})
@@ -174,8 +188,8 @@ class RerunView:
         self._moments = moments
         self._chosen = len(paths) if chosen is None else chosen
         self._paths = tuple(paths)
-        disabled = not self._paths or self._waiting
-        self._button.disabled = disabled
+        off = not self._paths or self._waiting
+        self._button.content = tools_html([tool("Open in rerun", OpenInRerun(), off=off)])
         wanted = (self._paths, self._chosen, self._waiting, self._problem)
         if wanted != self._drawn:
             self._drawn = wanted
@@ -231,13 +245,11 @@ class RerunView:
         with self._lock:
             self._panel = panel = self._server.gui.add_panel(order=6.0)
         with panel.add_tab("rerun", viser.Icon.APP_WINDOW):
-            self._server.gui.add_button("Close rerun", icon=viser.Icon.X, color="gray").on_click(
-                lambda _: self.close()
-            )
+            self._server.gui.add_html(tools_html([tool("Close rerun", CloseRerun())]))
             begins = {path: moments.get(path, 0) for path in paths}
             heading = [(path.stem, begins[path]) for path in paths]
             self._server.gui.add_html(render("rerun_frame", address=self._address(paths), heading=heading))
-            Presses(self._server).when_unfolded(self._unfolded)
+            self._server.gui.add_html(render("tell", command=TellUnfolded(panel=PANEL)))
         # Next to the scene, with a border that can be dragged.
         panel.dock_left()
         self._width = max(LEAST, round(SHARE * room))

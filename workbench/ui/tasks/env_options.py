@@ -4,26 +4,33 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import viser
 
+from workbench.commands.command import Command, Refused
+from workbench.commands.run import (
+    LONGEST_VALUE,
+    ApplyEnvOptions,
+    DiscardEnvOptions,
+    ResetEnvOptions,
+    SetKeyword,
+    SetNumEnvs,
+)
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN
 from workbench.core.env.keywords import MODES, HowMade, Keyword, as_json, read_value, shown
 from workbench.jobs.task import TaskOptions, changed_options, command_line
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.tasks.recents import MOST_ENVS, lasting
-from workbench.ui.server.control_values import checked_int, limit_text
-from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.inputs import refusals_told
+from workbench.session.tasks.recents import lasting
+from workbench.ui.widgets.fields import Field, Plain, choice, tick
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
-LONGEST = 2000
-"""Characters of a value."""
 LABELS = {
     "robot_uids": "Robot",
     "control_mode": "Control",
@@ -32,19 +39,7 @@ LABELS = {
 }
 NONE = "none (null)"
 _FEWEST_DIGITS, _MOST_DIGITS = 4, 9
-"""Decimals of a number field."""
-
-
-@dataclass(frozen=True)
-class _Field:
-    """One input and the keyword that it is for."""
-
-    keyword: Keyword
-    handle: Any
-    text: Callable[[], str]
-    """What stands in it, as `read_value` takes it."""
-    show: Callable[[str], None]
-    """Writes a value in JSON into it."""
+"""Decimals of the step of a number."""
 
 
 class EnvOptionsPanel(PagePart[SessionView]):
@@ -54,30 +49,29 @@ class EnvOptionsPanel(PagePart[SessionView]):
     run stay as they are. The form is written anew when the envs were made in another way.
     """
 
+    does = (SetNumEnvs, SetKeyword, ApplyEnvOptions, DiscardEnvOptions, ResetEnvOptions)
+
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self._session = server, session
         self._made: tuple[HowMade, TaskOptions] | None = None
         """What the form was last written for."""
-        self._fields: list[_Field] = []
+        self._num_envs = 1
+        self._keywords: tuple[Keyword, ...] = ()
+        self._values: dict[str, Plain] = {}
+        """What stands in the form, by the name of the keyword."""
+        self._fields: list[Field] = []
+        """Of the keywords."""
         gui = server.gui
         with gui.add_folder("How the envs are made", expand_by_default=False):
-            self._num_envs = gui.add_number("Envs", 1, min=1, max=MOST_ENVS, step=1)
+            self._envs = Field(server, "Envs", SetNumEnvs, "num_envs", self._num_envs)
             self._form = gui.add_folder(None)
-            self._apply = gui.add_button(
-                "Apply", icon=viser.Icon.CHECK, disabled=True, hint="Make the envs anew with these"
-            )
-            self._discard = gui.add_button(
-                "Discard", icon=viser.Icon.X, color="gray", visible=False, hint="Show what is in effect again"
-            )
+            self._tools = gui.add_html("")
             self._html = gui.add_html("")
-            self._reset = Presses(server).id_of("as the task does", lambda client: self._as_the_task_does())
-        self._apply.on_click(lambda event: self._apply_form(event.client))
-        self._discard.on_click(lambda _: self._discard_form())
 
     def key(self, view: SessionView) -> object:
         # The command names the file by its place on the disk, which is not asked for with every step.
         task = None if view.task is None else (view.task.made, view.task.device)
-        form = self._num_envs.value, [field.text() for field in self._fields]
+        form = self._num_envs, tuple(self._values.items())
         options = view.options, view.seed, view.options_refused
         return task, options, form, view.state, self._session.present_reference
 
@@ -89,62 +83,71 @@ class EnvOptionsPanel(PagePart[SessionView]):
             self._build(made[0])
             # What was typed while the first version was loading stays.
             if before is None or before[1] != made[1]:
-                self._num_envs.value = made[1].num_envs
-        changed = self._is_changed(view)
-        self._apply.disabled = not changed or view.state == "stopped"
-        self._discard.visible = changed or view.options_refused is not None
-        self._html.content = options_html(self._session.present_reference, view, self._reset)
+                self._num_envs = made[1].num_envs
+        self._envs.show(self._num_envs)
+        for keyword, field in zip(self._keywords, self._fields, strict=True):
+            field.show(self._values[keyword.name], off=bool(keyword.fixed))
+        changed = self._num_envs != view.options.num_envs or bool(self._changed())
+        apply = tool("Apply", ApplyEnvOptions(), off=not changed or view.state == "stopped", tone="main")
+        discard = tool("Discard", DiscardEnvOptions())
+        self._tools.content = tools_html(
+            [apply, discard] if changed or view.options_refused is not None else [apply]
+        )
+        self._html.content = options_html(self._session.present_reference, view)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case SetNumEnvs(num_envs=num_envs):
+                self._num_envs = num_envs
+            case SetKeyword(name=name, value=value):
+                if not any(keyword.name == name and not keyword.fixed for keyword in self._keywords):
+                    raise Refused(f"There is no {name} that can be changed here.")
+                if isinstance(value, str) and not value.isprintable():
+                    raise Refused(f"The {name} has characters that cannot be shown.")
+                self._values[name] = value
+            case ApplyEnvOptions():
+                self._apply()
+            case DiscardEnvOptions():
+                self._discard()
+            case ResetEnvOptions():
+                self._as_the_task_does()
 
     # --- the form --------------------------------------------------------------------------------
 
     def _build(self, made: HowMade) -> None:
-        keywords = (*made.modes, *made.own)
-        kinds = [(one.name, one.kind, one.choices, one.optional, one.fixed) for one in keywords]
-        before = [field.keyword for field in self._fields]
-        if kinds != [(one.name, one.kind, one.choices, one.optional, one.fixed) for one in before]:
+        before, self._keywords = self._keywords, (*made.modes, *made.own)
+        self._values = {keyword.name: _in_effect(keyword) for keyword in self._keywords}
+        if list(map(_input_of, before)) != list(map(_input_of, self._keywords)):
             for field in self._fields:
-                field.handle.remove()
+                field.remove()
             with self._form:
-                self._fields = [_field_for(self._server.gui, keyword) for keyword in keywords]
-        else:
-            self._fields = [
-                replace(field, keyword=keyword) for field, keyword in zip(self._fields, keywords, strict=True)
-            ]
-        self._show_keywords()
+                self._fields = [_field_for(self._server, keyword) for keyword in self._keywords]
 
-    def _show_keywords(self) -> None:
-        """Write what is in effect into the fields of the keywords."""
-        for field in self._fields:
-            if not field.keyword.fixed:
-                field.show(field.keyword.value)
+    def _changed(self) -> dict[Keyword, Plain]:
+        """What stands in the form, of the keywords of which something else is in effect."""
+        now = {keyword: self._values[keyword.name] for keyword in self._keywords}
+        return {keyword: value for keyword, value in now.items() if value != _in_effect(keyword)}
 
-    def _is_changed(self, view: SessionView) -> bool:
-        if self._num_envs.value != view.options.num_envs:
-            return True
-        return any(
-            field.text() != _text_of(field.keyword) for field in self._fields if not field.keyword.fixed
-        )
-
-    def _discard_form(self) -> None:
+    def _discard(self) -> None:
         view = self._session.view()
-        self._num_envs.value = view.options.num_envs
-        self._show_keywords()
+        self._num_envs = view.options.num_envs
+        self._values = {keyword.name: _in_effect(keyword) for keyword in self._keywords}
         if view.options_refused is not None:
             # The task works with what is in effect: loading it takes the problem off the page.
             self._session.versions.apply_options(view.options)
 
-    def _apply_form(self, client: viser.ClientHandle | None) -> None:
-        with refusals_told(client):
-            options = self._session.view().options
-            num_envs = checked_int(self._num_envs.value, 1, MOST_ENVS, "number of envs")
+    def _apply(self) -> None:
+        options = self._session.view().options
+        try:
             values = {
-                field.keyword: read_value(field.keyword, field.text())
-                for field in self._fields
-                if not field.keyword.fixed
+                keyword: read_value(keyword, value if isinstance(value, str) else json.dumps(value))
+                for keyword, value in self._changed().items()
             }
-            wanted = replace(options, num_envs=num_envs, env_kwargs=merged(options.env_kwargs, values))
-            if changed_options(options, wanted):
-                self._session.versions.apply_options(wanted)
+        except ValueError as why:
+            raise Refused(str(why)) from None
+        wanted = replace(options, num_envs=self._num_envs, env_kwargs=merged(options.env_kwargs, values))
+        if changed_options(options, wanted):
+            self._session.versions.apply_options(wanted)
 
     def _as_the_task_does(self) -> None:
         """Drop the keyword arguments that a person gave."""
@@ -187,67 +190,59 @@ def _of_the_machine(kwargs: Mapping[str, Any]) -> dict[str, Any]:
 # --- inputs ------------------------------------------------------------------------------------------
 
 
-def _field_for(gui: viser.GuiApi, keyword: Keyword) -> _Field:
-    label = LABELS.get(keyword.name, keyword.name)
-    handle: Any
+def _input_of(keyword: Keyword) -> object:
+    """What its input depends on, but for what is in it."""
+    return keyword.name, keyword.kind, keyword.choices, keyword.optional, keyword.fixed
+
+
+def _in_effect(keyword: Keyword) -> Plain:
+    """What the input of a keyword has in it when it shows what is in effect."""
     if keyword.fixed:
-        handle = gui.add_text(label, keyword.value, disabled=True, hint=f"Not changed here: {keyword.fixed}")
-        return _Field(keyword, handle, lambda: keyword.value, lambda text: None)
-    if keyword.kind == "choice" or (keyword.kind == "bool" and keyword.optional):
-        return _dropdown(gui, keyword, label)
-    if keyword.kind == "bool":
-        handle = gui.add_checkbox(label, keyword.value == "true")
-        return _Field(
-            keyword, handle, lambda: json.dumps(handle.value), lambda text: _write(handle, text == "true")
-        )
+        return keyword.value
+    if keyword.kind == "str":
+        return shown(keyword.value)
+    if keyword.kind == "bool" and not keyword.optional:
+        return keyword.value == "true"
     if keyword.kind in ("int", "float") and not keyword.optional and _is_number(keyword.value):
-        return _number(gui, keyword, label)
-    of_text = keyword.kind == "str"
-    hint = "Text" if of_text else 'A value in JSON: 0.5, true, [1, 2], "text"'
-    handle = gui.add_text(label, "", hint=hint + ("; null for none" if keyword.optional else ""))
-    limit_text(handle, LONGEST)
-    in_words: Callable[[str], str] = shown if of_text else lambda text: text
-    handle.value = in_words(keyword.value)
-    return _Field(keyword, handle, lambda: handle.value, lambda text: _write(handle, in_words(text)))
+        number = json.loads(keyword.value)
+        return int(number) if keyword.kind == "int" else float(number)
+    return keyword.value
 
 
-def _dropdown(gui: viser.GuiApi, keyword: Keyword, label: str) -> _Field:
+def _field_for(server: viser.ViserServer, keyword: Keyword) -> Field:
+    label, value = LABELS.get(keyword.name, keyword.name), _in_effect(keyword)
+    given = {"name": keyword.name}
+    if keyword.fixed:
+        hint = f"Not changed here: {keyword.fixed}"
+        return Field(server, label, SetKeyword, "value", value, given=[given], hint=hint)
+    if keyword.kind == "choice" or (keyword.kind == "bool" and keyword.optional):
+        return choice(server, label, SetKeyword, "value", _options(keyword), value, given=given)
+    if isinstance(value, bool):
+        return tick(server, label, SetKeyword, "value", value, given=given)
+    if isinstance(value, (int, float)):
+        return Field(server, label, SetKeyword, "value", value, given=[given], step=_step(value))
+    hint = "Text" if keyword.kind == "str" else 'A value in JSON: 0.5, true, [1, 2], "text"'
+    hint += "; null for none" if keyword.optional else ""
+    return Field(server, label, SetKeyword, "value", value, given=[given], hint=hint, longest=LONGEST_VALUE)
+
+
+def _options(keyword: Keyword) -> dict[str, Plain]:
+    """Values in JSON, by what is shown for them."""
     texts = keyword.choices or ("true", "false")
     names = [shown(text) for text in texts]
     # 1 and "1" look the same.
-    by_name = dict(zip(names if len(set(names)) == len(names) else texts, texts))
+    options: dict[str, Plain] = dict(zip(names if len(set(names)) == len(names) else texts, texts))
     if keyword.optional and "null" not in texts:
-        by_name[NONE] = "null"
-    names_of = {text: name for name, text in by_name.items()}
-    handle: Any = gui.add_dropdown(
-        label, tuple(by_name), initial_value=names_of.get(keyword.value, next(iter(by_name)))
-    )
-
-    def write(text: str) -> None:
-        if text in names_of:
-            _write(handle, names_of[text])
-
-    return _Field(keyword, handle, lambda: by_name[handle.value], write)
+        options[NONE] = "null"
+    return options
 
 
-def _number(gui: viser.GuiApi, keyword: Keyword, label: str) -> _Field:
-    value = json.loads(keyword.value)
-    handle: Any
-    if keyword.kind == "int":
-        handle = gui.add_number(label, int(value), step=1)
-        return _Field(
-            keyword, handle, lambda: json.dumps(handle.value), lambda text: _write(handle, json.loads(text))
-        )
-    # A field rounds to its step.
+def _step(value: float) -> float:
+    """What an arrow key adds to a number of this size."""
+    if isinstance(value, int):
+        return 1.0
     size = math.floor(math.log10(abs(value))) if value else 0
-    digits = min(max(_FEWEST_DIGITS, 3 - size), _MOST_DIGITS)
-    handle = gui.add_number(label, float(value), step=10.0**-digits)
-    return _Field(
-        keyword,
-        handle,
-        lambda: json.dumps(handle.value),
-        lambda text: _write(handle, float(json.loads(text))),
-    )
+    return 10.0 ** -min(max(_FEWEST_DIGITS, 3 - size), _MOST_DIGITS)
 
 
 def _is_number(text: str) -> bool:
@@ -255,20 +250,7 @@ def _is_number(text: str) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 2**53
 
 
-def _write(handle: Any, value: Any) -> None:
-    handle.value = value
-
-
-def _text_of(keyword: Keyword) -> str:
-    """What the field of a keyword has in it when it shows what is in effect."""
-    if keyword.kind == "str":
-        return shown(keyword.value)
-    if keyword.kind == "float" and not keyword.optional and _is_number(keyword.value):
-        return json.dumps(float(json.loads(keyword.value)))
-    return keyword.value
-
-
-def options_html(reference: object, view: SessionView, reset: str) -> str:
+def options_html(reference: object, view: SessionView) -> str:
     """What the form does not show: options that were refused, further arguments, the driver, and the command."""
     options = replace(view.options, seed=view.seed)
     refused = view.options_refused
@@ -282,7 +264,7 @@ def options_html(reference: object, view: SessionView, reset: str) -> str:
         given=bool(options.env_kwargs.keys() - HOW_IT_IS_RUN),
         device="" if view.task is None else view.task.device,
         command=command_line(lasting(str(reference)), options),
-        reset=reset,
+        reset=ResetEnvOptions(),
     )
 
 

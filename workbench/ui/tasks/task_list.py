@@ -3,33 +3,39 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from typing import Protocol
 
 import viser
 
 from workbench.authoring.templates.new_task import TEMPLATES
+from workbench.commands.command import Command, Refused
+from workbench.commands.tasks import (
+    LONGEST_NAME,
+    ChooseTemplate,
+    ClearTaskSearch,
+    CreateTask,
+    LookForTasks,
+    NameTask,
+    OpenListedTask,
+    OpenTaskList,
+    TemplateName,
+)
 from workbench.session.tasks.catalogue import Catalogue, CatalogueView, Entry, Section
 from workbench.session.tasks.typed import NotAPath
 from workbench.ui.library.dialogs import Dialog
-from workbench.ui.server.control_values import limit_text
-from workbench.ui.widgets.click_targets import Presses
-from workbench.ui.widgets.inputs import Control, refusals_told
-from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.fields import Field, choice
+from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render, sentence
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 PICTURES = "/task_pictures/"
 """Where the server gives the pictures of registered tasks."""
 LONGEST_WORDS = 4096
 """Characters of the search; a path may be as long."""
-LONGEST_NAME = 200
-TYPING = 0.15
-"""Seconds without a keystroke after which the search runs."""
 MOST_RECENT = 6
 """Recent tasks that are shown while nothing is searched."""
-TWICE = 4
-"""Bit of ``choosable.html`` for the second press of a double click: the first has chosen already."""
 OPEN = "Open…"
 NEW_TASK, CREATE = "New task", "Create"
 
@@ -44,11 +50,8 @@ class Chooser(Protocol):
         """Open this row of the list; returns at once. A number that is not listed is refused."""
         ...
 
-    def create(self, name: str, template: int) -> None:
+    def create(self, name: str, template: TemplateName) -> None:
         """Write a new task into the folder of the list, and open it.
-
-        Args:
-            template: its place in `TEMPLATES`.
 
         Raises:
             ValueError: nothing was written; the message says why.
@@ -67,52 +70,56 @@ class Chooser(Protocol):
 class TaskList:
     """A search field and the list, in the present container.
 
-    The arrow keys and Enter act in the browser (``task_list.js``), which presses a row as a mouse would; what is sent is
-    the row's number.
+    The arrow keys and Enter act in the browser (``task_list.js``), which asks for what a press on the row would.
     """
+
+    does = (OpenListedTask, LookForTasks, ClearTaskSearch, NameTask, ChooseTemplate, CreateTask)
 
     def __init__(
         self,
         server: viser.ViserServer,
         chooser: Chooser,
         on_chosen: Callable[[], None] = lambda: None,
-        clock: Clock = time.monotonic,
     ) -> None:
         """
         Args:
             on_chosen: called after a row was chosen.
         """
         self._chooser, self._on_chosen = chooser, on_chosen
-        self._words = ""
+        self._words = self._name = ""
+        self._template: TemplateName = TEMPLATES[0].name
         self._drawn: object = None
-        self._find = Control(
-            server.gui.add_text(
-                "Search",
-                "",
-                hint="Words in the name or the folder, all of which must be found; or the path of a file",
-            ),
-            send=self._look_for,
-            settle=TYPING,
-            clock=clock,
+        self._find = Field(
+            server,
+            "Search",
+            LookForTasks,
+            "words",
+            hint="Words in the name or the folder, all of which must be found; or the path of a file",
+            live=True,
+            longest=LONGEST_WORDS,
         )
         with server.gui.add_folder(NEW_TASK, expand_by_default=False):
-            self._name = server.gui.add_text(
-                "Name", "", hint="Such as stack_two, which is written to stack_two.py"
+            self._name_field = Field(
+                server,
+                "Name",
+                NameTask,
+                "name",
+                hint="Such as stack_two, which is written to stack_two.py",
+                longest=LONGEST_NAME,
             )
-            limit_text(self._name, LONGEST_NAME)
-            about = [f"{template.name}: {template.about}" for template in TEMPLATES]
-            self._template = server.gui.add_dropdown("Template", about)
-            create = server.gui.add_button(CREATE, icon=viser.Icon.FILE_PLUS, color="gray")
-            create.on_click(self._on_create)
+            about = {f"{template.name}: {template.about}": template.name for template in TEMPLATES}
+            self._template_choice = choice(
+                server, "Template", ChooseTemplate, "template", about, self._template
+            )
+            server.gui.add_html(tools_html([tool(CREATE, CreateTask())]))
         self._html = server.gui.add_html("")
-        presses = Presses(server)
-        self._numbers = presses.number_id("tasks", self._on_row)
-        self._clear = presses.id_of("clear", lambda _client: self._clear_search())
         chooser.catalogue.refresh()
 
     def draw(self) -> None:
         """Draw it if something has changed."""
         self._find.show(self._words)
+        self._name_field.show(self._name)
+        self._template_choice.show(self._template)
         catalogue = self._chooser.catalogue
         catalogue.follow()
         view, doing = catalogue.view(), self._chooser.doing()
@@ -125,35 +132,37 @@ class TaskList:
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        self._html.content = tasks_html(
-            view, self._words, doing, self._numbers, self._clear, self._chooser.is_open, typed, why_not
-        )
+        self._html.content = tasks_html(view, self._words, doing, self._chooser.is_open, typed, why_not)
 
-    def _look_for(self, words: str) -> None:
-        self._words = words[:LONGEST_WORDS]
-
-    def _clear_search(self) -> None:
-        self._find.handle.value = self._words = ""
-
-    def _on_create(self, event: viser.GuiEvent) -> None:
-        with refusals_told(event.client, "Nothing was written"):
-            self._chooser.create(self._name.value.strip(), self._template.options.index(self._template.value))
-            self._on_chosen()
-
-    def _on_row(self, sent: int) -> None:
-        number, held = divmod(sent, 8)
-        if held & TWICE or self._chooser.catalogue.entry(number) is None:
-            return
-        self._chooser.choose(number)
-        self._on_chosen()
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case OpenListedTask(number=number):
+                if self._chooser.catalogue.entry(number) is None:
+                    raise Refused("It is no longer in the list.")
+                self._chooser.choose(number)
+                self._on_chosen()
+            case LookForTasks(words=words):
+                self._words = words[:LONGEST_WORDS]
+            case ClearTaskSearch():
+                self._words = ""
+            case NameTask(name=name):
+                if not name.isprintable():
+                    raise Refused("The name has characters that cannot be shown.")
+                self._name = name
+            case ChooseTemplate(template=template):
+                self._template = template
+            case CreateTask():
+                try:
+                    self._chooser.create(self._name.strip(), self._template)
+                except ValueError as why:
+                    raise Refused(str(why)) from None
+                self._on_chosen()
 
 
 def tasks_html(
     view: CatalogueView,
     words: str,
     doing: str,
-    numbers: str,
-    clear: str,
     is_open: Callable[[Entry], bool] = lambda entry: False,
     typed: Entry | None = None,
     why_not: str = "",
@@ -163,7 +172,6 @@ def tasks_html(
     Args:
         words: searched for.
         doing: what is being opened, if anything.
-        numbers, clear: ids of the input that takes a row's number, and of the button that clears the search.
         is_open: whether a row is the open task, which is marked and which Enter does not choose.
         typed: the file whose path the words are.
         why_not: why the path in the words cannot be opened.
@@ -185,8 +193,8 @@ def tasks_html(
         view=view,
         words=words,
         doing=doing,
-        numbers=numbers,
-        clear=clear,
+        open_task=lambda number: OpenListedTask(number=number),
+        clear=ClearTaskSearch(),
         found=len(found),
         why_not=why_not,
         sections=sections,
@@ -237,27 +245,30 @@ def picture_route(catalogue: Catalogue) -> Callable[[str], tuple[int, str, bytes
 class OpenDialog(PagePart[object]):
     """The *Open...* dialog over a page. It is on all open pages, as every dialog of viser's is."""
 
+    does = (OpenTaskList, *TaskList.does)
+
     def __init__(
         self,
         server: viser.ViserServer,
         chooser: Chooser,
-        asking: Callable[[bool], None] = lambda asking: None,
-        clock: Clock = time.monotonic,
     ) -> None:
-        """
-        Args:
-            asking: called with True when it opens and False when it closes.
-        """
-        self._server, self._chooser, self._asking, self._clock = server, chooser, asking, clock
+        self._server, self._chooser = server, chooser
         self._lock = threading.RLock()
-        self._shown: tuple[Dialog, TaskList, viser.CommandHandle] | None = None
+        self._shown: tuple[Dialog, TaskList] | None = None
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case OpenTaskList():
+                self.open()
+            case _:
+                with self._lock:
+                    if self._shown is None:
+                        raise Refused("The list of tasks is closed.")
+                    self._shown[1].do(command, visitor)
 
     def add_button(self) -> None:
         """Add the button that opens it to the present container."""
-        button = self._server.gui.add_button(
-            OPEN, icon=viser.Icon.FOLDER_OPEN, color="gray", hint="Open another task"
-        )
-        button.on_click(lambda _: self.open())
+        self._server.gui.add_html(tools_html([tool(OPEN, OpenTaskList())]))
 
     def open(self) -> None:
         """Open it; close it if it is open."""
@@ -266,21 +277,19 @@ class OpenDialog(PagePart[object]):
                 self.close()
                 return
             with self._server.atomic():
-                dialog = Dialog(self._server, "Open a task", lambda: self._asking(False))
+                dialog = Dialog(self._server, "Open a task")
                 with dialog.modal:
-                    listed = TaskList(self._server, self._chooser, self.close, self._clock)
-                # viser's windows do not hear it themselves.
-                escape = self._server.gui.add_command("Close the list of tasks", hotkey="escape")
-                escape.on_trigger(lambda _: self.close())
-                self._shown = dialog, listed, escape
-            self._asking(True)
+                    listed = TaskList(self._server, self._chooser, self._close_chosen)
+                self._shown = dialog, listed
 
-    def close(self) -> None:
+    def _close_chosen(self) -> None:
+        self.close()
+
+    def close(self) -> bool:
+        """False if it is closed."""
         with self._lock:
             shown, self._shown = self._shown, None
-            # False if a page switch has removed both.
-            if shown is not None and shown[0].close():
-                shown[2].remove()
+            return shown is not None and shown[0].close()
 
     def draw(self, view: object) -> None:
         with self._lock:

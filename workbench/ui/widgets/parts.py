@@ -6,6 +6,9 @@ import time
 from collections.abc import Callable, Iterable
 from typing import ClassVar, Generic, TypeVar
 
+from workbench.commands.command import Command, Refused
+from workbench.ui.widgets.visitors import Visitor
+
 Clock = Callable[[], float]
 """Seconds: `time.monotonic`, or a test's own clock. All parts of a page share one."""
 View = TypeVar("View", contravariant=True)
@@ -21,6 +24,8 @@ class PagePart(Generic[View]):
 
     every: ClassVar[float] = 0.0
     """Seconds."""
+    does: tuple[type[Command], ...] = ()
+    """What a person can ask this part for."""
     of_the_moment: ClassVar[bool] = False
     """It shows numbers of the shown moment. Such parts are drawn together, from one view: while a task plays, a page whose
     parts are drawn at rates of their own shows several moments at once."""
@@ -34,6 +39,10 @@ class PagePart(Generic[View]):
         return None
 
     def draw(self, view: View) -> None:
+        raise NotImplementedError
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        """Do what a page asks for, one of `does`. On any thread. Raises `Refused`."""
         raise NotImplementedError
 
 
@@ -70,12 +79,28 @@ class Parts(Generic[View]):
     def __init__(self, parts: Iterable[PagePart[View]], clock: Clock = time.monotonic) -> None:
         self._clock = clock
         self._parts: list[tuple[PagePart[View], DrawDue]] = []
+        self._owners: dict[type[Command], PagePart[View]] = {}
         for part in parts:
             self.add(part)
 
     def add(self, part: PagePart[View]) -> None:
         """Draw this one too, after the others."""
         self._parts.append((part, DrawDue(part.every, self._clock)))
+        for kind in part.does:
+            assert kind not in self._owners, f"two parts do {kind.__name__}"
+            self._owners[kind] = part
+
+    @property
+    def does(self) -> frozenset[type[Command]]:
+        """What a person can ask these parts for."""
+        return frozenset(self._owners)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        """Let the part do it whose command it is. Raises `Refused`, also for a command that none of them does."""
+        owner = self._owners.get(type(command))
+        if owner is None:
+            raise Refused(f"Not on this page: {command.help()}.")
+        owner.do(command, visitor)
 
     def draw(self, view: View) -> None:
         due = [is_due.is_due(part.key(view), part.urgent(view)) for part, is_due in self._parts]

@@ -8,9 +8,10 @@ from typing import ClassVar
 
 import viser
 
-from workbench.session.live.session import Session
+from workbench.commands.cameras import StopMeasuring
 from workbench.session.process.job_lane import JobProgress
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
 
 JUST = 1.0
 """Seconds."""
@@ -51,11 +52,10 @@ class JobResult:
 
     _asked_last: ClassVar[JobResult | None] = None
 
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+    def __init__(self, server: viser.ViserServer) -> None:
         gui = server.gui
         self._bar = gui.add_html("", visible=False)
-        self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
-        self._stop.on_click(lambda _: session.studio.reports.stop())
+        self._stop = gui.add_html(tools_html([tool("Stop", StopMeasuring())]), visible=False)
         self._html = gui.add_html("", visible=False)
         self._began: float | None = None
         self._new = NewResult()

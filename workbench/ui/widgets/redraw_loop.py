@@ -11,7 +11,7 @@ import viser
 from workbench.machine.processes.watched_thread import watched_thread
 from workbench.ui.server.strangers import RareLog
 from workbench.ui.server.viser_private import wait_until_taken
-from workbench.ui.widgets.inputs import tell_all
+from workbench.ui.widgets.notices import tell_all
 
 FRAME = 1 / 30
 """Seconds. More pushes make a browser slower (measured: 350 a second leave it 13 to 30 frames a second)."""

@@ -8,13 +8,17 @@ from typing import Any, Generic, TypeVar
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.command import Command
+from workbench.commands.timeline import ShowRescored, StopRescoring, TurnRescored
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RUNNING, RescoreView
-from workbench.ui.widgets.click_targets import Paged, Presses
 from workbench.ui.widgets.line_chart import ChartLine, LineChart, span_of
+from workbench.ui.widgets.paged import Paged
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
+from workbench.ui.widgets.tools import tool, tools_html
+from workbench.ui.widgets.visitors import Visitor
 
 MOST_ROWS = 10
 """Of the list, at a time."""
@@ -32,6 +36,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
     """
 
     every = 0.25
+    does: tuple[type[Command], ...] = (ShowRescored, TurnRescored, StopRescoring)
     advice = ""
     """A sentence for where the bodies came far from the record."""
 
@@ -42,15 +47,12 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         """As the status says it; the rows need not say it again."""
 
     def _add_status(self, label: str, stop: Callable[[], None]) -> None:
-        self._stop = self._server.gui.add_button(
-            label, icon=viser.Icon.PLAYER_STOP, color="gray", visible=False
-        )
-        self._stop.on_click(lambda _: stop())
+        self._stop_rescoring = stop
+        self._stop = self._server.gui.add_html(tools_html([tool(label, StopRescoring())]), visible=False)
         self._status = self._server.gui.add_html("")
 
     def _add_list(self) -> None:
         self._list = self._server.gui.add_html("", visible=False)
-        self._presses = Presses(self._server)
         self._pages = Paged(MOST_ROWS)
 
     def _add_chart(self) -> None:
@@ -67,7 +69,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         self._list.visible = bool(listed)
         if listed:
             rows = [self._row(place) for place in self._pages.places(len(listed))]
-            pages = self._pages.shown(lambda key, do: self._presses.id_of(key, lambda _: do()))
+            pages = self._pages.shown(lambda by: TurnRescored(by=by))
             self._list.content = render("rescored_list", rows=rows, more=pages, column=self._column)
 
     def _draw_chart(
@@ -77,7 +79,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         self._chart.draw(title, x, lines, dot, span_of([line.values for line in lines]))
 
     def _row(self, place: int) -> dict[str, Any]:
-        verdict, row = self._listed[place], place % MOST_ROWS
+        verdict = self._listed[place]
         told = self._failed_since and verdict.why_not.startswith(self._failed_since)
         return {
             "badge": None,
@@ -85,14 +87,25 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
             "returns": "" if verdict.why_not else verdict_text.returns_text(verdict),
             "drift": f"drifted {verdict_text.drift_text(verdict)}" if verdict.drifted else "",
             "same": not verdict.differs,
-            "press": self._presses.id_of(("row", row), lambda _: self._go(row)),
+            "press": ShowRescored(run=self._key_of(verdict)),
             **self._of_row(verdict),
         }
 
-    def _go(self, row: int) -> None:
-        place = self._pages.first + row
-        if place < len(self._listed):
-            self._show(self._listed[place])
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ShowRescored(run=run):
+                for verdict in self._listed:
+                    if self._key_of(verdict) == run:
+                        self._show(verdict)
+                        break
+            case TurnRescored(by=by):
+                self._pages.turn(by)
+            case StopRescoring():
+                self._stop_rescoring()
+
+    def _key_of(self, verdict: Verdict[Of]) -> str:
+        """What tells its run from the others."""
+        raise NotImplementedError
 
     def _of_row(self, verdict: Verdict[Of]) -> dict[str, Any]:
         """What the run is called, a hint, and whether it is selected."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
 import jinja2
 
+from workbench.commands.command import Command
 from workbench.machine.folders import web_assets_folder
 from workbench.machine.text import plain_text, rate_text
 
@@ -79,6 +81,11 @@ def counted(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
+def asks(command: Command) -> str:
+    """The value of ``data-do``: a press asks for this command (``web_assets/input.js``)."""
+    return json.dumps(command.encode())
+
+
 def _shown(value: Any) -> Any:
     # Not Markup: that is a template's own text, whose values were escaped already.
     return plain_text(value, "\n\t") if type(value) is str else value
@@ -95,7 +102,7 @@ def _environment() -> jinja2.Environment:
         lstrip_blocks=True,
         auto_reload=False,  # else every panel looks at its file on every drawing
     )
-    filters = (place, size, percent, counted, rate_text, short_text, letter, colour)
+    filters = (place, size, percent, counted, rate_text, short_text, letter, colour, asks)
     environment.filters.update({filter.__name__: filter for filter in filters})
     macros = environment.get_template("can_be_pressed.html").module
     environment.globals.update(

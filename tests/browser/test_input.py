@@ -1,0 +1,341 @@
+"""The page's input: presses, keys and fields become commands, each once and in the order in which they were done."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.drive.far_line import FarLine, line_to
+from tests.drive.page import page_at
+from tests.drive.waiting import until
+from workbench.commands.cameras import PickPixel
+from workbench.commands.command import Command, Refused
+from workbench.commands.envs import SelectEnv
+from workbench.commands.library import OpenRow, PressRow
+from workbench.commands.page import FrameScene
+from workbench.commands.run import PauseLog, ResetAll, SetSeed, Step, TogglePlay
+from workbench.commands.timeline import Seek
+from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.ui.widgets.fields import Field, tick
+from workbench.ui.widgets.hotkeys import register
+from workbench.ui.widgets.templates import asks
+from workbench.ui.widgets.visitors import PATH, Visitor, Visitors
+
+pytestmark = pytest.mark.browser
+ROWS = 12
+DELAY = 0.2
+"""Seconds each way, over the far line."""
+MOST_SEED = 99
+
+
+def part(command: Command, text: str, **more: str) -> str:
+    """Something that can be pressed."""
+    data = "".join(f" data-{name}='{value}'" for name, value in more.items())
+    return f"<div data-do='{asks(command)}'{data} tabindex='0' role='button' style='height:24px'>{text}</div>"
+
+
+@dataclass
+class Small:
+    """A small page: rows that are redrawn all the time, a seed, a strip, a picture; and what it asked for."""
+
+    gated_server: GatedServer
+    page: Page
+    far: FarLine
+    came: list[Command] = field(default_factory=list)
+    seed: int = 7
+    swapped: bool = False
+    """The rows stand in another order."""
+    still: bool = False
+    """They are not redrawn."""
+    drawn_pause: bool = False
+    """What the page is told of the tick *Pause*."""
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        if isinstance(command, SetSeed):
+            if command.seed > MOST_SEED:
+                raise Refused(f"The seed goes up to {MOST_SEED}.")
+            self.seed = command.seed
+        self.came.append(command)
+
+    def has(self, *commands: Command) -> None:
+        until(lambda: len(self.came) >= len(commands), f"{commands}", seen=lambda: self.came)
+        assert self.came == list(commands)
+
+    def row(self, env: int) -> str:
+        return f"[data-do='{asks(SelectEnv(env=env))}']"
+
+
+@pytest.fixture(scope="module")
+def opened(browser: Browser) -> Iterator[Small]:
+    gated_server = open_server(ServerOptions(port=0))
+    server, visitors = gated_server.server, Visitors(gated_server.server)
+    gated_server.add_channel(PATH, visitors.serve)
+    seed = Field(server, "Seed", SetSeed, "seed", "7")
+    pause = tick(server, "Pause", PauseLog, "on", False)
+    strip = part(Seek(step=0), "strip", along='["step", 0, 100]') + part(
+        PickPixel(x=0.0, y=0.0), "picture", place=""
+    )
+    server.gui.add_html(strip + part(PressRow(id="a"), "recording", held="held", twice=asks(OpenRow(id="a"))))
+    rows = server.gui.add_html("")
+    register(server, visitors, {Step, ResetAll, TogglePlay, FrameScene}, "live page")
+    ending = threading.Event()
+    with line_to(gated_server.url, delay=DELAY) as far, page_at(browser, gated_server.url) as (page, errors):
+        small = Small(gated_server, page, far)
+        visitors.do = small.do
+
+        def draw() -> None:
+            count = 0
+            while not ending.wait(1 / 60):
+                if not small.still:
+                    count += 1
+                    order = range(ROWS - 1, -1, -1) if small.swapped else range(ROWS)
+                    rows.content = "".join(
+                        part(SelectEnv(env=env), f"env {env}, drawing {count}") for env in order
+                    )
+                seed.show(str(small.seed))
+                pause.show(small.drawn_pause)
+
+        drawing = threading.Thread(target=draw, daemon=True)
+        drawing.start()
+        page.wait_for_selector("[data-page]", state="attached")
+        expect(page.get_by_text("recording")).to_be_visible()
+        yield small
+        ending.set()
+        drawing.join()
+        assert not errors
+    gated_server.close()
+
+
+@pytest.fixture
+def small(opened: Small) -> Small:
+    opened.seed, opened.swapped, opened.still, opened.drawn_pause = 7, False, False, False
+    expect(opened.page.get_by_label("Seed")).to_have_value("7")
+    opened.page.evaluate("document.activeElement.blur()")
+    opened.came.clear()
+    return opened
+
+
+def press_for_a_while(page: Page, x: float, y: float) -> None:
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.wait_for_timeout(50)  # a finger's press, in which the row is drawn anew three times
+    page.mouse.up()
+
+
+def middle_of(page: Page, selector: str) -> tuple[float, float]:
+    box = until(lambda: page.locator(selector).bounding_box(), selector)
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def test_presses_on_rows_that_are_redrawn_count_once_each(small: Small) -> None:
+    wanted = [(7 * k) % ROWS for k in range(20)]
+    for env in wanted:
+        press_for_a_while(small.page, *middle_of(small.page, small.row(env)))
+    small.has(*(SelectEnv(env=env) for env in wanted))
+
+
+def test_a_press_means_what_was_under_the_pointer_as_it_went_down(small: Small) -> None:
+    small.page.mouse.move(*middle_of(small.page, small.row(2)))
+    small.page.mouse.down()
+    small.swapped = True
+    until(
+        lambda: small.page.get_by_text("drawing").first.inner_text().startswith(f"env {ROWS - 1}"),
+        "the other order",
+    )
+    small.page.mouse.up()
+    small.has(SelectEnv(env=2))
+
+
+def test_a_press_that_is_drawn_off_its_part_does_nothing(small: Small) -> None:
+    x, y = middle_of(small.page, small.row(3))
+    small.page.mouse.move(x, y)
+    small.page.mouse.down()
+    small.page.mouse.move(x - 400, y - 100)
+    small.page.mouse.up()
+    small.page.keyboard.press("s")
+    small.has(Step())
+
+
+def test_what_is_typed_is_done_before_the_command_that_follows_it(browser: Browser, small: Small) -> None:
+    """Over a line that takes 200 ms each way."""
+    small.came.clear()
+    with page_at(browser, small.far.address(small.gated_server.url)) as (page, errors):
+        page.set_default_timeout(120_000)
+        page.wait_for_selector("[data-page]", state="attached")  # until then viser may draw the panel anew
+        field = page.get_by_label("Seed")
+        expect(field).to_have_value("7")
+        for seed in (12, 34, 5):
+            field.fill("")
+            field.type(str(seed))
+            page.keyboard.press("Enter")
+            page.keyboard.press("Shift+R")
+        small.has(*(command for seed in (12, 34, 5) for command in (SetSeed(seed=seed), ResetAll())))
+        field.fill("8")
+        x, y = middle_of(page, small.row(1))
+        press_for_a_while(page, x, y)
+        until(lambda: len(small.came) == 8, "the press", seen=lambda: small.came)
+        assert small.came[6:] == [SetSeed(seed=8), SelectEnv(env=1)], (
+            "the press takes the focus from the field first"
+        )
+        assert not errors
+
+
+@pytest.mark.parametrize("typed", ["5000000000", "1.5", "NaN", "-1", "abc", "100", ""])
+def test_a_seed_that_is_none_is_refused_in_words_and_the_field_shows_what_holds(
+    small: Small, typed: str
+) -> None:
+    field = small.page.get_by_label("Seed")
+    field.fill(typed)
+    small.page.keyboard.press("Enter")
+    expect(small.page.locator(".mantine-Notification-root, .wb-not-taken").last).to_be_visible()
+    expect(field).to_have_value("7")
+    small.page.keyboard.press("s")
+    small.has(Step())
+
+
+def test_a_refusal_that_comes_late_leaves_what_is_typed_meanwhile(browser: Browser, small: Small) -> None:
+    small.came.clear()
+    with page_at(browser, small.far.address(small.gated_server.url)) as (page, errors):
+        page.set_default_timeout(120_000)
+        page.wait_for_selector("[data-page]", state="attached")
+        field = page.get_by_label("Seed")
+        field.fill(str(MOST_SEED + 1))
+        page.keyboard.press("Enter")
+        field.fill("55")
+        expect(page.locator(".mantine-Notification-root").filter(has_text="seed").last).to_be_visible()
+        page.wait_for_timeout(500)  # the reply comes beside the notification
+        expect(field).to_have_value("55")
+        page.keyboard.press("Enter")
+        small.has(SetSeed(seed=55))
+        assert not errors
+
+
+@pytest.mark.parametrize("taken", [True, False])
+def test_what_was_entered_stays_until_it_is_drawn_and_goes_if_it_is_not(small: Small, taken: bool) -> None:
+    box = small.page.get_by_label("Pause")
+    expect(box).not_to_be_checked()
+    box.click()
+    small.has(PauseLog(on=True))
+    for _ in range(8):
+        small.page.wait_for_timeout(50)  # the drawing may come that much later than the reply
+        assert box.is_checked()
+    small.drawn_pause = taken
+    small.page.wait_for_timeout(1500)
+    assert box.is_checked() == taken
+
+
+def test_escape_leaves_a_field_as_it_was(small: Small) -> None:
+    field = small.page.get_by_label("Seed")
+    field.fill("55")
+    small.page.keyboard.press("Escape")
+    expect(field).to_have_value("7")
+    small.page.keyboard.press("f")
+    small.has(FrameScene())
+
+
+def test_a_key_that_is_held_repeats_where_that_makes_sense(small: Small) -> None:
+    for key in ("s", "s", "s", "f", "f"):
+        small.page.keyboard.down(key)  # again without up: the browser says that it repeats
+    small.page.keyboard.up("s")
+    small.page.keyboard.up("f")
+    small.has(Step(), Step(), Step(), FrameScene())
+
+
+@pytest.mark.parametrize(
+    ("event", "commands"),
+    [
+        ("{key: 'S', code: 'KeyS'}", [Step()]),  # CapsLock
+        ("{key: '\u044b', code: 'KeyS'}", [Step()]),  # a Cyrillic layout
+        ("{key: 's', code: 'KeyO'}", [Step()]),  # Dvorak
+        ("{key: 'R', code: 'KeyR', shiftKey: true}", [ResetAll()]),
+        ("{key: 's', code: 'KeyS', isComposing: true}", []),  # an input method
+        ("{key: 's', code: 'KeyS', altKey: true}", []),
+        ("{key: 's', code: 'KeyS', ctrlKey: true}", []),
+    ],
+)
+def test_a_key_is_the_letter_that_is_on_it_in_any_layout(
+    small: Small, event: str, commands: list[Command]
+) -> None:
+    small.page.evaluate(
+        f"document.body.dispatchEvent(new KeyboardEvent('keydown', {{bubbles: true, ...{event}}}))"
+    )
+    small.page.keyboard.press("f")
+    small.has(*commands, FrameScene())
+
+
+def test_without_a_pointer_a_part_is_pressed_too_and_keeps_the_focus_when_it_is_redrawn(small: Small) -> None:
+    small.page.evaluate(f"document.querySelector(`{small.row(4)}`).click()")
+    small.has(SelectEnv(env=4))
+    small.page.keyboard.press("Tab")
+    small.page.evaluate(f"document.querySelector(`{small.row(5)}`).focus()")
+    small.page.wait_for_timeout(300)  # it is drawn anew some twenty times
+    small.page.keyboard.press("Enter")
+    small.has(SelectEnv(env=4), SelectEnv(env=5))
+    small.page.keyboard.press("Space")
+    small.has(SelectEnv(env=4), SelectEnv(env=5), SelectEnv(env=5))
+
+
+def test_a_click_gives_the_focus_back_so_that_space_plays(small: Small) -> None:
+    press_for_a_while(small.page, *middle_of(small.page, small.row(0)))
+    small.page.keyboard.press("Space")
+    small.has(SelectEnv(env=0), TogglePlay())
+
+
+def test_a_drag_along_a_strip_ends_where_the_pointer_does(small: Small) -> None:
+    box = until(lambda: small.page.get_by_text("strip", exact=True).bounding_box(), "the strip")
+    y = box["y"] + 5
+    small.page.mouse.move(box["x"] + box["width"] / 20, y)
+    small.page.mouse.down()
+    for k in range(1, 11):
+        small.page.mouse.move(box["x"] + box["width"] * k / 20, y)
+    small.page.mouse.up()
+    until(lambda: small.came and small.came[-1] == Seek(step=50), "its middle", seen=lambda: small.came)
+    steps = [command.step for command in small.came if isinstance(command, Seek)]
+    assert steps == sorted(steps) and len(steps) == len(small.came) <= 11
+
+
+def test_a_picture_says_where_it_was_pressed(small: Small) -> None:
+    box = until(lambda: small.page.get_by_text("picture", exact=True).bounding_box(), "the picture")
+    small.page.mouse.click(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2)
+    until(lambda: small.came, "the place")
+    (picked,) = small.came
+    assert isinstance(picked, PickPixel) and picked.x == pytest.approx(0.25, abs=0.01)
+    assert picked.y == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_row_hears_of_shift_and_ctrl_and_is_opened_by_a_second_press(small: Small) -> None:
+    row = small.page.get_by_text("recording", exact=True)
+    row.click(modifiers=["Shift"])
+    row.click(modifiers=["Control"])
+    small.page.wait_for_timeout(600)  # two presses after that are no double press with it
+    row.click()
+    row.click()
+    small.has(
+        PressRow(id="a", held="shift"), PressRow(id="a", held="ctrl"), PressRow(id="a"), OpenRow(id="a")
+    )
+
+
+def test_a_channel_that_is_lost_alone_comes_back_and_nothing_is_asked_twice(small: Small) -> None:
+    small.page.evaluate(
+        """() => new Promise((done) => {
+            const send = WebSocket.prototype.send;
+            WebSocket.prototype.send = function (text) {
+                if (typeof text !== "string") return send.call(this, text);
+                WebSocket.prototype.send = send;
+                this.addEventListener("close", done);
+                this.close();
+            };
+            document.body.dispatchEvent(new KeyboardEvent("keydown", {key: "f", code: "KeyF", bubbles: true}));
+        })"""
+    )
+    expect(small.page.get_by_text("may not have been done")).to_be_visible()
+    deadline = time.monotonic() + 60
+    while not small.came and time.monotonic() < deadline:
+        small.page.keyboard.press("s")
+        small.page.wait_for_timeout(200)  # the channel takes a moment to come back
+    assert set(small.came) == {Step()}, "what was lost is told, and not sent again"

@@ -1,0 +1,447 @@
+// What a person does becomes numbered commands on one WebSocket, in the order in which it was done. Each is answered.
+//
+//   data-page="x7Hq"                         this page's name, told by the server
+//   data-keys='[["s","live","step",true]]'   keys: context, command, whether a held key repeats it; data-contexts are on
+//   data-context="library"                   while this element is in the page, the keys of that context are on
+//   data-do='["select_env", {"env": 3}]'     a press does this
+//     data-held="held"                         its field for the keys that are held: "", "ctrl", "shift", "ctrl+shift"
+//     data-twice='["open_row", {...}]'         a second press soon after does this
+//     data-place                               its fields x and y: the place in the element, 0 to 1 from its upper left corner
+//     data-along='["step", 0, 99]'             its field for the place along the element: a whole number between these
+//   data-tell='["tell_unfolded", {...}]'     done when the element comes into the page (data-only: only where <html> has data-…)
+//   data-field='["set_seed", {}, "seed"]'    what is entered goes into the last named field: at Enter or when the focus leaves, when
+//                                            it is chosen, or (data-live) as it is typed; Enter does data-enter
+//     data-number="[0, null, 1, true]"         a number: the least, the greatest, what an arrow key adds, whether it is whole
+//   data-shows='[["text.set_seed.seed", "12", false, {}]]'  what the server has for a field of this name: copied into it while nobody
+//                                            uses it; whether it is off; options ([shown, value]) or bounds that it has from now on
+"use strict";
+{
+  const STILL = 6; // pixels that a press may move
+  const TWICE = 450; // milliseconds between two presses
+  const NOTICE = 8000; // milliseconds
+  const DRAWN = 1000; // milliseconds after which what was entered is drawn
+
+  // --- the channel ------------------------------------------------------------------------------------------------------
+
+  let socket = null;
+  let page = "";
+  let sent = 0;
+  const unanswered = new Map(); // number -> the data-field or the pressed element's data-do
+  const newest = new Map(); // the same -> a value that waits for the reply to the one before
+  const early = []; // asked before the socket was open
+
+  let notice = null;
+  function tell(text, beside = null) {
+    notice?.remove();
+    const shown = (notice = document.createElement("div"));
+    notice.className = "wb-not-taken";
+    notice.setAttribute("role", "alert");
+    notice.textContent = text;
+    document.body.append(notice);
+    const { left, bottom } = beside?.getBoundingClientRect() ?? { left: innerWidth / 2 - notice.offsetWidth / 2, bottom: 40 };
+    notice.style.left = `${Math.max(4, Math.min(left, innerWidth - notice.offsetWidth - 4))}px`;
+    notice.style.top = `${Math.min(bottom + 4, innerHeight - notice.offsetHeight - 4)}px`;
+    setTimeout(() => shown.remove(), NOTICE);
+  }
+
+  function send(command, of = "") {
+    const message = JSON.stringify({ n: ++sent, do: command });
+    if (socket?.readyState === WebSocket.OPEN) socket.send(message);
+    else if (!socket || socket.readyState === WebSocket.CONNECTING) early.push(message);
+    else return tell("Not done: there is no connection.");
+    unanswered.set(sent, of);
+  }
+
+  const isUnanswered = (of) => [...unanswered.values()].includes(of);
+
+  // Of a field or a drag only the newest value, while one is unanswered.
+  function sendNewest(of, command) {
+    if (isUnanswered(of)) newest.set(of, command);
+    else send(command, of);
+  }
+
+  // What was typed before a command goes before it.
+  function ask(command) {
+    for (const [of, value] of newest) send(value, of);
+    newest.clear();
+    send(command);
+  }
+
+  function answered({ n, refused }) {
+    const of = unanswered.get(n);
+    unanswered.delete(n);
+    if (of && newest.has(of) && !isUnanswered(of)) {
+      send(newest.get(of), of);
+      newest.delete(of);
+    }
+    if (of && !isUnanswered(of)) keepEntered(of, refused);
+    if (refused && of) showValues(of);
+    showValues();
+  }
+
+  function connect() {
+    if (socket) {
+      socket.onclose = null;
+      socket.close();
+      lost();
+    }
+    const opened = Date.now();
+    const mine = new WebSocket(`${location.origin.replace("http", "ws")}/do?${new URLSearchParams({ page })}`);
+    socket = mine;
+    mine.onopen = () => early.splice(0).forEach((message) => mine.send(message));
+    mine.onmessage = ({ data }) => answered(JSON.parse(data));
+    mine.onclose = () => {
+      lost();
+      setTimeout(() => socket === mine && connect(), Math.max(200, opened + 1000 - Date.now()));
+    };
+  }
+
+  // What was not answered may be done or not, and is not asked again: minutes later it would surprise.
+  function lost() {
+    if (unanswered.size) tell("The connection was lost: what was asked for last may not have been done.");
+    unanswered.clear();
+    newest.clear();
+    entered.clear();
+    early.splice(0);
+  }
+
+  // --- presses ----------------------------------------------------------------------------------------------------------
+
+  const part = (event, what) => (event.target instanceof Element ? event.target.closest(`[${what}]`) : null);
+  const heldOf = ({ ctrlKey, metaKey, shiftKey }) => [(ctrlKey || metaKey) && "ctrl", shiftKey && "shift"].filter(Boolean).join("+");
+  const within = (at, from, size) => Math.min(1, Math.max(0, (at - from) / Math.max(size, 1)));
+
+  // The command of an element, with what the event says of it.
+  function commandOf(element, event) {
+    const [name, fields] = JSON.parse(element.dataset.do);
+    const said = { ...fields };
+    if (element.dataset.held) said[element.dataset.held] = heldOf(event);
+    return [name, said];
+  }
+
+  // The command of each place in an element, which is replaced by the next redraw.
+  function commandAt(element) {
+    const [name, fields] = JSON.parse(element.dataset.do);
+    const { left, top, width, height } = element.getBoundingClientRect();
+    const [field, low, high] = JSON.parse(element.dataset.along ?? "[]");
+    return ({ clientX, clientY }) => {
+      const [x, y] = [within(clientX, left, width), within(clientY, top, height)];
+      return [name, { ...fields, ...(field ? { [field]: Math.round(low + x * (high - low)) } : { x, y }) }];
+    };
+  }
+
+  // A redraw may replace or move an element between pointer down and up, and then the browser makes no click. So a press means
+  // what was under the pointer as it went down, and counts if the pointer hardly moved or is still on what does the same.
+  let pressed = null; // { does, command, twice, held, x, y }
+  let dragged = null; // { of, at } of the element along which the pointer goes
+  let last = { does: "", at: 0 };
+
+  addEventListener(
+    "pointerdown",
+    (event) => {
+      pressed = dragged = null;
+      const element = part(event, "data-do");
+      if (!element || !event.isPrimary || event.button !== 0) return;
+      if ("place" in element.dataset || element.dataset.along) {
+        dragged = { of: element.dataset.do, at: commandAt(element) };
+        sendNewest(dragged.of, dragged.at(event));
+        event.preventDefault();
+        return;
+      }
+      const { clientX: x, clientY: y } = event;
+      const { do: does, twice } = element.dataset;
+      pressed = { does, command: commandOf(element, event), twice, held: heldOf(event), x, y };
+    },
+    true,
+  );
+  addEventListener("pointermove", (event) => {
+    if (dragged) sendNewest(dragged.of, dragged.at(event));
+  }, true);
+  addEventListener("pointercancel", () => (pressed = dragged = null), true);
+  addEventListener(
+    "pointerup",
+    (event) => {
+      const it = pressed;
+      pressed = dragged = null;
+      if (!it) return;
+      const still = Math.hypot(event.clientX - it.x, event.clientY - it.y) < STILL;
+      if (!still && part(event, "data-do")?.dataset.do !== it.does) return;
+      const again = it.twice && !it.held && last.does === it.does && performance.now() - last.at < TWICE;
+      last = { does: again || it.held ? "" : it.does, at: performance.now() };
+      ask(again ? JSON.parse(it.twice) : it.command);
+    },
+    true,
+  );
+  // Without a pointer: a screen reader, voice control, Enter and Space on a button.
+  addEventListener("click", (event) => {
+    const element = part(event, "data-do");
+    if (element && event.detail === 0) ask(commandOf(element, event));
+  }, true);
+
+  // --- keys -------------------------------------------------------------------------------------------------------------
+
+  const TYPED = "input:not([type=checkbox], [type=radio], [type=range], [type=button]), textarea, select, [contenteditable]:not([contenteditable=false])";
+  const CLOSED = CSS.supports("selector(:open)") ? "select:not(:open)" : ":not(*)";
+  const TYPED_INTO = "input[type=text], textarea";
+  const CONTROL = "button, a[href], input, select, summary, [role=slider], [role=tab], [role=menuitem], [role=option], [role=button]";
+  const MOVES = /^(Enter| |Arrow.*|Home|End|Page.*)$/;
+  const NAMES = { " ": "space" };
+  let keys = []; // [key, context, command, repeats]; the last ones are kept while a folded panel takes them out of the page
+  let always = [];
+  const down = new Map(); // code -> the command that is asked when this key goes up
+
+  function readKeys() {
+    const told = [...document.querySelectorAll("[data-keys]")].at(-1);
+    if (!told) return;
+    keys = JSON.parse(told.dataset.keys);
+    always = told.dataset.contexts.split(" ");
+  }
+
+  // CapsLock changes `key`, and a Cyrillic layout has no "s": the letter is that of the place where "s" is.
+  function nameOf({ key, code, ctrlKey, metaKey, altKey, shiftKey }) {
+    const letter = /^\p{L}$/u.test(key);
+    const name = NAMES[key] ?? (letter && !/^[a-z]$/i.test(key) ? code.replace("Key", "") : key);
+    const held = [(ctrlKey || metaKey) && "ctrl", altKey && "alt", shiftKey && (letter || name.length > 1) && "shift"];
+    return [...held.filter(Boolean), name.toLowerCase()].join("+");
+  }
+
+  // Over a dialog that is open only the keys of what is in it count.
+  function contexts() {
+    const dialog = [...document.querySelectorAll("[aria-modal=true], dialog[open]")].at(-1);
+    const there = [...(dialog ?? document).querySelectorAll("[data-context]")].map((one) => one.dataset.context);
+    return dialog ? there : [...there.reverse(), ...always];
+  }
+
+  function keyed(event) {
+    readKeys();
+    const name = nameOf(event);
+    const on = contexts();
+    const found = keys.filter(([key, context]) => key === name && on.includes(context));
+    return found.sort((a, b) => on.indexOf(a[1]) - on.indexOf(b[1]))[0];
+  }
+
+  addEventListener(
+    "keydown",
+    (event) => {
+      if (event.isComposing || event.keyCode === 229) return;
+      // A list that was opened by the pointer and closed again would take the letters of keys for its options.
+      if (byPointer && event.target.matches?.(CLOSED)) event.target.blur();
+      const at = document.activeElement ?? document.body;
+      const does = at.closest("[data-do]");
+      if (!event.defaultPrevented && (event.key === "Enter" || event.key === " ") && does && !at.closest(TYPED)) {
+        if (!event.repeat) ask(commandOf(does, event));
+        event.preventDefault();
+        event.stopImmediatePropagation();
+        return;
+      }
+      if (STEPS[event.key] && does?.closest("[data-roving]") && !heldOf(event)) {
+        walk(does, STEPS[event.key]);
+        event.preventDefault();
+        event.stopImmediatePropagation();
+        return;
+      }
+      const one = { ArrowUp: 1, ArrowDown: -1 }[event.key];
+      if (one && event.target.dataset?.number) {
+        stepNumber(event.target, one);
+        event.preventDefault();
+        return;
+      }
+      const found = keyed(event);
+      // Who types keeps all keys, but for Escape in a dialog's field; a focused control keeps those that move it.
+      const typing = at.closest(TYPED) && !(event.key === "Escape" && at.closest("[aria-modal=true]"));
+      if (typing || (MOVES.test(event.key) && !event.altKey && at.closest(CONTROL))) return;
+      if (!found) return;
+      const [, , command, repeats] = found;
+      if (!event.repeat || repeats) ask([command, {}]);
+      event.preventDefault();
+      event.stopImmediatePropagation();
+    },
+    true,
+  );
+
+  // In a table or on a strip Tab stops at one part, and the arrows go from there to the others.
+  const STEPS = { ArrowLeft: -1, ArrowUp: -1, ArrowRight: 1, ArrowDown: 1 };
+  function walk(from, step) {
+    const parts = [...from.closest("[data-roving]").querySelectorAll("[tabindex][data-do]")];
+    parts[parts.indexOf(from) + step]?.focus();
+  }
+
+  // --- fields -----------------------------------------------------------------------------------------------------------
+
+  const NUMBER = /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i;
+  function whyNot(text, [low, high, , whole]) {
+    const number = Number(text);
+    if (text === "") return "it was left empty";
+    if (!NUMBER.test(text)) return `\u201c${text.slice(0, 40)}\u201d is not a number`;
+    if (whole && Number.isFinite(number) && !Number.isInteger(number)) return `${number} is not a whole number`;
+    if (Number.isFinite(number) && (low ?? number) <= number && number <= (high ?? number)) return "";
+    if (low === null && high === null) return "it is too large";
+    if (high === null) return `it is at least ${low}`;
+    return low === null ? `it is at most ${high}` : `it goes from ${low} to ${high}`;
+  }
+
+  // What an input holds, as its command takes it; undefined where that is no number.
+  function valueOf(input) {
+    if (input.type === "checkbox") return input.checked;
+    if (input.tagName === "SELECT") return JSON.parse(input.value);
+    if (input.type === "range") return Number(input.value);
+    if (!input.dataset.number) return input.value;
+    const why = whyNot(input.value.trim(), JSON.parse(input.dataset.number));
+    if (!why) return Number(input.value);
+    showValues("", input);
+    tell(`${input.ariaLabel}: ${why}. It stays ${input.value}.`, input);
+  }
+
+  // Between the reply and the next drawing the server's value is the one before: without this an input would jump back to it.
+  const entered = new Map(); // data-field -> [what its input shows, until when that stays]
+
+  function typed(input) {
+    const of = input.dataset.field;
+    const [name, fields, field] = JSON.parse(of);
+    edited.delete(input);
+    const value = valueOf(input);
+    if (value === undefined) return;
+    entered.set(of, [input.tagName === "SELECT" ? input.value : String(value), Infinity]);
+    sendNewest(of, [name, { ...fields, [field]: value }]);
+  }
+
+  function keepEntered(of, refused) {
+    if (!entered.has(of)) return;
+    if (refused) return entered.delete(of);
+    entered.get(of)[1] = performance.now() + DRAWN;
+    setTimeout(showValues, DRAWN + 50);
+  }
+
+  // One step further, within its bounds.
+  function stepNumber(input, steps) {
+    const [low, high, step] = JSON.parse(input.dataset.number);
+    const next = Number(((Number(input.value) || 0) + steps * step).toPrecision(12));
+    input.value = Math.max(low ?? next, Math.min(high ?? next, next));
+    typed(input);
+  }
+  const edited = new WeakSet(); // inputs with text that was not sent yet
+  addEventListener("input", ({ target }) => {
+    if (!target.dataset?.field) return;
+    edited.add(target);
+    if ("live" in target.dataset) typed(target);
+  }, true);
+  addEventListener("change", ({ target }) => {
+    if (!target.dataset?.field || "live" in target.dataset) return;
+    typed(target);
+    if (byPointer && !target.matches(TYPED_INTO)) target.blur();
+  }, true);
+  addEventListener(
+    "keydown",
+    (event) => {
+      const input = event.target;
+      if ((event.key !== "Enter" && event.key !== "Escape") || !(input instanceof HTMLInputElement) || !input.matches(TYPED)) return;
+      if (input.dataset.field && event.key === "Escape") {
+        if ("live" in input.dataset) input.value = "";
+        else showValues("", input);
+        if ("live" in input.dataset) typed(input);
+      }
+      if (input.dataset.enter && event.key === "Enter") ask(JSON.parse(input.dataset.enter));
+      // A dialog has its own use for both keys.
+      if (!input.closest("[role=dialog]")) input.blur();
+    },
+  );
+
+  // Copied while nobody uses it; `refused` is a field whose value was not taken, unless more was typed since.
+  function showValues(refused = "", into = null) {
+    for (const shows of document.querySelectorAll("[data-shows]")) {
+      for (const [name, value, off, { options, bounds }] of JSON.parse(shows.dataset.shows)) {
+        for (const input of document.getElementsByName(name)) {
+          const of = input.dataset.field;
+          input.disabled = off;
+          if (options) offer(input, options);
+          if (bounds) bound(input, bounds);
+          const used = document.activeElement === input && input !== into && (of !== refused || edited.has(input));
+          const [shown, until] = entered.get(of) ?? ["", 0];
+          if (used || newest.has(of) || isUnanswered(of) || (shown !== String(value) && performance.now() < until)) continue;
+          if (input.type === "checkbox") input.checked = value;
+          else if (input.value !== String(value)) input.value = value;
+        }
+      }
+    }
+  }
+
+  function offer(select, options) {
+    const told = JSON.stringify(options);
+    if (select.dataset.options === told) return;
+    select.dataset.options = told;
+    select.replaceChildren(...options.map(([shown, value]) => new Option(shown, value)));
+  }
+
+  function bound(input, [low, high]) {
+    if (input.type === "range") [input.min, input.max] = [low, high];
+    else input.dataset.number = JSON.stringify([low, high, ...JSON.parse(input.dataset.number).slice(2)]);
+    if (input.type === "range") input.step = JSON.parse(input.parentElement.querySelector("[data-number]").dataset.number)[2];
+  }
+  addEventListener("focusout", () => setTimeout(showValues), true);
+
+  // --- focus ------------------------------------------------------------------------------------------------------------
+
+  // What was clicked gives the focus back, so that the page's keys go on: a button would else take Space for itself. Who
+  // walks with Tab keeps it.
+  let byPointer = false;
+  let focused = "";
+  addEventListener("pointerdown", () => {
+    byPointer = true;
+    focused = "";
+  }, true);
+  addEventListener("keydown", () => (byPointer = false), true);
+  function giveBack(event) {
+    if (event.type === "click" && event.detail === 0) return;
+    const here = document.activeElement;
+    if (!here || here === document.body) return;
+    if (!here.matches(TYPED) || event.target instanceof HTMLCanvasElement) here.blur();
+  }
+  let again = 0;
+  for (const kind of ["pointerup", "click"]) {
+    addEventListener(
+      kind,
+      (event) => {
+        giveBack(event);
+        // Again: some controls take the focus in handlers that come after this one.
+        clearTimeout(again);
+        again = setTimeout(() => byPointer && giveBack(event), 50);
+      },
+      true,
+    );
+  }
+
+  // A redraw takes the focus from an element that it replaces; it goes to the one that does the same.
+  addEventListener("focusin", ({ target }) => {
+    focused = (!byPointer && target.closest("[data-do]")?.dataset.do) || "";
+  }, true);
+  addEventListener("focusout", ({ relatedTarget }) => relatedTarget && (focused = ""), true);
+
+  // --- what comes into the page -------------------------------------------------------------------------------------------
+
+  const told = new WeakSet();
+  new MutationObserver(() => {
+    const now = document.querySelector("[data-page]")?.dataset.page ?? page;
+    if (now !== page) {
+      page = now;
+      connect();
+    }
+    if (page) {
+      for (const element of document.querySelectorAll("[data-tell]")) {
+        if (told.has(element) || (element.dataset.only && !document.documentElement.hasAttribute(`data-${element.dataset.only}`))) continue;
+        told.add(element);
+        send(JSON.parse(element.dataset.tell));
+      }
+    }
+    for (const input of document.querySelectorAll("[data-autofocus]")) {
+      input.removeAttribute("data-autofocus");
+      input.focus();
+      input.select();
+    }
+    if (focused && document.activeElement === document.body) {
+      document.querySelector(`[tabindex][data-do="${CSS.escape(focused)}"]`)?.focus({ preventScroll: true });
+    }
+    showValues();
+  }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-page", "data-shows"] });
+
+  window.wb = { ask, sendNewest };
+}

@@ -1,0 +1,127 @@
+"""The base of every command, and the list of all of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import msgspec
+import msgspec.structs
+
+KEY_NAMES = {
+    "space": "Space",
+    "arrowleft": "Left arrow",
+    "arrowright": "Right arrow",
+    "arrowup": "Up arrow",
+    "arrowdown": "Down arrow",
+    "pageup": "Page Up",
+    "pagedown": "Page Down",
+    "home": "Home",
+    "end": "End",
+    "enter": "Enter",
+    "escape": "Esc",
+    "delete": "Delete",
+}
+MODIFIERS = "ctrl", "alt", "shift"
+"""In the order in which a key names them. ``ctrl`` is Cmd on a Mac too."""
+
+
+class Refused(ValueError):
+    """A command is not possible now, or not with these values; the message tells the person why."""
+
+
+def name_of(kind: type[Command]) -> str:
+    """``reset_selected`` of `ResetSelected`."""
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
+
+
+class Command(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Something that a person, a script or an agent can ask for.
+
+    The first line of its docstring is its help. A value that its fields do not take is refused when it is read.
+    """
+
+    key: ClassVar[str] = ""
+    """The key that asks for it with its default values: ``s``, ``shift+arrowleft``, ``ctrl+z``."""
+    context: ClassVar[str] = "page"
+    """Where the key counts: ``page``, or an element with this ``data-context`` that is visible."""
+    repeats: ClassVar[bool] = False
+    """A key that is held down asks again and again."""
+
+    @classmethod
+    def help(cls) -> str:
+        """One sentence without its full stop."""
+        return (cls.__doc__ or "").strip().split("\n")[0].removesuffix(".")
+
+    @classmethod
+    def is_in_palette(cls) -> bool:
+        """A person can ask for it by its name alone."""
+        alone = not any(field.required for field in msgspec.structs.fields(cls))
+        return alone and cls.context != "dialog" and not cls.__name__.startswith("Tell")
+
+    def encode(self) -> tuple[str, dict[str, Any]]:
+        """Name and fields, as a page sends them."""
+        return name_of(type(self)), msgspec.to_builtins(self)
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key and the command that it asks for."""
+
+    key: str
+    context: str
+    command: str
+    repeats: bool
+
+
+class CommandList:
+    """All commands."""
+
+    def __init__(self, kinds: Iterable[type[Command]]) -> None:
+        self.kinds = tuple(kinds)
+        self._by_name = {name_of(kind): kind for kind in self.kinds}
+        assert len(self._by_name) == len(self.kinds), "two commands have one name"
+        taken = [(kind.context, kind.key) for kind in self.kinds if kind.key]
+        assert len(taken) == len(set(taken)), "two commands have one key"
+        assert all(is_key(kind.key) for kind in self.kinds if kind.key), "a key is written otherwise"
+
+    def __iter__(self) -> Iterator[type[Command]]:
+        return iter(self.kinds)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._by_name
+
+    def decode(self, name: str, fields: object) -> Command:
+        """Read a command.
+
+        Raises:
+            KeyError: there is no command of this name.
+            Refused: its fields do not take these values.
+        """
+        kind = self._by_name[name]
+        try:
+            return msgspec.convert(fields, kind)
+        except msgspec.ValidationError as fault:
+            raise Refused(f"{kind.help()}: {fault}.") from None
+
+    def keys(self) -> dict[type[Command], Key]:
+        """The key of each command that has one."""
+        with_key = (kind for kind in self.kinds if kind.key)
+        return {kind: Key(kind.key, kind.context, name_of(kind), kind.repeats) for kind in with_key}
+
+
+def is_key(key: str) -> bool:
+    *held, last = key.split("+")
+    known = len(last) == 1 and last == last.lower() or last in KEY_NAMES
+    return known and held == [name for name in MODIFIERS if name in held]
+
+
+def key_in_words(key: str) -> str:
+    """As the page and the docs show it: ``Space``, ``Shift+R``; empty for no key."""
+    if not key:
+        return ""
+    *held, last = key.split("+")
+    name = KEY_NAMES.get(last, last.upper())
+    return "+".join([*(one.capitalize() for one in held), name])
