@@ -356,8 +356,11 @@
           if (options) offer(input, options);
           if (bounds) bound(input, bounds);
           const used = document.activeElement === input && input !== into && (of !== refused || edited.has(input));
+          if (newest.has(of) || isUnanswered(of)) continue;
           const [shown, until] = entered.get(of) ?? ["", 0];
-          if (used || newest.has(of) || isUnanswered(of) || (shown !== String(value) && performance.now() < until)) continue;
+          if (shown === String(value)) entered.delete(of); // drawn: another command may change it from now on
+          else if (performance.now() < until) continue;
+          if (used) continue;
           if (input.type === "checkbox") input.checked = value;
           else if (input.value !== String(value)) input.value = value;
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -227,6 +228,17 @@ def test_what_was_entered_stays_until_it_is_drawn_and_goes_if_it_is_not(small: S
     small.drawn_pause = taken
     small.page.wait_for_timeout(1500)
     assert box.is_checked() == taken
+
+
+def test_what_another_command_makes_of_an_entered_value_is_shown_as_soon_as_it_is_drawn(small: Small) -> None:
+    field = small.page.get_by_label("Seed")
+    drawn = small.page.locator("[data-shows*='seed']")
+    field.fill("55")
+    small.page.keyboard.press("Enter")
+    expect(drawn).to_have_attribute("data-shows", re.compile('"55"'))
+    small.seed = 66
+    expect(drawn).to_have_attribute("data-shows", re.compile('"66"'))
+    assert field.input_value() == "66"
 
 
 def test_escape_leaves_a_field_as_it_was(small: Small) -> None:

@@ -164,6 +164,7 @@ def test_words_are_looked_for_as_they_are_typed(shown: Shown) -> None:
     until(lambda: len(shown.panel.selected()) == 1, "one selected")
     shown.page.keyboard.press("Escape")
     expect(pill).to_have_text(f"all {COUNT}")
+    expect(field).to_have_value("")
     field.click()
     shown.page.keyboard.type("even")
     expect(pill).to_have_text(f"all {COUNT // 2} of {COUNT}")
