@@ -6,6 +6,7 @@ All else is the real thing: how it begins, its keeper, its pulse, its signals an
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import multiprocessing.connection
 import os
 import signal
@@ -17,7 +18,7 @@ from typing import Any, get_args
 
 from workbench.authoring.problem import Interrupted
 from workbench.machine.processes.wire import Call, Unpacker, pack_message
-from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, HeartbeatWriter, Interrupts
+from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, STACK_SIGNAL, HeartbeatWriter, Interrupts
 from workbench.session.protocol.messages import (
     Answer,
     ListenForDebugger,
@@ -89,6 +90,11 @@ class SmallWorker:
     def work_on(self, seconds: str) -> None:
         """Python that no interrupt leaves."""
         signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)
+        self.work(seconds)
+
+    def without_handlers(self, seconds: str) -> None:
+        """As at the end of the interpreter, which takes them down."""
+        faulthandler.unregister(STACK_SIGNAL)
         self.work(seconds)
 
     def held_by_a_debugger(self, seconds: str) -> None:

@@ -4,7 +4,8 @@
     python -m tests.sweeps.every_command swing_up PickCube-v1
     python -m tests.sweeps.every_command --quick     with few envs, seeds and rollouts, in one process: a twentieth of the time
 
-The commands are those of a terminal, in processes of their own. Only the length of episodes and the candidates of ``solve`` are bounded.
+The commands are those of a terminal, in processes of their own but for ``new`` and ``export``. Only the length of episodes
+and the candidates of ``solve`` are bounded.
 """
 
 from __future__ import annotations
@@ -104,15 +105,16 @@ def walk(task: str, folder: Path, quick: bool = False, checks: bool = True) -> I
             shutil.copy(file, folder)
     elif task in FROM_TEMPLATES:
         reference = "from_template.py"
-        made = command(task, "new", folder, "from_template", "--from", task.removeprefix("template "))
+        made = in_this_process(task, "new", folder, "from_template", "--from", task.removeprefix("template "))
         assert made.code == 0, made.err
     at = folder / reference if reference.endswith(".py") else reference
     yield opened_here(task, at, num_envs) if quick else opened(task, at, folder, num_envs, checks)
     yield command(task, "check", folder, reference, "--json")
     yield command(task, "record", folder, reference, *steps, *alone)
     yield command(task, "rescore", folder, "recordings", "--json", *alone)
-    yield command(task, "export", folder, "recordings", "--lerobot", "lerobot")
-    yield command(task, "export", folder, "recordings", "--maniskill", "demos.h5")
+    # Here, which saves two starts of Python: what a process would change is nothing to it.
+    yield in_this_process(task, "export", folder, "recordings", "--lerobot", "lerobot")
+    yield in_this_process(task, "export", folder, "recordings", "--maniskill", "demos.h5")
     yield command(
         task, "solve", folder, reference, "--seeds", "1", *FEW_CANDIDATES, *steps, "--out", "solved", "--json"
     )

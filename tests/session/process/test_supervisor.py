@@ -178,6 +178,13 @@ def test_long_work_is_told_again_and_again_and_that_it_is_over() -> None:
         assert one.deaths == [] and one.busy.count(None) == 1
 
 
+def test_a_worker_whose_handlers_are_down_is_not_ended_by_the_question_where_it_is() -> None:
+    with minded() as one:
+        one.worker.send(do("without_handlers 1.5"))
+        one.until(lambda: None in one.busy, "its end")
+        assert one.deaths == []
+
+
 @pytest.mark.slow
 def test_an_interrupt_leaves_work_and_nothing_that_is_idle_or_held() -> None:
     with minded() as one:

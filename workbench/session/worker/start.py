@@ -42,7 +42,7 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
     _let_kernel_end_us_first()
     leave = os._exit
     _install_stack_writers(stacks)
-    from workbench.session.process.heartbeat import HeartbeatWriter
+    from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, HeartbeatWriter
 
     heartbeat = HeartbeatWriter(heartbeat_fd)
     heartbeat.begin("starting")
@@ -67,6 +67,7 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
         if isinstance(error, ImportError) and (text := untested_text()):
             print(f"workbench: {text}", file=sys.stderr)
         code = 1
+    signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)  # by default it would end the process from here on
     # Or the interpreter would wait for the task's threads, and the page for this process.
     others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
     if code or not all(thread.daemon for thread in others):
@@ -90,6 +91,9 @@ def _install_stack_writers(stacks: int) -> None:
     from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, STACK_SIGNAL
 
     faulthandler.enable(file=stacks, all_threads=False)
+    # At its end the interpreter takes faulthandler's handler down and puts back what was there. By default the signal would
+    # then end the process, and the page would name the signal as the cause.
+    signal.signal(STACK_SIGNAL, signal.SIG_IGN)
     faulthandler.register(STACK_SIGNAL, file=stacks, all_threads=False)
     # Until the worker installs its handler there is nothing to interrupt, and the default would end the process.
     signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)
