@@ -16,6 +16,7 @@ import pytest
 from tests.drive.episodes import begin
 from tests.drive.episodes import made as small
 from tests.recording.verify_rrd import verify_rrd
+from workbench.machine.processes.confinement import landlock_version
 from workbench.recording.reader.read_episode import read_episode
 from workbench.recording.reader.reading import recover_confined
 from workbench.recording.writing.finish import recover
@@ -118,3 +119,17 @@ def test_mending_is_done_by_a_process_that_bears_what_a_folder_brings(tmp_path: 
     assert len(recover_confined(tmp_path)) == 1
     (path,) = tmp_path.glob("*.json")
     assert read_episode(path).length == 5 and read_episode(path).broken_files == ()
+
+
+@pytest.mark.skipif(not landlock_version(), reason="this kernel has no Landlock")
+@pytest.mark.parametrize("outside", [False, True])
+def test_mending_reads_nothing_outside_the_folder(tmp_path: Path, outside: bool) -> None:
+    folder, elsewhere = tmp_path / "recordings", tmp_path / "elsewhere"
+    begin(folder, small(5, seed=8))
+    if outside:
+        (scene,) = (folder / FOLDER).glob("*.scene")
+        scene.rename(elsewhere)
+        scene.symlink_to(elsewhere)
+    assert len(recover_confined(folder)) == 1
+    geometry = read_episode(next(folder.glob("*.json"))).geometry
+    assert bool(geometry and geometry.visuals) != outside

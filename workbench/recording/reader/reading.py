@@ -186,7 +186,7 @@ def recover_confined(folder: Path) -> tuple[Path, ...]:
         return ()
     except OSError as error:
         raise RecordingError(f"{failed}{error.strerror}") from error
-    reader = Reader(Path("/"), writes=folder.absolute())
+    reader = Reader(folder.absolute(), writes=folder.absolute())
     try:
         answer = reader.ask(Recover(folder.absolute()), RECOVERY_SECONDS).answer
     except OSError as error:
