@@ -23,3 +23,25 @@ def test_why_one_could_not_be_written_is_not_lost_to_the_next(tmp_path: Path) ->
     lost, kept = (future.result() for future in futures)
     assert isinstance(lost, str) and "env 0" in lost and "gone" in lost
     assert isinstance(kept, EpisodeFiles) and kept.rrd.is_file()
+
+
+class Panic(BaseException):
+    """As rerun's Rust code raises: no `Exception`."""
+
+
+def test_a_panic_is_one_episode_that_could_not_be_written_and_is_waited_for_no_more(tmp_path: Path) -> None:
+    panics = [Panic("in Rust")]
+
+    def then(files: EpisodeFiles) -> None:
+        while panics:
+            raise panics.pop()
+
+    finisher = EpisodeFinisher(then=then)
+    episodes = [
+        GatheredEpisode(appended(tmp_path / name, made(3), pictures=False), env=0, seed=0) for name in "ab"
+    ]
+    lost, kept = (finisher.finish(episode).result(60) for episode in episodes)
+    assert isinstance(lost, str) and "in Rust" in lost
+    assert isinstance(kept, EpisodeFiles)
+    assert finisher.waiting == 0 and finisher.finished.count == 1
+    finisher.close()

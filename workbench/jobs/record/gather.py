@@ -413,32 +413,39 @@ class EpisodeFinisher:
                 return False
             episode, made = self._waiting.popleft()
             self._at_work += 1
+        files: EpisodeFiles | str | None = None
+        size = 0
         try:
-            made.set_result(self._finish(episode, process))
+            files, size = self._finish(episode, process)
         except BaseException as error:
             made.set_exception(error)
             raise
+        finally:
+            with self._lock:
+                self._at_work -= 1
+                if isinstance(files, str):
+                    self._finished = replace(self._finished, problem=files)
+                elif files is not None:
+                    before = self._finished
+                    self._finished = Finished(before.count + 1, before.bytes_written + size, files, None)
+            self._on_change()
+        made.set_result(files)
         return True
 
-    def _finish(self, episode: GatheredEpisode, process: FilesProcess | None) -> EpisodeFiles | str:
-        size = 0
-        made: EpisodeFiles | str
+    def _finish(
+        self, episode: GatheredEpisode, process: FilesProcess | None
+    ) -> tuple[EpisodeFiles | str, int]:
+        """The files, or why there are none, and their bytes."""
         try:
             made = episode.writer.finish(process)
             size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))
             if self._then is not None:
                 self._then(made)
-        except Exception as error:
-            # The journal stays; the next start tries again.
+        except BaseException as error:
+            if isinstance(error, (KeyboardInterrupt, SystemExit)):
+                raise
+            # A panic of rerun's Rust code is no Exception. The journal stays; the next start tries again.
             if not isinstance(error, (RecordingError, OSError, ValueError)):
                 report_failure(f"An episode of env {episode.env} could not be written", error)
-            made = f"an episode of env {episode.env} could not be written: {error}"
-        with self._lock:
-            self._at_work -= 1
-            now = self._finished
-            if isinstance(made, str):
-                self._finished = replace(now, problem=made)
-            else:
-                self._finished = Finished(now.count + 1, now.bytes_written + size, made, None)
-        self._on_change()
-        return made
+            return f"an episode of env {episode.env} could not be written: {error}", 0
+        return made, size

@@ -193,7 +193,7 @@ class EpisodeWriter:
             raise self._failed(error) from error
         try:
             self._finished = self._make_files(process)
-        except Exception:
+        except BaseException:  # also a panic of rerun's
             self._journal.sync()
             self.close()
             raise
