@@ -46,7 +46,11 @@ def test_a_task_with_a_fault_of_its_own_does_the_rest(renderer: None) -> None:
 
 
 # One task for each; the sweep has the others, and DrawSVG-v1 with its hundreds of bodies.
-@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault.ids[0] != "DrawSVG-v1"], ids=lambda fault: f"{fault.ids[0]} {fault.stage}")
+@pytest.mark.parametrize(
+    "fault",
+    [fault for fault in FAULTS if fault.ids[0] != "DrawSVG-v1"],
+    ids=lambda fault: f"{fault.ids[0]} {fault.stage}",
+)
 def test_a_fault_of_the_task_is_at_the_line_that_is_named(fault: Fault) -> None:
     made = batched(fault.ids[0], 4, rules="off")
     env = TaskEnv(made)

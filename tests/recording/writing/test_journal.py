@@ -161,6 +161,31 @@ def test_threads_write_all_journals_and_end_with_the_last(
     assert not thread.is_alive()
 
 
+def test_while_the_disk_hangs_in_a_sync_rows_are_written_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journals, "_journal_thread", type(journals._journal_thread)())
+    monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
+    hangs, goes_on = threading.Event(), threading.Event()
+
+    def hang(descriptor: int) -> None:
+        hangs.set()
+        goes_on.wait(60)
+
+    monkeypatch.setattr(os, "fsync", hang)
+    two = [Journal(tmp_path / f"{k}.arrow") for k in range(2)]
+    try:
+        assert hangs.wait(60)
+        for value in numbers(1, 2):
+            for journal in two:
+                journal.append(JournalEntry("row", 0, value))
+            until(lambda: all(rows(journal.path)[-1:] == [value] for journal in two), "it is written")
+    finally:
+        goes_on.set()
+        for journal in two:
+            journal.close()
+
+
 def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
     begin = journal.size
     made: Future[list[JournalEntry]] = Future()

@@ -68,7 +68,7 @@ class Journal:
     - ``entry`` `state`: JSON of an entry of ``evaluate()`` that is not a number and changes here (`columns.TextWriter`);
     - ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
 
-    One thread writes and syncs all journals of the process every `SYNC_SECONDS`. The file is locked (``flock``) while it
+    One thread writes all journals of the process every `SYNC_SECONDS`, another syncs them. The file is locked (``flock``) while it
     is written; the system releases the lock of a dead process, which tells dead writers from live ones.
     """
 
@@ -82,6 +82,7 @@ class Journal:
         self._waiting_bytes = 0
         self._lock = threading.Lock()  # of `_waiting`; not held during disk access
         self._writing = threading.Lock()
+        self._syncing = threading.Lock()
         self._error: OSError | None = None
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -152,8 +153,19 @@ class Journal:
                 self._waiting_bytes += sum(map(_size, made.result()))
 
     def sync(self) -> None:
-        """Write what was queued and sync it: it survives a power cut. An error is raised by the next `append`."""
-        self._flush(os.fsync)
+        """Write what was queued and sync it: it survives a power cut. An error is raised by the next `append`.
+
+        Rows can be written meanwhile: a sync may take long.
+        """
+        self.write()
+        with self._syncing:
+            if self._error is not None or not self._closer.alive:
+                return
+            try:
+                os.fsync(self._descriptor)
+                _require_name(self._descriptor)
+            except OSError as error:
+                self._error = error
 
     def finish(self) -> None:
         """Write everything and stop the periodic writing; the file stays locked until `close`.
@@ -163,27 +175,16 @@ class Journal:
         """
         _journal_thread.remove(self)
         self._error = None
-        self._flush(lambda _: None)
+        self.write()
         if self._error is not None:
             raise self._error
-
-    def _flush(self, last: Callable[[int], None]) -> None:
-        self.write()
-        with self._writing:
-            if self._error is not None or not self._closer.alive:
-                return
-            try:
-                last(self._descriptor)
-                if os.fstat(self._descriptor).st_nlink == 0:
-                    gone = "the folder, or the file in it, was removed during the recording"
-                    raise FileNotFoundError(errno.ENOENT, gone)
-            except OSError as error:
-                self._error = error
+        if self._closer.alive:
+            _require_name(self._descriptor)
 
     def close(self) -> None:
         """Close and unlock the file."""
         _journal_thread.remove(self)
-        with self._writing:
+        with self._syncing, self._writing:
             self._closer()
 
     def remove(self) -> None:
@@ -229,6 +230,13 @@ def _rows_joined(entries: Iterable[JournalEntry]) -> Iterator[JournalEntry]:
             yield from run
 
 
+def _require_name(descriptor: int) -> None:
+    """Raises OSError if the file has no name any more."""
+    if os.fstat(descriptor).st_nlink == 0:
+        gone = "the folder, or the file in it, was removed during the recording"
+        raise FileNotFoundError(errno.ENOENT, gone)
+
+
 def _size(entry: JournalEntry) -> int:
     return len(entry.value) + len(entry.kind) + 8
 
@@ -244,7 +252,10 @@ def _create(path: Path) -> int:
 
 
 class _JournalThread:
-    """Writes all journals of this process periodically, on a thread that runs while there are any."""
+    """Writes all journals of this process periodically, on a thread that runs while there are any.
+
+    Another thread syncs them: what a disk that hangs has not synced is written, and a killed process does not lose it.
+    """
 
     def __init__(self) -> None:
         self._journals: set[Journal] = set()
@@ -271,6 +282,7 @@ class _JournalThread:
                 flush()
 
     def _run(self) -> None:
+        syncing: threading.Thread | None = None
         while True:
             with self._changed:
                 wake = time.monotonic() + SYNC_SECONDS
@@ -283,9 +295,17 @@ class _JournalThread:
             with self._changed:
                 journals = list(self._journals)
             for journal in journals:
-                journal.write()  # all of them before the first fsync, which may take long
-            for journal in journals:
-                journal.sync()
+                journal.write()
+            if syncing is None or not syncing.is_alive():
+                syncing = threading.Thread(
+                    target=_sync_all, args=(journals,), name="episode-journals", daemon=True
+                )
+                syncing.start()
+
+
+def _sync_all(journals: Sequence[Journal]) -> None:
+    for journal in journals:
+        journal.sync()
 
 
 _journal_thread = _JournalThread()
