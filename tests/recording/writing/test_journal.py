@@ -179,7 +179,10 @@ def test_while_the_disk_hangs_in_a_sync_rows_are_written_on(
         for value in numbers(1, 2):
             for journal in two:
                 journal.append(JournalEntry("row", 0, value))
-            until(lambda: all(rows(journal.path)[-1:] == [value] for journal in two), "it is written")
+            until(
+                lambda value=value: all(rows(journal.path)[-1:] == [value] for journal in two),
+                "it is written",
+            )
     finally:
         goes_on.set()
         for journal in two:
