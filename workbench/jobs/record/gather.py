@@ -413,8 +413,6 @@ class EpisodeFinisher:
                 return False
             episode, made = self._waiting.popleft()
             self._at_work += 1
-        files: EpisodeFiles | str | None = None
-        size = 0
         try:
             files, size = self._finish(episode, process)
         except BaseException as error:
@@ -423,12 +421,13 @@ class EpisodeFinisher:
         finally:
             with self._lock:
                 self._at_work -= 1
-                if isinstance(files, str):
-                    self._finished = replace(self._finished, problem=files)
-                elif files is not None:
-                    before = self._finished
-                    self._finished = Finished(before.count + 1, before.bytes_written + size, files, None)
-            self._on_change()
+        with self._lock:
+            before = self._finished
+            if isinstance(files, str):
+                self._finished = replace(before, problem=files)
+            else:
+                self._finished = Finished(before.count + 1, before.bytes_written + size, files, None)
+        self._on_change()
         made.set_result(files)
         return True
 
