@@ -131,6 +131,30 @@ def name_no_test() -> None:
     os.environ["PYTEST_CURRENT_TEST"] = "a test"
 
 
+@pytest.fixture(autouse=True, scope="module")
+def ids_are_free_again() -> Iterator[None]:
+    """What a module's tests register, as tasks and robots, is gone after them: another file with the same id would count as a
+    second one."""
+    before = {name for known in _registries() for name in known}
+    yield
+    for known in _registries():
+        for name in known.keys() - before:
+            cls = getattr(known[name], "cls", None) or getattr(known[name], "agent_cls", None)
+            if cls is not None and not cls.__module__.startswith("mani_skill."):
+                del known[name]
+                sys.modules["gymnasium"].registry.pop(name, None)
+
+
+def _registries() -> list[dict[str, Any]]:
+    """ManiSkill's ids of tasks and of robots, if it was imported."""
+    tasks = sys.modules.get("mani_skill.utils.registration")
+    robots = sys.modules.get("mani_skill.agents.registration")
+    return [
+        *([] if tasks is None else [tasks.REGISTERED_ENVS]),
+        *([] if robots is None else [robots.REGISTERED_AGENTS]),
+    ]
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     report = yield

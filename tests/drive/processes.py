@@ -9,7 +9,10 @@ def workers_of(server: psutil.Process) -> list[psutil.Process]:
     """The keeper of each, the oldest first; a worker is its only child."""
     keepers: list[psutil.Process] = []
     for child in server.children():
-        command = " ".join(child.cmdline())
+        try:
+            command = " ".join(child.cmdline())
+        except psutil.NoSuchProcess:  # it has ended, and is waited for or not
+            continue
         if "workbench.session.worker.start" in command:
             keepers.append(child)
         elif "workbench.session.worker.fork_server" in command:

@@ -92,7 +92,7 @@ class Journal:
             with contextlib.suppress(OSError):  # report the first error
                 self.remove()
             raise
-        _journal_thread.watch(self)
+        _journal_threads.watch(self)
 
     @property
     def descriptor(self) -> int:
@@ -173,7 +173,7 @@ class Journal:
         It is not synced: files replace it at once. Entries that could not be written are tried again; raises OSError if
         they fail again.
         """
-        _journal_thread.remove(self)
+        _journal_threads.remove(self)
         self._error = None
         self.write()
         if self._error is not None:
@@ -183,7 +183,7 @@ class Journal:
 
     def close(self) -> None:
         """Close and unlock the file."""
-        _journal_thread.remove(self)
+        _journal_threads.remove(self)
         with self._syncing, self._writing:
             self._closer()
 
@@ -251,29 +251,32 @@ def _create(path: Path) -> int:
     raise FileNotFoundError(errno.ENOENT, "another process keeps removing the folder")
 
 
-class _JournalThread:
-    """Writes all journals of this process periodically, on a thread that runs while there are any.
+class _JournalThreads:
+    """Write and sync all journals of this process periodically, while there are any.
 
-    Another thread syncs them: what a disk that hangs has not synced is written, and a killed process does not lose it.
+    Two, since a sync may take long on a disk that hangs: what is not synced is written, and a killed process does not lose it.
     """
 
     def __init__(self) -> None:
         self._journals: set[Journal] = set()
         self._changed = threading.Condition()
-        self._thread: threading.Thread | None = None
+        self._threads: dict[str, threading.Thread] = {}
         self.flush_first: list[weakref.WeakMethod[Callable[[], None]]] = []
 
     def watch(self, journal: Journal) -> None:
         with self._changed:
             self._journals.add(journal)
-            if self._thread is None or not self._thread.is_alive():  # a forked child has none
-                self._thread = threading.Thread(target=self._run, name="episode-journals", daemon=True)
-                self._thread.start()
+            for what, work in (("write", self._write), ("sync", self._sync)):
+                thread = self._threads.get(what)
+                if thread is None or not thread.is_alive():  # a forked child has none
+                    thread = threading.Thread(target=work, name="episode-journals", daemon=True)
+                    self._threads[what] = thread
+                    thread.start()
 
     def remove(self, journal: Journal) -> None:
         with self._changed:
             self._journals.discard(journal)
-            self._changed.notify()
+            self._changed.notify_all()
 
     def flush(self) -> None:
         self.flush_first = [held for held in self.flush_first if held() is not None]
@@ -281,42 +284,37 @@ class _JournalThread:
             if flush := held():
                 flush()
 
-    def _run(self) -> None:
-        syncing: threading.Thread | None = None
-        while True:
-            with self._changed:
-                wake = time.monotonic() + SYNC_SECONDS
-                while self._journals and (left := wake - time.monotonic()) > 0:
-                    self._changed.wait(left)
-                if not self._journals:
-                    self._thread = None
-                    return
+    def _write(self) -> None:
+        while journals := self._wait("write"):
             self.flush()
-            with self._changed:
-                journals = list(self._journals)
             for journal in journals:
                 journal.write()
-            if syncing is None or not syncing.is_alive():
-                syncing = threading.Thread(
-                    target=_sync_all, args=(journals,), name="episode-journals", daemon=True
-                )
-                syncing.start()
+
+    def _sync(self) -> None:
+        while journals := self._wait("sync"):
+            for journal in journals:
+                journal.sync()
+
+    def _wait(self, what: str) -> list[Journal]:
+        """The journals after the interval; none, if the thread is to end."""
+        with self._changed:
+            wake = time.monotonic() + SYNC_SECONDS
+            while self._journals and (left := wake - time.monotonic()) > 0:
+                self._changed.wait(left)
+            if not self._journals:
+                self._threads.pop(what, None)
+            return list(self._journals)
 
 
-def _sync_all(journals: Sequence[Journal]) -> None:
-    for journal in journals:
-        journal.sync()
-
-
-_journal_thread = _JournalThread()
+_journal_threads = _JournalThreads()
 
 
 def before_writing(flush: Callable[[], None]) -> None:
     """Call the bound method `flush` before each write, while its object lives: for a caller that batches rows.
 
-    It runs on the journals' thread and must not raise.
+    It runs on a thread of the journals' and must not raise.
     """
-    _journal_thread.flush_first.append(weakref.WeakMethod(flush))
+    _journal_threads.flush_first.append(weakref.WeakMethod(flush))
 
 
 class _BoundedFile:
