@@ -137,8 +137,14 @@ def test_of_several_saves_in_50_ms_the_last_wins(session: Session, task_file: Pa
 
 
 def test_a_save_while_a_reload_runs_wins(session: Session, task_file: Path, good: str) -> None:
-    task_file.write_text(good.replace("base_color=[0.05,", "base_color=[0.7,"))
-    wait_until(session, lambda v: v.activity.startswith("building"), "the slow reload")
+    red = good.replace("base_color=[0.05,", "base_color=[0.7,")
+    task_file.write_text(red)
+    # Or it is over, where nobody looked meanwhile.
+    wait_until(
+        session,
+        lambda v: v.activity.startswith("building") or red in v.task.source.values(),
+        "the slow reload",
+    )
     last = reward_plus(good, 21)
     task_file.write_text(last)
     view = runs(session, last)
