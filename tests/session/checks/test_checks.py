@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -17,7 +18,7 @@ from workbench.core.rules import Finding
 from workbench.jobs.task import TaskOptions
 from workbench.session.checks.checks import RUNNING, Checks, ChecksView
 from workbench.session.process.askers import GaveWay
-from workbench.session.process.job_lane import Job, JobFailed, ProcessDied
+from workbench.session.process.jobs import Job, JobFailed, ProcessDied
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.session.rescore.background import StoppedBy
@@ -56,28 +57,25 @@ class ScriptedBackground:
     def hold(self) -> None:
         self.let = threading.Semaphore(0)
 
-    def ensure(self, job: Job, load: Load, or_else: Load | None = None) -> int:
+    async def ensure(self, job: Job, load: Load, or_else: Load | None = None) -> int:
         if self.fails is not None:
             raise self.fails
         self.loads.append(load)
         return 1
 
-    def in_turns(self, job: Job, work: Callable[[], Any], priority: str) -> Any:
+    async def in_turns(self, job: Job, work: Callable[[], Awaitable[Any]], priority: str) -> Any:
         self.priorities.append(priority)
         while True:
             try:
-                return work()
+                return await work()
             except GaveWay:
                 continue
 
-    def ask(
-        self, check: Callable[[], None], question: CheckGroup, on_progress: Callable[..., None]
-    ) -> CheckedGroup:
+    async def ask(self, question: CheckGroup, on_progress: Callable[..., None]) -> CheckedGroup:
         self.asked.append(question)
         for done, rule in enumerate(GROUPS[question.group], 1):
-            while not self.let.acquire(timeout=0.01):
-                check()
-            check()
+            while not self.let.acquire(blocking=False):
+                await asyncio.sleep(0.005)
             if rule not in question.known:
                 on_progress(done - 1, 2, RuleProgress(rule))
                 if rule == self.dies_at:

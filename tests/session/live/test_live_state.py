@@ -104,7 +104,11 @@ def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_show
     told = np.ones((3, 2), np.float32)
     played.tell(pictures(2), ToldRobots(told), Inspection(2, 3), RulesBroken((GONE_WRONG,)))
     played.tell(CameraFailed(EYE.key, "no shader"))
-    session.rescorer.rescoring.begin(RescoreView("rescoring", total=3), lambda job: None)
+
+    async def nothing(job: object) -> None:
+        """It is done at once."""
+
+    session.rescorer.rescoring.begin(RescoreView("rescoring", total=3), nothing)
     until(lambda: played.view.rescored.state == "done", "the judgement of this past")
     before = played.view
     assert (

@@ -108,54 +108,47 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
 ) -> None:
     """However much a recording holds in all: it ends only where too much waits at once, and the next begins anew."""
     monkeypatch.setattr(live, "_MOST_WAITING", 10_500)
-    go, changes = threading.Event(), list[int]()
-
-    def on_change() -> None:
-        changes.append(1)
-        if threading.current_thread().name == "recorder":
-            assert go.wait(60)
-
-    def taken(recorder: LiveRecorder) -> None:
-        """All that it was given before this: it tells of a recording that begins."""
-        before = len(changes)
-        recorder.start(task, (0,), goes_on=True)
-        until(lambda: len(changes) > before, "the steps to be taken")
-
+    taker = Taker()
     task: Any = SimpleNamespace()
     elapsed: Any = SimpleNamespace(nbytes=396)
     step: Any = SimpleNamespace(step=elapsed, columns={}, captured=(), snapshot=bytes(604), new_parts={})
-    monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: Taker())
-    go.set()
-    recorder = LiveRecorder(tmp_path, on_change, lambda envs: None)
+    monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: taker)
+    recorder = LiveRecorder(tmp_path, lambda: None, lambda envs: None)
     try:
         for _ in range(2):
+            taker.disk.set()
             recorder.start(task, (0,))
             for _ in range(4):
+                taken = taker.taken
                 for _ in range(8):
                     recorder.take(step)
-                taken(recorder)
+                until(lambda taken=taken: taker.taken == taken + 8, "the steps to be taken")
                 assert recorder.status().problem is None and recorder.status().active
-            go.clear()
-            recorder.start(task, (0,))  # whose thread now waits in `on_change`
+            taker.disk.clear()
             count = 0
             while recorder.status().active and count < 100:
                 recorder.take(step)
                 count += 1
-            assert 9 <= count <= 11 and recorder.status().problem is not None
-            go.set()
+            assert 9 <= count <= 12 and recorder.status().problem is not None
+            taker.disk.set()
     finally:
-        go.set()
+        taker.disk.set()
         recorder.close()
 
 
 class Taker:
-    """Takes every step."""
+    """Takes every step, if the disk does."""
 
     env_idx = (0,)
     under_way = ()
 
+    def __init__(self) -> None:
+        self.disk = threading.Event()
+        self.taken = 0
+
     def take(self, stepped: object) -> None:
-        """It is on the disk."""
+        assert self.disk.wait(60)
+        self.taken += 1
 
     def finish(self) -> None:
         """Nothing is left of it."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
-import threading
 import weakref
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from tests.drive.session import Told, history_of, told_session
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Stepped, TaskOptions
+from workbench.session import loop
 from workbench.session.history.history import History
 from workbench.session.process.askers import Background
+from workbench.session.process.jobs import Job
 from workbench.session.protocol.messages import Load
 from workbench.session.rescore.background import StoppedBy
 from workbench.session.rescore.past import PastRescorer, RescoredPast
@@ -178,35 +180,30 @@ def test_a_moment_that_is_judged_anew_is_compared_anew_and_not_a_number_is_a_dif
 
 
 def test_a_judgement_that_is_stopped_before_its_turn_keeps_nothing_of_the_past(shared: Told) -> None:
-    """The one before it hangs where it is told of: what waits behind it is never begun."""
-    begun, goes_on = threading.Event(), threading.Event()
-
-    def on_change() -> None:
-        if threading.current_thread().name == "rescore":
-            begun.set()
-            goes_on.wait(30)
-
     process = Background()
-    rescore = PastRescorer(on_change, process)
+    rescore = PastRescorer(lambda: None, process)
     old, _, jumped = drawn(1, 6, 2)
-    load = Load("Nothing-v1", TaskOptions())
+    goes_on = loop.do(asyncio.Event)
+
+    async def other_job() -> None:
+        await goes_on.wait()
+
+    loop.do(lambda: loop.begin(process.in_turns(Job("another one"), other_job)))
     try:
-        rescore.rescore(load, RescoredPast(recorded(shared, old, jumped)))
-        assert begun.wait(30)
         history = recorded(shared, old, jumped)
         moment = weakref.ref(history.at(history.first))
-        rescore.rescore(load, RescoredPast(history))
+        rescore.rescore(Load("Nothing-v1", TaskOptions()), RescoredPast(history))
         del history
         shared.load("rebuilt")  # the session keeps it no longer
         gc.collect()
         assert moment() is not None
         rescore.stop(StoppedBy.HAND)
-        gc.collect()
+        loop.do(gc.collect)
         assert moment() is None and rescore.curve("reward", 0) is not None
     finally:
-        goes_on.set()
+        loop.do(goes_on.set)
         rescore.rescoring.close()
-        process.end()
+        process.close()
 
 
 def test_an_entry_that_only_one_version_has_differs_and_comes_first(shared: Told) -> None:

@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 from workbench.core.scene.scene_index import read_poses, scene_index
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_maniskill
-from workbench.session.process.job_lane import Stopped
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
 STEPS = 6
+
+
+class GivenUp(Exception):
+    """Nobody waits for the scenes any more."""
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +55,11 @@ def make(episodes: dict[int, Episode], files: tuple[Path, ...] = (), stop: bool 
 
     def check() -> None:
         if stop:
-            raise Stopped
+            raise GivenUp
 
     made = SceneProcess(files)([*episodes.values()], check, lambda _, words: said.append(words))
     ended: dict[int, Any] = {}
-    with suppress(Stopped):
+    with suppress(GivenUp):
         for key, scene in zip(episodes, made, strict=True):
             ended[key] = scene if isinstance(scene, SceneError) else scene[0]
     assert said

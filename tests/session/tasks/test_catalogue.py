@@ -271,11 +271,9 @@ def test_a_task_that_cannot_be_drawn_is_not_tried_for_ever(
         def __init__(self, niceness: int) -> None:
             assert niceness == 19
 
-        def start(self) -> None: ...
+        def close(self) -> None: ...
 
-        def end(self) -> None: ...
-
-        def ask(self, check: object, question: registered_module.DrawTask) -> object:
+        async def ask(self, question: registered_module.DrawTask) -> object:
             asked.append(question.env_id)
             raise registered_module.JobFailed("it crashed")
 

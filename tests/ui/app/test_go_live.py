@@ -107,12 +107,12 @@ def test_into_the_task_that_is_open_one_goes_at_once_and_the_page_follows(desk: 
 
 
 def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason_to(desk: Desk) -> None:
-    desk.live._handle(LoadFailed(problem(), kept=True))
+    desk.live._take(LoadFailed(problem(), kept=True))
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
     desk.draw()
     assert desk.go_live.going() == "restoring Push-v1 at step 2 …" and desk.place.pages._wish is None
-    desk.live._handle(LoadFailed(problem(), kept=True))
+    desk.live._take(LoadFailed(problem(), kept=True))
     desk.draw()
     assert desk.go_live.going() == "" and desk.place.pages._wish == "live"
 

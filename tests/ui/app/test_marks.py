@@ -11,7 +11,7 @@ from tests.ui.scenes import running
 from workbench.commands.envs import ShowFirstFlagged
 from workbench.core.capture.outliers import Outlier, OutlierKind
 from workbench.session.history.env_table import EnvRows
-from workbench.session.process.job_lane import JobProgress
+from workbench.session.process.jobs import JobProgress
 from workbench.session.record.save_past import SaveStatus
 from workbench.ui.app.marks import Marks
 from workbench.ui.widgets.open_tabs import OpenTabs

@@ -121,7 +121,7 @@ def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
     desk.choose("pull.py")
     second = desk.session_of("pull.py")
     assert second.studio.placed_cameras() == () and second.view().selected_env == 0
-    until(lambda: first._shared._closing, "the end of the first session")
+    until(lambda: first._changes._closing, "the end of the first session")
     desk.choose("push.py")
     again = desk.session_of("push.py")
     assert again is not first

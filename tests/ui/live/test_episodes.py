@@ -8,7 +8,7 @@ from typing import Any
 from tests.drive.live import Live
 from tests.ui.scenes import running
 from workbench.session.live.timeline import TimelineView
-from workbench.session.process.job_lane import JobProgress
+from workbench.session.process.jobs import JobProgress
 from workbench.session.record.live import RecordingStatus
 from workbench.session.record.save_past import SaveStatus
 from workbench.ui.live.episodes_panel import (

@@ -36,7 +36,7 @@ from workbench.session.live.timeline import Strip, TimelineView
 from workbench.session.live.view import PastLoad, SessionView
 from workbench.session.process.captured_output import Printed, PrintedLine
 from workbench.session.process.heartbeat import Busy
-from workbench.session.process.job_lane import JobProgress
+from workbench.session.process.jobs import JobProgress
 from workbench.session.process.supervisor import Vitals
 from workbench.session.protocol.messages import ReloadReport, RulesBroken
 from workbench.session.record.live import RecordingStatus

@@ -15,7 +15,7 @@ from workbench.commands.solve import FollowBody, LookAtRollout, SaveSolved
 from workbench.core.env.keywords import HowMade, Keyword
 from workbench.planning.options import PlanOptions
 from workbench.session.live.solver import SolveView
-from workbench.session.process.job_lane import JobProgress
+from workbench.session.process.jobs import JobProgress
 from workbench.session.protocol.messages import Settings
 from workbench.session.record.live import RecordingStatus
 from workbench.session.record.save_past import SaveStatus

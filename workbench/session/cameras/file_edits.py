@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
-import traceback
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from workbench.authoring.camera_source.cameras import HookCameras
 from workbench.authoring.camera_source.disk import SourceEdit, apply, revert
 from workbench.authoring.source.text import RefusedEdit, plain_line_ends
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
 from workbench.jobs.task import TaskDescription
+from workbench.machine.processes.watched_thread import report_failure
 from workbench.session.cameras.edit_state import DONE, LEFT, change_text, copy, mismatch, plan
 from workbench.session.cameras.selection import StudioCameras
 from workbench.session.cameras.view import EditRequest, EditStage, EditState
 from workbench.session.history.history import ShownMoment
+from workbench.session.loop import Aside, begin, on_loop, result_of
 from workbench.session.process.askers import Asker
-from workbench.session.process.job_lane import JobFailed, Stopped
+from workbench.session.process.jobs import JobFailed, Jobs
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import DrawCamera, RunCameras
 
@@ -30,13 +33,17 @@ _LARGEST = 256
 """Pixels of the shorter side of a new camera's preview."""
 
 
+class _Stopped(Exception):
+    """The answer is not needed any more."""
+
+
 class FileEdits:
-    """Runs edits one after the other on a thread of its own; `view` has the result. Thread-safe; methods return at once.
+    """Makes edits one after the other; `view` has the result. Methods return at once.
 
     Placements change when the version with the edit is loaded, and none is lost by it.
 
     Args:
-        on_change: called, on any thread, when `view` has changed.
+        on_change: called when `view` has changed.
         open_copy: opens a class of a copied file in place of the task.
         asker: asks the worker that plays.
         load: returns how the running version was loaded; None before there is one.
@@ -69,60 +76,61 @@ class FileEdits:
         """Edits that are in the file and can be taken back, the newest last."""
         self._removed: dict[CameraKey, CameraSettings] = {}
         """Placements of cameras that were removed from the file."""
-        self._thread = ThreadPoolExecutor(1, "studio")
+        self._turn = asyncio.Lock()
+        """Of one edit after the other."""
+        self._drawings = Jobs(on_change, self._not_drawn)
+        """Of new cameras."""
+        self._aside = Aside("edits")
+        """Reads and writes the file, and finds edits in it."""
         self._closing = False
 
+    @on_loop
     def plan(self, request: EditRequest) -> None:
         """Find the edit for a request; it becomes `StudioView.edit_state`."""
         if request.settings is None:
-            with self._cameras.lock:
-                request = replace(request, settings=self._cameras.placements.now(request.key))
-        self._run_later(self._find_plan, request)
+            request = replace(request, settings=self._cameras.placements.now(request.key))
+        self._begin(self._find_plan(request))
 
-    def _find_plan(self, request: EditRequest) -> None:
-        with self._cameras.lock:
-            task, info = self._cameras.task, self._cameras.info(request.key)
-            if task is None:
-                return
-            before = self.view.request if self.view.stage == "planned" else None
-            # Clear the answer to another request. But a written edit waits for its version, which needs the state.
-            self.view = self.view if self.view.loading else EditState(request=request)
+    async def _find_plan(self, request: EditRequest) -> None:
+        task, info = self._cameras.task, self._cameras.info(request.key)
+        if task is None:
+            return
+        before = self.view.request if self.view.stage == "planned" else None
+        # Clear the answer to another request. But a written edit waits for its version, which needs the state.
+        self.view = self.view if self.view.loading else EditState(request=request)
         self._notify()
-        edit_state = plan(task, info, request, self._run)
-        with self._cameras.lock:
-            first, self._just_copied = self._just_copied, ""
-            if before is not None and (before.what, before.key) != (request.what, request.key):
-                first = change_text(before, LEFT)
-            drawing = edit_state.stage == "planned" and request.what == "add"
-            message = f"{first} {edit_state.message}".strip()
-            self.view = replace(edit_state, message=message, drawing=drawing)
+        edit_state = await self._aside.run(partial(plan, task, info, request, self._run))
+        first, self._just_copied = self._just_copied, ""
+        if before is not None and (before.what, before.key) != (request.what, request.key):
+            first = change_text(before, LEFT)
+        drawing = edit_state.stage == "planned" and request.what == "add"
+        message = f"{first} {edit_state.message}".strip()
+        self.view = replace(edit_state, message=message, drawing=drawing)
         self._notify()
         if drawing and request.settings is not None:
-            self._draw_new(request, request.settings)
+            settings = request.settings
+            self._drawings.start("a new camera", lambda job: self._draw_new(request, settings))
 
-    def _draw_new(self, request: EditRequest, settings: CameraSettings) -> None:
+    async def _draw_new(self, request: EditRequest, settings: CameraSettings) -> None:
         """Draw what a new camera would see; cancelled by the next request."""
         moment, smaller = self._shown(), _LARGEST / min(settings.width, settings.height)
         poses = moment.of(moment.env)
         question = DrawCamera(request.key, settings, moment.env, poses=poses, scale=min(1.0, smaller))
-
-        def check() -> None:
-            if self._stopped.is_set() or not self._last.running():
-                raise Stopped
-
         picture = None
         try:
-            picture = self._asker.ask(check, question)
-        except Stopped:
-            pass
+            picture = await self._asker.ask(question)
         except JobFailed as failure:
             self._cameras.problem = f"There is no picture of the new camera: {failure}."
-        with self._cameras.lock:
+        finally:
             if self.view.request is request:
                 self.view = replace(self.view, picture=picture, drawing=False)
-        self._notify()
+            self._notify()
+
+    def _not_drawn(self, failure: JobFailed) -> None:
+        self._cameras.problem = f"There is no picture of the new camera: {failure}."
 
     def _run(self, texts: Mapping[str, str]) -> HookCameras:
+        """Run the hooks of these texts; called beside the loop."""
         stopped = self._stopped = threading.Event()
         load, deadline = self._load(), time.monotonic() + self._patience
         if load is None or self._closing:
@@ -130,93 +138,102 @@ class FileEdits:
 
         def check() -> None:
             if stopped.is_set() or time.monotonic() > deadline:
-                raise Stopped
+                raise _Stopped
 
         try:
-            return self._asker.ask(check, RunCameras(load.task, texts))
-        except Stopped:
+            return result_of(self._asker.ask(RunCameras(load.task, texts)), check)
+        except _Stopped:
             raise RefusedEdit(
                 "the task did not answer, or another version came meanwhile; ask again"
             ) from None
         except JobFailed as failure:
             raise RefusedEdit(str(failure)) from failure
 
+    @on_loop
     def stop(self) -> None:
         """Cancel the present question: the worker is gone, or another version comes."""
         self._stopped.set()
+        self._drawings.stop()
 
+    @on_loop
     def write(self) -> None:
         """Write the planned edit; the file is reloaded, and the new camera compared with the edit."""
         message = "Saved to {file}; loading it."
-        self._run_later(self._change_file, ("planned",), apply, "written", message)
+        self._begin(self._change_file(("planned",), apply, "written", message))
 
+    @on_loop
     def undo_write(self) -> None:
         """Take the newest edit out of the file."""
         message = "Edit reverted in {file}; loading it."
-        self._run_later(self._change_file, IN_FILE, revert, "undone", message)
+        self._begin(self._change_file(IN_FILE, revert, "undone", message))
 
-    def _change_file(
+    async def _change_file(
         self,
         needs: tuple[EditStage, ...],
         do: Callable[[SourceEdit], None],
         stage: EditStage,
         message: str,
     ) -> None:
-        with self._cameras.lock:  # else the version could be loaded before `view` says that it is expected
-            view = self.view
-            if view.edit is None or view.stage not in needs:
-                return
-            try:
-                do(view.edit)
-            except RefusedEdit as refused:
-                kept = "refused" if stage == "written" else view.stage
-                self.view = replace(view, stage=kept, message=f"Not done: {refused.reason}.")
+        before = self.view
+        if before.edit is None or before.stage not in needs:
+            return
+        # Before the file is written: the version with the edit may be loaded before the disk says that it is done.
+        self._set_state(message.format(file=before.edit.names), stage, loading=True)
+        if stage == "undone":
+            taken = self._done[-1:]
+            del self._done[-1:]
+        else:
+            self._done.append(self.view)
+        self._notify()
+        try:
+            await self._aside.run(partial(do, before.edit))
+        except RefusedEdit as refused:
+            if stage == "undone":
+                self._done += taken
             else:
-                self._set_state(message.format(file=view.edit.names), stage, loading=True)
-                if stage == "undone":
-                    del self._done[-1:]
-                else:
-                    self._done.append(self.view)
+                del self._done[-1:]
+            kept = "refused" if stage == "written" else before.stage
+            self.view = replace(before, stage=kept, message=f"Not done: {refused.reason}.")
         self._notify()
 
+    @on_loop
     def copy_task(self) -> None:
         """Copy the task's file into `folder`, open the copy, and plan the refused request in it.
 
         Does nothing unless ``view.can_copy``. Never overwrites a file.
         """
-        self._run_later(self._copy)
+        self._begin(self._copy())
 
-    def _copy(self) -> None:
-        with self._cameras.lock:
-            task, can = self._cameras.task, self.view.can_copy
-        if task is None or not can:
+    async def _copy(self) -> None:
+        task = self._cameras.task
+        if task is None or not self.view.can_copy:
             return
-        file, view = copy(task, self.folder)
-        with self._cameras.lock:
-            # The request waits until the copy is loaded.
-            self._copied, self.view = file, replace(view, request=self.view.request)
-            self._just_copied = "" if file is None else f"This is your copy of the task, {file}."
-            if file is not None:
-                self._done.clear()  # they are of the other file
+        file, view = await self._aside.run(partial(copy, task, self.folder))
+        # The request waits until the copy is loaded.
+        self._copied, self.view = file, replace(view, request=self.view.request)
+        self._just_copied = "" if file is None else f"This is your copy of the task, {file}."
+        if file is not None:
+            self._done.clear()  # they are of the other file
         self._notify()
         if file is not None:
             self._open_copy(file, task.class_name)
 
+    @on_loop
     def drop_plan(self) -> None:
         """Drop the plan and show the newest written edit again; if that is shown, forget all written edits."""
-        with self._cameras.lock:
-            if self.view.stage in IN_FILE:
-                self._done.clear()
-            self.view = self._done[-1] if self._done else EditState()
-            self._copied, self._just_copied = None, ""
-            if self._cameras.task is not None:
-                self.loaded(self._cameras.task)  # the version with that edit may have been loaded meanwhile
+        self._drawings.stop()
+        if self.view.stage in IN_FILE:
+            self._done.clear()
+        self.view = self._done[-1] if self._done else EditState()
+        self._copied, self._just_copied = None, ""
+        if self._cameras.task is not None:
+            self.loaded(self._cameras.task)  # the version with that edit may have been loaded meanwhile
         self._notify()
 
     # --- events, from the studio -----------------------------------------------------------------------
 
     def loaded(self, task: TaskDescription) -> frozenset[CameraKey]:
-        """Compare the running version with the written edit; the lock is held.
+        """Compare the running version with the written edit.
 
         Returns:
             The cameras that the edit changed, if this is the version with it.
@@ -258,12 +275,12 @@ class FileEdits:
         )
 
     def plan_in_copy(self, task: TaskDescription) -> None:
-        """Plan the refused request in the copy of the task, if this is the copy; the lock is held."""
+        """Plan the refused request in the copy of the task, if this is the copy."""
         if self._copied is None or task.file != str(self._copied):
             return
         self._copied = None
-        if self.view.request is not None and not self._closing:
-            self._submit(self._find_plan, self.view.request)
+        if self.view.request is not None:
+            self._begin(self._find_plan(self.view.request))
 
     def _update_placements(self, request: EditRequest, in_file: CameraSettings | None) -> bool:
         """Update the placements after an edit was made or undone; none is lost.
@@ -297,7 +314,7 @@ class FileEdits:
         return went_back
 
     def failed_to_load(self) -> None:
-        """A version failed to load; the lock is held."""
+        """A version failed to load."""
         if self._copied is not None:
             why = f"{self._copied} was made, but does not load: fix or delete it."
             self.view = EditState("refused", self.view.request, message=why)
@@ -313,28 +330,31 @@ class FileEdits:
         self.view = replace(self.view, stage=stage, message=message, snippet="", loading=loading)
 
     def close(self) -> None:
-        """Wait for a running edit."""
-        with self._cameras.lock:
-            self._closing = True
+        """Wait for a running edit. Called on another thread than the loop."""
+        self._close()
+        self._aside.close()
+
+    @on_loop
+    def _close(self) -> None:
+        self._closing = True
         self.stop()
-        self._thread.shutdown(wait=True, cancel_futures=True)
+        self._drawings.close()
 
-    # --- the thread ------------------------------------------------------------------------------------
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        """Do this after the edits before."""
+        self._drawings.stop()
+        begin(self._in_turn(work))
 
-    def _run_later(self, work: Callable[..., None], *args: object) -> None:
-        with self._cameras.lock:
-            if not self._closing:
-                self._submit(work, *args)
-
-    def _submit(self, work: Callable[..., None], *args: object) -> None:
-        self._last = self._thread.submit(work, *args)
-        self._last.add_done_callback(self._worked)
-
-    def _worked(self, future: Future[None]) -> None:
-        error = None if future.cancelled() else future.exception()
-        if error is None:
-            return
-        traceback.print_exception(error)
-        with self._cameras.lock:
-            self._cameras.problem = f"The workbench itself failed at this, and nothing was done: {error!r}"
-        self._notify()
+    async def _in_turn(self, work: Coroutine[Any, Any, None]) -> None:
+        async with self._turn:
+            if self._closing:
+                work.close()
+                return
+            try:
+                await work
+            except Exception as error:
+                report_failure("An edit of the task's file failed", error)
+                self._cameras.problem = (
+                    f"The workbench itself failed at this, and nothing was done: {error!r}"
+                )
+                self._notify()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,8 +16,9 @@ from workbench.core.cameras.report import CameraReport, OfferedPlacement, Search
 from workbench.session.cameras.selection import StudioCameras
 from workbench.session.cameras.view import MeasuredMoment, PickedPixel, StudioCamera, StudioResults
 from workbench.session.history.history import ShownMoment, ShownPast
+from workbench.session.loop import on_loop
 from workbench.session.process.askers import Asker, Background
-from workbench.session.process.job_lane import Job, JobFailed, JobLane, JobProgress
+from workbench.session.process.jobs import Job, JobFailed, JobProgress, Jobs
 from workbench.session.protocol.messages import Load, Reset
 from workbench.session.protocol.questions import DrawCamera, MeasureCamera, SuggestCameras
 
@@ -36,7 +36,7 @@ Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]
 
 
 class CameraReports:
-    """Jobs about the selected camera, of several questions to a worker each. Thread-safe; methods return at once.
+    """Jobs about the selected camera, of several questions to a worker each. Methods return at once.
 
     The shown moment is asked of the worker that plays, one env at a time, so that it continues playing; fresh episodes
     of the background process. Each of the two has one job at a time; a new one replaces it.
@@ -59,25 +59,18 @@ class CameraReports:
             load: returns the running version for another worker; None before there is one.
         """
         self._cameras, self._past, self._load, self._on_change = cameras, past, load, on_change
-        self._lock = threading.Lock()
-        self._results = StudioResults()
+        self.results = StudioResults()
         self._live, self._background = asker, background
-        self._live_lane = JobLane("studio-live", on_change, self._failed)
-        self._background_lane = JobLane("studio-background", on_change, self._failed)
-
-    # --- results -------------------------------------------------------------------------------------
-
-    @property
-    def results(self) -> StudioResults:
-        with self._lock:
-            return self._results
+        self._live_jobs = Jobs(on_change, self._failed)
+        self._background_jobs = Jobs(on_change, self._failed)
 
     @property
     def progress(self) -> JobProgress | None:
-        return self._background_lane.progress or self._live_lane.progress
+        return self._background_jobs.progress or self._live_jobs.progress
 
     # --- jobs ------------------------------------------------------------------------------------------
 
+    @on_loop
     def measure(self, seeds: int = 0) -> None:
         """Measure the selected camera, as placed, over all envs.
 
@@ -93,6 +86,7 @@ class CameraReports:
         elif camera is not None and (load := self._load()) is not None:
             self._measure_seeds(camera, load, min(seeds, MOST_MEASURED))
 
+    @on_loop
     def measure_steps(self, most: int = MOST_MEASURED) -> None:
         """Measure the selected camera, as placed, over steps of the selected env's episode, with partial reports.
 
@@ -110,39 +104,45 @@ class CameraReports:
             self._measure_live(f"over {len(moments)} steps", camera, cases, _REPORT_EVERY)
 
     def _measure_live(self, over: str, camera: StudioCamera, cases: Sequence[Case], every: int) -> None:
-        def work(job: Job) -> None:
+        async def work(job: Job) -> None:
             with self._measuring():
                 question = MeasureCamera(camera.key, None, 0)
-                self._measure(job, self._live, question, camera.now, [], cases, len(cases), every)
+                await self._measure(job, self._live, question, camera.now, [], cases, len(cases), every)
 
-        self._live_lane.start(f"measuring {camera.key[1]} {over}", work)
+        self._live_jobs.start(f"measuring {camera.key[1]} {over}", work)
 
     def _measure_seeds(self, camera: StudioCamera, load: Load, seeds: int) -> None:
         question = MeasureCamera(camera.key, camera.now if camera.moved else None, 0)
 
-        def work(job: Job) -> None:
+        async def work(job: Job) -> None:
             reports: list[CameraReport] = []
 
-            def measure() -> None:
+            async def measure() -> None:
                 """Continue with the first seed without a report: a job of higher rank may have interrupted this one."""
-                num_envs = self._background.ensure(job, _for_measuring(load))
+                num_envs = await self._background.ensure(job, _for_measuring(load))
 
-                def cases() -> Iterator[Case]:
-                    for seed in range(begun := len(reports), seeds):
-                        if (env := seed % num_envs) == 0 or seed == begun:
-                            self._background.ask(job.check, Reset(None, FIRST_SEED + seed - env))
-                        yield env, None, None
-
-                self._measure(
-                    job, self._background, question, camera.now, reports, cases(), seeds, num_envs, fresh=True
-                )
+                for seed in range(begun := len(reports), seeds):
+                    if (env := seed % num_envs) == 0 or seed == begun:
+                        await self._background.ask(Reset(None, FIRST_SEED + seed - env))
+                    case = [(env, None, None)]
+                    await self._measure(
+                        job,
+                        self._background,
+                        question,
+                        camera.now,
+                        reports,
+                        case,
+                        seeds,
+                        num_envs,
+                        fresh=True,
+                    )
 
             with self._measuring():
-                self._background.in_turns(job, measure)
+                await self._background.in_turns(job, measure)
 
-        self._background_lane.start(f"measuring {camera.key[1]} over {seeds} seeds", work)
+        self._background_jobs.start(f"measuring {camera.key[1]} over {seeds} seeds", work)
 
-    def _measure(
+    async def _measure(
         self,
         job: Job,
         asker: Asker,
@@ -165,7 +165,7 @@ class CameraReports:
         moments: list[MeasuredMoment] = []
         for env, poses, moment in cases:
             job.report(len(reports), total)
-            reports.append(asker.ask(job.check, replace(question, env=env, poses=poses)))
+            reports.append(await asker.ask(replace(question, env=env, poses=poses)))
             moments += [] if moment is None else [moment]
             if len(reports) % every == 0 or len(reports) == total:
                 self._update(
@@ -178,6 +178,7 @@ class CameraReports:
                     measuring=False,
                 )
 
+    @on_loop
     def suggest(self, objects: Sequence[str], low: Triple, high: Triple, seeds: int) -> None:
         """Search placements of the selected camera that see these objects in fresh episodes.
 
@@ -195,25 +196,24 @@ class CameraReports:
         space = SearchSpace(tuple(objects), low, high, camera.now, key[0], mount=camera.info.mount)
         what = f"searching placements for {key[1]}"
 
-        def work(job: Job) -> None:
-            def search() -> tuple[OfferedPlacement, ...]:
-                num_envs = self._background.ensure(job, _for_measuring(load))
-                self._background.ask(job.check, Reset(None, FIRST_SEED))
+        async def work(job: Job) -> None:
+            async def search() -> tuple[OfferedPlacement, ...]:
+                num_envs = await self._background.ensure(job, _for_measuring(load))
+                await self._background.ask(Reset(None, FIRST_SEED))
                 envs = tuple(range(min(max(1, seeds), num_envs)))
                 job.report(0, 0, what)
-                return self._background.ask(
-                    job.check,
-                    SuggestCameras(space, envs),
-                    lambda done, total, part: job.report(done, total, what),
+                return await self._background.ask(
+                    SuggestCameras(space, envs), lambda done, total, part: job.report(done, total, what)
                 )
 
             self._update(suggestions=(), suggestions_of=key)
-            found = self._background.in_turns(job, search)
+            found = await self._background.in_turns(job, search)
             problem = "" if found else f"no placement in that box sees {' and '.join(objects)} in any env."
             self._update(suggestions=found, problem=problem)
 
-        self._background_lane.start(what, work)
+        self._background_jobs.start(what, work)
 
+    @on_loop
     def compare(self, other: CameraSettings) -> None:
         """Draw the shown env with the selected camera as placed, and with other settings."""
         camera = self._selected_camera()
@@ -221,17 +221,17 @@ class CameraReports:
             return
         key, moment, why_not = camera.key, self._past.shown_moment(), camera.refused or why_no_camera(other)
 
-        def work(job: Job) -> None:
-            now, then = (
-                self._draw(job, moment, DrawCamera(key, settings, moment.env)) for settings in (None, other)
-            )
+        async def work(job: Job) -> None:
+            now = await self._draw(moment, DrawCamera(key, None, moment.env))
+            then = await self._draw(moment, DrawCamera(key, other, moment.env))
             self._update(compared=(now, then))
 
         if why_not:
             self._set_problem(f"{key[1]} is not compared: {why_not}.")
         else:
-            self._live_lane.start(f"comparing two placements of {key[1]}", work)
+            self._live_jobs.start(f"comparing two placements of {key[1]}", work)
 
+    @on_loop
     def make_sheet(self) -> None:
         """Draw the selected camera's pictures of all envs, one by one; worst first if there is a report over them."""
         camera = self._selected_camera()
@@ -244,61 +244,61 @@ class CameraReports:
             measured = [report.envs[i] for i in report.worst_first()]
             order = measured if sorted(measured) == order else order
 
-        def work(job: Job) -> None:
+        async def work(job: Job) -> None:
             self._update(sheet=())
             for done, env in enumerate(order):
                 job.report(done, len(order))
-                picture = self._draw(job, moment, DrawCamera(key, None, env))
+                picture = await self._draw(moment, DrawCamera(key, None, env))
                 self._update(sheet=(*self.results.sheet, picture))
 
-        self._live_lane.start(f"taking pictures of all envs with {key[1]}", work)
+        self._live_jobs.start(f"taking pictures of all envs with {key[1]}", work)
 
+    @on_loop
     def pick(self, u: float, v: float) -> None:
         """Probe a pixel of the selected camera: 0, 0 is the upper left corner of the picture, 1, 1 the lower right one."""
         camera, task, moment = self._selected_camera(), self._cameras.task, self._past.shown_moment()
         if camera is None or task is None:
             return
 
-        def work(job: Job) -> None:
+        async def work(job: Job) -> None:
             question = DrawCamera(camera.key, None, moment.env, ("depth", "segmentation"))
-            picture = self._draw(job, moment, question)
+            picture = await self._draw(moment, question)
             self._update(picked=pick_pixel(camera.info, picture, u, v, task.segmentation))
 
-        self._live_lane.start("refining", work)
+        self._live_jobs.start("refining", work)
 
+    @on_loop
     def stop(self) -> None:
         """Cancel all jobs; results so far stay."""
-        self._live_lane.stop()
-        self._background_lane.stop()
+        self._live_jobs.stop()
+        self._background_jobs.stop()
         self._on_change()
 
+    @on_loop
     def mark_outdated(self) -> None:
         """Mark the results as those of an earlier version, and cancel all jobs. Does not call `on_change`."""
-        self._live_lane.stop()
-        self._background_lane.stop()
-        with self._lock:
-            self._results = replace(self._results, outdated=True, compared=None, picked=None, sheet=())
+        self._live_jobs.stop()
+        self._background_jobs.stop()
+        self.results = replace(self.results, outdated=True, compared=None, picked=None, sheet=())
 
     def close(self) -> None:
-        """Cancel all jobs; returns when their threads have ended."""
-        self._live_lane.close()
-        self._background_lane.close()
+        """Cancel all jobs, and begin no more."""
+        self._live_jobs.close()
+        self._background_jobs.close()
 
     # --- helpers -----------------------------------------------------------------------------------------
 
     def _selected_camera(self) -> StudioCamera | None:
-        with self._cameras.lock:
-            camera = self._cameras.selected_camera()
+        camera = self._cameras.selected_camera()
         self._on_change()
         return camera
 
     def _set_problem(self, problem: str) -> None:
-        with self._cameras.lock:
-            self._cameras.problem = problem
+        self._cameras.problem = problem
         self._on_change()
 
-    def _draw(self, job: Job, moment: ShownMoment, question: DrawCamera) -> Picture:
-        return self._live.ask(job.check, replace(question, poses=moment.of(question.env)))
+    async def _draw(self, moment: ShownMoment, question: DrawCamera) -> Picture:
+        return await self._live.ask(replace(question, poses=moment.of(question.env)))
 
     @contextmanager
     def _measuring(self) -> Iterator[None]:
@@ -310,11 +310,10 @@ class CameraReports:
             self._update(measuring=False)
 
     def _update(self, **values: object) -> None:
-        with self._lock:
-            self._results = replace(self._results, **{"problem": "", **values})  # type: ignore[arg-type]
+        self.results = replace(self.results, **{"problem": "", **values})  # type: ignore[arg-type]
         self._on_change()
 
-    def _failed(self, job: Job, failure: JobFailed) -> None:
+    def _failed(self, failure: JobFailed) -> None:
         why = str(failure)
         self._update(problem=f"{why[:1].upper()}{why[1:]}" + ("" if why.endswith(".") else "."))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -235,14 +234,13 @@ class KeptPlacements:
 
 
 class StudioCameras:
-    """The cameras, placements and selection that all parts of the studio share. Callers hold `lock`.
+    """The cameras, placements and selection that all parts of the studio share. Used on the loop.
 
     Args:
         kept: of an earlier session of the task.
     """
 
     def __init__(self, kept: KeptPlacements | None = None) -> None:
-        self.lock = threading.Lock()
         self.task: TaskDescription | None = None
         self.selected: CameraKey | None = None
         self.was_chosen = False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +18,9 @@ from workbench.session.cameras.reports import CameraReports
 from workbench.session.cameras.selection import KeptPlacements, PlacementChange, StudioCameras
 from workbench.session.cameras.view import StudioView
 from workbench.session.history.history import ShownPast
+from workbench.session.loop import do, on_loop
 from workbench.session.process.askers import Asker, Background
-from workbench.session.process.job_lane import Job, JobFailed, JobLane
+from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.protocol.messages import Load, PlaceCamera, Placed, ReloadLevel, Request
 from workbench.session.protocol.questions import DrawCamera
 
@@ -30,7 +30,7 @@ Previewed = tuple[StepResult | None, DrawCamera]
 
 
 class CameraStudio:
-    """Places cameras and previews them. All methods are thread-safe and return at once; `view` has the results.
+    """Places cameras and previews them. All methods return at once and may be called on any thread; `view` has the results.
 
     A placement is here (with undo), in the worker's live cameras, and at last in the author's file. This one is
     authoritative: after each load it is sent to the worker again, so that neither a reload nor a crash moves a camera. If
@@ -64,14 +64,11 @@ class CameraStudio:
         self._send, self._on_change = send, on_change
         self._shown = past.shown_moment
         self._cameras = StudioCameras(kept)
-        self._lock = self._cameras.lock
         self._asker = asker
         self.file = FileEdits(self._cameras, self._notify, open_file, asker, load, self._shown)
-        self._asking = threading.Lock()
-        """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
         self.reports = CameraReports(self._cameras, asker, background, self._notify, past, load)
-        self._preview_lane = JobLane("studio-preview", self._notify, self._preview_failed)
+        self._previews = Jobs(self._notify, self._preview_failed)
         self._preview_scale = 1.0
         self._preview: Picture | None = None
         self._preview_problem = ""
@@ -80,15 +77,16 @@ class CameraStudio:
 
     # --- placing -------------------------------------------------------------------------------------
 
+    @on_loop
     def select(self, key: CameraKey | None) -> None:
         """Select the camera that the page works on."""
-        with self._lock:
-            self._cameras.was_chosen = True
-            self._cameras.selected = (
-                key if key is None or self._cameras.info(key) is not None else self._cameras.selected
-            )
+        self._cameras.was_chosen = True
+        self._cameras.selected = (
+            key if key is None or self._cameras.info(key) is not None else self._cameras.selected
+        )
         self._notify()
 
+    @on_loop
     def place(
         self, key: CameraKey, settings: CameraSettings, control: object = None, pause: float = math.inf
     ) -> None:
@@ -98,35 +96,36 @@ class CameraStudio:
             control: id of the control; successive calls with the same one are one step of undo (a drag).
             pause: seconds without a call after which a new step begins.
         """
-        with self._lock:
-            why_not = self._cameras.refusal(key) or why_no_camera(settings)
-            self._cameras.problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
-            moved = not why_not and self._cameras.placements.place(key, settings, control, pause)
+        why_not = self._cameras.refusal(key) or why_no_camera(settings)
+        self._cameras.problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
+        moved = not why_not and self._cameras.placements.place(key, settings, control, pause)
         self.send_placements([key] if moved else [])
 
+    @on_loop
     def undo(self) -> None:
         """Undo the last step."""
         self._step(self._cameras.placements.undo)
 
+    @on_loop
     def redo(self) -> None:
         """Redo the step that was undone last."""
         self._step(self._cameras.placements.redo)
 
     def _step(self, move: Callable[[], PlacementChange | None]) -> None:
-        with self._lock:
-            step = move()
-            self._cameras.problem = ""
+        step = move()
+        self._cameras.problem = ""
         self.send_placements([] if step is None else [step.key])
 
+    @on_loop
     def back_to_file(self, key: CameraKey) -> None:
         """Place a camera as in the file."""
-        with self._lock:
-            file = self._cameras.placements.in_file.get(key)
-            moved = file is not None and self._cameras.placements.place(
-                key, file, label=f"put {key[1]} back to the file"
-            )
+        file = self._cameras.placements.in_file.get(key)
+        moved = file is not None and self._cameras.placements.place(
+            key, file, label=f"put {key[1]} back to the file"
+        )
         self.send_placements([key] if moved else [])
 
+    @on_loop
     def take_suggestion(self, index: int) -> None:
         """Place the camera as in a suggestion."""
         results = self.reports.results
@@ -134,48 +133,43 @@ class CameraStudio:
         if key is None or not 0 <= index < len(results.suggestions):
             return
         found = results.suggestions[index].settings
-        with self._lock:
-            now = self._cameras.placements.now(key)
+        now = self._cameras.placements.now(key)
         if now is not None:
             self.place(key, replace(now, position=found.position, quaternion=found.quaternion))
 
+    @on_loop
     def set_preview_scale(self, scale: float) -> None:
         """Show the selected camera at this factor of its own size; 1 for its own picture. Never written to the file."""
-        with self._lock:
-            self._preview_scale, self._preview, self._previewed = scale, None, None
+        self._preview_scale, self._preview, self._previewed = scale, None, None
         self._notify()
 
+    @on_loop
     def draw_preview(self) -> None:
         """Draw another preview, if something changed since the last and none is being drawn."""
-        with self._lock:
-            key, (step, env) = self._cameras.selected, self._cameras.drawn
-            now = None if key is None else self._cameras.placements.now(key)
-            if self._preview_scale == 1.0 or key is None or now is None or self._cameras.refusal(key):
-                return
-            question = DrawCamera(key, now, env, PREVIEW_MODALITIES, scale=self._preview_scale)
-            seen = (
-                self._previewed is not None and self._previewed[0] is step and self._previewed[1] == question
-            )
-            if seen or self._preview_lane.progress is not None:
-                return
-            self._previewed, self._preview_problem = (step, question), ""
+        key, (step, env) = self._cameras.selected, self._cameras.drawn
+        now = None if key is None else self._cameras.placements.now(key)
+        if self._preview_scale == 1.0 or key is None or now is None or self._cameras.refusal(key):
+            return
+        question = DrawCamera(key, now, env, PREVIEW_MODALITIES, scale=self._preview_scale)
+        seen = self._previewed is not None and self._previewed[0] is step and self._previewed[1] == question
+        if seen or self._previews.progress is not None:
+            return
+        self._previewed, self._preview_problem = (step, question), ""
 
         question = replace(question, poses=self._shown().of(env))
 
-        def work(job: Job) -> None:
-            picture = self._asker.ask(job.check, question)
-            with self._lock:
-                self._preview = picture
+        async def work(job: Job) -> None:
+            self._preview = await self._asker.ask(question)
 
-        self._preview_lane.start("a preview", work)
+        self._previews.start("a preview", work)
 
-    def _preview_failed(self, job: Job, failure: JobFailed) -> None:
+    def _preview_failed(self, failure: JobFailed) -> None:
         """The last preview stays; the next change draws again."""
-        with self._lock:
-            self._preview_problem = f"The preview failed: {failure}."
+        self._preview_problem = f"The preview failed: {failure}."
 
     # --- calibration files -----------------------------------------------------------------------------
 
+    @on_loop
     def export(self, keys: Sequence[CameraKey], form: Literal["json", "opencv", "ros"]) -> str:
         """The text of a calibration file: cameras as placed, at the shown moment of the selected env.
 
@@ -184,8 +178,7 @@ class CameraStudio:
         Raises:
             ValueError: a camera is missing or cannot be exported; the message is for the reader.
         """
-        with self._lock:
-            cameras = [self._cameras.to_export(key) for key in keys]
+        cameras = [self._cameras.to_export(key) for key in keys]
         if form == "ros":
             return "---\n".join(calibration_files.camera_as_ros_yaml(camera) for camera in cameras)
         write = (
@@ -193,6 +186,7 @@ class CameraStudio:
         )
         return write(cameras)
 
+    @on_loop
     def import_pose(
         self,
         key: CameraKey,
@@ -208,9 +202,8 @@ class CameraStudio:
         Raises:
             ValueError: with a message for the reader.
         """
-        with self._lock:
-            info, now = self._cameras.info(key), self._cameras.placements.now(key)
-            mount = None if info is None else self._cameras.mount_pose(info)
+        info, now = self._cameras.info(key), self._cameras.placements.now(key)
+        mount = None if info is None else self._cameras.mount_pose(info)
         if now is None or info is None:
             raise ValueError(f"there is no {key[0]} camera {key[1]} that can be placed")
         found = calibration_files.find_poses(text)
@@ -237,36 +230,35 @@ class CameraStudio:
             env: the selected one.
         """
         results, progress = self.reports.results, self.reports.progress
-        with self._lock:
-            self._cameras.drawn = step, env
-            preview = self._preview
-            measured = None if results.report_of is None else self._cameras.placements.now(results.report_of)
-            was = results.report_settings
-            # Rounding when it was written does not count.
-            moved = measured is None or was is None or bool(differences(measured, was, close=3e-4))
-            return StudioView(
-                cameras=self._cameras.all_cameras(),
-                results=results,
-                report_stale=results.report is not None and (moved or results.outdated),
-                preview_scale=self._preview_scale,
-                preview=preview
-                if preview and (preview.key, preview.env) == (self._cameras.selected, env)
-                else None,
-                progress=progress,
-                selected=self._cameras.selected,
-                was_chosen=self._cameras.was_chosen,
-                undo=self._cameras.placements.undo_label,
-                redo=self._cameras.placements.redo_label,
-                edit_state=self.file.view,
-                problem=self._cameras.problem or results.problem or self._preview_problem,
-                serial=self._serial,
-            )
+        self._cameras.drawn = step, env
+        preview = self._preview
+        measured = None if results.report_of is None else self._cameras.placements.now(results.report_of)
+        was = results.report_settings
+        # Rounding when it was written does not count.
+        moved = measured is None or was is None or bool(differences(measured, was, close=3e-4))
+        return StudioView(
+            cameras=self._cameras.all_cameras(),
+            results=results,
+            report_stale=results.report is not None and (moved or results.outdated),
+            preview_scale=self._preview_scale,
+            preview=preview
+            if preview and (preview.key, preview.env) == (self._cameras.selected, env)
+            else None,
+            progress=progress,
+            selected=self._cameras.selected,
+            was_chosen=self._cameras.was_chosen,
+            undo=self._cameras.placements.undo_label,
+            redo=self._cameras.placements.redo_label,
+            edit_state=self.file.view,
+            problem=self._cameras.problem or results.problem or self._preview_problem,
+            serial=self._serial,
+        )
 
     # --- events, from the session ----------------------------------------------------------------------
 
     def loaded(self, task: TaskDescription, level: ReloadLevel | None) -> tuple[CameraKey, ...]:
-        """A version runs: update cameras and placements, and compare it with a written edit. Called under the session's
-        lock; sends nothing.
+        """A version runs: update cameras and placements, and compare it with a written edit. Sends
+        nothing.
 
         Args:
             level: of its reload; None for the first version.
@@ -274,53 +266,50 @@ class CameraStudio:
         Returns:
             The cameras whose placement has to be sent to the worker, by `send_placements`.
         """
-        with self._lock:
-            self._cameras.task = task
-            in_file = {c.key: c.settings for c in task.cameras if c.settings is not None}
-            own = self.file.loaded(task)
-            dropped = self._cameras.placements.loaded(in_file, own)
-            self.file.plan_in_copy(task)
-            self._cameras.problem = ""
-            if dropped:
-                names = " and ".join(key[1] for key in dropped)
-                one = len(dropped) == 1
-                self._cameras.problem = (
-                    f"{names} {'was' if one else 'were'} changed in the file and now {'follows' if one else 'follow'} "
-                    "it; Undo restores your placement."
-                )
-            self._cameras.select_again()
-            self._serial += 1
-            if level not in ("same", "cameras"):
-                self.reports.mark_outdated()
-            # Dropped ones too: their placement may have been on its way during the load. And edited ones: after an edit
-            # was taken out again the version may count as the same, so the worker's camera would stay where it was.
-            to_send = (*self._cameras.placements.placed, *dropped, *(own & in_file.keys()))
-            return tuple(dict.fromkeys(to_send))
+        self._cameras.task = task
+        in_file = {c.key: c.settings for c in task.cameras if c.settings is not None}
+        own = self.file.loaded(task)
+        dropped = self._cameras.placements.loaded(in_file, own)
+        self.file.plan_in_copy(task)
+        self._cameras.problem = ""
+        if dropped:
+            names = " and ".join(key[1] for key in dropped)
+            one = len(dropped) == 1
+            self._cameras.problem = (
+                f"{names} {'was' if one else 'were'} changed in the file and now {'follows' if one else 'follow'} "
+                "it; Undo restores your placement."
+            )
+        self._cameras.select_again()
+        self._serial += 1
+        if level not in ("same", "cameras"):
+            self.reports.mark_outdated()
+        # Dropped ones too: their placement may have been on its way during the load. And edited ones: after an edit
+        # was taken out again the version may count as the same, so the worker's camera would stay where it was.
+        to_send = (*self._cameras.placements.placed, *dropped, *(own & in_file.keys()))
+        return tuple(dict.fromkeys(to_send))
 
+    @on_loop
     def interrupted(self) -> None:
         """Cancel all jobs: the file was saved, or the worker is gone."""
         self.reports.stop()
-        self._preview_lane.stop()
+        self._previews.stop()
         self._previewed = None
         self.file.stop()
 
     def failed_to_load(self) -> None:
         """A version failed to load; the one before continues."""
-        with self._lock:
-            self.file.failed_to_load()
+        self.file.failed_to_load()
         self._notify()
 
+    @on_loop
     def placed_cameras(self) -> tuple[PlaceCamera, ...]:
         """All placements, as requests to another worker."""
-        with self._lock:
-            return tuple(
-                PlaceCamera(key, settings) for key, settings in self._cameras.placements.placed.items()
-            )
+        return tuple(PlaceCamera(key, settings) for key, settings in self._cameras.placements.placed.items())
 
+    @on_loop
     def kept_placements(self) -> KeptPlacements:
         """For a later session of this task."""
-        with self._lock:
-            return self._cameras.kept()
+        return self._cameras.kept()
 
     def placed(self, event: Placed, task: TaskDescription | None) -> None:
         """The worker's answer to a placement.
@@ -329,34 +318,28 @@ class CameraStudio:
             task: with the camera's new info.
         """
         again = False
-        with self._lock:
-            if event.why_not:
-                self._cameras.problem = f"{event.key[1]} could not be placed: {event.why_not}."
-                self._cameras.placements.refused(event.key)
-                again = event.settings is not None
-            else:
-                self._cameras.task = task
+        if event.why_not:
+            self._cameras.problem = f"{event.key[1]} could not be placed: {event.why_not}."
+            self._cameras.placements.refused(event.key)
+            again = event.settings is not None
+        else:
+            self._cameras.task = task
         self.send_placements([event.key] if again else [])
 
     def close(self) -> None:
-        """Cancel all jobs, and wait for a running edit."""
-        self.reports.close()
-        self._preview_lane.close()
+        """Cancel all jobs, and wait for a running edit. Called on another thread than the loop."""
+        do(self.reports.close)
+        do(self._previews.close)
         self.file.close()
 
     # --- sending ---------------------------------------------------------------------------------------
 
     def send_placements(self, keys: Sequence[CameraKey]) -> None:
         """Send the present placements of these cameras to the worker."""
-        # Read and sent under one lock: otherwise, of two threads, the older placement might be sent last.
-        with self._asking:
-            with self._lock:
-                requests = [PlaceCamera(key, self._cameras.placements.placed.get(key)) for key in keys]
-            for request in requests:
-                self._send(request)
+        for key in keys:
+            self._send(PlaceCamera(key, self._cameras.placements.placed.get(key)))
         self._notify()
 
     def _notify(self) -> None:
-        with self._lock:
-            self._serial += 1
+        self._serial += 1
         self._on_change()

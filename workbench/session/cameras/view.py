@@ -13,7 +13,7 @@ from workbench.core.cameras.report import CameraReport, OfferedPlacement
 
 if TYPE_CHECKING:
     from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.session.process.job_lane import JobProgress
+from workbench.session.process.jobs import JobProgress
 
 EditStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
 """``planned``: shown, not written. ``written``: in the file, before its reload. ``checked``: the new env's camera equals the

@@ -6,15 +6,15 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
 from workbench.checks.results import RuleResult, by_rule, failed
 from workbench.checks.rules import core_rules_of, degree_of_each
 from workbench.core.rules import Finding
+from workbench.session.loop import on_loop
 from workbench.session.process.askers import WAITING, Background, Priority
-from workbench.session.process.held_view import HeldView
-from workbench.session.process.job_lane import Job, JobFailed, JobLane, ProcessDied
+from workbench.session.process.jobs import Job, JobFailed, Jobs, ProcessDied
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.session.rescore.background import StoppedBy
@@ -64,7 +64,7 @@ class Checks:
     """Checks the version that runs, and keeps what the version before came to until each rule is checked anew.
 
     Nothing of it runs in the worker that plays. The process gives way to whatever a person waits for; a group that was cut
-    short is asked again without the rules that are known. All methods but `close` return at once.
+    short is asked again without the rules that are known. Methods return at once.
     """
 
     def __init__(self, on_change: Callable[[], None], process: Background, after_each_save: bool) -> None:
@@ -74,17 +74,18 @@ class Checks:
             process: where it runs; other jobs come first.
             after_each_save: whether `loaded` begins to check.
         """
-        self._process = process
-        self._held = HeldView(ChecksView(after_each_save=after_each_save), on_change)
+        self._process, self._on_change = process, on_change
+        self._view = ChecksView(after_each_save=after_each_save)
         self._of: object = None
         """The version that `view` belongs to."""
-        self._lane = JobLane("checks", on_change, self._failed)
+        self._jobs = Jobs(on_change, self._failed)
 
     @property
     def view(self) -> ChecksView:
-        progress = self._lane.progress
-        return replace(self._held.now, waits=progress is not None and progress.what == WAITING)
+        progress = self._jobs.progress
+        return replace(self._view, waits=progress is not None and progress.what == WAITING)
 
+    @on_loop
     def loaded(self, load: Load, same_task: bool) -> None:
         """A version runs in the worker that plays.
 
@@ -93,74 +94,72 @@ class Checks:
             same_task: whether it is another version of the task that ran.
         """
         if not same_task:
-            self._held.change(before=(), results=())
-        if self._of == _version(load) and self._held.now.state in ("done", "off"):
+            self._set(before=(), results=())
+        if self._of == _version(load) and self._view.state in ("done", "off"):
             return
-        if self._held.now.after_each_save:
+        if self._view.after_each_save:
             self.check(load)
         else:
-            self._lane.stop()
+            self._jobs.stop()
             self._begin(load, "none")
 
+    @on_loop
     def check(self, load: Load) -> None:
         """Check this version; a running check ends."""
         if all(degree == "off" for degree in degree_of_each(choice=load.options.rules).values()):
-            self._lane.stop()
+            self._jobs.stop()
             self._begin(load, "off")
             return
-        with self._held.lock:
-            # Under the lock, or the job's first update might come before the view.
-            self._lane.start("checks", lambda job: self._check(job, load))
-            self._put_begun(load, "loading")
-        self._held.changed()
+        self._jobs.start("checks", lambda job: self._check(job, load))
+        self._begin(load, "loading")
 
+    @on_loop
     def check_after_each_save(self, wanted: bool) -> None:
         """Whether `loaded` begins to check, from now on."""
-        self._held.change(after_each_save=wanted)
+        self._set(after_each_save=wanted)
 
+    @on_loop
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
         """End the check; results so far stay."""
-        with self._held.lock:
-            self._lane.stop()
-            if self._held.now.state not in RUNNING:
-                return
-            self._held.set(state="stopped", stopped_by=why, why=why.value, looks_at="")
-        self._held.changed()
+        self._jobs.stop()
+        if self._view.state in RUNNING:
+            self._set(state="stopped", stopped_by=why, why=why.value, looks_at="")
 
+    @on_loop
     def close(self) -> None:
-        """Stop; returns when the thread has ended."""
+        """Stop, and check nothing more."""
         self.stop(StoppedBy.CLOSING)
-        self._lane.close()
+        self._jobs.close()
 
-    # --- on the lane ---------------------------------------------------------------------------------
+    # --- the job -------------------------------------------------------------------------------------
 
-    def _check(self, job: Job, load: Load) -> None:
+    async def _check(self, job: Job, load: Load) -> None:
         degrees = degree_of_each(choice=load.options.rules)
         began: float | None = None
         done: set[str] = set()
         under_way: str | None = None
         deaths = 0
 
-        def ask(group: int) -> CheckedGroup:
+        async def ask(group: int) -> CheckedGroup:
             nonlocal began
-            load_version(self._process, job, load)
+            await load_version(self._process, job, load)
             began = began or time.monotonic()
-            self._held.update(job, state="checking")
-            return self._process.ask(job.check, CheckGroup(group, degrees, tuple(done)), hear)
+            self._set(state="checking")
+            return await self._process.ask(CheckGroup(group, degrees, tuple(done)), hear)
 
         def hear(count: int, total: int, now: RuleProgress) -> None:
             nonlocal under_way
             under_way = now.rule if now.result is None else None
             if now.result is not None:
                 done.add(now.rule)
-                self._take(job, began, total, now.result)
+                self._take(began, total, now.result)
 
         group, groups = 0, 1
         while group < groups:
             ahead = began is None or time.monotonic() - began < AHEAD
             priority: Priority = "low" if ahead else "lowest"
             try:
-                answer = self._process.in_turns(job, partial(ask, group), priority)
+                answer = await self._process.in_turns(job, partial(ask, group), priority)
             except ProcessDied as died:
                 deaths += 1
                 if began is None or deaths > MOST_DEATHS:
@@ -170,49 +169,48 @@ class Checks:
                 rules = core_rules_of(degrees) if under_way == "" else filter(None, [under_way])
                 for rule in rules:
                     done.add(rule)
-                    self._take(job, began, self._held.now.total, failed(rule, problem))
+                    self._take(began, self._view.total, failed(rule, problem))
                 group += under_way == ""  # that is the last one
                 under_way = None
                 continue
             group, groups = group + 1, answer.groups
-            self._held.update(job, total=answer.rules, looks_at=answer.next)
-        self._held.update(job, state="done", before=(), looks_at="")
+            self._set(total=answer.rules, looks_at=answer.next)
+        self._set(state="done", before=(), looks_at="")
 
-    def _take(self, job: Job, began: float | None, total: int, result: RuleResult) -> None:
-        results = by_rule((*self._held.now.results, result))
-        before = tuple(finding for finding in self._held.now.before if finding.rule != result.rule)
+    def _take(self, began: float | None, total: int, result: RuleResult) -> None:
+        results = by_rule((*self._view.results, result))
+        before = tuple(finding for finding in self._view.before if finding.rule != result.rule)
         seconds = time.monotonic() - (began or time.monotonic())
-        self._held.update(job, results=tuple(results.values()), before=before, total=total, seconds=seconds)
+        self._set(results=tuple(results.values()), before=before, total=total, seconds=seconds)
 
-    def _failed(self, job: Job, failure: JobFailed) -> None:
-        self._held.update(job, state="failed", why=str(failure), problem=failure.problem, looks_at="")
+    def _failed(self, failure: JobFailed) -> None:
+        self._set(state="failed", why=str(failure), problem=failure.problem, looks_at="")
 
     # --- the view ------------------------------------------------------------------------------------
 
-    def _begin(self, load: Load, state: ChecksState) -> None:
-        with self._held.lock:
-            self._put_begun(load, state)
-        self._held.changed()
+    def _set(self, **values: Any) -> None:
+        self._view = replace(self._view, serial=self._view.serial + 1, **values)
+        self._on_change()
 
-    def _put_begun(self, load: Load, state: ChecksState) -> None:
+    def _begin(self, load: Load, state: ChecksState) -> None:
         """Nothing is known of this version yet."""
-        self._of, view = _version(load), self._held.now
+        self._of, view = _version(load), self._view
         before = {
             finding.key: finding
             for finding in (*view.before, *view.findings)
             if _still_there(finding, load.source)
         }
-        self._held.put(
-            ChecksView(
-                state,
-                before=() if state == "off" else tuple(before.values()),
-                total=view.total,
-                after_each_save=view.after_each_save,
-            )
+        self._view = ChecksView(
+            state,
+            serial=view.serial + 1,
+            before=() if state == "off" else tuple(before.values()),
+            total=view.total,
+            after_each_save=view.after_each_save,
         )
+        self._on_change()
 
 
-def load_version(process: Background, job: Job, load: Load) -> None:
+async def load_version(process: Background, job: Job, load: Load) -> None:
     """Load a version in the background process, if it is not loaded.
 
     Raises:
@@ -220,7 +218,7 @@ def load_version(process: Background, job: Job, load: Load) -> None:
     """
     try:
         # Where the process stands, at some moment of a job before, the new code may raise: then it is built anew.
-        process.ensure(job, load, or_else=replace(load, level="rebuilt"))
+        await process.ensure(job, load, or_else=replace(load, level="rebuilt"))
     except JobFailed as failure:
         if failure.problem is None:
             raise

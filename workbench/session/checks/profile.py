@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
 from workbench.checks.results import StepProfile
 from workbench.session.checks.checks import load_version
+from workbench.session.loop import on_loop
 from workbench.session.process.askers import Background
-from workbench.session.process.held_view import HeldView
-from workbench.session.process.job_lane import Job, JobFailed, JobLane
+from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import ProfileStep
 
@@ -36,7 +36,7 @@ class ProfileView:
 
 
 class StepProfiler:
-    """Makes one profile at a time; a person waits for it. All methods but `close` return at once."""
+    """Makes one profile at a time; a person waits for it. Methods return at once."""
 
     def __init__(self, on_change: Callable[[], None], process: Background) -> None:
         """
@@ -44,51 +44,45 @@ class StepProfiler:
             on_change: called when `view` has changed.
             process: where it runs.
         """
-        self._process = process
-        self._held = HeldView(ProfileView(), on_change)
-        self._lane = JobLane("profile", on_change, self._failed)
+        self._process, self._on_change = process, on_change
+        self.view = ProfileView()
+        self._jobs = Jobs(on_change, self._failed)
 
-    @property
-    def view(self) -> ProfileView:
-        return self._held.now
-
+    @on_loop
     def profile(self, load: Load) -> None:
         """Time a step of this version."""
-        with self._held.lock:
-            self._lane.start("profile", lambda job: self._profile(job, load))
-            self._held.set(state="running", why="", problem=None)
-        self._held.changed()
+        self._jobs.start("profile", lambda job: self._profile(job, load))
+        self._set(state="running", why="", problem=None)
 
+    @on_loop
     def loaded(self) -> None:
         """Another version runs: a running profile ends, and the last one is of an earlier version."""
-        with self._held.lock:
-            self._lane.stop()
-            stopped = self._held.now.state == "running"
-            self._held.set(
-                state="stopped" if stopped else self._held.now.state, stale=self._held.now.profile is not None
-            )
-        self._held.changed()
+        self.stop()
+        self._set(stale=self.view.profile is not None)
 
+    @on_loop
     def stop(self) -> None:
         """End a running profile."""
-        with self._held.lock:
-            self._lane.stop()
-            if self._held.now.state != "running":
-                return
-            self._held.set(state="stopped")
-        self._held.changed()
+        self._jobs.stop()
+        if self.view.state == "running":
+            self._set(state="stopped")
 
+    @on_loop
     def close(self) -> None:
-        """Stop; returns when the thread has ended."""
+        """Stop, and make no more."""
         self.stop()
-        self._lane.close()
+        self._jobs.close()
 
-    def _profile(self, job: Job, load: Load) -> None:
-        def ask() -> StepProfile:
-            load_version(self._process, job, load)
-            return self._process.ask(job.check, ProfileStep())
+    async def _profile(self, job: Job, load: Load) -> None:
+        async def ask() -> StepProfile:
+            await load_version(self._process, job, load)
+            return await self._process.ask(ProfileStep())
 
-        self._held.update(job, state="done", profile=self._process.in_turns(job, ask), stale=False)
+        self._set(state="done", profile=await self._process.in_turns(job, ask), stale=False)
 
-    def _failed(self, job: Job, failure: JobFailed) -> None:
-        self._held.update(job, state="failed", why=str(failure), problem=failure.problem)
+    def _failed(self, failure: JobFailed) -> None:
+        self._set(state="failed", why=str(failure), problem=failure.problem)
+
+    def _set(self, **values: Any) -> None:
+        self.view = replace(self.view, serial=self.view.serial + 1, **values)
+        self._on_change()

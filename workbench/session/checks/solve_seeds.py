@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from workbench.authoring.problem import Problem, TaskError
 from workbench.jobs.pool.deal import Deal, ItemQueue, PoolError, Work
@@ -14,8 +14,8 @@ from workbench.jobs.pool.processes import Processes
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.planning.report import SolveReport, underway_text
-from workbench.session.process.held_view import HeldView
-from workbench.session.process.job_lane import Job, JobFailed, JobLane
+from workbench.session.loop import Aside, on_loop, post
+from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.protocol.messages import Load
 
 _NICENESS = 10
@@ -79,14 +79,12 @@ class SeedsSolver:
             on_change: called when `view` has changed.
             recordings: the folder for the episodes.
         """
-        self._recordings = recordings.absolute()
-        self._held = HeldView(SeedsView(), on_change)
-        self._lane = JobLane("solve-seeds", on_change, self._failed)
+        self._recordings, self._on_change = recordings.absolute(), on_change
+        self.view = SeedsView()
+        self._jobs = Jobs(on_change, self._failed)
+        self._aside = Aside("solve-seeds")
 
-    @property
-    def view(self) -> SeedsView:
-        return self._held.now
-
+    @on_loop
     def solve(self, load: Load, seeds: int, plan: PlanOptions) -> None:
         """Solve so many seeds; a running job ends, and keeps what is done.
 
@@ -95,56 +93,57 @@ class SeedsSolver:
         """
         if not isinstance(load.task, str):
             # Only the texts of a recording's task were cleared, not the file that bears its name.
-            self._held.change(
-                state="failed", why="this task comes from a recording: open its file to solve it"
-            )
+            self._set(state="failed", why="this task comes from a recording: open its file to solve it")
             return
         workers = max(1, min(seeds, len(os.sched_getaffinity(0)) // 2))
         setup = _Setup(load.task, self._recordings, seeds, workers, plan, replace(load.options, seed=0))
-        with self._held.lock:
-            self._lane.start("solving seeds", lambda job: self._solve(job, setup))
-            self._held.set(
-                state="starting",
-                report=None,
-                total=seeds,
-                done=0.0,
-                activity="",
-                stale=False,
-                why="",
-                problem=None,
-            )
-        self._held.changed()
+        self._jobs.start("solving seeds", lambda job: self._solve(job, setup))
+        self._set(
+            state="starting",
+            report=None,
+            total=seeds,
+            done=0.0,
+            activity="",
+            stale=False,
+            why="",
+            problem=None,
+        )
 
+    @on_loop
     def loaded(self) -> None:
         """Another version runs: what is known is of an earlier one."""
-        with self._held.lock:
-            if self._held.now.report is not None:
-                self._held.set(stale=True)
-        self._held.changed()
+        if self.view.report is not None:
+            self._set(stale=True)
 
+    @on_loop
     def stop(self) -> None:
         """End it; seeds that are done stay, with their recordings."""
-        with self._held.lock:
-            self._lane.stop()
-            if self._held.now.state not in RUNNING:
-                return
-            self._held.set(state="stopped", activity="")
-        self._held.changed()
+        self._jobs.stop()
+        if self.view.state in RUNNING:
+            self._set(state="stopped", activity="")
 
     def close(self) -> None:
-        """Stop; returns when the processes have ended."""
+        """Stop; returns when the processes have ended. Called on another thread than the loop."""
         self.stop()
-        self._lane.close()
+        self._aside.close()
 
-    # --- on the lane ---------------------------------------------------------------------------------
+    # --- the job -------------------------------------------------------------------------------------
 
-    def _solve(self, job: Job, setup: _Setup) -> None:
+    async def _solve(self, job: Job, setup: _Setup) -> None:
+        await self._aside.run(lambda: self._run(job, setup))
+        self._set(state="done", activity="")
+
+    def _run(self, job: Job, setup: _Setup) -> None:
+        """On a thread of its own."""
+        if job.stopped:
+            return
         work = Work(_run, setup, SolveReport, _Update, "that solves")
+
+        def tell(news: _Update) -> None:
+            post(lambda: job.stopped or self._take(news))
+
         deal: Deal[SolveReport, _Update] = Deal(
-            range(1),
-            lambda number, report: self._take(job, _Update(report=report)),
-            lambda news: self._take(job, news),
-            lambda: job.stopped,
+            range(1), lambda number, report: tell(_Update(report=report)), tell, lambda: job.stopped
         )
         try:
             Processes(1).run(work, deal)
@@ -154,18 +153,21 @@ class SeedsSolver:
             raise JobFailed(f"no process could be started: {error}") from error
         except PoolError as error:
             raise JobFailed(str(error)) from error
-        self._held.update(job, state="done", activity="")
 
-    def _take(self, job: Job, news: _Update) -> None:
+    def _take(self, news: _Update) -> None:
         if news.report is not None:
-            self._held.update(job, state="solving", report=news.report)
+            self._set(state="solving", report=news.report)
         elif news.done is not None:
-            self._held.update(job, state="solving", done=news.done, activity=news.activity)
+            self._set(state="solving", done=news.done, activity=news.activity)
         else:
-            self._held.update(job, activity=news.activity)
+            self._set(activity=news.activity)
 
-    def _failed(self, job: Job, failure: JobFailed) -> None:
-        self._held.update(job, state="failed", why=str(failure), problem=failure.problem, activity="")
+    def _failed(self, failure: JobFailed) -> None:
+        self._set(state="failed", why=str(failure), problem=failure.problem, activity="")
+
+    def _set(self, **values: Any) -> None:
+        self.view = replace(self.view, serial=self.view.serial + 1, **values)
+        self._on_change()
 
 
 def _run(setup: _Setup, queue: ItemQueue) -> None:

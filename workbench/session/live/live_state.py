@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-import threading
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +19,6 @@ from workbench.authoring.problem import Problem
 from workbench.core.camera_data import CameraKey
 from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
-from workbench.jobs.policy import NoPolicy, find_policy
 from workbench.jobs.task import Stepped, TaskDescription, TaskOptions, changed_options
 from workbench.machine.processes.wire import pack
 from workbench.session.history.env_table import EnvTable
@@ -58,7 +54,7 @@ _MOST_LOADS = 20
 class LiveState:
     """What each event and each request changes in the page's view.
 
-    No lock, no thread, no messages: `Session` calls it under the lock of `SharedState` and sends what is needed.
+    No thread, no messages: `Session` calls it on the loop and sends what is needed.
     """
 
     reference: TaskName
@@ -428,17 +424,6 @@ class LiveState:
 
     # --- reading -------------------------------------------------------------------------------------
 
-    def knows_file(self, path: str) -> bool:
-        """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder."""
-        known = [Path(file).absolute() for file in self.own_files()]
-        if self.policy is not None:
-            with contextlib.suppress(NoPolicy):
-                known.append(Path(find_policy(self.policy, self.folder)[0]).absolute())
-        file = Path(path)
-        # A module that has never loaded is in no `source_files`. Resolved: a path may leave the folder again by "..".
-        beside = self.own_folder is not None and file.resolve().is_relative_to(self.own_folder.resolve())
-        return file in known or (beside and file.suffix == ".py" and file.is_file())
-
     def own_files(self) -> list[str]:
         """The known files of the author."""
         return own_files_of(() if self.now.task is None else self.now.task.source_files, self.own_file)
@@ -528,44 +513,3 @@ def past_after(
 def scene_kept(event: Loaded) -> bool:
     """Whether the env, its episodes and its history stay."""
     return event.reload is not None and event.reload.level in SCENE_KEPT
-
-
-class SharedState:
-    """A session's state with its lock, and a counter of changes that pages wait for.
-
-    Pages, the worker's thread, the file watcher and the recorder all change it. A page reads all of it at once
-    (`Session.view`), so a counter is enough.
-    """
-
-    def __init__(self, state: LiveState) -> None:
-        self.lock = threading.Lock()
-        """Of `state`; hold it for moments only."""
-        self.state = state
-        self._changed = threading.Condition(self.lock)
-        self._count = 0
-        self._closing = False
-
-    @contextmanager
-    def changing(self) -> Iterator[LiveState]:
-        """The state, with the lock held, to change it; notifies pages at the end."""
-        with self.lock:
-            yield self.state
-        self.notify()
-
-    def notify(self) -> None:
-        """Notify pages of a change. Call it without the lock."""
-        with self._changed:
-            self._count += 1
-            self._changed.notify_all()
-
-    def wait(self, seen: int, timeout: float) -> int:
-        """Block until the counter differs from `seen`; returns the counter."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._count != seen or self._closing, timeout)
-            return self._count
-
-    def close(self) -> None:
-        """Wake all waiting pages; `wait` returns at once from now on."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify_all()

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -16,8 +14,9 @@ from workbench.authoring.problem import Problem
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Stepped
 from workbench.session.checks.checks import load_version
+from workbench.session.loop import on_loop
 from workbench.session.process.askers import Background
-from workbench.session.process.job_lane import Job, JobFailed, JobLane
+from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.protocol.messages import FollowPlan, Load, PlanWanted, Request, Settings
 from workbench.session.protocol.questions import PlanActions, Planned, PlannedEnv
 
@@ -79,7 +78,7 @@ class Solver:
     """Answers what the worker that plays wants planned, one plan at a time; a newer wish replaces the one before.
 
     A process of its own has the same version of the task with the envs of the rollouts. It is started with the first plan,
-    and ends a while after the last. All methods but `close` return at once.
+    and ends a while after the last. Used on the loop, but for `close`.
     """
 
     def __init__(
@@ -93,31 +92,28 @@ class Solver:
         """
         self._on_change, self._send, self._pause = on_change, send, pause
         self._process = Background(_NICENESS)
-        self._lock = threading.Lock()
         self._state: SolveView = SolveView()
         """Without what belongs to one env."""
         self._episodes: dict[int, _Episode] = {}
-        self._lane = JobLane("solve", on_change, self._failed)
+        self._jobs = Jobs(on_change, self._refuse)
 
     def view(self, env: int) -> SolveView:
         """What is known of this env."""
-        progress = self._lane.progress
-        with self._lock:
-            state, episode = self._state, self._episodes.get(env, _Episode())
-            solved = tuple((e, one.solved_at) for e, one in sorted(self._episodes.items()) if one.solved_at)
-            predicted, achieved = _curves(episode)
-            return replace(
-                state,
-                activity=progress.what if progress is not None and state.state == "starting" else "",
-                plan=episode.plan,
-                plan_step=episode.plan_step,
-                predicted=predicted,
-                achieved=achieved,
-                begins=episode.begins,
-                solved_at=episode.solved_at,
-                solved=solved,
-                steps_per_second=episode.rate,
-            )
+        progress, state, episode = self._jobs.progress, self._state, self._episodes.get(env, _Episode())
+        solved = tuple((e, one.solved_at) for e, one in sorted(self._episodes.items()) if one.solved_at)
+        predicted, achieved = _curves(episode)
+        return replace(
+            state,
+            activity=progress.what if progress is not None and state.state == "starting" else "",
+            plan=episode.plan,
+            plan_step=episode.plan_step,
+            predicted=predicted,
+            achieved=achieved,
+            begins=episode.begins,
+            solved_at=episode.solved_at,
+            solved=solved,
+            steps_per_second=episode.rate,
+        )
 
     def plan(self, wanted: PlanWanted, load: Load, settings: Settings) -> None:
         """Plan, and send the worker the actions to follow.
@@ -131,11 +127,9 @@ class Solver:
             return
         # One env of the task is enough to make the rollouts' envs like it, and its seed decides nothing.
         alone = replace(load, options=replace(load.options, num_envs=1, seed=0))
-        with self._lock:
-            self._lane.start("planning", lambda job: self._plan(job, wanted, alone, settings))
-            loaded = self._process.has_loaded(alone)
-            self._set(state="planning" if loaded else "starting", why="", problem=None)
-        self._on_change()
+        loaded = self._process.has_loaded(alone)
+        self._set(state="planning" if loaded else "starting", why="", problem=None)
+        self._jobs.start("planning", lambda job: self._plan(job, wanted, alone, settings))
 
     def stepped(self, event: Stepped, planned: bool) -> None:
         """Note what the worker that plays came to.
@@ -143,67 +137,53 @@ class Solver:
         Args:
             planned: the source of its actions is *solve*.
         """
-        with self._lock:
-            if not planned and not self._episodes:
-                return
-            for env in range(len(event.reset_mask)):
-                if event.reset_mask[env] or not planned:
-                    self._episodes.pop(env, None)
-                if planned:
-                    self._note(env, event.step, bool(event.reset_mask[env]))
-            self._set()
+        if not planned and not self._episodes:
+            return
+        for env in range(len(event.reset_mask)):
+            if event.reset_mask[env] or not planned:
+                self._episodes.pop(env, None)
+            if planned:
+                self._note(env, event.step, bool(event.reset_mask[env]))
+        self._set()
 
+    @on_loop
     def stop(self) -> None:
         """End the planning; the last plan stays, to be looked at."""
-        with self._lock:
-            self._lane.stop()
-            if self._state.state in ("starting", "planning"):
-                self._set(state="none")
+        self._jobs.stop()
+        if self._state.state in ("starting", "planning"):
+            self._set(state="none")
         self._on_change()
 
     def close(self) -> None:
-        """Stop, and end the process; returns when its thread has ended."""
+        """Stop; returns when the process has ended. Called on another thread than the loop."""
         self.stop()
-        self._lane.close()
-        self._process.end()
+        self._process.close()
 
-    # --- on the lane ---------------------------------------------------------------------------------
+    # --- the job -------------------------------------------------------------------------------------
 
-    def _plan(self, job: Job, wanted: PlanWanted, load: Load, settings: Settings) -> None:
+    async def _plan(self, job: Job, wanted: PlanWanted, load: Load, settings: Settings) -> None:
         began = time.monotonic()
 
-        def ask() -> Planned:
-            load_version(self._process, job, load)
+        async def ask() -> Planned:
+            await load_version(self._process, job, load)
             question = PlanActions(wanted.snapshot, wanted.bodies, settings.plan, settings.traced)
-            return self._process.ask(job.check, question, partial(self._far, job))
+            return await self._process.ask(question, lambda done, total, part: job.report(done, total))
 
-        planned = self._process.in_turns(job, ask)
+        planned = await self._process.in_turns(job, ask)
         actions = np.stack([one.actions for one in planned.envs], 1)
         seconds = time.monotonic() - began
-        with self._lock:
-            if job.stopped:
-                return
-            made = sum(len(one.returns) * one.horizon for one in planned.envs) * settings.plan.rounds
-            for one in planned.envs:
-                episode = self._episodes.setdefault(one.env, _Episode())
-                episode.plan, episode.horizon = one, one.horizon
-                episode.plan_step = episode.begins + len(episode.rewards)
-                episode.predicted[len(episode.rewards)] = float(one.returns[0]) / one.horizon
-                episode.rate = made / max(seconds, 1e-6)
-            self._set(state="planning")
+        made = sum(len(one.returns) * one.horizon for one in planned.envs) * settings.plan.rounds
+        for one in planned.envs:
+            episode = self._episodes.setdefault(one.env, _Episode())
+            episode.plan, episode.horizon = one, one.horizon
+            episode.plan_step = episode.begins + len(episode.rewards)
+            episode.predicted[len(episode.rewards)] = float(one.returns[0]) / one.horizon
+            episode.rate = made / max(seconds, 1e-6)
+        self._set(state="planning")
         self._send(FollowPlan(wanted.number, wanted.env_idx, actions))
-        self._on_change()
-
-    def _far(self, job: Job, done: int, total: int, part: Any) -> None:
-        job.report(done, total)
-
-    def _failed(self, job: Job, failure: JobFailed) -> None:
-        if not job.stopped:
-            self._refuse(failure)
 
     def _refuse(self, failure: JobFailed) -> None:
-        with self._lock:
-            self._set(state="failed", why=str(failure), problem=failure.problem)
+        self._set(state="failed", why=str(failure), problem=failure.problem)
         self._pause()
         self._on_change()
 

@@ -13,10 +13,11 @@ from workbench.core.camera_data import CameraKind, Picture
 from workbench.jobs.task import ShownPictures, Stepped
 from workbench.session.history.env_table import EnvRows, EnvTable
 from workbench.session.history.history import EnvMoment, History, Moment, ShownMoment
+from workbench.session.loop import on_loop
 from workbench.session.protocol.messages import CameraRequest, DrawPast, Request, Restore
 
 if TYPE_CHECKING:
-    from workbench.session.live.live_state import SharedState
+    from workbench.session.live.live_state import LiveState
 
 Scope = Literal["this", "all", "into all"]
 """Which envs go back: the selected one; all, each to its own state; or all to the selected env's state."""
@@ -84,7 +85,7 @@ class Strip:
 
 
 class Timeline:
-    """The history of the present task and the shown moment. Not thread-safe: the session locks.
+    """The history of the present task and the shown moment. Used on the loop.
 
     Live is the newest moment. The slider pins another one, and then all that the page draws of the batch (poses, numbers,
     pictures) comes from the server's memory, while the worker continues. The worker gets requests only to continue from a
@@ -351,64 +352,75 @@ class Timeline:
 
 
 class TimeTravel:
-    """The timeline as the page uses it. All methods are thread-safe and return at once."""
+    """The timeline as the page uses it. All methods return at once, and may be called on any thread."""
 
     def __init__(
-        self, shared: SharedState, send: Callable[[Request], None], pause: Callable[[], None]
+        self,
+        state: LiveState,
+        on_change: Callable[[], None],
+        send: Callable[[Request], None],
+        pause: Callable[[], None],
     ) -> None:
         """
         Args:
-            shared: the session's state.
+            state: the session's.
+            on_change: called when another moment is shown.
             send: sends a request to the worker.
             pause: stops playing.
         """
-        self._state, self._lock, self._notify = shared.state, shared.lock, shared.notify
-        self._send, self._pause = send, pause
+        self._state, self._on_change, self._send, self._pause = state, on_change, send, pause
 
     # --- show ------------------------------------------------------------------------------------
 
+    @on_loop
     def seek(self, serial: int | None) -> None:
         """Show the moment of this serial; None shows live."""
         self._seek(lambda timeline: timeline.seek(serial))
 
+    @on_loop
     def seek_by(self, steps: int) -> None:
         """Show a moment of the selected env before (negative) or after the shown one."""
         env = self._env
         self._seek(lambda timeline: timeline.seek_by(env, steps))
 
+    @on_loop
     def seek_step(self, env: int, step: int) -> None:
         """Show the moment of a step of this env's shown episode."""
         self._seek(lambda timeline: timeline.seek_step(env, step))
 
+    @on_loop
     def seek_tick(self, tick: int, in_episode: bool = False) -> None:
         """Show the moment after a control step, counted as the curves count; of the selected env's shown episode alone if
         `in_episode`."""
         env = self._env if in_episode else None
         self._seek(lambda timeline: timeline.seek_tick(tick, env))
 
+    @on_loop
     def seek_event(self, direction: int) -> None:
         """Show the next (1) or previous (-1) event of the selected env: reset, success, fail, truncation, jump back."""
         env = self._env
         self._seek(lambda timeline: timeline.seek_event(env, direction))
 
+    @on_loop
     def draw(self) -> None:
         """Request pictures of the shown moment, if some of the watched cameras lack one."""
-        with self._lock:
-            s = self._state
-            request = (
-                None
-                if s.timeline is None
-                else s.timeline.draw(self._env, s.now.settings.cameras, s.now.settings.pictures)
-            )
+        s = self._state
+        request = (
+            None
+            if s.timeline is None
+            else s.timeline.draw(self._env, s.now.settings.cameras, s.now.settings.pictures)
+        )
         if request is not None:
             self._send(request)
 
     # --- go back ---------------------------------------------------------------------------------
 
+    @on_loop
     def continue_from_shown(self, scope: Scope) -> None:
         """Continue the simulation from the shown moment, in the envs of `scope`."""
         self._travel(lambda timeline, env: timeline.continue_from_shown(env, scope))
 
+    @on_loop
     def undo(self) -> None:
         """Undo the selected env's last reset or jump back, and pause."""
         self._pause()
@@ -416,68 +428,66 @@ class TimeTravel:
 
     # --- read ------------------------------------------------------------------------------------
 
+    @on_loop
     def strip(self, low: int, high: int) -> Strip | None:
         """The selected env's history between two ticks; None before a task is loaded."""
-        with self._lock:
-            timeline = self._state.timeline
-            if timeline is None or not len(timeline.history):
-                return None
-            return timeline.strip(self._env, low, high)
+        timeline = self._state.timeline
+        if timeline is None or not len(timeline.history):
+            return None
+        return timeline.strip(self._env, low, high)
 
+    @on_loop
     def episode(self) -> tuple[int, int] | None:
         """First and last tick of the selected env's episode that contains the shown moment, also where it went back."""
-        with self._lock:
-            timeline = self._state.timeline
-            if timeline is None or not len(timeline.history):
-                return None
-            begin, end = timeline.episode(self._env)
-            return timeline.tick_of(begin), timeline.tick_of(end)
+        timeline = self._state.timeline
+        if timeline is None or not len(timeline.history):
+            return None
+        begin, end = timeline.episode(self._env)
+        return timeline.tick_of(begin), timeline.tick_of(end)
 
+    @on_loop
     def segment(self) -> tuple[int, int] | None:
         """First and last serial of the selected env's segment that contains the shown moment."""
-        with self._lock:
-            timeline = self._state.timeline
-            if timeline is None or not len(timeline.history):
-                return None
-            return timeline.history.segment_at(self._env, timeline.at)
+        timeline = self._state.timeline
+        if timeline is None or not len(timeline.history):
+            return None
+        return timeline.history.segment_at(self._env, timeline.at)
 
+    @on_loop
     def shown_moment(self) -> ShownMoment:
         """See `ShownPast`."""
-        with self._lock:
-            s = self._state
-            shown = None if s.timeline is None else s.timeline.shown
-            count = 0 if s.now.task is None else s.now.task.num_envs
-            return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
+        s = self._state
+        shown = None if s.timeline is None else s.timeline.shown
+        count = 0 if s.now.task is None else s.now.task.num_envs
+        return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
 
+    @on_loop
     def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
         """See `ShownPast`."""
-        with self._lock:
-            s = self._state
-            if s.timeline is None or not len(s.timeline.history):
-                return ()
-            return s.timeline.history.episode(self._env, s.timeline.at, most)
+        s = self._state
+        if s.timeline is None or not len(s.timeline.history):
+            return ()
+        return s.timeline.history.episode(self._env, s.timeline.at, most)
 
     @property
     def _env(self) -> int:
         return self._state.now.settings.selected_env
 
     def _seek(self, seek: Callable[[Timeline], None]) -> None:
-        with self._lock:
-            timeline = self._state.timeline
-            if timeline is None:
-                return
-            before = timeline.shown
-            seek(timeline)
-            if timeline.shown is before:
-                return
-            self._state.new_pictures()
-        self._notify()
+        timeline = self._state.timeline
+        if timeline is None:
+            return
+        before = timeline.shown
+        seek(timeline)
+        if timeline.shown is before:
+            return
+        self._state.new_pictures()
+        self._on_change()
 
     def _travel(self, ask: Callable[[Timeline, int], Restore | None]) -> None:
-        with self._lock:
-            timeline = self._state.timeline
-            request = None if timeline is None else ask(timeline, self._env)
-            self._state.new_pictures()
+        timeline = self._state.timeline
+        request = None if timeline is None else ask(timeline, self._env)
+        self._state.new_pictures()
         if request is not None:
             self._send(request)
-        self._notify()
+        self._on_change()

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from workbench.authoring.loading.modules import read_source
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem
+from workbench.jobs.policy import NoPolicy, find_policy
 from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
-from workbench.session.live.live_state import SharedState
+from workbench.session.live.live_state import LiveState
+from workbench.session.loop import Aside, do, on_loop
 from workbench.session.process.supervisor import Death, End
 from workbench.session.protocol.messages import (
     Load,
@@ -74,7 +78,7 @@ class Recovery:
     its newest moment, the same from its start, and at last nothing, until the file changes. None is tried twice, so that
     no file can end workers one after the other. A version that crashes twice, each time soon after it was loaded, is no good
     one: the version before it comes back. Without one it comes back itself, unless it crashed twice without making a step.
-    Used under the session's lock.
+    Used on the loop.
     """
 
     def __init__(
@@ -213,143 +217,153 @@ class Versions:
 
     def __init__(
         self,
-        shared: SharedState,
+        state: LiveState,
+        on_change: Callable[[], None],
         send: Callable[[Request], None],
         replace_worker: Callable[[], None],
         on_save: Callable[[], None],
     ) -> None:
         """
         Args:
-            on_save: called when a watched file was saved, before it is loaded.
+            state: the session's.
+            on_change: called when a watched file was saved.
+            on_save: called then too, before it is loaded.
         """
-        self._shared, self._send, self._replace_worker = shared, send, replace_worker
-        self._on_save = on_save
-        self._recovery = Recovery(shared.state.newest_moment)
+        self._state, self._on_change, self._send = state, on_change, send
+        self._replace_worker, self._on_save = replace_worker, on_save
+        self._recovery = Recovery(state.newest_moment)
         self._watcher = SourceWatcher(self._on_files_changed)
+        self._aside = Aside("follow")
+        """Begins to watch, for which files are read."""
         self._needed = NewProcessNeeded("", False)
         """Why the next worker is a new process, where the last one said so."""
 
     def start(self) -> None:
-        """Watch the task's own file from now on."""
-        self._follow((), {})
+        """Watch the task's own file from now on. Called before there is a worker, on another thread than the loop."""
+        self._watcher.follow(self._wanted(()))
 
     # --- requests ------------------------------------------------------------------------------------
 
+    @on_loop
     def reload(self, level: LoadLevel = "auto") -> None:
         """Load the file again. A level other than ``auto`` is forced, even if it keeps parts of the old version.
 
         A worker that does not take the request (an endless loop) is interrupted or replaced.
         """
-        with self._shared.lock:
-            state = self._shared.state
-            request = state.load_request(*self._recovery.file_requested(), level=level)
-            stopped = state.now.state == "stopped"
-        if stopped:
+        request = self._state.load_request(*self._recovery.file_requested(), level=level)
+        if self._state.now.state == "stopped":
             self._replace_worker()  # the new one loads the file, see `first_requests`
         else:
             self._send(request)
 
+    @on_loop
     def choose_class(self, name: str) -> None:
         """Load another task class of the same file, one of `TaskDescription.others`."""
-        with self._shared.lock:
-            chosen = self._shared.state.choose_class(name)
-        if chosen:
+        if self._state.choose_class(name):
             self.reload()
 
+    @on_loop
     def apply_options(self, options: TaskOptions) -> None:
         """Make the envs with other options. If the task fails with them, the present envs and options stay."""
-        with self._shared.lock:
-            self._shared.state.apply_options(options)
+        self._state.apply_options(options)
         self.reload()
 
+    @on_loop
     def use_control_mode(self, mode: str) -> None:
         """Make the envs with this control mode, unless it is in effect."""
-        with self._shared.lock:
-            state = self._shared.state
-            options, task = state.options, state.now.task
+        options, task = self._state.options, self._state.now.task
         if task is not None and task.control_mode != mode:
             self.apply_options(replace(options, env_kwargs={**options.env_kwargs, "control_mode": mode}))
 
+    @on_loop
     def open_file(self, file: Path, class_name: str) -> None:
         """Open a task class of another file instead, and watch that file."""
-        with self._shared.lock:
-            self._shared.state.open_file(file, class_name)
-        self.start()
+        self._state.open_file(file, class_name)
+        self._follow((), {})
         self.reload()
 
+    @on_loop
     def restart_worker(self) -> None:
         """Kill the worker and start another, which loads the file as it is now, at the newest moment."""
-        with self._shared.lock:
-            self._recovery.restart_requested()
+        self._recovery.restart_requested()
         self._replace_worker()
 
+    @on_loop
     def _on_files_changed(self, paths: set[Path]) -> None:
         self._on_save()
-        with self._shared.changing() as state:
-            state.set(stale=True)
-            state.use_saved_file()
+        self._state.set(stale=True)
+        self._state.use_saved_file()
+        self._on_change()
         self.reload()
 
     # --- for a new worker ----------------------------------------------------------------------------
 
+    @on_loop
     def first_requests(self) -> list[Request]:
         """First requests to a new worker: settings, what to load, and whether to play."""
-        with self._shared.lock:
-            state = self._shared.state
-            requests: list[Request] = [state.settings()]
-            next_load = self._recovery.next_load()
-            if next_load is not None:
-                needed, self._needed = self._needed, NewProcessNeeded("", False)
-                requests.append(
-                    state.load_request(*next_load, because=needed.reason, same_scene=needed.same_scene)
-                )
-            else:
-                state.wait_for_file()
-            # A version that failed while it ran would fail again: it comes back paused.
-            if state.wants_play and not (self._recovery.restoring and state.now.problem_at_run):
-                requests.append(Play(True))
-            return requests
+        state = self._state
+        requests: list[Request] = [state.settings()]
+        next_load = self._recovery.next_load()
+        if next_load is not None:
+            needed, self._needed = self._needed, NewProcessNeeded("", False)
+            requests.append(
+                state.load_request(*next_load, because=needed.reason, same_scene=needed.same_scene)
+            )
+        else:
+            state.wait_for_file()
+        # A version that failed while it ran would fail again: it comes back paused.
+        if state.wants_play and not (self._recovery.restoring and state.now.problem_at_run):
+            requests.append(Play(True))
+        return requests
 
+    @on_loop
     def own_files(self) -> list[str]:
         """The known files of the author."""
-        with self._shared.lock:
-            return self._shared.state.own_files()
+        return self._state.own_files()
 
     def knows_file(self, path: str) -> bool:
-        """See `LiveState.knows_file`."""
-        with self._shared.lock:
-            return self._shared.state.knows_file(path)
+        """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder. Looks at the
+        disk."""
+        state = self._state
+        known, policy, folder, own_folder = do(
+            lambda: (state.own_files(), state.policy, state.folder, state.own_folder)
+        )
+        if policy is not None:
+            with contextlib.suppress(NoPolicy):
+                known = [*known, str(find_policy(policy, folder)[0])]
+        file = Path(path)
+        # A module that has never loaded is in no `source_files`. Resolved: a path may leave the folder again by "..".
+        beside = own_folder is not None and file.resolve().is_relative_to(own_folder.resolve())
+        return file in [Path(one).absolute() for one in known] or (
+            beside and file.suffix == ".py" and file.is_file()
+        )
 
+    @on_loop
     def running_load(self) -> Load | None:
         """Loads the running version into another worker; None if no task runs."""
-        with self._shared.lock:
-            task = self._shared.state.now.task
-            return None if task is None else self._shared.state.load_request(dict(task.source))
+        task = self._state.now.task
+        return None if task is None else self._state.load_request(dict(task.source))
 
     def began(self, loading: Loading) -> None:
-        """The worker has begun a load. Under the lock."""
+        """The worker has begun a load."""
         self._recovery.began(loading.number)
 
     def stepped(self, event: Stepped) -> None:
-        """The worker has made a step. Under the lock."""
+        """The worker has made a step."""
         if event.step.action is not None:
             self._recovery.stepped()
 
     def new_process_needed(self, needed: NewProcessNeeded) -> None:
-        """The worker ends and leaves the load to the next one. Under the lock."""
+        """The worker ends and leaves the load to the next one."""
         self._needed = needed
 
     # --- results -------------------------------------------------------------------------------------
 
-    def version_loaded(self, task: TaskDescription) -> tuple[bool, bool]:
-        """A version runs. Under the lock.
-
-        Returns:
-            Whether it was brought back after a crash, and whether it differs from the files.
-        """
+    def version_loaded(self, task: TaskDescription) -> bool:
+        """A version runs; returns whether it was brought back after a crash."""
         restored = self._recovery.restoring
         self._recovery.loaded(task)
-        return restored, restored and not is_on_disk(task.source)
+        return restored
 
     def follow(self, task: TaskDescription, stale: bool) -> None:
         """Watch the files of the running version."""
@@ -357,14 +371,13 @@ class Versions:
 
     def failed(self, failed: LoadFailed) -> None:
         """A load failed; a worker without a version gets the next attempt of `Recovery`, unless it is spoiled and ends."""
-        with self._shared.lock:
-            if failed.spoiled:
-                self._needed = NewProcessNeeded(failed.spoiled, failed.at_run)
-                next_load = None
-            else:
-                next_load = self._recovery.next_load() if self._recovery.failed(failed.kept) else None
-            request = None if next_load is None else self._shared.state.load_request(*next_load)
-            task = self._shared.state.now.task
+        if failed.spoiled:
+            self._needed = NewProcessNeeded(failed.spoiled, failed.at_run)
+            next_load = None
+        else:
+            next_load = self._recovery.next_load() if self._recovery.failed(failed.kept) else None
+        request = None if next_load is None else self._state.load_request(*next_load)
+        task = self._state.now.task
         if request is not None:
             self._send(request)
         if failed.problem.file is not None:
@@ -381,31 +394,36 @@ class Versions:
         Returns:
             The problem to show, if any, and whether there is a version to bring back.
         """
-        with self._shared.lock:
-            while_loading = self._recovery.loading
-            texts = self._loading_texts() if while_loading else None
-            self._recovery.died(death.end is End.DIED, idle=death.doing is None)
-            problem = self._shared.state.died(death, while_loading, printed, texts)
-            return problem, self._shared.state.now.task is not None
+        while_loading = self._recovery.loading
+        texts = self._loading_texts() if while_loading else None
+        self._recovery.died(death.end is End.DIED, idle=death.doing is None)
+        problem = self._state.died(death, while_loading, printed, texts)
+        return problem, self._state.now.task is not None
 
     def _loading_texts(self) -> Mapping[str, str]:
-        """Source by path of the version that is being loaded, as far as it is known. Under the lock."""
+        """Source by path of the version that is being loaded, as far as it is known."""
         if self._recovery.restoring:
             good = self._recovery.good_source
             return {} if good is None else good
         if self._recovery.file_waits:
             # It was saved again since: its lines on disk are not those that ran.
-            return dict.fromkeys(self._shared.state.own_files(), "")
+            return dict.fromkeys(self._state.own_files(), "")
         return {}
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop watching. Called on another thread than the loop."""
+        self._aside.close()
         self._watcher.stop()
 
     def _follow(self, paths: Iterable[str], texts: Mapping[str, str], at_fault: Path | None = None) -> None:
-        """Watch the task's own file, those of `paths` in its folder, and the one that `at_fault` names, wherever it is."""
-        own_file, folder = self._shared.state.own_file, self._shared.state.own_folder
+        if wanted := self._wanted(paths, at_fault):
+            self._aside.begin(partial(self._watcher.follow, wanted, texts))
+
+    def _wanted(self, paths: Iterable[str], at_fault: Path | None = None) -> set[Path]:
+        """The task's own file, those of `paths` in its folder, and the one that `at_fault` names, wherever it is; none if
+        nothing is watched."""
+        own_file, folder = self._state.own_file, self._state.own_folder
         if own_file is None or folder is None:
-            return
+            return set()
         modules = [Path(p) for p in paths if Path(p).is_relative_to(folder)]
-        self._watcher.follow({own_file, *modules, *([] if at_fault is None else [at_fault])}, texts)
+        return {own_file, *modules, *([] if at_fault is None else [at_fault])}

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
-import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from typing import Any, Literal, TypeVar
 
 from workbench.core.camera_data import CameraKey
 from workbench.machine.processes.family import describe_exit
+from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.processes.wire import Call, Question, Unpacker, Unreadable, value_type
-from workbench.session.process.job_lane import Job, JobFailed, ProcessDied
+from workbench.session import loop
+from workbench.session.process.jobs import Job, JobFailed, ProcessDied
 from workbench.session.process.worker_process import WorkerProcess
 from workbench.session.protocol.messages import Answer, Cancel, Load, PlaceCamera, Progress, Request
 
-_LOOK = 0.05
-"""Seconds between two checks whether the job is stopped."""
+_LOOK = 1.0
+"""Seconds between two looks whether a process still lives that says nothing."""
 _NICENESS = 10
 """The worker that plays comes first where there are fewer cores than work."""
 WAITING = "waiting for other work in the background"
@@ -38,55 +40,58 @@ def _ignore(done: int, total: int, part: Any) -> None:
     pass
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """A question under way."""
+
+    question: Question[Any]
+    answer: asyncio.Future[Any]
+    on_progress: OnProgress
+
+
 class Asker:
-    """Asks the worker that plays. Thread-safe; several questions may be under way."""
+    """Asks the worker that plays; several questions may be under way. Used on the loop."""
 
     def __init__(self, send: Callable[[Request], None]) -> None:
         self._send = send
         self._numbers = count(1)
-        self._condition = threading.Condition()
-        self._received: dict[int, deque[Answer | Progress]] = {}
-        """Received and not yet handled, for each question under way."""
+        self._asked: dict[int, _Asked] = {}
+        """By number."""
 
-    def ask(
-        self, check: Callable[[], None], question: Question[Value], on_progress: OnProgress = _ignore
-    ) -> Value:
-        """
-        Args:
-            check: called often while waiting; an exception from it ends the question, and the answer is dropped.
+    async def ask(self, question: Question[Value], on_progress: OnProgress = _ignore) -> Value:
+        """The answer. Whoever is cancelled meanwhile does not get it.
 
         Raises:
             JobFailed: there is no answer.
         """
-        with self._condition:
-            number = next(self._numbers)
-            self._received[number] = deque()
+        number = next(self._numbers)
+        asked = _Asked(question, asyncio.get_running_loop().create_future(), on_progress)
+        self._asked[number] = asked
         try:
             self._send(Call(number, question))
-            while True:
-                check()
-                event = self._next(number)
-                if isinstance(event, Progress):
-                    part = _unpacked(event.part, question.part) if event.part else None
-                    on_progress(event.done, event.total, part)
-                elif event is not None:
-                    return _value(event, question)
+            return await asked.answer
         finally:
-            with self._condition:
-                del self._received[number]
+            del self._asked[number]
 
     def take(self, event: Answer | Progress) -> None:
         """Handle an event of the worker."""
-        with self._condition:
-            if event.number in self._received:
-                self._received[event.number].append(event)
-                self._condition.notify_all()
+        asked = self._asked.get(event.number)
+        if asked is None or asked.answer.done():
+            return
+        try:
+            if isinstance(event, Answer):
+                asked.answer.set_result(_value(event, asked.question))
+            else:
+                part = _unpacked(event.part, asked.question.part) if event.part else None
+                asked.on_progress(event.done, event.total, part)
+        except Exception as error:
+            asked.answer.set_exception(error)
 
-    def _next(self, number: int) -> Answer | Progress | None:
-        with self._condition:
-            received = self._received[number]
-            self._condition.wait_for(lambda: received, _LOOK)
-            return received.popleft() if received else None
+    def _fail(self, error: Exception) -> None:
+        """There are no answers to what is under way."""
+        for asked in self._asked.values():
+            if not asked.answer.done():
+                asked.answer.set_exception(error)
 
 
 class GaveWay(Exception):
@@ -101,15 +106,15 @@ _Rank = tuple[int, int]
 
 
 class Background(Asker):
-    """Asks a process in the background, one question at a time. Jobs share it in turns.
+    """Asks a process in the background, one question at a time. Jobs share it in turns. Used on the loop.
 
     Rescoring the past, drawing it and searching cameras take seconds to minutes and move the envs, so they cannot run
     in the worker that plays. This process has a lower priority; it costs some seconds to start and 0.75 GB. It ends
-    after `IDLE_SECONDS` without a job, and with the thread that started it, that of the first lane.
+    after `IDLE_SECONDS` without a job.
 
     The job that was begun last comes first, since a person waits for it: the others give way and continue later. A
-    worker answers in order, so a job that stops or gives way leaves one unread answer, which is taken at the end of its
-    turn, or the process is ended. A process that dies fails its job; the next job starts another.
+    worker answers in order, so a job that stops or gives way leaves one answer that is still to come; the next turn begins when it
+    has, or the process is ended. A process that dies fails its job; the next job starts another.
     """
 
     def __init__(self, niceness: int = _NICENESS) -> None:
@@ -119,15 +124,16 @@ class Background(Asker):
         """
         super().__init__(self._send_call)
         self._niceness = niceness
-        self._turns = threading.Condition()
-        self._current: _Rank | None = None
-        self._waiting: list[_Rank] = []
-        self._idle: threading.Timer | None = None
+        self._turn: _Rank | None = None
+        """Of the job that has it; also until its last answer has come."""
+        self._waiting: dict[_Rank, asyncio.Future[None]] = {}
+        self._idle: asyncio.TimerHandle | None = None
         """Ends the process if it stays idle."""
-        self._process: WorkerProcess | None = None
-        self._said = b""
-        """The end of what the process wrote to ``stderr``."""
+        self._process: _Process | None = None
+        self._ending: set[_Process] = set()
         self._unanswered: Call | None = None
+        self._overdue: asyncio.TimerHandle | None = None
+        """Ends the process if the answer to a question that nobody waits for does not come."""
         self._loaded: Load | None = None
         """The last load; None after a failure."""
         self._placed: dict[CameraKey, PlaceCamera] = {}
@@ -136,86 +142,75 @@ class Background(Asker):
 
     @property
     def pid(self) -> int | None:
-        """None while there is no process."""
-        process = self._process
+        """None while there is no process; that of one that was ended until it has."""
+        process = self._process or next(iter(self._ending), None)
         return None if process is None else process.pid
 
-    @contextmanager
-    def turn(self, job: Job, priority: Priority = "person") -> Iterator[None]:
-        """Hold the process for a job. Waits while another job has it, or one of higher priority waits; where such a job
-        comes during the turn, `ask` raises GaveWay.
+    # --- turns ---------------------------------------------------------------------------------------
 
-        Raises:
-            Stopped: the job was stopped.
-        """
-        self._begin_turn(job, (_ORDER[priority], job.number))
-        try:
-            yield
-        finally:
-            self._settle(job)
-            with self._turns:
-                self._current = None
-                self._end_when_idle()
-                self._turns.notify_all()
-
-    def in_turns(self, job: Job, work: Callable[[], Value], priority: Priority = "person") -> Value:
-        """Run `work` in a turn, again after each time it gave way; the envs are elsewhere then."""
+    async def in_turns(
+        self, job: Job, work: Callable[[], Awaitable[Value]], priority: Priority = "person"
+    ) -> Value:
+        """Run `work` while no other job has the process and none of higher priority waits; again after each time it gave way
+        to one; the envs are elsewhere then."""
+        rank = _ORDER[priority], job.number
         while True:
+            await self._begin_turn(rank)
             try:
-                with self.turn(job, priority):
-                    return work()
+                return await work()
             except GaveWay:
                 job.report(0, 0, WAITING)
+            finally:
+                self._end_turn()
+
+    async def _begin_turn(self, rank: _Rank) -> None:
+        granted = self._waiting[rank] = asyncio.get_running_loop().create_future()
+        if self._is_waited_for() and not _is_load(self._question):
+            self._fail(GaveWay())
+        self._grant()
+        try:
+            await granted
+        except asyncio.CancelledError:
+            if self._turn == rank:
+                self._end_turn()  # it was granted at the same moment
+            raise
+        finally:
+            self._waiting.pop(rank, None)
+
+    def _grant(self) -> None:
+        if self._turn is not None or self._unanswered is not None:
+            return
+        if self._idle is not None:
+            self._idle.cancel()
+        if not self._waiting:
+            self._idle = loop.later(IDLE_SECONDS, self.end)
+            return
+        self._turn = max(self._waiting)
+        self._waiting.pop(self._turn).set_result(None)
+
+    def _end_turn(self) -> None:
+        self._turn = None
+        if self._unanswered is not None and self._process is not None:
+            self._process.send(Cancel())
+            patience = _LOAD_PATIENCE if _is_load(self._question) else _PATIENCE
+            self._overdue = loop.later(patience, self.end)
+        self._grant()
+
+    def _is_waited_for(self) -> bool:
+        """Whether a job of higher priority waits than the one that has the process."""
+        return self._turn is not None and max(self._waiting, default=self._turn) > self._turn
+
+    @property
+    def _question(self) -> Any:
+        return None if self._unanswered is None else self._unanswered.request
+
+    # --- questions -----------------------------------------------------------------------------------
 
     def has_loaded(self, load: Load) -> bool:
         """Whether this version is loaded."""
         return load.level == "auto" and self._loaded == load
 
-    def _end_when_idle(self) -> None:
-        if self._idle is not None:
-            self._idle.cancel()
-        self._idle = threading.Timer(IDLE_SECONDS, self._end_if_idle)
-        self._idle.daemon = True
-        self._idle.start()
-
-    def _end_if_idle(self) -> None:
-        with self._turns:
-            # A turn since then has set another timer.
-            if threading.current_thread() is self._idle and self._current is None and not self._waiting:
-                self.end()
-
-    def _begin_turn(self, job: Job, rank: _Rank) -> None:
-        with self._turns:
-            self._waiting.append(rank)
-            try:
-                while self._current is not None or max(self._waiting) > rank:
-                    job.check()
-                    self._turns.wait(_LOOK)
-                self._current = rank
-            finally:
-                self._waiting.remove(rank)
-
-    def _must_give_way(self) -> bool:
-        """Whether a job of higher priority waits."""
-        with self._turns:
-            return self._current is not None and max(self._waiting, default=self._current) > self._current
-
-    def start(self) -> None:
-        """Start the process if there is none.
-
-        Raises:
-            JobFailed: it cannot be started.
-        """
-        if self._process is not None:
-            return
-        try:
-            # The worker that plays shows the author's output; here it would appear twice. Its last words tell why it died.
-            self._said = b""
-            self._process = WorkerProcess(self._hear, self._niceness)
-        except OSError as error:
-            raise JobFailed(f"no process could be started in the background: {error}") from error
-
-    def ensure(
+    async def ensure(
         self, job: Job, load: Load, placed: tuple[PlaceCamera, ...] = (), or_else: Load | None = None
     ) -> int:
         """Start the process, load this version and place the cameras, as far as that is not done.
@@ -228,117 +223,185 @@ class Background(Asker):
             the number of envs.
 
         Raises:
-            Stopped: the job was stopped.
             JobFailed: one of the steps failed; with the problem, if the author's code raised.
         """
         if self._process is None:
             job.report(0, 0, "starting a process in the background")
-            job.check()  # a stopped job must not start a process
-            self.start()
         if not self.has_loaded(load):
             self._loaded = None
             job.report(0, 0, "building envs in the background")
             try:
-                loaded = self.ask(job.check, load)
+                loaded = await self.ask(load)
             except JobFailed as failure:
                 if failure.problem is None:
                     raise
                 if or_else is None:
                     why = f"the task failed in the background: {failure.problem.message}"
                     raise JobFailed(why, failure.problem) from failure
-                loaded = self.ask(job.check, or_else)
+                loaded = await self.ask(or_else)
             self._loaded, self.num_envs = load, loaded.task.num_envs
             if loaded.reload is None or loaded.reload.level not in ("same", "patched"):
                 self._placed = {}
         wanted = {request.key: request for request in placed}
         # A camera that is no longer placed goes back to the file's pose.
         for key in [key for key in self._placed if key not in wanted]:
-            self.ask(job.check, PlaceCamera(key, None))
+            await self.ask(PlaceCamera(key, None))
             del self._placed[key]
         for key, request in wanted.items():
             if self._placed.get(key) != request:
-                self.ask(job.check, request)
+                await self.ask(request)
                 self._placed[key] = request
         return self.num_envs
 
-    def ask(
-        self, check: Callable[[], None], question: Question[Value], on_progress: OnProgress = _ignore
-    ) -> Value:
-        """As `Asker.ask`.
+    async def ask(self, question: Question[Value], on_progress: OnProgress = _ignore) -> Value:
+        """As `Asker.ask`; starts the process if there is none.
 
         Raises:
             JobFailed: there is no answer.
             ProcessDied: for that reason.
             GaveWay: a job of higher priority waits. A load is finished first: that job most likely needs it too.
         """
+        # Before the question: the waiting job would wait for it too.
+        if self._is_waited_for() and not _is_load(question):
+            raise GaveWay
+        if self._process is None:
+            self._process = _Process(self, self._niceness)
+        return await super().ask(question, on_progress)
 
-        def check_turn() -> None:
-            check()
-            if not isinstance(question, Load) and self._must_give_way():
-                raise GaveWay
+    def take(self, event: Answer | Progress) -> None:
+        super().take(event)
+        if isinstance(event, Answer) and self._unanswered is not None:
+            if event.number == self._unanswered.number:
+                self._answered()
 
-        check_turn()  # before the question: the waiting job would wait for it too
-        try:
-            return super().ask(check_turn, question, on_progress)
-        except EOFError as error:
-            if isinstance(error, Unreadable):
-                code, why = None, f"sent unreadable data ({error}) and was ended"
-            else:
-                code = None if self._process is None else self._process.exit_code()
-                why = describe_exit(code)
-            self.end()  # all that it wrote is read then
-            check()
-            if (code or 0) > 0 and (last := self._said.decode(errors="replace").strip().rpartition("\n")[2]):
-                why += f": {last}"
-            raise ProcessDied(f"the process in the background {why}") from None
-
-    def end(self) -> None:
-        """End the process, if there is one. `pid` stays its own until it has ended."""
-        with self._turns:
-            if self._process is not None:
-                self._process.stop(grace=0.0)
-            self._process, self._unanswered, self._loaded, self._placed, self.num_envs = (
-                None,
-                None,
-                None,
-                {},
-                0,
-            )
-
-    def _settle(self, job: Job) -> None:
-        """Read the answer that is still due; end the process if it does not come in time."""
-        if self._process is None or self._unanswered is None:
-            return
-        self._process.send(Cancel())
-        patience = _LOAD_PATIENCE if isinstance(self._unanswered.request, Load) else _PATIENCE
-        deadline = time.monotonic() + patience
-        try:
-            while self._unanswered is not None and not job.closing:
-                if time.monotonic() > deadline:
-                    self.end()
-                    return
-                self._next(self._unanswered.number)
-        except EOFError:
-            self.end()  # it died of the last question; the next job starts another
+    def _answered(self) -> None:
+        self._unanswered = None
+        if self._overdue is not None:
+            self._overdue.cancel()
+            self._overdue = None
+        self._grant()
 
     def _send_call(self, request: Request) -> None:
         assert self._process is not None and isinstance(request, Call)
         self._unanswered = request
         self._process.send(request)
 
-    def _next(self, number: int) -> Answer | Progress | None:
-        assert self._process is not None
-        event: Any = self._process.receive(timeout=_LOOK)
-        if not isinstance(event, Answer | Progress) or event.number != number:
-            return None
-        if isinstance(event, Answer):
-            self._unanswered = None
-        return event
+    # --- the process ---------------------------------------------------------------------------------
+
+    @loop.on_loop
+    def end(self) -> None:
+        """End the process, if there is one."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        self._ending.add(process)
+        process.kill()
+        self._forget(ProcessDied("the process in the background was ended"))
+
+    def close(self) -> None:
+        """End the process; returns when it has ended. Called on another thread."""
+        self.end()
+        for process in loop.do(lambda: tuple(self._ending)):
+            process.join()
+
+    def _ended(self, process: _Process, why: str) -> None:
+        """This process has ended."""
+        self._ending.discard(process)
+        if process is self._process:
+            self._process = None
+            self._forget(ProcessDied(why))
+
+    def _forget(self, error: ProcessDied) -> None:
+        self._loaded, self._placed, self.num_envs = None, {}, 0
+        self._fail(error)
+        self._answered()
+
+
+class _Process:
+    """A worker process, started and heard on a thread of its own, with which the kernel ends it."""
+
+    def __init__(self, background: Background, niceness: int) -> None:
+        self._background, self._niceness = background, niceness
+        self._worker: WorkerProcess | None = None
+        self._unsent: list[Request] = []
+        self._killed = False
+        self._said = b""
+        """The end of what it wrote to ``stderr``."""
+        self._lock = threading.Lock()
+        """Of the start: what is sent before it is sent then."""
+        self._thread = threading.Thread(target=self._run, name="background", daemon=True)
+        self._thread.start()
+
+    @property
+    def pid(self) -> int | None:
+        worker = self._worker
+        return None if worker is None else worker.pid
+
+    def send(self, request: Request) -> None:
+        with self._lock:
+            if self._worker is None:
+                self._unsent.append(request)
+            else:
+                self._worker.send(request)
+
+    def kill(self) -> None:
+        with self._lock:
+            self._killed = True
+            if self._worker is not None:
+                self._worker.kill()
+
+    def join(self) -> None:
+        self._thread.join()
+
+    def _run(self) -> None:
+        why = "it failed within the workbench"
+        try:
+            why = self._serve()
+        except OSError as error:
+            why = f"no process could be started in the background: {error}"
+        except Exception as error:
+            report_failure("The process in the background could not be heard", error)
+        finally:
+            loop.do(partial(self._background._ended, self, why))
+
+    def _serve(self) -> str:
+        """Returns why it ended."""
+        # The worker that plays shows the author's output; here it would appear twice. Its last words tell why it died.
+        worker = WorkerProcess(self._hear, self._niceness)
+        code: int | None = None
+        with self._lock:
+            self._worker = worker
+            for request in self._unsent:
+                worker.send(request)
+            if self._killed:
+                worker.kill()
+        try:
+            while True:
+                event: Any = worker.receive(timeout=_LOOK)
+                if isinstance(event, Answer | Progress):
+                    loop.do(partial(self._take, event))
+        except Unreadable as error:
+            why = f"sent unreadable data ({error}) and was ended"
+        except EOFError:
+            code = worker.exit_code()
+            why = describe_exit(code)
+        worker.stop(grace=0.0)  # all that it wrote is read then
+        if (code or 0) > 0 and (last := self._said.decode(errors="replace").strip().rpartition("\n")[2]):
+            why += f": {last}"
+        return f"the process in the background {why}"
+
+    def _take(self, event: Answer | Progress) -> None:
+        if self._background._process is self:
+            self._background.take(event)
 
     def _hear(self, stream: str, piece: bytes) -> bool:
         if stream == "stderr":
             self._said = (self._said + piece)[-_KEPT_OF_WORDS:]
         return False
+
+
+def _is_load(question: object) -> bool:
+    return isinstance(question, Load)
 
 
 def _value(answer: Answer, question: Question[Value]) -> Value:

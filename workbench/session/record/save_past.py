@@ -6,6 +6,7 @@ import pickle
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,11 @@ from workbench.jobs.task import TaskDescription
 from workbench.recording.episode.columns import BatchPacker
 from workbench.recording.writing.publish import RecordingError
 from workbench.session.history.history import EnvMoment, History, Moment
+from workbench.session.loop import Aside, do, on_loop
 from workbench.session.process.askers import WAITING, Background
-from workbench.session.process.job_lane import Job, JobFailed, JobLane, JobProgress
+from workbench.session.process.jobs import Job, JobFailed, JobProgress, Jobs
 from workbench.session.protocol.messages import Load, PlaceCamera, Reset
-from workbench.session.protocol.questions import CaptureMoment
+from workbench.session.protocol.questions import Captured, CaptureMoment
 
 
 @dataclass(frozen=True)
@@ -148,22 +150,28 @@ class PastSaver:
         self._folder, self._finisher, self._on_change = folder, finisher, on_change
         self._status = SaveStatus()
         self._process = process
-        self._job_lane = JobLane("keep-past", on_change, self._failed)
+        self._jobs = Jobs(on_change, self._failed)
+        self._aside = Aside("keep-past")
+        """Writes, since the disk may be slow."""
 
+    @on_loop
     def save(self, what: SaveRequest) -> None:
         """Start; cancels the running job."""
         self._report("")
-        self._job_lane.start(WAITING, lambda job: self._save(job, what))
+        self._jobs.start(WAITING, lambda job: self._save(job, what))
 
+    @on_loop
     def stop(self) -> None:
         """Cancel the running job; it writes no file."""
-        self._job_lane.stop()
+        self._jobs.stop()
         self._report("stopped; nothing was saved")
 
+    @on_loop
     def refuse(self, why: str, at: object) -> None:
         """Report why nothing can be recorded of what is shown `at` now."""
         self._report(why, failed=True, refused_at=at)
 
+    @on_loop
     def forget(self) -> None:
         """Drop the last result: something else is recorded, or another version runs."""
         if self._status.message:
@@ -174,68 +182,78 @@ class PastSaver:
         status = self._status
         if status.refused_at not in (None, at):
             status = SaveStatus()
-        return replace(status, progress=self._job_lane.progress)
+        return replace(status, progress=self._jobs.progress)
 
     def close(self) -> None:
-        self._job_lane.close()
+        """Cancel the running job; returns when nothing is written any more. Called on another thread than the loop."""
+        do(self._jobs.close)
+        self._aside.close()
 
-    # --- on the lane's thread --------------------------------------------------------------------------
+    # --- the job -------------------------------------------------------------------------------------
 
-    def _save(self, job: Job, what: SaveRequest) -> None:
+    async def _save(self, job: Job, what: SaveRequest) -> None:
         seeds: dict[int, int] = {}
         writers: dict[int, GatheredEpisode] = {}
         moments, packer = deque(moments_of(what.episodes)), BatchPacker()
         total = len(moments)
 
-        def redraw() -> None:
+        async def redraw() -> None:
             """Continue with the first moment that is not captured yet: a job of higher rank may have interrupted this one."""
-            self._process.ensure(job, what.load, what.placed)
+            await self._process.ensure(job, what.load, what.placed)
             for episode in what.episodes:
                 if episode.env not in seeds:
                     job.report(len(seeds), len(what.episodes), "trying the seeds")
-                    seeds[episode.env] = self._verified_seed(job, episode)
+                    seeds[episode.env] = await self._verified_seed(episode)
             while moments:
                 job.report(total - len(moments), total, "rendering it again")
                 moment, rows = moments[0]
                 question = CaptureMoment(pickle.dumps(moment.snapshot), tuple(rows), what.task.can_render)
-                captured = self._process.ask(job.check, question)
+                captured = await self._process.ask(question)
                 del moments[0]
-                for row, episodes in rows.items():
-                    for episode in episodes:
-                        if (writer := writers.get(episode.env)) is not None:
-                            writer.set_source(moment.acted_by)
-                        else:
-                            writer = self._begun(what, episode, seeds[episode.env])
-                            writers[episode.env] = writer
-                        writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
+                await self._aside.run(partial(write, moment, rows, captured))
 
-        try:
-            self._process.in_turns(job, redraw)
-        except BaseException as error:
+        def write(moment: Moment, rows: dict[int, list[PastEpisode]], captured: Captured) -> None:
+            for row, episodes in rows.items():
+                for episode in episodes:
+                    if (writer := writers.get(episode.env)) is not None:
+                        writer.set_source(moment.acted_by)
+                    else:
+                        writer = self._begun(what, episode, seeds[episode.env])
+                        writers[episode.env] = writer
+                    writer.take(packer, moment.as_recorded, row, captured.columns, captured.pictures)
+
+        def discard() -> None:
             for episode in writers.values():
                 episode.writer.discard()
+
+        def finish() -> list[str]:
+            made = [self._finisher.finish(episode) for episode in writers.values()]
+            return [result for future in made if isinstance(result := future.result(), str)]
+
+        try:
+            await self._process.in_turns(job, redraw)
+        except BaseException as error:
+            self._aside.begin(discard)
             if isinstance(error, RecordingError | ValueError):
                 raise JobFailed(f"it could not be saved: {error}") from error
             raise
         job.report(1, 1, "writing the files")
-        made = [self._finisher.finish(episode) for episode in writers.values()]
-        problems = [result for future in made if isinstance(result := future.result(), str)]
-        if problems:
+        if problems := await self._aside.run(finish):
             raise JobFailed(problems[0])
         steps = sum(episode.steps for episode in what.episodes)
         unfinished = sum(not episode.ended for episode in what.episodes)
         lost = sum(seeds[episode.env] != episode.seed for episode in what.episodes)
         envs = what.episodes[0].env if len(what.episodes) == 1 else None
-        which = f"{len(made)} episodes" if envs is None else f"an episode of env {envs}"
+        which = f"{len(writers)} episodes" if envs is None else f"an episode of env {envs}"
         kept = f"saved {which}, {steps} step{'' if steps == 1 else 's'}"
         earlier = sum(
             _as_played(what.task, episode).source_hash != what.task.source_hash for episode in what.episodes
         )
         self._report(
             kept
-            + _unfinished_text(unfinished, len(made))
-            + _lost_seed_text(lost, len(made))
-            + _earlier_text(earlier, len(made))
+            + _unfinished_text(unfinished, len(writers))
+            + _lost_seed_text(lost, len(writers))
+            + _earlier_text(earlier, len(writers))
         )
 
     def _begun(self, what: SaveRequest, episode: PastEpisode, seed: int) -> GatheredEpisode:
@@ -248,7 +266,7 @@ class PastSaver:
         )
         return writer
 
-    def _verified_seed(self, job: Job, episode: PastEpisode) -> int:
+    async def _verified_seed(self, episode: PastEpisode) -> int:
         """Its seed, if a reset of its env alone with it gives the first state; else -1.
 
         What envs that were reset together drew from torch's generator depends on all of them.
@@ -256,17 +274,16 @@ class PastSaver:
         if episode.seed < 0:
             return episode.seed
         first, env = episode.moments[0]
-        step = self._process.ask(job.check, Reset((env,), episode.seed))
+        step = await self._process.ask(Reset((env,), episode.seed))
         now, then = step.poses[env], first.as_recorded.poses[env]
         return episode.seed if np.allclose(now, then, rtol=0, atol=_SAME_START, equal_nan=True) else -1
 
-    def _failed(self, job: Job, failure: JobFailed) -> None:
+    def _failed(self, failure: JobFailed) -> None:
         why, problem = str(failure), failure.problem
         if problem is not None:
             where = "" if problem.line is None else f" (line {problem.line})"
             why = f"it could not be rendered again: {problem.message}{where}"
-        if not job.stopped:
-            self._report(why, failed=True)
+        self._report(why, failed=True)
 
     def _report(self, message: str, failed: bool = False, refused_at: object = None) -> None:
         self._status = SaveStatus(message, failed, refused_at)

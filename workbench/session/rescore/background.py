@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
 from workbench.jobs.rescore.verdict import Verdict
-from workbench.session.process.held_view import HeldView
-from workbench.session.process.job_lane import Job, JobFailed, JobLane
+from workbench.session.loop import on_loop
+from workbench.session.process.jobs import Job, JobFailed, Jobs
 
 
 class StoppedBy(Enum):
@@ -66,57 +66,54 @@ class RescoreView:
 
 
 class Rescoring:
-    """Runs one job at a time; a new one replaces the one before. All methods but `close` return at once."""
+    """Runs one job at a time; a new one replaces the one before. Methods return at once."""
 
-    def __init__(self, name: str, on_change: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, on_change: Callable[[], None] = lambda: None) -> None:
         """
         Args:
-            name: of the thread.
             on_change: called when `view` has changed.
         """
-        self._held = HeldView(RescoreView(), on_change)
-        self._job_lane = JobLane(name, on_change, self._failed)
+        self.view = RescoreView()
+        self._on_change = on_change
+        self._jobs = Jobs(on_change, self._failed)
 
-    @property
-    def view(self) -> RescoreView:
-        return self._held.now
-
-    def begin(self, view: RescoreView, work: Callable[[Job], None]) -> None:
+    @on_loop
+    def begin(self, view: RescoreView, work: Callable[[Job], Awaitable[None]]) -> None:
         """Start `work`, cancelling the job before; `view` is shown first."""
 
-        def run(job: Job) -> None:
-            work(job)
-            self.update(job, state="done")
+        async def run(job: Job) -> None:
+            await work(job)
+            self.update(state="done")
 
-        with self._held.lock:
-            self._job_lane.start("rescoring", run)
-            self._held.put(view)
-        self._held.changed()
+        self._put(view)
+        self._jobs.start("rescoring", run)
 
-    def update(self, job: Job, **values: Any) -> None:
-        """Change fields of `view`, unless the job was stopped."""
-        self._held.update(job, **values)
+    def update(self, **values: Any) -> None:
+        """Change fields of `view`; called by the job."""
+        self._put(replace(self.view, **values))
 
+    @on_loop
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
         """Cancel the running job; results so far stay."""
-        with self._held.lock:
-            self._job_lane.stop()
-            if self._held.now.state not in RUNNING:
-                return
-            self._held.set(state="stopped", stopped_by=why, why=why.value)
-        self._held.changed()
+        self._jobs.stop()
+        if self.view.state in RUNNING:
+            self.update(state="stopped", stopped_by=why, why=why.value)
 
+    @on_loop
     def forget(self) -> None:
         """Cancel the running job and clear the view."""
         self.stop(StoppedBy.LOSS)
-        with self._held.lock:
-            self._held.put(RescoreView())
-        self._held.changed()
+        self._put(RescoreView())
 
+    @on_loop
     def close(self) -> None:
-        """Stop; returns when the thread has ended."""
+        """Stop, and begin nothing more."""
         self.stop(StoppedBy.CLOSING)
-        self._job_lane.close()
+        self._jobs.close()
 
-    def _failed(self, job: Job, failure: JobFailed) -> None:
-        self.update(job, state="failed", why=str(failure), problem=failure.problem)
+    def _put(self, view: RescoreView) -> None:
+        self.view = replace(view, serial=self.view.serial + 1)
+        self._on_change()
+
+    def _failed(self, failure: JobFailed) -> None:
+        self.update(state="failed", why=str(failure), problem=failure.problem)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,8 +16,9 @@ from workbench.core.capture.recorded_run import pose_distances
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.rescore.verdict import Scores, Verdict, compare, scalar_entries
 from workbench.session.history.history import History, Moment
+from workbench.session.loop import on_loop
 from workbench.session.process.askers import Background
-from workbench.session.process.job_lane import Job, JobFailed
+from workbench.session.process.jobs import Job, JobFailed
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import MomentToRescore, RescoredMoments, RescoreMoments
 from workbench.session.rescore.background import RescoreView, Rescoring, StoppedBy
@@ -260,16 +260,17 @@ class PastRescorer:
             on_change: called when `rescoring` has changed.
             process: where it runs; other jobs come first.
         """
-        self.rescoring = Rescoring("rescore", on_change)
-        self._process, self._lock = process, threading.Lock()
+        self.rescoring = Rescoring(on_change)
+        self._process = process
         self._rescored: RescoredPast | None = None
         """Of the running or the last job."""
 
+    @on_loop
     def curve(self, name: str, env: int) -> RescoredCurve | None:
         """As `RescoredPast.curve`; None also before the first job."""
-        with self._lock:
-            return None if self._rescored is None else self._rescored.curve(name, env)
+        return None if self._rescored is None else self._rescored.curve(name, env)
 
+    @on_loop
     def rescore(self, load: Load, rescored: RescoredPast) -> None:
         """Start a job, replacing the one before.
 
@@ -280,27 +281,26 @@ class PastRescorer:
         if rescored.steps == 0:
             return
         self.stop(StoppedBy.LOAD)
-        with self._lock:
-            self._rescored = rescored
+        self._rescored = rescored
         view = RescoreView("loading", total=rescored.steps, task="the new code")
         self.rescoring.begin(view, lambda job: self._rescore(job, load, rescored))
 
+    @on_loop
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
         """As `Rescoring.stop`."""
         self.rescoring.stop(why)
-        with self._lock:
-            if self._rescored is not None:
-                self._rescored.release()  # a job that had not started does not do it
+        if self._rescored is not None:
+            self._rescored.release()
 
+    @on_loop
     def forget(self) -> None:
         """Stop and clear the view: the history is gone."""
         self.rescoring.forget()
-        with self._lock:
-            self._rescored = None
+        self._rescored = None
 
-    # --- on the lane ---------------------------------------------------------------------------------
+    # --- the job -------------------------------------------------------------------------------------
 
-    def _rescore(self, job: Job, load: Load, rescored: RescoredPast) -> None:
+    async def _rescore(self, job: Job, load: Load, rescored: RescoredPast) -> None:
         summed_up, missed = 0.0, dict[str, str]()
 
         def on_answer(answer: RescoredMoments, seconds: float) -> None:
@@ -309,12 +309,10 @@ class PastRescorer:
             now, done = time.monotonic(), rescored.rescored_steps
             if answer.problem is not None or done == rescored.steps or now - summed_up > _SUMMARY_EVERY:
                 summed_up = now
-                with self._lock:
-                    names, differing = rescored.names()
-                    verdicts = tuple(rescored.verdicts())
-                self.rescoring.update(job, verdicts=verdicts, names=names, differing_names=differing)
+                names, differing = rescored.names()
+                verdicts = tuple(rescored.verdicts())
+                self.rescoring.update(verdicts=verdicts, names=names, differing_names=differing)
             self.rescoring.update(
-                job,
                 state="rescoring",
                 done=done,
                 steps=done,
@@ -324,59 +322,50 @@ class PastRescorer:
             if answer.problem is not None:
                 raise JobFailed("the new code raised", answer.problem)
 
-        def rescore_rows(rows: range) -> None:
-            self._load(job, load, rescored)
-            self._replay_steps(job, rescored, rows, on_answer)
+        async def rescore_rows(rows: range) -> None:
+            await self._load(job, load, rescored)
+            await self._replay_steps(rescored, rows, on_answer)
 
         try:
             for rows in rescored.runs():
-                self._process.in_turns(job, partial(rescore_rows, rows), priority="low")
+                await self._process.in_turns(job, partial(rescore_rows, rows), priority="low")
         finally:
-            with self._lock:
-                rescored.release()
+            rescored.release()
 
-    def _load(self, job: Job, load: Load, rescored: RescoredPast) -> None:
+    async def _load(self, job: Job, load: Load, rescored: RescoredPast) -> None:
         if self._process.has_loaded(load):
             return
-        self.rescoring.update(job, state="loading")
+        self.rescoring.update(state="loading")
         if self._process.num_envs == rescored.num_envs:
             # Loading tries the new code at the env's present moment, where the last job ended. There it may raise or
             # loop although it runs from the recorded beginnings: so go to one of these first.
-            self._ask(job, rescored, rescored.runs()[0][:1])
+            await self._ask(rescored, rescored.runs()[0][:1])
         try:
-            self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))
+            await self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))
         except JobFailed as failure:
             if failure.problem is None:
                 raise
             raise JobFailed("the new code could not be loaded to rescore with", failure.problem) from failure
 
-    def _replay_steps(
-        self,
-        job: Job,
-        rescored: RescoredPast,
-        rows: range,
-        on_answer: Callable[[RescoredMoments, float], None],
+    async def _replay_steps(
+        self, rescored: RescoredPast, rows: range, on_answer: Callable[[RescoredMoments, float], None]
     ) -> None:
         at, count = rows.start, 2
         while at < rows.stop:
             chunk = range(at, min(at + count, rows.stop))
             began = time.monotonic()
-            answer = self._ask(job, rescored, chunk)
+            answer = await self._ask(rescored, chunk)
             took = time.monotonic() - began
-            with self._lock:
-                job.check()
-                for row, step in zip(chunk, answer.steps, strict=False):
-                    try:
-                        rescored.add(row, step)
-                    except ValueError as error:
-                        raise JobFailed(f"the episodes cannot be compared: {error}") from error
+            for row, step in zip(chunk, answer.steps, strict=False):
+                try:
+                    rescored.add(row, step)
+                except ValueError as error:
+                    raise JobFailed(f"the episodes cannot be compared: {error}") from error
             on_answer(answer, took)
             in_time = count * _CHUNK_SECONDS / max(took, 1e-3)
             count = max(1, min(int(in_time), 2 * count, _MOST_AT_ONCE))
             at = chunk.stop
 
-    def _ask(self, job: Job, rescored: RescoredPast, rows: range) -> RescoredMoments:
-        with self._lock:
-            job.check()
-            moments = tuple(rescored.moment_to_rescore(row) for row in rows)
-        return self._process.ask(job.check, RescoreMoments(moments))
+    async def _ask(self, rescored: RescoredPast, rows: range) -> RescoredMoments:
+        moments = tuple(rescored.moment_to_rescore(row) for row in rows)
+        return await self._process.ask(RescoreMoments(moments))

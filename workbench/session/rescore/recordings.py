@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,8 +31,9 @@ from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.episode.side_files import side_files_text
 from workbench.recording.reader.reading import read_recording
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared, recorded_content
+from workbench.session.loop import Aside, on_loop
 from workbench.session.process.askers import Background
-from workbench.session.process.job_lane import Job, JobFailed
+from workbench.session.process.jobs import Job, JobFailed
 from workbench.session.protocol.messages import Load
 from workbench.session.rescore.background import RescoreView, Rescoring
 
@@ -113,43 +114,6 @@ def hidden_modules_text(reference: TaskName) -> list[str]:
     )
 
 
-def rescore_each(
-    groups: Sequence[RescoreGroup],
-    cleared: Sequence[TaskName | NotCleared],
-    rescore: Callable[[RescoreGroup, TaskName], None],
-    known: Callable[[], Iterable[Verdict[Source]]],
-    not_rescored: Callable[[list[Verdict[Source]]], None],
-) -> None:
-    """Rescore each group with the code cleared for it, or its recorded text. A group that fails leaves the others: a
-    folder holds recordings of many tasks, and one of them may be gone.
-
-    Args:
-        known: returns all verdicts so far.
-        not_rescored: gets a verdict for each episode that has none because its group failed.
-
-    Raises:
-        JobFailed, TaskError, CannotEnterRecording: of the first group, if all fail.
-    """
-    failures: list[JobFailed | TaskError | CannotEnterRecording] = []
-    for group, reference in zip(groups, cleared, strict=True):
-        try:
-            if isinstance(reference, NotCleared):
-                raise CannotEnterRecording(str(reference)) from reference
-            text = recorded_source(group.info) if group.recorded_source else nullcontext(reference)
-            with text as opened:
-                rescore(group, opened)
-        except (JobFailed, TaskError, CannotEnterRecording) as error:
-            failures.append(error)
-            why = str(error)
-            if isinstance(error, JobFailed) and error.problem is not None:
-                why += f": {error.problem.message}"
-            rescored = {verdict.of.id for verdict in known()}
-            missing = [file for file in group.files if file.id not in rescored]
-            not_rescored([Verdict(file, task=group.info.task, why_not=why) for file in missing])
-    if failures and len(failures) == len(groups):
-        raise failures[0]
-
-
 def rescore_options(options: TaskOptions) -> tuple[TaskOptions, str]:
     """The same env without pictures, which take most of the time and which no reward reads; and a note on the change."""
     kwargs, note = dict(options.env_kwargs), ""
@@ -192,11 +156,14 @@ class Rescorer:
             clearances: decides which code may run; None without a person to ask.
             base: options of every opened task.
         """
-        self.rescoring = Rescoring("rescore")
+        self.rescoring = Rescoring()
         self._process = Background()
+        self._aside = Aside("rescore")
+        """Reads recordings, and waits for answers of people."""
         self._clearances = clearances or Clearances()
         self._base = base or TaskOptions()
 
+    @on_loop
     def start(
         self,
         files: Sequence[Source],
@@ -209,16 +176,21 @@ class Rescorer:
         if not files:
             return
 
-        def work(job: Job) -> None:
-            groups, broken_files = group_episodes(
-                files, MOST_AT_ONCE, self._base, file=file, recorded_source=recorded_source
-            )
-            notes = [f"with {_code_text(group)}" for group in groups[:MOST_NAMED]]
-            notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
-            notes += dict.fromkeys(g.note for g in groups if g.note)
-            self._update(job, broken_files, state="asking", notes=tuple(notes))
+        async def work(job: Job) -> None:
             try:
-                self._rescore_all(job, groups, use_env_states)
+                groups, broken_files = await self._aside.run(
+                    lambda: group_episodes(
+                        files, MOST_AT_ONCE, self._base, file=file, recorded_source=recorded_source
+                    )
+                )
+                notes = [f"with {_code_text(group)}" for group in groups[:MOST_NAMED]]
+                notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
+                notes += dict.fromkeys(g.note for g in groups if g.note)
+                self._update(broken_files, state="asking", notes=tuple(notes))
+                cleared = await self._aside.run(
+                    lambda: self._clearances.clear_all([group.code for group in groups], lambda: job.stopped)
+                )
+                await self._rescore_each(job, groups, cleared, use_env_states)
             except CannotEnterRecording as error:
                 raise JobFailed(str(error)) from error
             finally:
@@ -226,28 +198,57 @@ class Rescorer:
 
         self.rescoring.begin(RescoreView("loading", total=len(files), unit="episodes"), work)
 
-    # --- on the lane ---------------------------------------------------------------------------------
+    def close(self) -> None:
+        """Stop; returns when the process has ended. Called on another thread than the loop."""
+        self.rescoring.close()
+        self._aside.end()
+        self._process.close()
 
-    def _rescore_all(self, job: Job, groups: list[RescoreGroup], use_env_states: bool) -> None:
-        cleared = self._clearances.clear_all([group.code for group in groups], lambda: job.stopped)
-        job.check()
+    # --- the job -------------------------------------------------------------------------------------
 
-        rescore_each(
-            groups,
-            cleared,
-            lambda group, task: self._rescore(job, group, task, use_env_states),
-            lambda: self.rescoring.view.verdicts,
-            lambda verdicts: self._update(job, verdicts),
-        )
+    async def _rescore_each(
+        self,
+        job: Job,
+        groups: Sequence[RescoreGroup],
+        cleared: Sequence[TaskName | NotCleared],
+        use_env_states: bool,
+    ) -> None:
+        """Rescore each group with the code cleared for it, or its recorded text. A group that fails leaves the others: a
+        folder holds recordings of many tasks, and one of them may be gone.
 
-    def _rescore(self, job: Job, group: RescoreGroup, reference: TaskName, use_env_states: bool) -> None:
+        Raises:
+            JobFailed, TaskError, CannotEnterRecording: of the first group, if all fail.
+        """
+        failures: list[JobFailed | TaskError | CannotEnterRecording] = []
+        for group, reference in zip(groups, cleared, strict=True):
+            try:
+                if isinstance(reference, NotCleared):
+                    raise CannotEnterRecording(str(reference)) from reference
+                text = recorded_source(group.info) if group.recorded_source else nullcontext(reference)
+                with text as opened:
+                    await self._rescore(job, group, opened, use_env_states)
+            except (JobFailed, TaskError, CannotEnterRecording) as error:
+                failures.append(error)
+                why = str(error)
+                if isinstance(error, JobFailed) and error.problem is not None:
+                    why += f": {error.problem.message}"
+                rescored = {verdict.of.id for verdict in self.rescoring.view.verdicts}
+                missing = [file for file in group.files if file.id not in rescored]
+                self._update([Verdict(file, task=group.info.task, why_not=why) for file in missing])
+        if failures and len(failures) == len(groups):
+            raise failures[0]
+
+    async def _rescore(
+        self, job: Job, group: RescoreGroup, reference: TaskName, use_env_states: bool
+    ) -> None:
         process = self._process
-        warnings = tuple(dict.fromkeys((*self.rescoring.view.warnings, *hidden_modules_text(reference))))
-        self._update(job, state="loading", task=_code_text(group), warnings=warnings)
+        hidden = await self._aside.run(lambda: hidden_modules_text(reference))
+        warnings = tuple(dict.fromkeys((*self.rescoring.view.warnings, *hidden)))
+        self._update(state="loading", task=_code_text(group), warnings=warnings)
         # Never patched into the env of the group before.
         load = Load(reference, group.options, level="rebuilt")
         try:
-            process.ensure(job, load, or_else=replace(load, options=with_renderer(group.options)))
+            await process.ensure(job, load, or_else=replace(load, options=with_renderer(group.options)))
         except JobFailed as failure:
             if failure.problem is None:
                 raise
@@ -255,23 +256,23 @@ class Rescorer:
                 f"{_code_text(group)} cannot be opened. Choose *as recorded*, or start the workbench with --task FILE",
                 failure.problem,
             ) from failure
-        self._update(job, state="rescoring")
+        self._update(state="rescoring")
         began, before, steps = time.monotonic(), self.rescoring.view.seconds, self.rescoring.view.steps
 
         def on_part(part: Rescored) -> None:
             seconds = before + time.monotonic() - began
-            self._update(job, part.verdicts, steps=steps + part.steps, seconds=seconds)
+            self._update(part.verdicts, steps=steps + part.steps, seconds=seconds)
 
         question = Rescore(group.files, use_env_states)
-        last = process.ask(job.check, question, lambda done, total, part: on_part(part))
+        last = await process.ask(question, lambda done, total, part: on_part(part))
         on_part(last)
         if last.problem is not None:
             raise JobFailed(f"the code of {group.info.task} raised", last.problem)
 
-    def _update(self, job: Job, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
+    def _update(self, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
         """Change fields of the view, and add these verdicts."""
         known = (*self.rescoring.view.verdicts, *verdicts)
-        self.rescoring.update(job, verdicts=known, done=len(known), **values)
+        self.rescoring.update(verdicts=known, done=len(known), **values)
 
 
 def _code_text(group: RescoreGroup) -> str:

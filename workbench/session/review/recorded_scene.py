@@ -9,8 +9,9 @@ from pathlib import Path
 from workbench.core.capture.recorded_run import HOW_IT_IS_RUN
 from workbench.recording.episode.episode import Episode
 from workbench.session.clearance import paths_in_arguments
+from workbench.session.loop import result_of
 from workbench.session.process.askers import Background, OnProgress
-from workbench.session.process.job_lane import JobFailed
+from workbench.session.process.jobs import JobFailed, ProcessDied
 from workbench.session.protocol.questions import MakeScene, SceneMade
 
 _NOT_PASSED_ON = HOW_IT_IS_RUN | {
@@ -66,7 +67,7 @@ class SceneProcess:
                 else:
                     yield replace(episode, geometry=made.geometry, poses=made.poses), made.missed
         finally:
-            process.end()
+            process.close()
 
     def _make(
         self, process: Background, episode: Episode, check: Callable[[], None], on_progress: OnProgress
@@ -89,10 +90,9 @@ class SceneProcess:
             self._imports,
         )
         try:
-            process.start()
-            return process.ask(check, question, on_progress)
-        except JobFailed as failure:
-            if process.pid is not None:
-                raise SceneError(str(failure)) from failure
+            return result_of(process.ask(question, on_progress), check)
+        except ProcessDied as failure:
             why = f"The scene of {info.task} could not be made ({failure}), so there are only numbers and curves."
             raise SceneError(why) from failure
+        except JobFailed as failure:
+            raise SceneError(str(failure)) from failure

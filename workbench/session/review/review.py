@@ -6,11 +6,12 @@ import datetime
 import logging
 import math
 import os
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from workbench.core.scene.shapes import SharedShapes
 from workbench.machine.processes.family import allocated_memory
@@ -19,7 +20,8 @@ from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import LibraryRow, UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import read_recording
-from workbench.session.process.job_lane import Stopped
+from workbench.session.loop import Aside, Changes, do, on_loop, post
+from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.process.memory_limit import format_size, total_memory
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
 from workbench.session.review.view import START, Opened, ReviewView, find_events
@@ -59,12 +61,16 @@ class _Playback:
     """Seconds of the clock."""
 
 
+class _Stopped(Exception):
+    """The scenes are not needed any more."""
+
+
 class Review:
-    """Up to `MOST_OPEN` opened recordings and one position. All methods are thread-safe and return at once.
+    """Up to `MOST_OPEN` opened recordings and one position. All methods may be called on any thread, and return at
+    once.
 
     Recordings are in memory (pictures encoded), so seeking changes a number. While playing, the position follows from
-    the clock when it is asked for; no thread ticks. Each opening has a thread of its own. A later opening, or `close`,
-    makes an earlier one stop: its number is no longer the newest.
+    the clock when it is asked for; nothing ticks. A later opening, or `close`, makes an earlier one stop.
     """
 
     def __init__(
@@ -92,16 +98,14 @@ class Review:
             lambda row, shapes, stopped: read_recording(row.source, shapes, library.folder, stopped)
         )
         self._memory = memory
-        self._changed = threading.Condition()
+        self._changes = Changes()
         self._view = ReviewView()
         self._playback: _Playback | None = None
-        self._opening = 0
-        """Number of the newest opening: results of earlier ones are dropped."""
+        self._opening = Jobs(lambda: None, self._failed)
         self._partly_shown = False
         """The newest opening has put something on the page."""
         self._closed: set[str] = set()
         """Ids closed by the user while the opening still runs."""
-        self._thread: threading.Thread | None = None
         self._files: dict[Path, _Stamp] = {}
         """Files of the open recordings."""
         self._open_problems: tuple[str, ...] = ()
@@ -110,22 +114,26 @@ class Review:
 
     # --- what the page reads -------------------------------------------------------------------------
 
+    @on_loop
     def view(self) -> ReviewView:
         """A snapshot; cheap enough for every frame."""
-        with self._changed:
-            self._advance()
-            return self._view
+        self._advance()
+        return self._view
 
     def wait(self, seen: int, timeout: float) -> int:
         """Sleep until the view is newer than `seen`, at most `timeout` seconds; returns the newest serial."""
         deadline = time.monotonic() + timeout
-        with self._changed:
-            while True:
-                self._advance()
-                left = deadline - time.monotonic()
-                if self._view.serial != seen or left <= 0:
-                    return self._view.serial
-                self._changed.wait(min(left, self._next_position_in()))
+        while True:
+            changes = self._changes.count
+            serial, next_position_in = do(self._now)
+            left = deadline - time.monotonic()
+            if serial != seen or left <= 0:
+                return serial
+            self._changes.wait(changes, min(left, next_position_in))
+
+    def _now(self) -> tuple[int, float]:
+        self._advance()
+        return self._view.serial, self._next_position_in()
 
     # --- opening -------------------------------------------------------------------------------------
 
@@ -151,62 +159,65 @@ class Review:
                 f"At most {MOST_OPEN} recordings can be open at once; the first {MOST_OPEN} were opened."
             )
             wanted = wanted[:MOST_OPEN]
-        with self._changed:
-            self._opening += 1
-            number = self._opening
-            self._partly_shown = False
-            self._closed.clear()
-            if not wanted:
-                self._change(problems=tuple(problems), not_opened=(), loading="")
-                return
-            # The library lists the newest first, but a comparison asks what became of the oldest. It is also read first:
-            # the recording that is shown first stays selected when others arrive.
-            wanted.sort(key=lambda row: (row.date is None, row.date or _NEVER))
-            self._change(loading=_opening_text(wanted, 0), problems=tuple(problems), not_opened=())
-            self._thread = threading.Thread(
-                target=self._open, args=(number, wanted, problems, state), name="review-open", daemon=True
-            )
-            self._thread.start()
+        do(lambda: self._begin(wanted, problems, state))
+
+    def _begin(self, wanted: list[LibraryRow], problems: list[str], state: int | None) -> None:
+        self._opening.stop()
+        self._partly_shown = False
+        self._closed = set()
+        if not wanted:
+            self._change(problems=tuple(problems), not_opened=(), loading="")
+            return
+        # The library lists the newest first, but a comparison asks what became of the oldest. It is also read first:
+        # the recording that is shown first stays selected when others arrive.
+        wanted.sort(key=lambda row: (row.date is None, row.date or _NEVER))
+        self._change(loading=_opening_text(wanted, 0), problems=tuple(problems), not_opened=())
+        self._opening.start("opening", lambda job: self._open(job, wanted, problems, state))
+
+    async def _open(self, job: Job, rows: list[LibraryRow], problems: list[str], state: int | None) -> None:
+        # Each opening has one of its own: a disk that hangs must not keep the next.
+        aside = Aside("review-open")
+        try:
+            await self._open_on(aside, job, rows, problems, state)
+        finally:
+            aside.end()
 
     def open_again(self) -> None:
         """Try once more what could not be read, beside what is open: a busy machine may have been too slow."""
-        with self._changed:
-            ids = (*(one.id for one in self._view.opened), *self._view.not_opened)
-        self.open(ids)
+        view = self.view()
+        self.open((*(one.id for one in view.opened), *view.not_opened))
 
+    @on_loop
     def close_one(self, index: int) -> None:
         """Close one of the open recordings."""
-        with self._changed:
-            if 0 <= index < len(self._view.opened):
-                kept = [o for number, o in enumerate(self._view.opened) if number != index]
-                selected = self._view.selected - (self._view.selected > index)
-                if self._partly_shown:
-                    self._closed.add(self._view.opened[index].id)
-                self._set_opened(kept, min(selected, max(len(kept) - 1, 0)), self._view.align)
+        if 0 <= index < len(self._view.opened):
+            kept = [o for number, o in enumerate(self._view.opened) if number != index]
+            selected = self._view.selected - (self._view.selected > index)
+            if self._partly_shown:
+                self._closed.add(self._view.opened[index].id)
+            self._set_opened(kept, min(selected, max(len(kept) - 1, 0)), self._view.align)
 
+    @on_loop
     def swap(self, index: int, other: int) -> None:
         """Swap two open recordings in the order; the position stays."""
-        with self._changed:
-            view = self._view
-            if not {index, other} <= set(range(len(view.opened))):
-                return
-            self._advance()
-            order = list(range(len(view.opened)))
-            order[index], order[other] = other, index
-            position = self._view.position
-            self._opening += 1
-            self._set_opened([view.opened[k] for k in order], order.index(view.selected), view.align)
-            self._seek(position)
+        view = self._view
+        if not {index, other} <= set(range(len(view.opened))):
+            return
+        self._advance()
+        order = list(range(len(view.opened)))
+        order[index], order[other] = other, index
+        position = self._view.position
+        self._opening.stop()
+        self._set_opened([view.opened[k] for k in order], order.index(view.selected), view.align)
+        self._seek(position)
 
     def close(self) -> None:
-        """Stop opening; returns when the thread has ended, or after 10 s."""
-        with self._changed:
-            self._opening += 1
-            thread = self._thread
-        if thread is not None:
-            thread.join(timeout=10.0)
+        """Stop opening."""
+        do(self._opening.close)
 
-    def _open(self, number: int, rows: list[LibraryRow], problems: list[str], state: int | None) -> None:
+    async def _open_on(
+        self, aside: Aside, job: Job, rows: list[LibraryRow], problems: list[str], state: int | None
+    ) -> None:
         opened: list[Opened] = []
         failed: list[str] = []
         shapes = SharedShapes()
@@ -221,19 +232,12 @@ class Review:
                     f"{format_size(self._most_bytes)} of memory. Open fewer at once."
                 )
                 break
-            with self._changed:
-                if number != self._opening:
-                    return
-                if opened and time.monotonic() - shown_at > wait:
-                    self._show(opened, files, state)
-                    shown_at, wait = time.monotonic(), 2 * wait
-                self._change(loading=_opening_text(rows, done))
-            stamps = _stamps_of(row)
+            if opened and time.monotonic() - shown_at > wait:
+                self._show(opened, files, state)
+                shown_at, wait = time.monotonic(), 2 * wait
+            self._change(loading=_opening_text(rows, done))
             try:
-                episode = _shared(self._read(row, shapes, lambda: number != self._opening), shapes)
-                opened.append(Opened(row.id, row.name, episode, find_events(episode)))
-                files.update(stamps)
-                problems += [broken.sentence for broken in episode.broken_files]
+                one, stamps = await aside.run(partial(self._read_row, row, shapes, job))
             except (OSError, UnreadableRecording) as error:
                 problems.append(f"{row.name} was not opened. {error}")
                 failed.append(row.id)
@@ -242,18 +246,29 @@ class Review:
                 log.exception("%s could not be opened.", row.name)
                 problems.append(f"{row.name} could not be opened ({type(error).__name__}: {error}).")
                 failed.append(row.id)
+            else:
+                opened.append(one)
+                files.update(stamps)
+                problems += [broken.sentence for broken in one.episode.broken_files]
         opened.sort(key=lambda one: one.episode.info.written_at)
-        with self._changed:
-            if number != self._opening:
-                return
-            self._open_problems = tuple(problems)
-            if opened:
-                self._show(opened, files, state)
-            self._change(loading="", problems=self._open_problems, not_opened=tuple(failed))
-        self._give_scenes(number, [one for one in opened if not one.has_scene], shapes)
+        self._open_problems = tuple(problems)
+        if opened:
+            self._show(opened, files, state)
+        self._change(loading="", problems=self._open_problems, not_opened=tuple(failed))
+        without = [one for one in opened if not one.has_scene]
+        await aside.run(lambda: self._give_scenes(job, without, shapes))
+
+    def _read_row(self, row: LibraryRow, shapes: SharedShapes, job: Job) -> tuple[Opened, dict[Path, _Stamp]]:
+        """Beside the loop."""
+        stamps = _stamps_of(row)
+        episode = _shared(self._read(row, shapes, lambda: job.stopped), shapes)
+        return Opened(row.id, row.name, episode, find_events(episode)), stamps
+
+    def _failed(self, failure: JobFailed) -> None:
+        self._change(loading="", problems=(*self._view.problems, f"{failure}."))
 
     def _show(self, opened: Sequence[Opened], files: Mapping[Path, _Stamp], state: int | None) -> None:
-        """Show the recordings read so far, without those closed again; under the lock.
+        """Show the recordings read so far, without those closed again.
 
         Selection and position stay once something of this opening was shown.
         """
@@ -269,62 +284,58 @@ class Review:
             if state is not None:
                 self._seek(state)
 
-    def _give_scenes(self, number: int, without: Sequence[Opened], shapes: SharedShapes) -> None:
-        def set_message(one: Opened, message: str, making: bool = True) -> None:
-            self._replace_opened(number, one.id, lambda now: replace(now, scene=message, making=making))
+    def _give_scenes(self, job: Job, without: Sequence[Opened], shapes: SharedShapes) -> None:
+        """Beside the loop."""
+
+        def update(one: Opened, **values: Any) -> None:
+            post(lambda: job.stopped or self._replace_opened(one.id, **values))
 
         def check() -> None:
-            if number != self._opening or all(one.id in self._closed for one in without):
-                raise Stopped
+            if job.stopped or all(one.id in self._closed for one in without):
+                raise _Stopped
 
         make = self._make_scene
         wanted = [] if make is None else [one for one in without if one.episode.env_states]
         for one in without:
             if one in wanted:
-                set_message(one, "its scene is made next")
+                update(one, scene="its scene is made next", making=True)
             else:
-                set_message(one, "This recording holds no scene to draw.", False)
+                update(one, scene="This recording holds no scene to draw.", making=False)
         if make is None or not wanted:
             return
         scenes = make(
-            [one.episode for one in wanted], check, lambda index, text: set_message(wanted[index], text)
+            [one.episode for one in wanted],
+            check,
+            lambda index, text: update(wanted[index], scene=text, making=True),
         )
         try:
             for one, made in zip(wanted, scenes, strict=True):
                 if isinstance(made, SceneError):
-                    set_message(one, str(made), False)
+                    update(one, scene=str(made), making=False)
                     continue
-                episode, message = (
-                    _shared(made[0], shapes),
-                    f"Not restored: {'; '.join(made[1])}." if made[1] else "",
-                )
-                self._replace_opened(
-                    number,
-                    one.id,
-                    lambda now, episode=episode, message=message: replace(
-                        now, episode=episode, scene=message, making=False
-                    ),
-                )
-        except Stopped:
+                episode = _shared(made[0], shapes)
+                message = f"Not restored: {'; '.join(made[1])}." if made[1] else ""
+                update(one, episode=episode, scene=message, making=False)
+        except _Stopped:
             return
         except Exception as error:
             # That process may send anything. Without this the page would stay on "making" without a reason.
             report_failure("Scenes of recordings could not be made", error)
             for one in wanted:
-                set_message(one, f"Its scene could not be made ({type(error).__name__}: {error}).", False)
+                text = f"Its scene could not be made ({type(error).__name__}: {error})."
+                update(one, scene=text, making=False)
 
-    def _replace_opened(self, number: int, id: str, change: Callable[[Opened], Opened]) -> None:
-        with self._changed:
-            index = next((index for index, one in enumerate(self._view.opened) if one.id == id), None)
-            if number == self._opening and index is not None:
-                opened = list(self._view.opened)
-                got_scene = not opened[index].has_scene
-                opened[index] = change(opened[index])
-                got_scene &= opened[index].has_scene
-                self._change(opened=tuple(opened), opened_serial=self._view.opened_serial + got_scene)
+    def _replace_opened(self, id: str, **values: Any) -> None:
+        index = next((index for index, one in enumerate(self._view.opened) if one.id == id), None)
+        if index is not None:
+            opened = list(self._view.opened)
+            had_scene = opened[index].has_scene
+            opened[index] = replace(opened[index], **values)
+            got_scene = opened[index].has_scene and not had_scene
+            self._change(opened=tuple(opened), opened_serial=self._view.opened_serial + got_scene)
 
     def _set_opened(self, opened: Sequence[Opened], selected: int, align: str, stay: bool = False) -> None:
-        """Show these at the first position, or at the present one if `stay`; under the lock."""
+        """Show these at the first position, or at the present one if `stay`."""
         if stay:
             self._advance()
         else:
@@ -342,93 +353,94 @@ class Review:
         )
         self._align(align if align in alignments else START, position=state)
 
+    @on_loop
     def add_problem(self, sentence: str) -> None:
         """Show this among the problems, until something is opened."""
-        with self._changed:
-            self._open_problems = (*self._open_problems, sentence)
-            self._change(problems=(*self._view.problems, sentence))
+        self._open_problems = (*self._open_problems, sentence)
+        self._change(problems=(*self._view.problems, sentence))
 
     # --- the position --------------------------------------------------------------------------------
 
+    @on_loop
     def seek(self, position: int) -> None:
         """Go to a position, or the nearest in range."""
-        with self._changed:
-            self._seek(position)
+        self._seek(position)
 
+    @on_loop
     def seek_by(self, steps: int) -> None:
         """Go some states forward, or back if negative; pauses."""
-        with self._changed:
-            self._advance()
-            self._pause()
-            self._seek(self._view.position + steps)
+        self._advance()
+        self._pause()
+        self._seek(self._view.position + steps)
 
+    @on_loop
     def seek_event(self, direction: int) -> None:
         """Go to the next (1) or previous (-1) event of any open recording; of the selected one if many are open."""
-        with self._changed:
-            self._advance()
-            view = self._view
-            several = range(len(view.opened)) if len(view.opened) <= MOST_COMPARED else (view.selected,)
-            places = {
-                h.state - view.anchors[index]
-                for index in several
-                if view.opened
-                for h in view.opened[index].events
-            }
-            places |= {view.last} if view.opened else set()
-            ahead = [p for p in places if (p - view.position) * direction > 0]
-            if ahead:
-                self._pause()
-                self._seek(min(ahead, key=lambda place: abs(place - view.position)))
-
-    def to_first(self) -> None:
-        with self._changed:
-            self._seek(self._view.first)
-
-    def to_last(self) -> None:
-        with self._changed:
+        self._advance()
+        view = self._view
+        several = range(len(view.opened)) if len(view.opened) <= MOST_COMPARED else (view.selected,)
+        places = {
+            h.state - view.anchors[index]
+            for index in several
+            if view.opened
+            for h in view.opened[index].events
+        }
+        places |= {view.last} if view.opened else set()
+        ahead = [p for p in places if (p - view.position) * direction > 0]
+        if ahead:
             self._pause()
-            self._seek(self._view.last)
+            self._seek(min(ahead, key=lambda place: abs(place - view.position)))
 
+    @on_loop
+    def to_first(self) -> None:
+        self._seek(self._view.first)
+
+    @on_loop
+    def to_last(self) -> None:
+        self._pause()
+        self._seek(self._view.last)
+
+    @on_loop
     def show(self, index: int, state: int) -> None:
         """Select a recording and go to a state of it."""
-        with self._changed:
-            if 0 <= index < len(self._view.opened):
-                self._pause()
-                self._change(selected=index)
-                self._seek(state - self._view.anchors[index])
+        if 0 <= index < len(self._view.opened):
+            self._pause()
+            self._change(selected=index)
+            self._seek(state - self._view.anchors[index])
 
+    @on_loop
     def select(self, index: int) -> None:
-        with self._changed:
-            if 0 <= index < len(self._view.opened):
-                self._change(selected=index)
+        if 0 <= index < len(self._view.opened):
+            self._change(selected=index)
 
+    @on_loop
     def align(self, how: str) -> None:
         """Align at one of `ReviewView.alignments`. The shown state of the selected recording stays.
 
         Raises:
             ValueError: unknown alignment.
         """
-        with self._changed:
-            if how not in self._view.alignments:
-                raise ValueError("The recordings cannot be aligned at that.")
-            self._advance()
-            view = self._view
-            kept = view.states[view.selected] if view.opened else None
-            self._align(how, position=kept)
+        if how not in self._view.alignments:
+            raise ValueError("The recordings cannot be aligned at that.")
+        self._advance()
+        view = self._view
+        kept = view.states[view.selected] if view.opened else None
+        self._align(how, position=kept)
 
     # --- playing -------------------------------------------------------------------------------------
 
+    @on_loop
     def toggle_play(self) -> None:
-        with self._changed:
-            self._advance()
-            if self._view.playing:
-                self._pause()
-            elif self._view.opened and self._view.last > self._view.first:
-                at_end = self._view.position >= self._view.last
-                position = self._view.first if at_end else self._view.position
-                self._playback = _Playback(position, self._clock())
-                self._change(playing=True, position=position)
+        self._advance()
+        if self._view.playing:
+            self._pause()
+        elif self._view.opened and self._view.last > self._view.first:
+            at_end = self._view.position >= self._view.last
+            position = self._view.first if at_end else self._view.position
+            self._playback = _Playback(position, self._clock())
+            self._change(playing=True, position=position)
 
+    @on_loop
     def set_speed(self, speed: float) -> None:
         """Set the speed, as a multiple of real time.
 
@@ -437,34 +449,35 @@ class Review:
         """
         if not 0 < speed < 1000:
             raise ValueError("The speed is a number above 0.")
-        with self._changed:
-            self._advance()
-            self._restart_playback()
-            self._change(speed=speed)
+        self._advance()
+        self._restart_playback()
+        self._change(speed=speed)
 
+    @on_loop
     def set_loop(self, loop: bool) -> None:
-        with self._changed:
-            self._change(loop=loop)
+        self._change(loop=loop)
 
     # --- files ---------------------------------------------------------------------------------------
 
     def check_files(self) -> None:
         """Report files that were deleted or changed since they were read; at most every `_CHECK_EVERY` seconds."""
-        with self._changed:
-            if self._clock() - self._files_checked < _CHECK_EVERY:
-                return
-            self._files_checked = self._clock()
-            files, problems = dict(self._files), self._open_problems
-        problems = tuple(dict.fromkeys((*problems, *_changed_files(files))))
-        with self._changed:
-            if problems != self._view.problems and files == self._files and not self._view.loading:
-                self._change(problems=problems)
+        if self._clock() - self._files_checked < _CHECK_EVERY:
+            return
+        self._files_checked = self._clock()
+        files = self._files
+        found = _changed_files(files)
+        do(lambda: self._set_changed_files(files, found))
 
-    # --- under the lock ------------------------------------------------------------------------------
+    def _set_changed_files(self, files: Mapping[Path, _Stamp], found: Sequence[str]) -> None:
+        problems = tuple(dict.fromkeys((*self._open_problems, *found)))
+        if problems != self._view.problems and files is self._files and not self._view.loading:
+            self._change(problems=problems)
+
+    # --- on the loop ---------------------------------------------------------------------------------
 
     def _change(self, **values: object) -> None:
         self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
-        self._changed.notify_all()
+        self._changes.notify()
 
     def _align(self, how: str, position: int | None) -> None:
         """Align, and stay at a state of the selected recording (`position`); None goes to the first position."""

@@ -21,8 +21,9 @@ from workbench.machine.folders import cache_folder
 from workbench.machine.maniskill_installed import installed_maniskills, lines_if_lacking
 from workbench.machine.processes.child_python import LOWEST
 from workbench.machine.processes.watched_thread import watched_thread
+from workbench.session.loop import result_of
 from workbench.session.process.askers import Background
-from workbench.session.process.job_lane import JobFailed
+from workbench.session.process.jobs import JobFailed
 from workbench.session.protocol.questions import DrawTask, ListTasks
 
 log = logging.getLogger(__name__)
@@ -141,15 +142,14 @@ class RegisteredTasks:
             self._say(pictures=frozenset(one for one in self._cached.ids if _read_jpeg(self._file(one))))
             self._draw_all(process)
         finally:
-            process.end()
+            process.close()
             self._say(doing="")
 
     def _list(self, process: Background) -> None:
         if not self._cached.ids:
             self._say(doing="listing ManiSkill's tasks")
             try:
-                process.start()
-                ids = process.ask(self._within(LONGEST_LIST), ListTasks())
+                ids = result_of(process.ask(ListTasks()), self._within(LONGEST_LIST))
             except (JobFailed, _Ended) as failure:
                 if not self._closing.is_set():
                     self._say(problem=f"ManiSkill's tasks could not be listed: {failure}.")
@@ -168,8 +168,7 @@ class RegisteredTasks:
                 return
             self._say(doing=f"drawing {env_id}")
             try:
-                process.start()
-                drawn = process.ask(self._within(LONGEST_DRAWING), DrawTask(env_id))
+                drawn = result_of(process.ask(DrawTask(env_id)), self._within(LONGEST_DRAWING))
                 if drawn.pixels is None:
                     self._note_failure(env_id, drawn.why_not, drawn.needs_download)
                     continue
@@ -178,7 +177,7 @@ class RegisteredTasks:
                 if self._closing.is_set():
                     return
                 if isinstance(failure, _Ended):
-                    process.end()  # it may be in an endless loop
+                    process.close()  # it may be in an endless loop
                 self._note_failure(env_id, str(failure))
                 continue
             except OSError as error:
@@ -187,12 +186,12 @@ class RegisteredTasks:
             self._say(pictures=self._view.pictures | {env_id})
             count += 1
             if count % PICTURES_A_PROCESS == 0:
-                process.end()
+                process.close()
 
     def _wait_until_allowed(self, process: Background) -> bool:
         """False if it is to end."""
         while not self._may_work():
-            process.end()
+            process.close()
             self._say(doing="")
             if self._closing.wait(_LOOK):
                 return False

@@ -201,7 +201,7 @@ class Workplace:
                     self._recovering.join(timeout=10.0)
                 self._shelf.review.close()
                 self._shelf.library.close()
-        for part in (self.sharing, self.dialog, self.rescorer.rescoring, self.go_live):
+        for part in (self.sharing, self.dialog, self.rescorer, self.go_live):
             part.close()
         if self.home is not None:
             self.home.close()

@@ -9,7 +9,7 @@ from typing import ClassVar
 import viser
 
 from workbench.commands.cameras import StopMeasuring
-from workbench.session.process.job_lane import JobProgress
+from workbench.session.process.jobs import JobProgress
 from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.tools import tool, tools_html
 

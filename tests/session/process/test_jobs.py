@@ -1,0 +1,179 @@
+"""Jobs beside a session: one at a time, stopped at any time, and one that fails fails alone. And the loop that they run on."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Awaitable, Callable, Iterator
+
+import pytest
+
+from tests.drive.waiting import until
+from workbench.machine.processes.watched_thread import listen, stop_listening
+from workbench.session import loop
+from workbench.session.process.jobs import Job, JobFailed, JobProgress, Jobs
+
+
+class Seen:
+    """Jobs, and what a page sees of them."""
+
+    def __init__(self) -> None:
+        self.failed: list[str] = []
+        self.said: list[str] = []
+        self.jobs = Jobs(lambda: None, lambda failure: self.failed.append(str(failure)))
+
+    def start(self, what: str, work: Callable[[Job], Awaitable[None]]) -> None:
+        loop.do(lambda: self.jobs.start(what, work))
+
+    def progress(self) -> JobProgress | None:
+        return loop.do(lambda: self.jobs.progress)
+
+    def runs(self) -> bool:
+        """Whether a job that is started now is done."""
+        done = threading.Event()
+
+        async def work(job: Job) -> None:
+            done.set()
+
+        self.start("the next", work)
+        return done.wait(60)
+
+
+@pytest.fixture
+def seen() -> Iterator[Seen]:
+    seen = Seen()
+    listen(seen.said.append)
+    yield seen
+    loop.do(seen.jobs.close)
+    stop_listening(seen.said.append)
+
+
+def test_a_job_that_fails_is_told_and_the_next_is_done(seen: Seen) -> None:
+    async def broken(job: Job) -> None:
+        raise AttributeError("no such thing")
+
+    async def refuses(job: Job) -> None:
+        raise JobFailed("not today")
+
+    for work, words in ((broken, "no such thing"), (refuses, "not today")):
+        seen.start("counting", work)
+        until(lambda words=words: seen.failed and words in seen.failed[-1], "the failure")
+        assert seen.progress() is None
+        assert seen.runs()
+    assert len(seen.said) == 1 and "AttributeError" in seen.said[0], "only a fault of the workbench"
+
+
+def test_a_job_that_is_stopped_changes_nothing_more_and_one_that_has_not_begun_never_does(seen: Seen) -> None:
+    done: list[str] = []
+
+    async def works_on(job: Job) -> None:
+        done.append("begins")
+        job.report(1, 2, "half of it")
+        try:
+            await asyncio.sleep(600)
+        finally:
+            done.append("tidies up")
+        done.append("goes on")
+
+    async def never(job: Job) -> None:
+        done.append("never")
+
+    def begin_and_stop() -> None:
+        seen.jobs.start("second", never)
+        assert seen.jobs.progress == JobProgress("second", 0, 0)
+        seen.jobs.stop()
+        assert seen.jobs.progress is None
+
+    seen.start("first", works_on)
+    until(lambda: seen.progress() == JobProgress("half of it", 1, 2), "that it is under way")
+    loop.do(begin_and_stop)
+    assert seen.runs()
+    assert done == ["begins", "tidies up"] and seen.failed == []
+
+
+def test_after_the_end_nothing_begins(seen: Seen) -> None:
+    ended = threading.Event()
+
+    async def works_on(job: Job) -> None:
+        try:
+            await asyncio.sleep(600)
+        finally:
+            ended.set()
+
+    seen.start("works on", works_on)
+    until(lambda: seen.progress() is not None, "that it is under way")
+    loop.do(lambda: None)
+    loop.do(seen.jobs.close)
+    assert ended.wait(60)
+    seen.start("too late", works_on)
+    assert seen.progress() is None
+
+
+# --- the loop ------------------------------------------------------------------------------------------
+
+
+def test_changes_are_made_one_after_the_other_whoever_asks() -> None:
+    count = 0
+
+    def change() -> None:
+        nonlocal count
+        before = count
+        time.sleep(0.0001)  # another thread may go on here
+        count = before + 1
+
+    threads = [threading.Thread(target=lambda: [loop.do(change) for _ in range(100)]) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert count == 800
+
+
+def test_what_a_change_raises_is_raised_where_it_was_asked_for_and_the_loop_goes_on() -> None:
+    def fails() -> None:
+        raise LookupError("nothing there")
+
+    said: list[str] = []
+    listen(said.append)
+    try:
+        with pytest.raises(LookupError):
+            loop.do(fails)
+        loop.post(fails)
+        until(lambda: said, "a word of it")
+        assert loop.do(lambda: loop.do(lambda: 7)) == 7, "also from the loop itself"
+    finally:
+        stop_listening(said.append)
+
+
+def test_who_waits_for_work_of_the_loop_can_give_it_up() -> None:
+    ended = threading.Event()
+
+    async def work() -> None:
+        try:
+            await asyncio.sleep(600)
+        finally:
+            ended.set()
+
+    def check() -> None:
+        raise TimeoutError("long enough")
+
+    with pytest.raises(TimeoutError, match="long enough"):
+        loop.result_of(work(), check)
+    assert ended.wait(60)
+
+
+def test_what_blocks_keeps_its_order_and_does_not_keep_the_loop() -> None:
+    aside, goes_on, done = loop.Aside("test"), threading.Event(), list[int]()
+
+    async def work(number: int) -> None:
+        await aside.run(lambda: goes_on.wait(60))
+        done.append(number)
+
+    for number in range(3):
+        loop.do(lambda number=number: loop.begin(work(number)))
+    assert loop.do(lambda: 7) == 7
+    goes_on.set()
+    until(lambda: len(done) == 3, "all of it")
+    assert done == [0, 1, 2]
+    aside.close()

@@ -1,0 +1,178 @@
+"""The one thread on which the state of sessions changes: an asyncio loop.
+
+What pages ask for, what a worker says and what jobs come to are changes, made one after the other, each whole. So no lock
+guards what they change, and what is read is of one moment. Nothing on the loop blocks: what does (a disk, another process)
+is awaited, or done by an `Aside`. The thread begins with the first use and lasts as long as the process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import queue
+import threading
+from collections.abc import Callable, Coroutine
+from concurrent import futures
+from typing import Any, ParamSpec, TypeVar
+
+from workbench.machine.processes.watched_thread import report_failure
+
+_LOOK = 0.05
+"""Seconds between two checks whether a result is still wanted."""
+_tasks: set[asyncio.Task[Any]] = set()
+Value = TypeVar("Value")
+Args = ParamSpec("Args")
+
+
+@functools.cache
+def _loop() -> asyncio.AbstractEventLoop:
+    loop = asyncio.new_event_loop()
+    threading.Thread(target=loop.run_forever, name="loop", daemon=True).start()
+    return loop
+
+
+def is_here() -> bool:
+    """Whether this is the loop's thread."""
+    return asyncio._get_running_loop() is _loop()
+
+
+def do(change: Callable[[], Value]) -> Value:
+    """Make a change on the loop, and wait for it; returns what it returns, and raises what it raises."""
+    if is_here():
+        return change()
+    made: futures.Future[Value] = futures.Future()
+
+    def make() -> None:
+        try:
+            made.set_result(change())
+        except BaseException as error:
+            made.set_exception(error)
+
+    _loop().call_soon_threadsafe(make)
+    return made.result()
+
+
+def post(change: Callable[[], object]) -> None:
+    """Make a change on the loop soon. What it raises is reported."""
+
+    def make() -> None:
+        try:
+            change()
+        except Exception as error:
+            report_failure("A change failed", error)
+
+    _loop().call_soon_threadsafe(make)
+
+
+def on_loop(method: Callable[Args, Value]) -> Callable[Args, Value]:
+    """A method that does its work on the loop, whoever calls it."""
+
+    @functools.wraps(method)
+    def called(*args: Args.args, **kwargs: Args.kwargs) -> Value:
+        return do(functools.partial(method, *args, **kwargs))
+
+    return called
+
+
+def begin(work: Coroutine[Any, Any, Value]) -> asyncio.Task[Value]:
+    """Begin work on the loop; called there."""
+    task = _loop().create_task(work)
+    _tasks.add(task)  # asyncio itself holds tasks weakly
+    task.add_done_callback(_tasks.discard)
+    return task
+
+
+def later(seconds: float, change: Callable[[], object]) -> asyncio.TimerHandle:
+    """Make a change after some seconds, unless it is cancelled; called on the loop."""
+    return _loop().call_later(seconds, change)
+
+
+def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lambda: None) -> Value:
+    """For another thread: wait for work on the loop.
+
+    Args:
+        check: called often meanwhile; what it raises cancels the work, and is raised.
+    """
+    future = asyncio.run_coroutine_threadsafe(work, _loop())
+    while True:
+        done, _ = futures.wait([future], _LOOK)
+        if done:
+            return future.result()
+        try:
+            check()
+        except BaseException:
+            future.cancel()
+            raise
+
+
+class Changes:
+    """Counts the changes of something, for pages that wait for the next. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self.count = 0
+        self._closing = False
+
+    def notify(self) -> None:
+        """There was a change."""
+        with self._changed:
+            self.count += 1
+            self._changed.notify_all()
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """Block until the count differs from `seen`; returns the count."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.count != seen or self._closing, timeout)
+            return self.count
+
+    def close(self) -> None:
+        """Wake all that wait; `wait` returns at once from now on."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+
+
+class Aside:
+    """A thread for what blocks, one thing after the other. It begins with the first use, and nobody waits for it at the end
+    of the process: a call into a disk that hangs cannot be ended."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._work: queue.SimpleQueue[tuple[Callable[[], Any], futures.Future[Any]] | None] = (
+            queue.SimpleQueue()
+        )
+        self._thread: threading.Thread | None = None
+
+    def begin(self, work: Callable[[], Value]) -> futures.Future[Value]:
+        """Do this after what was begun before; called on the loop."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+            self._thread.start()
+        made: futures.Future[Value] = futures.Future()
+        self._work.put((work, made))
+        return made
+
+    async def run(self, work: Callable[[], Value]) -> Value:
+        """Do this after what was begun before, and wait for it. Who is cancelled meanwhile does not stop it."""
+        return await asyncio.wrap_future(self.begin(work))
+
+    def end(self) -> None:
+        """End the thread when all that was begun is done."""
+        self._work.put(None)
+
+    def close(self) -> None:
+        """The same, and return then; called on another thread than the loop."""
+        self.end()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while (next_work := self._work.get()) is not None:
+            work, made = next_work
+            # A future that was cancelled before it began is left out.
+            if not made.set_running_or_notify_cancel():
+                continue
+            try:
+                made.set_result(work())
+            except BaseException as error:
+                made.set_exception(error)
