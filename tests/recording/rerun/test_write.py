@@ -6,35 +6,38 @@ import dataclasses
 import errno
 import os
 import resource
-from collections.abc import Callable
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
+from rerun.chunk import Chunk, RrdReader
 
 from tests.drive.episodes import Made, header_of, journal_of
 from tests.drive.rows import append
+from tests.drive.waiting import until
+from tests.recording.read_rrd import read_rrd
 from tests.recording.verify_rrd import verify_rrd
-from workbench.recording.rerun import shared_bytes
+from workbench.recording.episode.episode import Episode
+from workbench.recording.reader.read_episode import read_episode
+from workbench.recording.rerun import layout
 from workbench.recording.rerun import write as rrd
-from workbench.recording.rerun.append_blueprint import blueprint_stream
+from workbench.recording.rerun.viewer import quiet_environment, rerun_command
 from workbench.recording.writing.from_journal import episode_in
 from workbench.recording.writing.journal import JournalReader
 
 Maker = Callable[..., Made]
 
 
-@pytest.mark.parametrize("most_kept", [0, 1])
 def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
-    child_process: None,
-    make_episode: Maker,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    most_kept: int,
+    child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
-    """Also where the last that it takes is a part of the blueprint, or of the index; with the scene's bytes kept and not."""
-    monkeypatch.setattr(shared_bytes, "_MOST_KEPT", most_kept)
+    """Also where the last byte that fits is part of the blueprint or of the index."""
     episode = make_episode(30, action=np.random.default_rng(0).random((30, 1)).astype(np.float32))
     writer = episode.writer(tmp_path)
     for row in episode.rows():
@@ -87,13 +90,91 @@ def test_whoever_has_turned_rerun_off_still_gets_the_whole_recording(
     assert os.environ["RERUN"] == "off"
 
 
-def test_a_blueprint_can_be_shown_before_the_recording(make_episode: Maker, tmp_path: Path) -> None:
-    path = make_episode().write(tmp_path).rrd
-    (inside,) = RrdReader(path).blueprints()
-    alone = tmp_path / "alone.rbl"
-    content = blueprint_stream(path)
-    assert content is not None
-    alone.write_bytes(content)
-    again = RrdReader(alone)
-    assert [entry.recording_id for entry in again.blueprints()] == [inside.recording_id]
-    assert again.recordings() == []
+def test_a_viewer_that_reads_from_the_beginning_gets_the_blueprint_first(
+    child_process: None, make_episode: Maker, tmp_path: Path
+) -> None:
+    path = make_episode(300).write(tmp_path).rrd
+    printed = subprocess.run(
+        [*rerun_command(), "rrd", "print", os.fspath(path)],
+        env=quiet_environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    ).stdout
+    blueprint, recording = printed.split("BlueprintActivationCommand")
+    assert "Chunk(" in blueprint and "/world" not in blueprint
+    assert "make_active: true, make_default: true" in recording and "/world" in recording
+
+
+def test_episodes_of_one_process_are_different_recordings_with_equal_content(
+    child_process: None, make_episode: Maker, tmp_path: Path
+) -> None:
+    episode = make_episode(5)
+    paths = []
+    for seed in range(4):
+        episode.info = dataclasses.replace(episode.info, seed=seed, id=f"{seed}")
+        paths.append(episode.write(tmp_path).rrd)
+    readers = [RrdReader(path) for path in paths]
+    assert len({store.recording_id for reader in readers for store in reader.recordings()}) == 4
+    assert [len(reader.blueprints()) for reader in readers] == [1] * 4
+    first, *others = (read_rrd(path) for path in paths)
+    for other in others:
+        assert other.keys() == first.keys()
+        for entity, columns in first.items():
+            assert other[entity].keys() == columns.keys()
+            if entity.startswith(("/__properties", "/logs")):  # with the seed in them
+                continue
+            for name, column in columns.items():
+                again = other[entity][name]
+                np.testing.assert_equal((again.steps, again.values), (column.steps, column.values))
+    for seed, path in enumerate(paths):
+        assert read_episode(path).info.seed == seed
+        assert verify_rrd(path) is None
+
+
+def test_threads_that_write_at_once_write_whole_files_and_leave_no_threads(
+    child_process: None, make_episode: Maker, tmp_path: Path
+) -> None:
+    def some(number: int) -> list[Path]:
+        episode = make_episode(5)
+        episode.info = dataclasses.replace(episode.info, task=f"Task{number}-v1")
+        return [episode.write(tmp_path / f"{number}").rrd for _ in range(5)]
+
+    def own_threads() -> int:
+        names = (Path(task, "comm").read_text() for task in Path("/proc/self/task").iterdir())
+        return sum(name.startswith(("ChunkBatcher", "RecordingStream", "rerun-copy")) for name in names)
+
+    with ThreadPoolExecutor(4) as pool:
+        paths = [path for done in pool.map(some, range(4)) for path in done]
+    for path in paths:
+        reader = RrdReader(path)
+        assert len(reader.blueprints()) == 1
+        assert len(reader.store()) == len(reader.stream().to_chunks())
+    until(lambda: own_threads() == 0, "the threads of rerun's streams have ended")
+
+
+def test_a_process_that_is_forked_meanwhile_does_not_hold_the_file_open(
+    child_process: None, make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As PyTorch's workers are, in the process that records."""
+    forked = []
+
+    def chunks(episode: Episode) -> Iterator[Chunk]:
+        if (pid := os.fork()) == 0:
+            time.sleep(600)
+            os._exit(0)
+        forked.append(pid)
+        yield from layout.chunks(episode)
+
+    monkeypatch.setattr(rrd, "chunks", chunks)
+    episode = make_episode(5)
+    writing = threading.Thread(target=lambda: episode.write(tmp_path), daemon=True)
+    writing.start()
+    writing.join(timeout=30)
+    for pid in forked:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+    assert forked and not writing.is_alive()
+    (path,) = tmp_path.glob("*.rrd")
+    assert verify_rrd(path) is None

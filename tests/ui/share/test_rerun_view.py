@@ -10,14 +10,10 @@ from pathlib import Path
 
 import pytest
 import rerun as rr
-import rerun.blueprint as rrb
 from playwright.sync_api import Browser, Request
-from rerun.chunk import LazyChunkStream
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
-from workbench.recording.rerun.append_blueprint import add_blueprint, blueprint_stream, encode_blueprint
-from workbench.recording.rerun.chunks import static_chunk
 from workbench.recording.rerun.viewer import VIEWER_FILES, web_viewer_folder
 from workbench.ui.server.access import cookie_name
 from workbench.ui.server.file_response import Downloads
@@ -92,22 +88,6 @@ def test_the_viewer_is_sent_packed_to_those_who_take_it(
     assert body == gzip.decompress((web_viewer_folder() / "re_viewer.js.gz").read_bytes())
     for name in ("", "../secret", "index.html.gz"):
         assert get(gated_server, root + name)[0] == 404
-
-
-def test_the_blueprint_of_a_recording_is_sent_before_it(
-    gated_server: GatedServer, pages: RerunPages, recording: Path, tmp_path: Path
-) -> None:
-    ours = tmp_path / "ours.rrd"
-    LazyChunkStream.from_iter([static_chunk("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)]).write_rrd(
-        ours, application_id="workbench", recording_id="two"
-    )
-    add_blueprint(ours, encode_blueprint("workbench", rrb.Blueprint(rrb.Spatial3DView())))
-    address = pages.address([recording, ours])
-    assert 'for (const name of ["1.rbl"])' in get(gated_server, address)[2].decode()
-    status, _, body = get(gated_server, address + "1.rbl")
-    assert (status, body) == (200, blueprint_stream(ours))
-    for name in ("0.rbl", "2.rbl", "../1.rbl", "1.rbl/"):
-        assert not get(gated_server, address + name)[2].startswith(b"RRF2")
 
 
 @pytest.mark.slow

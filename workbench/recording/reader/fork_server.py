@@ -29,14 +29,14 @@ from workbench.recording.reader.requests import (
     PictureRead,
     ReadFailed,
     ReadPicture,
-    ReadRerunInfo,
     ReadRows,
+    ReadStoreId,
     ReadSweep,
     Recover,
     Recovered,
     Request,
-    RerunInfo,
     RowsRead,
+    StoreId,
     SweepRead,
 )
 from workbench.recording.reader.scan import RecordingFiles
@@ -150,8 +150,10 @@ class _Reader:
             return self._open(request)
         if isinstance(request, ReadPicture):
             return self._picture(request)
-        if isinstance(request, ReadRerunInfo):
-            return _rerun_info(request)
+        if isinstance(request, ReadStoreId):
+            from workbench.recording.rerun.read import store_id
+
+            return StoreId(store_id(request.path))
         if isinstance(request, ReadSweep):
             return _sweep(request)
         assert isinstance(request, Recover)
@@ -203,19 +205,6 @@ def _sweep(request: ReadSweep) -> SweepRead:
         return SweepRead(read_results(request.path))
     except NoSweep as error:
         raise UnreadableRecording(f"{request.path.name} {error}.") from error
-
-
-def _rerun_info(request: ReadRerunInfo) -> RerunInfo:
-    from workbench.recording.rerun.append_blueprint import blueprint_stream
-    from workbench.recording.rerun.private_api import store_id
-
-    found = []
-    for ask in (store_id, blueprint_stream):
-        try:
-            found.append(ask(request.path))
-        except (ValueError, OSError, RuntimeError, AssertionError):
-            found.append(None)  # rerun then uses its own layout, at the first step
-    return RerunInfo(found[0], found[1])
 
 
 def _failed(why: Literal["unreadable", "system", "gone"], message: str) -> ReadFailed:

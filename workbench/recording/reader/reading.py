@@ -30,13 +30,13 @@ from workbench.recording.reader.requests import (
     PictureRead,
     ReadFailed,
     ReadPicture,
-    ReadRerunInfo,
     ReadRows,
+    ReadStoreId,
     ReadSweep,
     Recover,
     Recovered,
-    RerunInfo,
     RowsRead,
+    StoreId,
     SweepRead,
 )
 from workbench.recording.reader.scan import NOTES, SUFFIXES, RecordingFiles, broken, files_named, scan_folder
@@ -147,13 +147,13 @@ def read_recording(
     return episode
 
 
-def read_rerun_info(path: Path) -> tuple[str | None, bytes | None]:
-    """Rerun's id and the blueprint of the recording in an ``.rrd``. Raises as `read_recording`."""
+def read_store_id(path: Path) -> str:
+    """Rerun's id of the recording in an ``.rrd``. Raises as `read_recording`."""
     path = Path(path).absolute()
     reader = _reader(path.parent, episodes=True)
     reader.allow(_link_targets([path]))
-    info, _ = _request(reader, ReadRerunInfo(path), RerunInfo, path.name)
-    return info.store, info.blueprint
+    store, _ = _request(reader, ReadStoreId(path), StoreId, path.name)
+    return store.id
 
 
 def read_sweep(path: Path) -> SweepResults:
@@ -257,7 +257,7 @@ def _thumbnail(jpeg: bytes | None) -> bytes | None:
 
 def _request(
     reader: Reader,
-    request: OpenEpisode | ReadRerunInfo | ReadSweep,
+    request: OpenEpisode | ReadStoreId | ReadSweep,
     kind: type[T],
     name: str,
     stopped: Callable[[], bool] = lambda: False,

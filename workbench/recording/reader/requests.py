@@ -69,8 +69,8 @@ class CloseEpisodes(msgspec.Struct, frozen=True):
     opened: list[int]
 
 
-class ReadRerunInfo(msgspec.Struct, frozen=True):
-    """Id and blueprint of an ``.rrd``, for rerun's viewer; answered by `RerunInfo`."""
+class ReadStoreId(msgspec.Struct, frozen=True):
+    """Rerun's id of the recording in an ``.rrd``; answered by `StoreId`."""
 
     path: Path
 
@@ -87,7 +87,7 @@ class Recover(msgspec.Struct, frozen=True):
     folder: Path
 
 
-Request = ReadRows | OpenEpisode | ReadPicture | CloseEpisodes | ReadRerunInfo | ReadSweep | Recover
+Request = ReadRows | OpenEpisode | ReadPicture | CloseEpisodes | ReadStoreId | ReadSweep | Recover
 
 
 class RowsRead(msgspec.Struct, frozen=True):
@@ -132,10 +132,8 @@ class PictureRead(msgspec.Struct, frozen=True):
     blob: bytes | None = None
 
 
-class RerunInfo(msgspec.Struct, frozen=True):
-    store: str | None
-    """Rerun's id of the recording."""
-    blueprint: bytes | None
+class StoreId(msgspec.Struct, frozen=True):
+    id: str
 
 
 class SweepRead(msgspec.Struct, frozen=True):
@@ -155,4 +153,4 @@ class ReadFailed(msgspec.Struct, frozen=True):
     message: str
 
 
-Answer = RowsRead | EpisodeRead | PictureRead | RerunInfo | SweepRead | Recovered | ReadFailed
+Answer = RowsRead | EpisodeRead | PictureRead | StoreId | SweepRead | Recovered | ReadFailed

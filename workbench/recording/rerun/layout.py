@@ -72,22 +72,12 @@ def chunks(episode: Episode) -> Iterator[Chunk]:
         ValueError: rerun refuses a value.
         OSError: a picture cannot be read.
     """
-    yield from shared_chunks(episode)
-    yield from own_chunks(episode)
-
-
-def shared_chunks(episode: Episode) -> Iterator[Chunk]:
-    """Those of `chunks` that the next episode of the scene has too: the same objects, with the same ids."""
-    assert episode.geometry is not None
-    yield _world()
-    yield from _meshes(episode.geometry, episode.info.env_index, _bodies(episode))
-    yield from _series(_numbers(episode))
-
-
-def own_chunks(episode: Episode) -> Iterator[Chunk]:
-    """The others of `chunks`."""
     poses, bodies = episode.poses, _bodies(episode)
-    assert poses is not None
+    assert poses is not None and episode.geometry is not None
+    numbers = _numbers(episode)
+    yield _world()
+    yield from _meshes(episode.geometry, episode.info.env_index, bodies)
+    yield from _series(numbers)
     still = _never_moves(poses)
     cameras = list(zip(episode.cameras, camera_entities([camera.info for camera in episode.cameras])))
     pieces = _pieces(episode.cameras)
@@ -110,7 +100,7 @@ def own_chunks(episode: Episode) -> Iterator[Chunk]:
         if not _never_moves(camera.pose):
             pose = np.concatenate(optical_pose(camera.pose), axis=1)
             yield from timed.poses([entity], camera.frame, pose[:, None])
-    for entity, _, values in _numbers(episode):
+    for entity, _, values in numbers:
         if values.size:
             yield timed.scalars(entity, states[len(states) - len(values) :], values)
     for number, some in pieces:

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import pyarrow as pa
-from rerun.chunk import LazyStore, RrdReader
+from rerun.chunk import LazyStore
 from rerun.error_utils import RerunWarning
 
 from workbench.machine.versions import PrivateName
 
 READING = "reading and recording .rrd files"
-BLUEPRINTS = "the layout that an .rrd opens with in rerun"
 PRIVATE_NAMES = (
     PrivateName("rerun.chunk:LazyStore", "_internal", READING),
     PrivateName("rerun_bindings:LazyStoreInternal", "_chunk_index", READING),
-    PrivateName("rerun:RecordingStream", "_from_native", BLUEPRINTS),
-    PrivateName("rerun_bindings", "new_blueprint", BLUEPRINTS),
-    PrivateName("rerun_bindings", "set_callback_sink_blueprint", BLUEPRINTS),
-    PrivateName("rerun_bindings", "flush_and_cleanup_orphaned_recordings", BLUEPRINTS),
-    PrivateName("rerun.blueprint:Blueprint", "_log_to_stream", BLUEPRINTS),
 )
-"""Those that this module and `append_blueprint` use."""
+"""Those that this module uses."""
 
 # Opening a truncated file raises an error; this warning would repeat it in the terminal.
 warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)
@@ -119,18 +111,6 @@ def decode_chunk(message: bytes) -> pa.RecordBatch:
         raise ValueError(f"not a chunk of rerun ({error})") from error
 
 
-def store_id(path: Path) -> str:
-    """Id of the recording in `path` in messages to rerun's viewer (``viewer_control.proto``).
-
-    Raises ValueError or OSError if there is none.
-    """
-    recordings = RrdReader(path).recordings()
-    if not recordings:
-        raise ValueError(f"{path.name} holds no recording")
-    application = recordings[0].application_id.replace("\\", "\\\\").replace(":", "\\:")
-    return f"Recording:{application}:{recordings[0].recording_id}"
-
-
 # --- protobuf --------------------------------------------------------------------------------------
 #
 # Only the two wire types in rerun's files: varint and bytes. Google's library needs message definitions, which rerun's
@@ -159,17 +139,6 @@ def read_fields(message: bytes | memoryview) -> list[Field]:
     return fields
 
 
-def write_fields(fields: Sequence[Field]) -> bytes:
-    """The message with `fields`."""
-    parts: list[bytes | memoryview] = []
-    for number, value in fields:
-        if isinstance(value, int):
-            parts += [_as_varint(number << 3 | _NUMBER), _as_varint(value)]
-        else:
-            parts += [_as_varint(number << 3 | _BYTES), _as_varint(len(value)), value]
-    return b"".join(parts)
-
-
 def _varint(content: memoryview) -> tuple[int, memoryview]:
     value = shift = 0
     for place, byte in enumerate(content[:10]):
@@ -178,12 +147,3 @@ def _varint(content: memoryview) -> tuple[int, memoryview]:
             return value, content[place + 1 :]
         shift += 7
     raise ValueError("a number without an end")
-
-
-def _as_varint(value: int) -> bytes:
-    content = bytearray()
-    while value > 0x7F:
-        content.append(value & 0x7F | 0x80)
-        value >>= 7
-    content.append(value)
-    return bytes(content)

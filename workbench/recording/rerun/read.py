@@ -300,6 +300,18 @@ def read_properties(path: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
+def store_id(path: Path) -> str:
+    """Id of the recording in `path` in messages to rerun's viewer (``viewer_control.proto``).
+
+    Raises ValueError, OSError or RuntimeError if there is none.
+    """
+    recordings = RrdReader(path).recordings()
+    if not recordings:
+        raise ValueError(f"{path.name} holds no recording")
+    application = recordings[0].application_id.replace("\\", "\\\\").replace(":", "\\:")
+    return f"Recording:{application}:{recordings[0].recording_id}"
+
+
 def _data_of(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.Array]]:
     """The columns of a chunk without timelines and row ids."""
     for field, column in zip(batch.schema, batch.columns):

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import datetime
-import errno
-import json
 import math
-import os
-import re
-import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
@@ -19,14 +14,13 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from rerun.chunk import Chunk, LazyChunkStream
+from rerun.chunk import Chunk
 from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.core.camera_data import moved_cameras_text
 from workbench.recording.episode.description import describe
 from workbench.recording.episode.document import fields_of, json_text
 from workbench.recording.episode.episode import Episode, EpisodeInfo, acted_by_text, movable_bounds
-from workbench.recording.rerun.append_blueprint import BlueprintBytes, add_blueprint, encode_blueprint
 from workbench.recording.rerun.chunks import STEP, property_chunk, static_chunk
 from workbench.recording.rerun.layout import (
     EVENTS,
@@ -37,10 +31,8 @@ from workbench.recording.rerun.layout import (
     camera_entities,
     chunks,
     evaluate_entity,
-    own_chunks,
-    shared_chunks,
 )
-from workbench.recording.rerun.shared_bytes import add_kept, is_known, keep, key_of, schema_hash
+from workbench.recording.rerun.stream import encode_blueprint, write_recording
 
 MAX_SERIES = 32
 """An ``evaluate()`` entry with more numbers is not drawn: it would hide the others."""
@@ -63,83 +55,21 @@ def write_rrd(episode: Episode, path: Path) -> None:
     # Without strict mode rerun drops a mesh that it refuses, with a warning.
     with catch_and_log_exceptions(strict=True):
         blueprint = _blueprint(application_id, arrangement(episode))
-        if episode.cameras:
-            everything = chain(_property_chunks(episode, properties(episode)), chunks(episode))
-            write_chunks(everything, path, application_id)
-            add_blueprint(path, blueprint)
-        else:
-            _write_small(episode, path, application_id, blueprint)
+        everything = chain(_property_chunks(episode), chunks(episode))
+        write_recording(path, application_id, blueprint, everything)
 
 
-def _write_small(episode: Episode, path: Path, application_id: str, blueprint: BlueprintBytes) -> None:
-    """Write an episode without pictures, whose scene is most of its file: the scene's bytes are kept for the next one."""
-    named = properties(episode)
-    texts = [
-        _texts_chunk(name, json_text(named.pop(name))) for name in ("versions", "source") if name in named
-    ]
-    own = [*_property_chunks(episode, named), *own_chunks(episode)]
-    shared = [*texts, *shared_chunks(episode)]
-    key = key_of(application_id, shared)
-    rest = None
-    if is_known(key):
-        write_chunks(own, path, application_id)
-        if add_kept(path, key, blueprint):
-            return
-        rest = schema_hash(path)
-    write_chunks(chain(own, shared), path, application_id)
-    if rest is not None:
-        keep(key, path, rest)
-    add_blueprint(path, blueprint)
-
-
-def _property_chunks(episode: Episode, named: Mapping[str, dict[str, Any]]) -> Iterator[Chunk]:
+def _property_chunks(episode: Episode) -> Iterator[Chunk]:
     written = datetime.datetime.fromisoformat(episode.info.written_at).timestamp()
     started = rr.encodings.TimeInt(seconds=written)
     info = rr.archetypes.RecordingInfo(name=_title(episode), start_time=started)
     yield static_chunk("/__properties", info)
-    for name, values in named.items():
+    for name, values in properties(episode).items():
         yield property_chunk(name, values)
 
 
 @lru_cache(maxsize=64)
-def _texts_chunk(name: str, texts: str) -> Chunk:
-    """The chunk of a property that most episodes of a process share, from its values as JSON."""
-    return property_chunk(name, json.loads(texts))
-
-
-def write_chunks(chunks: Iterable[Chunk], path: Path, application_id: str) -> None:
-    """Write `chunks` as one recording. Raises OSError, and errors of `chunks`."""
-    failed: list[BaseException] = []
-
-    def watched() -> Iterator[Chunk]:
-        try:
-            yield from chunks
-        except GeneratorExit:  # rerun has stopped reading
-            raise
-        except BaseException as error:
-            failed.append(error)
-            raise
-
-    stream = LazyChunkStream.from_iter(watched())
-    try:
-        # Rerun's default id is that of the process: two episodes of one process would become one.
-        stream.write_rrd(path, application_id=application_id, recording_id=uuid.uuid4().hex)
-    except RuntimeError as error:
-        if failed:
-            raise failed[0] from None
-        raise _disk_error(error, path) from error
-
-
-def _disk_error(error: RuntimeError, path: Path) -> OSError:
-    """The OSError for rerun's message of a disk error, with its errno."""
-    number = re.search(r"\(os error (\d+)\)", str(error))
-    if number is None:
-        return OSError(errno.EIO, f"{path.name} could not be written ({error})")
-    return OSError(int(number[1]), os.strerror(int(number[1])), str(path))
-
-
-@lru_cache(maxsize=64)
-def _blueprint(application_id: str, arranged: Arrangement) -> BlueprintBytes:
+def _blueprint(application_id: str, arranged: Arrangement) -> bytes:
     return encode_blueprint(application_id, blueprint_of(arranged))
 
 

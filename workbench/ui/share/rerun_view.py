@@ -18,7 +18,7 @@ from workbench.commands.command import Command, Refused
 from workbench.commands.page import TellUnfolded
 from workbench.commands.share import CloseRerun, OpenInRerun
 from workbench.machine.folders import web_assets_folder
-from workbench.recording.reader.reading import read_rerun_info
+from workbench.recording.reader.reading import read_store_id
 from workbench.recording.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, viewer_file, viewer_is_cached
 from workbench.ui.server.file_response import Downloads, FileReply
 from workbench.ui.server.gated_server import GatedServer
@@ -37,7 +37,6 @@ Moments = Mapping[Path, int]
 
 PANEL = "rerun"
 _SHOW = "/rerun/show/"
-_BLUEPRINT = ".rbl"
 _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
 
 
@@ -83,17 +82,12 @@ class RerunPages:
         if shown is None:
             return 404, "text/plain; charset=utf-8", b"There is no such recording."
         paths, moments = shown
-        part = asked.partition("/")[2]
-        for number, path in enumerate(paths):
-            if part == f"{number}{_BLUEPRINT}" and (blueprint := _blueprint(path)) is not None:
-                return 200, "application/octet-stream", blueprint
         names = ", ".join(path.stem for path in paths)
         # The first step too: rerun follows the data until it reads, at the end of a file, that it shall pause.
         begins = {**dict.fromkeys(paths, 0), **{path.resolve(): step for path, step in moments().items()}}
         page = render(
             "rerun_go_on",
             names=names,
-            blueprints=[f"{n}{_BLUEPRINT}" for n, path in enumerate(paths) if _blueprint(path)],
             paths=[self._offers.address(path) for path in paths],
             moments=[f"{store}@{step}" for store, step in _stores(begins)],
             viewer=_VIEWER,
@@ -101,23 +95,12 @@ class RerunPages:
         return 200, "text/html; charset=utf-8", page.encode()
 
 
-def _blueprint(path: Path) -> bytes | None:
-    try:
-        return read_rerun_info(path)[1]
-    except (ValueError, OSError) as error:
-        log.info("%s shows no blueprint of its own before it is read: %s", path.name, error)
-        return None
-
-
 def _stores(moments: Moments) -> Iterator[tuple[str, int]]:
     for path, step in moments.items():
         try:
-            store, _ = read_rerun_info(path)
+            yield read_store_id(path), step
         except (ValueError, OSError) as error:
             log.warning("rerun cannot be told to open %s at step %d: %s", path.name, step, error)
-            continue
-        if store is not None:
-            yield store, step
 
 
 def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:
