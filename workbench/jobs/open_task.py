@@ -47,7 +47,7 @@ from workbench.core.rules import Degree, Finding
 from workbench.core.scene.read_scene import read_geometry
 from workbench.core.scene.scene_index import joint_names
 from workbench.jobs.task import ActionDimension, TaskDescription, TaskOptions
-from workbench.machine.versions import moved_text, untested, untested_text
+from workbench.machine.versions import untested, untested_text
 
 
 @dataclass(frozen=True)
@@ -344,12 +344,11 @@ def _rerun_notice() -> str:
     if not untested(["rerun-sdk"]):
         return ""  # rerun is not imported to open a task: it takes 0.3 s
     try:
-        from workbench.recording.rerun.private_api import PRIVATE_NAMES
-
-        text = moved_text(each for each in PRIVATE_NAMES if not each.exists())
+        import workbench.recording.rerun.read
+        import workbench.recording.rerun.write  # noqa: F401
     except ImportError as error:
-        text = f"Recordings are not possible: {error}."
-    return f"{text} {untested_text()}" if text else ""
+        return f"Recordings are not possible: {error}. {untested_text()}"
+    return ""
 
 
 def _rules(loaded: LoadedTask, options: TaskOptions) -> Degree | None:

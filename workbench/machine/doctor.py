@@ -47,10 +47,8 @@ VERSION_QUESTIONS = """
 import json
 from workbench.core import maniskill_private
 from workbench.machine.versions import moved_text
-from workbench.recording.rerun import private_api
 from workbench.ui.server import viser_private
-moved = [*maniskill_private.moved_names(), *(each for each in private_api.PRIVATE_NAMES if not each.exists())]
-print(json.dumps({"moved": moved_text(moved), "viser": viser_private.missing_names()}))
+print(json.dumps({"moved": moved_text(maniskill_private.moved_names()), "viser": viser_private.missing_names()}))
 """
 
 

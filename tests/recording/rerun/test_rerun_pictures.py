@@ -1,4 +1,4 @@
-"""What of a recording is read only when it is looked at, or not at all because another one has brought it."""
+"""Pictures of a recording are read when they are looked at."""
 
 from __future__ import annotations
 
@@ -7,20 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
 
 from tests.drive.episodes import made, write
 from tests.recording.refused_calls import descriptors
 from workbench.recording.episode.episode import CameraTrack, Episode
+from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun import read
-from workbench.recording.rerun.chunks import STEP
-from workbench.recording.rerun.private_api import IndexedChunk, decode_chunk, index_of
+from workbench.recording.rerun import layout, read
 
 
-def camera_of(episode: Episode) -> CameraTrack:
+def camera_of(episode: Episode, rgb: bool = True) -> CameraTrack:
     (track,) = episode.cameras
-    assert track.rgb is not None and track.segmentation is not None
+    assert (track.rgb is not None) == rgb and track.segmentation is not None
     return track
 
 
@@ -30,42 +28,71 @@ def brightness(episode: Episode, index: int) -> int:
     return int(np.rint(track.rgb[index].mean()))
 
 
-def pictures_in(rrd: Path) -> list[IndexedChunk]:
-    places = index_of(RrdReader(rrd).store(), STEP)
-    return [place for place in places if "EncodedImage:blob" in place.components and not place.static]
-
-
-def test_a_chunk_is_decoded_as_rerun_decodes_it(tmp_path: Path) -> None:
-    rrd = write(tmp_path, made(5)).with_suffix(".rrd")
-    content = rrd.read_bytes()
-    theirs = {}
-    for chunk in RrdReader(rrd).stream():
-        batch = chunk.to_record_batch()
-        theirs[chunk.entity_path, chunk.is_static, tuple(sorted(batch.schema.names))] = batch
-    places = index_of(RrdReader(rrd).store(), STEP)
-    assert len(places) == len(theirs) > 20
-    for place in places:
-        ours = decode_chunk(content[place.begin : place.end])
-        expected = theirs[place.entity, place.static, tuple(sorted(ours.schema.names))]
-        for name in ours.schema.names:
-            # As words: nan is not nan.
-            assert repr(ours.column(name).to_pylist()) == repr(expected.column(name).to_pylist()), (
-                place.entity
-            )
-
-
-def test_pictures_are_read_when_they_are_looked_at(tmp_path: Path) -> None:
+def test_pictures_of_a_file_that_is_damaged_while_it_is_open_are_an_error(tmp_path: Path) -> None:
     rrd = write(tmp_path, made(9)).with_suffix(".rrd")
     intact, damaged = read_episode(rrd), read_episode(rrd)
     assert brightness(intact, 4) == pytest.approx(80, abs=3)
     with rrd.open("r+b") as file:
-        for place in pictures_in(rrd):
-            file.seek(place.begin)
-            file.write(bytes(place.end - place.begin))
+        file.write(bytes(rrd.stat().st_size))
     assert brightness(intact, 5) == pytest.approx(100, abs=3), "its neighbours came with it"
     with pytest.raises(OSError, match="damaged"):
         brightness(damaged, 4)
-    assert len(read_episode(rrd).reward) == 9, "all else can be read"
+
+
+@pytest.mark.parametrize("part", np.linspace(0.3, 0.9, 7))
+def test_of_an_rrd_that_is_damaged_somewhere_the_rest_is_read_or_it_is_refused(
+    tmp_path: Path, part: float
+) -> None:
+    rrd = tmp_path / "alone.rrd"
+    write(tmp_path, made(9)).with_suffix(".rrd").rename(rrd)
+    with rrd.open("r+b") as file:
+        file.seek(int(part * rrd.stat().st_size))
+        file.write(bytes(500))
+    try:
+        episode = read_episode(rrd)
+    except UnreadableRecording as error:
+        assert rrd.name in str(error)
+        return
+    assert episode.reward.tolist() == list(range(1, 10))
+    (camera,) = episode.cameras
+    lost = {name for name in ("rgb", "depth", "segmentation") if getattr(camera, name) is None}
+    told = " ".join(broken.sentence for broken in episode.broken_files)
+    assert lost == {name for name in ("rgb", "depth", "segmentation") if f"base_camera/{name}" in told}
+
+
+def test_damaged_pictures_do_not_cost_the_other_cameras(tmp_path: Path) -> None:
+    rrd = tmp_path / "alone.rrd"
+    write(tmp_path, made(9)).with_suffix(".rrd").rename(rrd)
+    content = rrd.read_bytes()
+    place = content.index(b"\xff\xd8\xff\xe0")  # of the first JPEG
+    rrd.write_bytes(content[:place] + bytes(64) + content[place + 64 :])
+    episode = read_episode(rrd)
+    track = camera_of(episode, rgb=False)
+    assert track.rgb is None and track.depth is not None
+    assert track.depth[3] == pytest.approx(0.3)
+    (broken,) = episode.broken_files
+    assert broken.sentence == "alone.rrd was changed: pictures are missing (base_camera/rgb)."
+
+
+def test_pictures_of_a_deleted_recording_are_read_while_it_is_open(tmp_path: Path) -> None:
+    rrd = write(tmp_path, made(9)).with_suffix(".rrd")
+    episode = read_episode(rrd)
+    rrd.unlink()
+    assert brightness(episode, 4) == pytest.approx(80, abs=3)
+
+
+def test_pictures_of_several_chunks_are_read_in_any_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(layout, "_MOST_PICTURES", 3)
+    monkeypatch.setattr(read, "KEPT_BYTES", 0)
+    episode = read_episode(write(tmp_path, made(10)).with_suffix(".rrd"))
+    assert camera_of(episode).frame.tolist() == list(range(11))
+    order = [10, 0, 5, 3, 9, 2, 2, 7]
+    assert [brightness(episode, i) for i in order] == pytest.approx([20 * i for i in order], abs=3)
+    segmentation = camera_of(episode).segmentation
+    assert segmentation is not None
+    assert all((segmentation[i] == 1).all() for i in order)
 
 
 def test_a_picture_here_and_there_is_of_the_state_that_it_was_taken_at(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from workbench.recording.maniskill.read import read_maniskill as read_maniskill
 from workbench.recording.maniskill.safe_h5 import open_h5
 from workbench.recording.maniskill.write import TRAJECTORY
 from workbench.recording.rerun.layout import (
+    CAMERAS,
     OBSERVATION,
     batch_entity,
     body_entities,
@@ -90,6 +91,10 @@ def read_without_task(path: Path, shapes: SharedShapes | None = None) -> tuple[E
         try:
             check(files[".rrd"], checksums)
             table = RerunTable(files[".rrd"], shapes)
+            if table.lost_pictures:
+                cameras = ", ".join(entity.removeprefix(f"{CAMERAS}/") for entity in table.lost_pictures)
+                what = f"was changed: pictures are missing ({cameras})."
+                broken_files.append(BrokenFile(files[".rrd"].name, what))
         except (OSError, ValueError, RuntimeError) as error:
             lost = "its 3-D scene, its pictures and what evaluate() said are missing"
             broken_files.append(_broken_file(files[".rrd"], error, lost))

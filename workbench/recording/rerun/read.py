@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import threading
+import warnings
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from rerun.chunk import Chunk, LazyStore, RrdReader
+from rerun.error_utils import RerunWarning
 
 from workbench.core.camera_data import CameraInfo
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
@@ -27,19 +29,22 @@ from workbench.recording.episode.encoded_pictures import (
     encode,
 )
 from workbench.recording.rerun.chunks import LOOK, STEP
-from workbench.recording.rerun.private_api import IndexedChunk, decode_chunk, index_of
 
 _PROPERTIES = "/__properties"
 _ALL = ("+ /**", f"+ {_PROPERTIES}/**")
 """``/**`` does not include rerun's own entities."""
+
+# Opening a truncated file raises an error; this warning would repeat it in the terminal.
+warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)
 
 
 class RerunTable:
     """The content of an ``.rrd`` by entity and component.
 
     Rerun's query engine is an extra of 100 MB, but chunks are Arrow tables, so columns that `layout` wrote come out as
-    columns. Pictures are read on access (`pictures`). A mesh is in every recording of its scene, often as the same chunk:
-    one that another recording has loaded is found by its id in the index, and not read again.
+    columns. The file is read once, in pieces; pictures are not kept, but read again on access (`pictures`). A mesh is in
+    every recording of its scene, often as the same chunk: one that another recording has loaded is found by the chunk's id,
+    and not decoded again.
 
     The file stays open while its pictures may be read, also after it is deleted.
     """
@@ -54,53 +59,53 @@ class RerunTable:
         self._shapes = SharedShapes() if shapes is None else shapes
         self._timed: dict[tuple[str, str], list[tuple[NDArray[np.int64], pa.Array]]] = {}
         self._static: dict[tuple[str, str], pa.Array] = {}
+        self._pictures: dict[tuple[str, str], list[_PictureChunk]] = {}
+        self._static_chunks: dict[str, list[tuple[str, int]]] = {}
+        """Id and size of the static chunks of each entity."""
+        self.lost_pictures: tuple[str, ...] = ()
+        """Entities whose pictures cannot be read, because the file is damaged there."""
         self._file = OpenFile(path)
-        self._pictures: dict[tuple[str, str], list[IndexedChunk]] = {}
-        self._known: dict[str, tuple[str, Mesh, Material]] = {}
-        """Visuals by entity that another recording has loaded."""
-        self._alone: dict[str, IndexedChunk] = {}
-        """The static chunk of each entity with exactly one."""
-        store = RrdReader(self._file.for_rerun).store()
-        self._scan_index(index_of(store, STEP))
-        for chunk in self._chunks(store):
-            batch = chunk.to_record_batch()
-            steps = None
-            if not chunk.is_static:
-                index = batch.schema.get_field_index(STEP)
-                if index < 0:
-                    continue
-                steps = batch.column(index).cast(pa.int64(), safe=False).to_numpy()
+        chunks = self._file.chunks(*_ALL)
+        try:
+            for chunk in chunks:
+                self._add(chunk)
+        except (ValueError, RuntimeError):
+            self._read_what_is_left()
+
+    def _read_what_is_left(self) -> None:
+        """Read a damaged file: pictures are most of it, and one of them should not cost the rest."""
+        for held in (self._timed, self._static, self._pictures, self._static_chunks):
+            held.clear()
+        pictures = self._file.entities_with(PICTURE_COMPONENTS.values())
+        for chunk in self._file.chunks(*_ALL, *(f"- {entity}" for entity in pictures)):
+            self._add(chunk)
+        for entity in pictures:
+            try:
+                read = list(self._file.chunks(f"+ {entity}"))
+            except (ValueError, RuntimeError):
+                self.lost_pictures += (entity,)
+                continue
+            for chunk in read:
+                self._add(chunk)
+
+    def _add(self, chunk: Chunk) -> None:
+        batch = chunk.to_record_batch()
+        entity = chunk.entity_path
+        if chunk.is_static:
+            self._static_chunks.setdefault(entity, []).append((chunk.id, batch.nbytes))
             for name, column in _data_of(batch):
-                key = (chunk.entity_path, name)
-                if steps is not None:
-                    self._timed.setdefault(key, []).append((steps, column))
-                elif len(column) and column[len(column) - 1].is_valid:
-                    self._static[key] = column[len(column) - 1].values
-
-    def _scan_index(self, index: Sequence[IndexedChunk]) -> None:
-        """Find the chunks in the index that need not be read."""
-        several = set()
-        for place in index:
-            if not place.static:
-                for component in set(place.components) & set(PICTURE_COMPONENTS.values()):
-                    self._pictures.setdefault((place.entity, component), []).append(place)
-            elif place.entity in self._alone:
-                several.add(place.entity)
+                if len(column) and column[len(column) - 1].is_valid:
+                    self._static[entity, name] = column[len(column) - 1].values
+            return
+        steps = _steps(batch)
+        if steps is None:
+            return
+        for name, column in _data_of(batch):
+            if name in PICTURE_COMPONENTS.values():
+                # A copy: Arrow's would keep the pictures of the chunk in memory.
+                self._pictures.setdefault((entity, name), []).append(_PictureChunk(chunk.id, steps.copy()))
             else:
-                self._alone[place.entity] = place
-        for entity in several:
-            del self._alone[entity]
-        for entity, place in self._alone.items():
-            known = self._shapes.known(_content_key(place))
-            if known is not None:
-                self._known[entity] = known
-
-    def _chunks(self, store: LazyStore) -> Iterator[Chunk]:
-        # Rerun's reader can skip whole entities only.
-        pictures = [f"- {entity}" for entity in {entity for entity, _ in self._pictures}]
-        yield from store.stream().filter(content=[*_ALL, *pictures], is_static=False)
-        known = [f"- {entity}" for entity in self._known]
-        yield from store.stream().filter(content=[*_ALL, *known], is_static=True)
+                self._timed.setdefault((entity, name), []).append((steps, column))
 
     def property(self, name: str, component: str) -> Any:
         """A property's value, a list of several, None if missing."""
@@ -153,12 +158,11 @@ class RerunTable:
     def pictures(
         self, entity: str, modality: Modality, info: CameraInfo
     ) -> tuple[NDArray[np.int64], EncodedPictures] | None:
-        """States and pictures of ``<camera>/<modality>``; None if there are none. Raises OSError."""
-        places = self._pictures.get((entity, PICTURE_COMPONENTS[modality]), [])
-        if not places:
+        """States and pictures of ``<camera>/<modality>``; None if there are none."""
+        chunks = self._pictures.get((entity, PICTURE_COMPONENTS[modality]), [])
+        if not chunks:
             return None
-        places = sorted(places, key=lambda place: (place.steps or (0, 0))[0])
-        return pictures_in(self._file, places, modality, info.height, info.width)
+        return pictures_in(self._file, entity, chunks, modality, info.height, info.width)
 
     def geometry(self, bare: SceneGeometry, entities: Sequence[str]) -> SceneGeometry:
         """`bare` with the visuals of its bodies, shared with other recordings; `entities` are the bodies'."""
@@ -181,15 +185,18 @@ class RerunTable:
 
     def _visual_at(self, entity: str, default: str) -> tuple[str, Mesh, Material] | None:
         """Name (`default` if not recorded), mesh and material of a visual; None if there is none."""
-        if entity in self._known:
-            return self._known[entity]
+        chunks = self._static_chunks.get(entity, [])
+        # Rerun's ids are unique; the size guards against manipulated files.
+        mark = chunks[0] if len(chunks) == 1 else None
+        if mark is not None and (known := self._shapes.known(mark)) is not None:
+            return known
         mesh = self._mesh(entity)
         if mesh is None:
             return None
         name, material = self._look(entity, default)
         mesh, material = self._shapes.shared(mesh, material)
-        if entity in self._alone and {(entity, LOOK), (entity, "visual")} & self._static.keys():
-            self._shapes.learn(_content_key(self._alone[entity]), name, mesh, material)
+        if mark is not None and {(entity, LOOK), (entity, "visual")} & self._static.keys():
+            self._shapes.learn(mark, name, mesh, material)
         return name, mesh, material
 
     def _mesh(self, entity: str) -> Mesh | None:
@@ -265,11 +272,6 @@ def rows_at(steps: NDArray[np.int64], first: int, states: int) -> NDArray[np.int
     return np.searchsorted(steps, np.arange(first, states), side="right") - 1
 
 
-def _content_key(place: IndexedChunk) -> tuple[bytes, int, int]:
-    """Key of a chunk's content. Rerun's ids are unique; the sizes guard against manipulated files."""
-    return (place.id, place.end - place.begin, place.unpacked)
-
-
 def _plain(values: pa.Array) -> NDArray:
     """The numbers in an array of numbers, of lists of numbers, or of bytes."""
     while pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
@@ -288,7 +290,7 @@ def read_properties(path: Path) -> dict[str, dict[str, Any]]:
     """
     found: dict[str, dict[str, Any]] = {}
     file = OpenFile(path)
-    for chunk in RrdReader(file.for_rerun).stream():
+    for chunk in RrdReader(file.path).stream():
         if not chunk.entity_path.startswith(_PROPERTIES):
             continue
         name = chunk.entity_path[len(_PROPERTIES) :].lstrip("/")
@@ -323,8 +325,6 @@ def _data_of(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.Array]]:
 
 KEPT_BYTES = 64 << 20
 """Decompressed chunks kept in the process; the newest is kept at any size."""
-MOST_ROWS = 1_000_000
-"""Limit of a chunk: the number comes from an untrusted index."""
 PICTURE_COMPONENTS: dict[Modality, str] = {
     "rgb": "EncodedImage:blob",
     "depth": "EncodedDepthImage:blob",
@@ -332,23 +332,48 @@ PICTURE_COMPONENTS: dict[Modality, str] = {
 }
 
 
+@dataclass(frozen=True)
+class _PictureChunk:
+    id: str
+    steps: NDArray[np.int64]
+    """(R,) state of each picture."""
+
+
 class OpenFile:
-    """An open file for chunks, usable from any thread."""
+    """An open ``.rrd``, usable from any thread."""
 
     def __init__(self, path: Path) -> None:
         """Raises OSError."""
         self.name, self._path = path.name, path
         with open_regular_file(path) as file:
             self._descriptor = os.dup(file.fileno())
+        self._store: LazyStore | None = None
 
     @property
-    def for_rerun(self) -> Path:
+    def path(self) -> Path:
         """A path by which rerun opens it, while this object lives: it takes no name that is not UTF-8."""
         try:
             os.fspath(self._path).encode()
         except UnicodeEncodeError:
             return Path(f"/proc/self/fd/{self._descriptor}")
         return self._path
+
+    def chunks(self, *content: str, is_static: bool | None = None) -> Iterator[Chunk]:
+        """The chunks of these entities, in rerun's filter syntax, read one after the other.
+
+        Raises ValueError or RuntimeError if it is not a complete ``.rrd``.
+        """
+        yield from self._opened().stream().filter(content=content, is_static=is_static)
+
+    def entities_with(self, components: Iterable[str]) -> tuple[str, ...]:
+        """Entities that have one of the components. Raises as `chunks`."""
+        columns, wanted = self._opened().schema().component_columns(), set(components)
+        return tuple({column.entity_path: None for column in columns if column.component in wanted})
+
+    def _opened(self) -> LazyStore:
+        if self._store is None:
+            self._store = RrdReader(self.path).store()
+        return self._store
 
     def __del__(self) -> None:
         if hasattr(self, "_descriptor"):
@@ -357,14 +382,6 @@ class OpenFile:
     def __reduce__(self) -> str:
         # In another process the descriptor would be another file, which `__del__` would close.
         raise TypeError("An open recording cannot be sent to another process; send its path.")
-
-    def chunk(self, place: IndexedChunk) -> pa.RecordBatch:
-        """The chunk at `place`. Raises OSError if it cannot be decoded."""
-        content = os.pread(self._descriptor, place.end - place.begin, place.begin)
-        try:
-            return decode_chunk(content)
-        except ValueError as error:
-            raise OSError(f"{self.name} is damaged at byte {place.begin}: {error}") from error
 
 
 class _ChunkCache:
@@ -375,19 +392,19 @@ class _ChunkCache:
     """
 
     def __init__(self) -> None:
-        self._chunks: OrderedDict[tuple[int, int], tuple[OpenFile, pa.Array]] = OrderedDict()
+        self._chunks: OrderedDict[tuple[int, str, str], tuple[OpenFile, pa.Array]] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
 
-    def rows(self, file: OpenFile, place: IndexedChunk, component: str) -> pa.Array:
-        """The rows of a component. Raises OSError."""
+    def rows(self, file: OpenFile, entity: str, chunk: str, component: str) -> pa.Array:
+        """The rows of a component in the chunk with that id. Raises OSError."""
         # The cache keeps the file alive, so its id is not reused.
-        key = (id(file), place.begin)
+        key = (id(file), entity, chunk)
         with self._lock:
             if key in self._chunks:
                 self._chunks.move_to_end(key)
                 return self._chunks[key][1]
-        rows = file.chunk(place).column(component)
+        rows = _read_rows(file, entity, chunk, component)
         with self._lock:
             if key not in self._chunks:
                 self._chunks[key] = (file, rows)
@@ -401,16 +418,36 @@ class _ChunkCache:
 _chunk_cache = _ChunkCache()
 
 
+def _read_rows(file: OpenFile, entity: str, chunk: str, component: str) -> pa.Array:
+    # Rerun's reader finds entities, not chunks: 10 ms for the 3,000 pictures of a camera (measured).
+    try:
+        for read in file.chunks(f"+ {entity}", is_static=False):
+            if read.id == chunk:
+                return read.to_record_batch().column(component)
+    except (ValueError, RuntimeError) as error:
+        raise OSError(f"{file.name} is damaged: {error}") from error
+    raise OSError(f"{file.name} has changed")
+
+
 def pictures_in(
-    file: OpenFile, places: Sequence[IndexedChunk], modality: Modality, height: int, width: int
+    file: OpenFile,
+    entity: str,
+    chunks: Sequence[_PictureChunk],
+    modality: Modality,
+    height: int,
+    width: int,
 ) -> tuple[NDArray[np.int64], EncodedPictures]:
-    """State (P,) of each picture, and the pictures, in the chunks `places`, ordered by time. Raises OSError."""
-    component, ends = PICTURE_COMPONENTS[modality], np.cumsum([place.rows for place in places])
+    """State (P,) of each picture, ascending, and the pictures."""
+    component = PICTURE_COMPONENTS[modality]
+    states = np.concatenate([chunk.steps for chunk in chunks])
+    order = np.argsort(states, kind="stable")
+    begins = np.cumsum([0, *(len(chunk.steps) for chunk in chunks)])
 
     def one(number: int) -> bytes:
-        part = int(np.searchsorted(ends, number, side="right"))
-        rows = _chunk_cache.rows(file, places[part], component)
-        content = rows[number - int(ends[part]) + len(rows)].values[0].values.to_numpy().tobytes()
+        place = int(order[number])
+        part = int(np.searchsorted(begins, place, side="right")) - 1
+        rows = _chunk_cache.rows(file, entity, chunks[part].id, component)
+        content = rows[place - int(begins[part])].values[0].values.to_numpy().tobytes()
         if modality != "segmentation":
             return content
         # The file holds plain ids: encode them as in the journal.
@@ -418,14 +455,10 @@ def pictures_in(
         ids = np.frombuffer(content, np.int32 if wide else np.uint16).reshape(height, width)
         return encode("segmentation", ids.astype(np.int32))
 
-    frames = np.concatenate([_steps(file, place) for place in places])
-    return frames, EncodedPictures(modality, LazyPictures(int(ends[-1]), one))
+    return states[order], EncodedPictures(modality, LazyPictures(len(states), one))
 
 
-def _steps(file: OpenFile, place: IndexedChunk) -> NDArray[np.int64]:
-    if place.rows > MOST_ROWS:
-        raise OSError(f"{file.name} claims {place.rows:,} pictures in one piece")
-    if place.steps is not None and place.steps[1] - place.steps[0] + 1 == place.rows:
-        return np.arange(place.steps[0], place.steps[1] + 1)
-    # With gaps, only the chunk itself has the states.
-    return file.chunk(place).column(STEP).cast(pa.int64(), safe=False).to_numpy()
+def _steps(batch: pa.RecordBatch) -> NDArray[np.int64] | None:
+    """(R,) state of each row; None if the chunk has no such timeline."""
+    index = batch.schema.get_field_index(STEP)
+    return None if index < 0 else batch.column(index).cast(pa.int64(), safe=False).to_numpy()
