@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
 from rerun.chunk import Chunk, RrdReader
 
 from tests.drive.episodes import Made, header_of, journal_of
@@ -178,3 +179,36 @@ def test_a_process_that_is_forked_meanwhile_does_not_hold_the_file_open(
     assert forked and not writing.is_alive()
     (path,) = tmp_path.glob("*.rrd")
     assert verify_rrd(path) is None
+
+
+def test_what_the_user_logs_with_rerun_meanwhile_stays_theirs(
+    child_process: None, make_episode: Maker, tmp_path: Path
+) -> None:
+    """An env that is recorded may log with rerun itself: to a stream, to one of its thread, and to the global recording."""
+
+    def log_and_record(name: str, log: Callable[[str, rr.TextLog], None]) -> None:
+        for step in range(5):
+            log(f"before/{step}", rr.TextLog(name))
+            writing = threading.Thread(target=lambda: make_episode().write(tmp_path / "ours"))
+            writing.start()
+            writing.join()
+            log(f"after/{step}", rr.TextLog(name))
+
+    own, of_thread = (rr.RecordingStream("theirs", recording_id=name) for name in ("own", "thread"))
+    own.save(tmp_path / "own.rrd")
+    of_thread.save(tmp_path / "thread.rrd")
+    log_and_record("own", own.log)
+    with of_thread:
+        log_and_record("thread", rr.log)
+    rr.init("theirs", recording_id="global")
+    rr.save(tmp_path / "global.rrd")
+    log_and_record("global", rr.log)
+    rr.disconnect()
+    own.disconnect()
+    wanted = {f"/{when}/{step}" for when in ("before", "after") for step in range(5)}
+    for name in ("own", "thread", "global"):
+        reader = RrdReader(tmp_path / f"{name}.rrd")
+        assert [store.recording_id for store in reader.recordings()] == [name]
+        held = {chunk.entity_path for chunk in reader.stream()}
+        assert {entity for entity in held if not entity.startswith("/__properties")} == wanted
+    assert all(verify_rrd(path) is None for path in (tmp_path / "ours").glob("*.rrd"))

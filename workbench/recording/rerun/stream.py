@@ -82,8 +82,10 @@ def _rerun_enabled() -> Iterator[None]:
 
 
 def _end_threads(application_id: str) -> None:
-    """End the threads of streams that nobody refers to. Else each stream leaves two, for as long as the process lives."""
-    rr.init(application_id, init_logging=False)
+    """End the threads of disconnected streams. Else each leaves two, for as long as the process lives."""
+    # It also turns off the global recording, to which the user's code may log: their data count more than our threads.
+    if rr.get_global_data_recording() is None and rr.get_thread_local_data_recording() is None:
+        rr.init(application_id, init_logging=False)
 
 
 class _File(Protocol):
