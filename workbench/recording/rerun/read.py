@@ -65,9 +65,8 @@ class RerunTable:
         self.lost_pictures: tuple[str, ...] = ()
         """Entities whose pictures cannot be read, because the file is damaged there."""
         self._file = OpenFile(path)
-        chunks = self._file.chunks(*_ALL)
         try:
-            for chunk in chunks:
+            for chunk in self._file.chunks(*_ALL):
                 self._add(chunk)
         except (ValueError, RuntimeError):
             self._read_what_is_left()
@@ -81,12 +80,12 @@ class RerunTable:
             self._add(chunk)
         for entity in pictures:
             try:
-                read = list(self._file.chunks(f"+ {entity}"))
+                for chunk in self._file.chunks(f"+ {entity}"):
+                    self._add(chunk)
             except (ValueError, RuntimeError):
                 self.lost_pictures += (entity,)
-                continue
-            for chunk in read:
-                self._add(chunk)
+                for component in PICTURE_COMPONENTS.values():
+                    self._pictures.pop((entity, component), None)
 
     def _add(self, chunk: Chunk) -> None:
         batch = chunk.to_record_batch()
