@@ -201,9 +201,12 @@ def test_what_the_user_logs_with_rerun_meanwhile_stays_theirs(
     with of_thread:
         log_and_record("thread", rr.log)
     rr.init("theirs", recording_id="global")
-    rr.save(tmp_path / "global.rrd")
-    log_and_record("global", rr.log)
-    rr.disconnect()
+    try:
+        rr.save(tmp_path / "global.rrd")
+        log_and_record("global", rr.log)
+        rr.disconnect()
+    finally:
+        rr.set_global_data_recording(None)  # the tests after this one have the same process
     own.disconnect()
     wanted = {f"/{when}/{step}" for when in ("before", "after") for step in range(5)}
     for name in ("own", "thread", "global"):
