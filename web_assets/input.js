@@ -20,6 +20,7 @@
   const TWICE = 450; // milliseconds between two presses
   const NOTICE = 8000; // milliseconds
   const DRAWN = 1000; // milliseconds after which what was entered is drawn
+  const AWAY = 1500; // milliseconds without a connection, after which the page says so
 
   // --- the channel ------------------------------------------------------------------------------------------------------
 
@@ -86,14 +87,44 @@
       lost();
     }
     const opened = Date.now();
+    let refused = true;
     const mine = new WebSocket(`${location.origin.replace("http", "ws")}/do?${new URLSearchParams({ page })}`);
     socket = mine;
-    mine.onopen = () => early.splice(0).forEach((message) => mine.send(message));
+    mine.onopen = () => {
+      refused = false;
+      clearTimeout(away);
+      away = 0;
+      gone?.remove();
+      early.splice(0).forEach((message) => mine.send(message));
+    };
     mine.onmessage = ({ data }) => answered(JSON.parse(data));
     mine.onclose = () => {
       lost();
+      away ||= setTimeout(tellGone, AWAY);
+      if (refused) reloadIfShutOut();
       setTimeout(() => socket === mine && connect(), Math.max(200, opened + 1000 - Date.now()));
     };
+  }
+
+  let away = 0; // timer of the notice
+  let gone = null; // the notice
+  function tellGone() {
+    gone = document.createElement("div");
+    gone.className = "wb-server-gone";
+    gone.setAttribute("role", "alert");
+    const what = document.createElement("b");
+    what.textContent = `No answer from the workbench at ${location.host}.`;
+    gone.append(
+      what,
+      " What you see is the last that it sent, and nothing here can be pressed. If its command still runs in a terminal, look at the way there (network, ssh). If it has ended, start it again and open the address that it prints. This page goes on by itself as soon as it answers.",
+    );
+    document.body.append(gone);
+  }
+
+  // After the token was renewed the server refuses the connection; the page that it sends then says what to do.
+  async function reloadIfShutOut() {
+    const reply = await fetch("/workbench/logo.svg", { cache: "no-store" }).catch(() => null);
+    if (reply?.status === 403) location.reload();
   }
 
   // What was not answered may be done or not, and is not asked again: minutes later it would surprise.

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, expect
 
+from tests.drive.far_line import line_to
 from tests.drive.page import new_page, open_workbench
+from workbench.ui.server.gated_server import ServerOptions, open_server
+from workbench.ui.widgets.visitors import PATH, Visitors
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -23,3 +26,24 @@ def test_a_server_that_is_gone_is_said_with_its_address(browser: Browser, tmp_pa
         gone = page.get_by_role("alert").filter(has_text=opened.url.split("/")[2])
         expect(gone).to_be_in_viewport()
         page.close()
+
+
+def test_the_notice_goes_when_the_server_can_be_reached_again(browser: Browser) -> None:
+    gated_server = open_server(ServerOptions(port=0))
+    gated_server.add_channel(PATH, Visitors(gated_server.server).serve)
+    try:
+        with line_to(gated_server.url) as line:
+            page, _ = new_page(browser, drawn=False)
+            page.goto(line.address(gated_server.url))
+            page.wait_for_selector("[data-page]", state="attached")
+        gone = page.get_by_role("alert").filter(has_text=str(line.port))
+        expect(gone).to_be_in_viewport()
+        page.wait_for_timeout(3000)  # it tries again meanwhile
+        expect(gone).to_have_count(1)
+        with line_to(gated_server.url, port=line.port):
+            expect(gone).to_have_count(0)
+            page.wait_for_timeout(2000)  # in which it would come again
+            expect(gone).to_have_count(0)
+            page.close()
+    finally:
+        gated_server.close()

@@ -29,6 +29,7 @@ class FarLine:
     room: int = 2 << 20
     """Bytes a connection that wait in it: the window of a channel of ssh."""
     port: int = 0
+    """Its near end; 0 takes any free one."""
     down: int = 0
     """Bytes that reached the browsers so far."""
     up: int = 0
@@ -89,6 +90,7 @@ class FarLine:
                 writer.close()
             finally:
                 delivering.cancel()
+                writer.close()
 
         async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             back, out = await asyncio.open_connection("127.0.0.1", port)
@@ -96,7 +98,7 @@ class FarLine:
             with contextlib.suppress(asyncio.CancelledError):
                 await asyncio.gather(carry(reader, out, "up"), carry(back, writer, "down"))
 
-        server = await asyncio.start_server(accept, "127.0.0.1", 0)
+        server = await asyncio.start_server(accept, "127.0.0.1", self.port)
         self.port = server.sockets[0].getsockname()[1]
         self.loop = asyncio.get_running_loop()
         ready.set()
@@ -104,12 +106,14 @@ class FarLine:
 
 
 @contextmanager
-def line_to(url: str, bits_per_second: float = float("inf"), delay: float = 0.0) -> Iterator[FarLine]:
-    """A line to the server of this address."""
-    line, ready = FarLine(bits_per_second, delay), threading.Event()
-    port = urlsplit(url).port
-    assert port is not None
-    thread = threading.Thread(target=lambda: asyncio.run(line.serve(port, ready)), daemon=True)
+def line_to(
+    url: str, bits_per_second: float = float("inf"), delay: float = 0.0, port: int = 0
+) -> Iterator[FarLine]:
+    """A line to the server of this address. At its end all its connections are lost."""
+    line, ready = FarLine(bits_per_second, delay, port=port), threading.Event()
+    far_port = urlsplit(url).port
+    assert far_port is not None
+    thread = threading.Thread(target=lambda: asyncio.run(line.serve(far_port, ready)), daemon=True)
     thread.start()
     assert ready.wait(10.0)
     try:

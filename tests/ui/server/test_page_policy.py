@@ -19,6 +19,7 @@ from workbench.machine.folders import web_assets_folder
 from workbench.ui.server import responses
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.responses import DIRECTIVES, HANDLERS
+from workbench.ui.widgets.visitors import PATH, Visitors
 
 
 @pytest.fixture
@@ -121,9 +122,10 @@ def test_code_that_came_into_the_page_as_html_does_not_run(gated_server, browser
 @pytest.mark.browser
 def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
     gated_server = open_server(ServerOptions(port=0))
+    gated_server.add_channel(PATH, Visitors(gated_server.server).serve)
     try:
         with page_at(browser, gated_server.url) as (page, _):
-            until(gated_server.server.get_clients, "the page")
+            page.wait_for_selector("[data-page]", state="attached")
             gated_server.renew_token()
             page.wait_for_selector("text=Open the address that the terminal shows", timeout=60_000)
             page.goto(gated_server.url, wait_until="domcontentloaded")
@@ -135,8 +137,8 @@ def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
 @pytest.mark.browser
 @pytest.mark.slow
 def test_each_exception_is_needed(filled, browser, monkeypatch):
-    # 'self' means ws: too in Chromium, but not in every browser; connect-src 'self' is what let_in.js asks when the
-    # connection is lost, see the test above.
+    # 'self' means ws: too in Chromium, but not in every browser; connect-src 'self' is what input.js asks when the
+    # connection is refused, see the test above.
     elsewhere = {("connect-src", source) for source in ("'self'", "ws://{authority}", "wss://{authority}")}
     # viser's scripts by their hashes; without one there is no page.
     exceptions = [

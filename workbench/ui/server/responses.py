@@ -31,7 +31,6 @@ and body, or a file. Runs in a thread, so it may read files."""
 SCRIPTS = (
     "no_eval.js",
     "needs_webgl.js",
-    "let_in.js",
     "typed_ahead.js",
     "input.js",
     "into_sight.js",
