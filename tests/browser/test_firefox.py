@@ -96,7 +96,7 @@ def test_inputs_are_written_as_their_labels(page: Firefox) -> None:
 
 def test_the_console_tells_of_nothing_but_the_eval_that_is_forbidden(page: Firefox) -> None:
     page.text()
-    # viser's sorter of splats makes functions from text when the page is loaded (no_eval.js); Firefox tells of it even so.
+    # viser's sorter of splats makes functions from text when the page is loaded (browser.js); Firefox tells of it even so.
     assert [
         said for said in page.errors if not re.search("blocked a JavaScript eval|blocked by CSP", said)
     ] == []

@@ -55,7 +55,7 @@ class InSoftware:
         self._making: threading.Thread | None = None
 
     def ask(self) -> None:
-        """Let the pages tell (``drawn_in_software.js``). Call it in the main panel of each new page."""
+        """Let the pages tell (``browser.js``). Call it in the main panel of each new page."""
         self._server.gui.add_html(render("tell", command=TellDrawnInSoftware(), only="drawn-in-software"))
 
     def told_by(self, visitor: Visitor) -> None:

@@ -29,8 +29,7 @@ Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
 and body, or a file. Runs in a thread, so it may read files."""
 
 SCRIPTS = (
-    "no_eval.js",
-    "needs_webgl.js",
+    "browser.js",
     "typed_ahead.js",
     "input.js",
     "into_sight.js",
@@ -40,7 +39,6 @@ SCRIPTS = (
     "view_width.js",
     "envs_width.js",
     "key_list.js",
-    "drawn_in_software.js",
     "tab_title.js",
     "task_list.js",
     "tab_stays.js",
@@ -252,7 +250,7 @@ def _scripts() -> str:
 # - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not unsafe-inline: HTML from a name,
 #   a note or a file that slipped past escaping still would not run. unsafe-hashes allows the handlers of our templates
 #   and no others. wasm-unsafe-eval is for the program that unpacks the server's messages. eval stays forbidden: viser
-#   needs it for Gaussian splats and Plotly, which the workbench has not (web_assets/no_eval.js).
+#   needs it for Gaussian splats and Plotly, which the workbench has not (web_assets/browser.js).
 # - worker-src blob: viser's connection and its sorting run in workers made from texts.
 # - style-src 'unsafe-inline': viser's widgets and our HTML have styles in their tags; a style runs no code.
 # - img-src data: blob: pictures from the websocket, and viser's icons.

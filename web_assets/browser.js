@@ -1,0 +1,55 @@
+// What this browser cannot do: draw with WebGL 2 at all, or on a graphics card.
+"use strict";
+{
+  const SOFTWARE = /swiftshader|llvmpipe|softpipe|software/i; // as in viser's BrowserWarning.tsx
+  const [TOLD, NOTICE] = ["wb-told-software", 8000]; // milliseconds
+  const NO_WEBGL = `<h1>This browser has no WebGL 2</h1>
+    <p>Workbench draws its 3-D view with WebGL 2, and shows nothing without it. The workbench itself is running. What to do:</p>
+    <ul>
+      <li><b>Chrome, Edge, Chromium:</b> in Settings, System, turn on “Use graphics acceleration when available”, and restart the browser. chrome://gpu says what is off.</li>
+      <li><b>Firefox:</b> open about:config, and set webgl.disabled to false and webgl.force-enabled to true. about:support, Graphics, says what is off.</li>
+      <li><b>No GPU (a virtual machine, a remote desktop):</b> start Chrome or Chromium with --enable-unsafe-swiftshader, which draws in software; or forward the port over ssh and open the page in a browser on your own machine.</li>
+    </ul>`;
+
+  function tellNoWebGL() {
+    const box = document.createElement("div");
+    box.className = "wb-needs-webgl";
+    box.setAttribute("role", "alert");
+    box.innerHTML = NO_WEBGL;
+    document.body.append(box);
+  }
+
+  // viser lowers the resolution of its view when frames come slowly. In software the page answers nothing for 0.2 to 0.8 s
+  // while it makes the new buffers. viser reads a fixed resolution from its address, once, before it makes its canvas; there it
+  // does not stay, for people copy addresses.
+  function fixResolution() {
+    const KEY = "fixedDpr"; // viser 1.1, DevSettingsStore.ts
+    const address = new URL(location.href);
+    if (address.searchParams.has(KEY)) return;
+    const before = address.href;
+    address.searchParams.set(KEY, Math.min(Math.max(devicePixelRatio, 1), 2)); // as react-three-fiber's canvas by itself
+    history.replaceState(history.state, "", address);
+    new MutationObserver((_, observer) => {
+      if (!document.querySelector("canvas[data-engine]")) return;
+      observer.disconnect();
+      history.replaceState(history.state, "", before);
+    }).observe(document, { childList: true, subtree: true });
+  }
+
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const named = gl?.getExtension("WEBGL_debug_renderer_info");
+  if (!gl) addEventListener("DOMContentLoaded", tellNoWebGL);
+  else if (named && SOFTWARE.test(gl.getParameter(named.UNMASKED_RENDERER_WEBGL))) {
+    fixResolution();
+    // The server is told by the elements that ask for it (data-only). viser's notice is shown once, for a while (page.css).
+    const { dataset } = document.documentElement;
+    dataset.drawnInSoftware = localStorage.getItem(TOLD) ?? "";
+    localStorage.setItem(TOLD, "told");
+    setTimeout(() => (dataset.drawnInSoftware = "told"), NOTICE);
+  }
+  gl?.getExtension("WEBGL_lose_context")?.loseContext(); // a browser keeps some sixteen at most
+
+  // viser's sorter of Gaussian splats, of which the workbench shows none, makes functions from text when the page is loaded. The
+  // page's policy forbids it, and the console would complain.
+  addEventListener("unhandledrejection", (event) => event.reason instanceof EvalError && event.preventDefault());
+}
