@@ -20,6 +20,7 @@
   const TWICE = 450; // milliseconds between two presses
   const NOTICE = 8000; // milliseconds
   const DRAWN = 1000; // milliseconds after which what was entered is drawn
+  const OPENING = 1000; // milliseconds in which a window opens
   const AWAY = 1500; // milliseconds without a connection, after which the page says so
 
   // --- the channel ------------------------------------------------------------------------------------------------------
@@ -217,9 +218,10 @@
   const CONTROL = "button, a[href], input, select, summary, [role=slider], [role=tab], [role=menuitem], [role=option], [role=button]";
   const MOVES = /^(Enter| |Arrow.*|Home|End|Page.*)$/;
   const NAMES = { " ": "space" };
+  const OPENS = /^ctrl\+(k|o|shift\+p)$/; // the palette, the list of tasks
+  let opening = 0; // until when a window may open; what is typed meanwhile is meant for it, and triggers nothing here
   let keys = []; // [key, context, command, repeats]; the last ones are kept while a folded panel takes them out of the page
   let always = [];
-  const down = new Map(); // code -> the command that is asked when this key goes up
 
   function readKeys() {
     const told = [...document.querySelectorAll("[data-keys]")].at(-1);
@@ -258,6 +260,14 @@
       // A list that was opened by the pointer and closed again would take the letters of keys for its options.
       if (byPointer && event.target.matches?.(CLOSED)) event.target.blur();
       const at = document.activeElement ?? document.body;
+      const now = performance.now();
+      if (event.key === "Escape" || at.closest(TYPED)) opening = 0;
+      else if (OPENS.test(nameOf(event))) opening = now + OPENING;
+      else if (now < opening && !event.ctrlKey && !event.metaKey && !event.altKey) {
+        event.preventDefault();
+        event.stopImmediatePropagation();
+        return;
+      }
       const does = at.closest("[data-do]");
       if (!event.defaultPrevented && (event.key === "Enter" || event.key === " ") && does && !at.closest(TYPED)) {
         if (!event.repeat) ask(commandOf(does, event));

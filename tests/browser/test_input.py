@@ -280,6 +280,25 @@ def test_a_key_is_the_letter_that_is_on_it_in_any_layout(
     small.has(*commands, FrameScene())
 
 
+def test_letters_right_after_the_palettes_key_do_nothing_on_the_page(small: Small) -> None:
+    small.page.evaluate(
+        """() => {
+            const press = (what) =>
+                document.body.dispatchEvent(new KeyboardEvent("keydown", {bubbles: true, cancelable: true, ...what}));
+            press({key: "k", code: "KeyK", ctrlKey: true});
+            press({key: "s", code: "KeyS"});
+        }"""
+    )
+    palette = small.page.get_by_placeholder("Search commands...")
+    expect(palette).to_be_focused()
+    small.page.keyboard.type("f")
+    expect(palette).to_have_value("f")
+    small.page.keyboard.press("Escape")
+    expect(palette).to_have_count(0)
+    small.page.keyboard.press("f")
+    small.has(FrameScene())
+
+
 def test_without_a_pointer_a_part_is_pressed_too_and_keeps_the_focus_when_it_is_redrawn(small: Small) -> None:
     small.page.evaluate(f"document.querySelector(`{small.row(4)}`).click()")
     small.has(SelectEnv(env=4))

@@ -30,7 +30,6 @@ and body, or a file. Runs in a thread, so it may read files."""
 
 SCRIPTS = (
     "browser.js",
-    "typed_ahead.js",
     "input.js",
     "into_sight.js",
     "folds.js",
