@@ -89,7 +89,7 @@
     }
     const opened = Date.now();
     let refused = true;
-    const mine = new WebSocket(`${location.origin.replace("http", "ws")}/do?${new URLSearchParams({ page })}`);
+    const mine = new WebSocket(`${location.origin.replace("http", "ws")}/do?${new URLSearchParams({ page, width: innerWidth })}`);
     socket = mine;
     mine.onopen = () => {
       refused = false;

@@ -114,3 +114,37 @@ def test_a_pose_is_copied(page: Page) -> None:
     expect(page.locator(".wb-leaves").get_by_text("cube", exact=True)).to_be_visible()
     page.locator(".wb-leaves tr", has=page.get_by_text("cube", exact=True)).locator(".wb-pill").click()
     until(lambda: page.evaluate("navigator.clipboard.readText()").startswith("sapien.Pose(p=["), "the copy")
+
+
+def columns(page: Page) -> list[str]:
+    """Those that are seen."""
+    return page.evaluate(
+        "() => [...document.querySelector('.wb-env-table').tHead.rows[0].cells].filter(c => c.offsetWidth).map(c => c.textContent.trim())"
+    )
+
+
+def overhang(page: Page) -> float:
+    """Pixels by which the table is wider than its panel."""
+    return page.evaluate(
+        "() => { const table = document.querySelector('.wb-env-table'); return table.getBoundingClientRect().right - table.closest('.wb-envs').getBoundingClientRect().right }"
+    )
+
+
+def test_the_view_keeps_half_of_the_page_and_columns_that_find_no_room_are_named(page: Page) -> None:
+    view = page.evaluate("() => document.querySelector('canvas[data-engine]').getBoundingClientRect().width")
+    assert view >= 1280 / 2 - 10
+    assert overhang(page) <= 0
+    note = page.get_by_text(re.compile(r"^\d hidden$")).locator("visible=true")
+    before = columns(page)
+    (count,) = (int(text.split()[0]) for text in note.all_inner_texts())
+    named = note.get_attribute("title") or ""
+    assert not [name for name in before if f" {name}," in named]
+    edge = page.locator('[data-dock-region-resize="left"] > *').first.bounding_box()
+    assert edge is not None
+    page.mouse.move(edge["x"] + edge["width"] / 2, 400)
+    page.mouse.down()
+    page.mouse.move(edge["x"] + 300, 400, steps=5)
+    page.mouse.up()
+    expect(note).to_have_count(0)
+    assert len(columns(page)) == len(before) + count
+    assert overhang(page) <= 0

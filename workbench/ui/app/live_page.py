@@ -101,7 +101,8 @@ PICTURES_HINT = (
     "Auto: fast while something moves, exact when it stands still. What this page records is exact."
 )
 PANEL_WIDTH = 372
-ENVS_WIDTH = 520
+ENVS_WIDTHS = 220, 640
+"""Pixels of the table of envs, at least and at most; the view keeps half of the page."""
 
 
 class Page:
@@ -254,10 +255,11 @@ class Page:
         with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
             self._envs = EnvPanel(self._server, self._session)
         self._env_window.dock_left()
-        self._env_window.set_width(ENVS_WIDTH)
         # Minimized at first: it takes half of a small screen's view.
         self._env_window.minimize()
         self._envs_open = False
+        self._envs_fitted = 0
+        """Width of the page for which the table got its width."""
 
     # --- start and stop --------------------------------------------------------------------------
 
@@ -339,15 +341,27 @@ class Page:
     def _unfolded(self, panel: str) -> None:
         """A page shows this panel."""
         if panel == ENVS:
+            self._fit_envs()
             self._envs.unfold()
         elif panel == STUDIO:
             self._studio.unfold()
         elif panel == INSPECT:
             self._inspect.unfold()
 
+    def _fit_envs(self) -> None:
+        """Give the table the width of its columns, once for each width of the page: a person may have dragged its edge."""
+        wanted = self._envs.wanted_width()
+        page = min((visitor.page_width for visitor in self._visitors.all() if visitor.page_width), default=0)
+        if page in (0, self._envs_fitted) or not wanted:
+            return
+        least, most = ENVS_WIDTHS
+        self._env_window.set_width(max(least, min(wanted, most, page / 2 - PANEL_WIDTH)))
+        self._envs_fitted = page
+
     def _toggle_envs(self) -> None:
         self._envs_open = not self._envs_open
         if self._envs_open:
+            self._fit_envs()
             self._envs.unfold()
             self._env_window.expand()
         else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -26,6 +26,7 @@ from workbench.machine.text import number_text
 from workbench.session.history.env_table import EnvRows, Outcome
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.ui.live.env_columns import DOT, Column, levels, wanted_width
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.live.timeline import polylines
 from workbench.ui.widgets.paged import Paged
@@ -59,6 +60,8 @@ MOST_ENTRIES = 6
 """Columns of bool entries at first; with more a row is wider than the view. The others can be chosen."""
 POINTS = 40
 """Points of a row's small curve."""
+STEP_CHARACTERS = 3
+"""A number of a step is at least so long soon."""
 REWARD_CURVE = "reward curve"
 """The column that nothing is sorted by."""
 CURVE_WIDTH, CURVE_HEIGHT = 60, 14
@@ -328,12 +331,21 @@ class EnvPanel(MomentPart):
         content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
         self._handle.content = content
 
+    def wanted_width(self) -> float:
+        """Pixels of a panel in which every column is seen."""
+        rows = self._session.env_rows()
+        if rows is None:
+            return 0.0
+        return wanted_width(
+            self._measure(rows, make_rows(rows, np.arange(min(rows.num_envs, MOST_ROWS)), self._chosen))
+        )
+
     def _html(self, rows: EnvRows, selected: int) -> str:
         if self._column not in columns(rows, self._chosen):
             self._column, self._descending = "env", False
         envs = order(rows, self._column, self._descending, self._filter)
         places = self._pages.places(len(envs))
-        shown = envs[places.start : places.stop]
+        shown = make_rows(rows, envs[places.start : places.stop], self._chosen)
         return render(
             "envs",
             none_so=FILTERS[self._filter][2],
@@ -352,19 +364,19 @@ class EnvPanel(MomentPart):
             choosing=self._choosing,
             pages=self._pages.shown(lambda by: TurnEnvs(by=by)),
             head=self._head(rows),
+            levels=levels(self._measure(rows, shown)),
             rows=[
                 {
                     "cells": row,
                     "selected": row["env"] == selected,
                     "press": ShowEnvAtEvent(env=row["env"]),
                 }
-                for row in make_rows(rows, shown, self._chosen)
+                for row in shown
             ],
         )
 
     def _head(self, rows: EnvRows) -> list[dict[str, object]]:
         names = entry_names(rows, self._chosen)
-        ranks = gives_way(names, self._chosen, self._column)
 
         def sortable(name: str, column: str, hint: str) -> dict[str, object]:
             arrow = (
@@ -379,7 +391,6 @@ class EnvPanel(MomentPart):
                 "arrow": arrow,
                 "press": SortEnvs(column=column),
                 "hint": hint,
-                "gives_way": ranks.get(column),
             }
 
         entries = [
@@ -390,11 +401,39 @@ class EnvPanel(MomentPart):
             "arrow": "",
             "press": None,
             "hint": "Over the episode; all rows on one scale",
-            "gives_way": ranks[REWARD_CURVE],
         }
         start = [sortable(name, name, HINTS[name]) for name in ("env", "state", "steps", "return")]
         end = [sortable(name, name, HINTS[name]) for name in ("last", "flags")]
         return [*start, plain, *entries, *end]
+
+    def _measure(self, rows: EnvRows, shown: list[dict[str, Any]]) -> list[Column]:
+        """The columns in the order of `_head`."""
+        names = entry_names(rows, self._chosen)
+        ranks = gives_way(names, self._chosen, self._column)
+
+        def longest(texts: Iterable[str]) -> int:
+            return max(STEP_CHARACTERS, *map(len, texts), 0)
+
+        states = longest(row["state"] for row in shown)
+        last = longest(row["last"] for row in shown)
+        firsts = [
+            Column(
+                name,
+                longest(row["first_true"][place] for row in shown),
+                rank=ranks.get(f"first {name}"),
+            )
+            for place, name in enumerate(names)
+        ]
+        return [
+            Column("env", longest(str(row["env"]) for row in shown)),
+            Column("state", states, states, DOT),
+            Column("steps", longest(row["steps"] for row in shown), rank=ranks.get("steps")),
+            Column("return", longest(row["total"] for row in shown), rank=ranks.get("return")),
+            Column("reward", 0, fixed=CURVE_WIDTH, rank=ranks.get(REWARD_CURVE)),
+            *firsts,
+            Column("last", last + STEP_CHARACTERS, last, DOT if last else 0.0, ranks.get("last")),
+            Column("flags", 3, rank=ranks.get("flags")),
+        ]
 
     def _entries(self, rows: EnvRows) -> list[dict[str, object]]:
         shown = entry_names(rows, self._chosen)

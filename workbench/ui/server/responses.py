@@ -36,7 +36,6 @@ SCRIPTS = (
     "curve_clicks.js",
     "view_stays.js",
     "view_width.js",
-    "envs_width.js",
     "key_list.js",
     "tab_title.js",
     "task_list.js",

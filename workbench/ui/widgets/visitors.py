@@ -48,6 +48,8 @@ class Visitor:
     name: str
     """Random, and told to the page only."""
     client: viser.ClientHandle
+    page_width: int = 0
+    """Pixels of CSS when it connected last; 0 before."""
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     """Held while a command of this page is done: they are done in the order in which they came."""
 
@@ -120,6 +122,8 @@ class Visitors:
         if visitor is None:
             await connection.close(1008, "no such page")
             return
+        width = query.get("width", [""])[0]
+        visitor.page_width = int(width) if width.isdecimal() and len(width) < 6 else 0
         async for raw in connection:
             try:
                 message = _decoder.decode(raw)

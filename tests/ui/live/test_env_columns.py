@@ -1,0 +1,28 @@
+"""Which columns of the table of envs are left out where its panel is narrow."""
+
+from __future__ import annotations
+
+from workbench.ui.live.env_columns import Column, levels, wanted_width
+
+COLUMNS = [
+    Column("env", 3),
+    Column("state", 9, 9),
+    Column("is_obj_placed", 3, rank=1),
+    Column("flags", 3, rank=0),
+]
+
+
+def test_columns_are_left_out_by_rank_and_those_without_a_rank_stay() -> None:
+    found = levels(COLUMNS)
+    assert [level.columns for level in found if level.columns] == [(4,), (3,)]
+    assert found[-1].names == ("flags", "is_obj_placed")
+
+
+def test_the_narrower_the_panel_the_more_is_left_out_and_a_wide_one_shows_all() -> None:
+    limits = [level.below for level in levels(COLUMNS)]
+    assert limits == sorted(limits, reverse=True) and len(set(limits)) == len(limits)
+    assert limits[0] <= wanted_width(COLUMNS)
+
+
+def test_a_name_with_underscores_takes_less_room_than_its_letters() -> None:
+    assert Column("is_obj_placed", 3).least(words=True) < Column("isxobjxplaced", 3).least(words=True)
