@@ -8,7 +8,10 @@
 //     data-twice='["open_row", {...}]'         a second press soon after does this
 //     data-place                               its fields x and y: the place in the element, 0 to 1 from its upper left corner
 //     data-along='["step", 0, 99]'             its field for the place along the element: a whole number between these
+//   data-copy="text"                         a press copies this
 //   data-tell='["tell_unfolded", {...}]'     done when the element comes into the page (data-only: only where <html> has data-…)
+//   data-into-sight                          then its parent is scrolled into sight; data-follow="7": the library's row with that number
+//   data-title="PushCube"                    the name of the browser's tab; without one the last one stays
 //   data-field='["set_seed", {}, "seed"]'    what is entered goes into the last named field: at Enter or when the focus leaves, when
 //                                            it is chosen, or (data-live) as it is typed; Enter does data-enter
 //     data-number="[0, null, 1, true]"         a number: the least, the greatest, what an arrow key adds, whether it is whole
@@ -208,6 +211,11 @@
   addEventListener("click", (event) => {
     const element = part(event, "data-do");
     if (element && event.detail === 0) ask(commandOf(element, event));
+    const from = part(event, "data-copy");
+    if (!from) return;
+    if (!navigator.clipboard) return prompt("Copy with Ctrl+C", from.dataset.copy);
+    navigator.clipboard.writeText(from.dataset.copy);
+    from.textContent = "copied";
   }, true);
 
   // --- keys -------------------------------------------------------------------------------------------------------------
@@ -220,12 +228,15 @@
   const NAMES = { " ": "space" };
   const OPENS = /^ctrl\+(k|o|shift\+p)$/; // the palette, the list of tasks
   let opening = 0; // until when a window may open; what is typed meanwhile is meant for it, and triggers nothing here
+  const PRESSED = "[data-do], [data-copy], [data-fold]";
   let keys = []; // [key, context, command, repeats]; the last ones are kept while a folded panel takes them out of the page
   let always = [];
+  let keyList = null; // their list for a person
 
   function readKeys() {
     const told = [...document.querySelectorAll("[data-keys]")].at(-1);
     if (!told) return;
+    keyList = told;
     keys = JSON.parse(told.dataset.keys);
     always = told.dataset.contexts.split(" ");
   }
@@ -240,7 +251,7 @@
 
   // Over a dialog that is open only the keys of what is in it count.
   function contexts() {
-    const dialog = [...document.querySelectorAll("[aria-modal=true], dialog[open]")].at(-1);
+    const dialog = [...document.querySelectorAll("[aria-modal=true], dialog[open], body > .wb-all-keys")].at(-1);
     const there = [...(dialog ?? document).querySelectorAll("[data-context]")].map((one) => one.dataset.context);
     return dialog ? there : [...there.reverse(), ...always];
   }
@@ -252,6 +263,21 @@
     const found = keys.filter(([key, context]) => key === name && on.includes(context));
     return found.sort((a, b) => on.indexOf(a[1]) - on.indexOf(b[1]))[0];
   }
+
+  // A copy, which no redraw takes out of the page.
+  function toggleKeyList() {
+    const shown = document.querySelector("body > .wb-all-keys");
+    if (shown || !keyList) return shown?.hidePopover();
+    const list = document.body.appendChild(keyList.cloneNode(true));
+    list.removeAttribute("data-keys");
+    list.addEventListener("toggle", ({ newState }) => newState === "closed" && list.remove());
+    list.showPopover();
+  }
+
+  // viser moves its view with these, and offers no way to take them from it: S would be a step and carry the view away. Its
+  // listener comes after this one on the document.
+  const MOVE_VIEW = /^(Key[WASDQE]|Arrow(Up|Down|Left|Right))$/; // viser 1.1, CameraControls.tsx
+  document.addEventListener("keydown", (event) => MOVE_VIEW.test(event.code) && event.stopImmediatePropagation());
 
   addEventListener(
     "keydown",
@@ -268,9 +294,10 @@
         event.stopImmediatePropagation();
         return;
       }
-      const does = at.closest("[data-do]");
+      const does = at.closest(PRESSED);
       if (!event.defaultPrevented && (event.key === "Enter" || event.key === " ") && does && !at.closest(TYPED)) {
-        if (!event.repeat) ask(commandOf(does, event));
+        if (does.dataset.do && !event.repeat) ask(commandOf(does, event));
+        else if (!event.repeat) does.click();
         event.preventDefault();
         event.stopImmediatePropagation();
         return;
@@ -291,6 +318,7 @@
       // Who types keeps all keys, but for Escape in a dialog's field; a focused control keeps those that move it.
       const typing = at.closest(TYPED) && !(event.key === "Escape" && at.closest("[aria-modal=true]"));
       if (typing || (MOVES.test(event.key) && !event.altKey && at.closest(CONTROL))) return;
+      if (event.key === "?") toggleKeyList();
       if (!found) return;
       const [, , command, repeats] = found;
       if (!event.repeat || repeats) ask([command, {}]);
@@ -456,36 +484,57 @@
 
   // A redraw takes the focus from an element that it replaces; it goes to the one that does the same.
   addEventListener("focusin", ({ target }) => {
-    focused = (!byPointer && target.closest("[data-do]")?.dataset.do) || "";
+    const { do: does, fold } = (!byPointer && target.closest("[data-do], [data-fold]")?.dataset) || {};
+    focused = does ? `[data-do="${CSS.escape(does)}"]` : fold ? `[data-fold="${CSS.escape(fold)}"]` : "";
   }, true);
   addEventListener("focusout", ({ relatedTarget }) => relatedTarget && (focused = ""), true);
 
   // --- what comes into the page -------------------------------------------------------------------------------------------
 
-  const told = new WeakSet();
+  // For each attribute what is done once with an element that has it.
+  const arrivals = {
+    tell(element) {
+      const { tell, only } = element.dataset;
+      if (!only || document.documentElement.hasAttribute(`data-${only}`)) send(JSON.parse(tell));
+    },
+    autofocus(input) {
+      input.focus();
+      input.select();
+    },
+    // Again, since what stands beside it comes a moment later.
+    intoSight(element) {
+      const show = () => element.parentElement?.scrollIntoView({ block: "nearest" });
+      show();
+      setTimeout(show, 150);
+    },
+    follow(element) {
+      document.querySelector(`.wb-library [data-row="${CSS.escape(element.dataset.follow)}"]`)?.scrollIntoView({ block: "nearest" });
+    },
+  };
+  const arrived = new WeakSet();
+  const attribute = (name) => `data-${name.replace(/[A-Z]/g, (letter) => `-${letter.toLowerCase()}`)}`;
+
+  document.title = "Workbench";
   new MutationObserver(() => {
     const now = document.querySelector("[data-page]")?.dataset.page ?? page;
     if (now !== page) {
       page = now;
       connect();
     }
-    if (page) {
-      for (const element of document.querySelectorAll("[data-tell]")) {
-        if (told.has(element) || (element.dataset.only && !document.documentElement.hasAttribute(`data-${element.dataset.only}`))) continue;
-        told.add(element);
-        send(JSON.parse(element.dataset.tell));
+    const title = document.querySelector("[data-title]")?.dataset.title;
+    if (title && title !== document.title) document.title = title;
+    for (const [name, then] of Object.entries(page ? arrivals : {})) {
+      for (const element of document.querySelectorAll(`[${attribute(name)}]`)) {
+        if (arrived.has(element)) continue;
+        arrived.add(element);
+        then(element);
       }
     }
-    for (const input of document.querySelectorAll("[data-autofocus]")) {
-      input.removeAttribute("data-autofocus");
-      input.focus();
-      input.select();
-    }
     if (focused && document.activeElement === document.body) {
-      document.querySelector(`[tabindex][data-do="${CSS.escape(focused)}"]`)?.focus({ preventScroll: true });
+      document.querySelector(`[tabindex]${focused}`)?.focus({ preventScroll: true });
     }
     showValues();
-  }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-page", "data-shows"] });
+  }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-page", "data-shows", "data-title"] });
 
-  window.wb = { ask, sendNewest };
+  window.wb = { ask, sendNewest, arrivals };
 }

@@ -41,7 +41,7 @@ def charts(desk: Desk) -> Locator:
 
 
 def test_a_question_mark_lists_the_keys_which_rest_meanwhile(desk: Desk) -> None:
-    listed = desk.page.locator(".wb-key-list")
+    listed = desk.page.get_by_role("dialog", name="Keys")
     desk.press("?")
     expect(listed.get_by_text("Play or pause")).to_be_visible()
     desk.press("s", "Escape")

@@ -271,7 +271,7 @@ def test_keys_walk_over_the_pages(table: Table) -> None:
         table.key(NextRow())
     table.draw()
     assert table.selected() == tuple(newest(MOST_ROWS, MOST_ROWS + 1))
-    assert table.shown() == newest(MOST_ROWS, COUNT) and "wb.follow" in table.panels.html("<style")
+    assert table.shown() == newest(MOST_ROWS, COUNT) and "data-follow" in table.panels.html("<style")
     table.key(AlsoPreviousRow())
     table.key(AlsoPreviousRow())
     assert table.selected() == tuple(newest(MOST_ROWS - 2, MOST_ROWS + 1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import http.client
 import os
 import re
@@ -21,7 +23,7 @@ import viser.infra._infra
 from tests.drive.page import page_at
 from workbench.cli.terminal.output import print_addresses
 from workbench.ui.server import gated_server as door_module
-from workbench.ui.server import listening, responses, viser_private
+from workbench.ui.server import listening, viser_private
 from workbench.ui.server.access import cookie_name
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.listening import ServerError
@@ -207,7 +209,8 @@ def test_the_scripts_of_the_installed_page_are_the_known_ones() -> None:
     page = Path(viser.__file__).parent / "client" / "build" / "index.html"
     first, _ = viser_private.page_scripts() or ("", "")
     inline = re.findall(r"<script[^>]*>(.+?)</script>", page.read_text(), re.S)
-    assert f"sha256-{first}" in map(responses.hash_of, inline)
+    hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in inline]
+    assert first.removeprefix("sha256-") in hashes
 
 
 def test_a_viser_that_starts_its_server_another_way_opens_no_door(monkeypatch):

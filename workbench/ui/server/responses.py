@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import functools
 import gzip
-import hashlib
 import html
 import mimetypes
 from collections.abc import Callable, Mapping
@@ -31,16 +29,10 @@ and body, or a file. Runs in a thread, so it may read files."""
 SCRIPTS = (
     "browser.js",
     "input.js",
-    "into_sight.js",
-    "folds.js",
+    "panels.js",
     "curve_clicks.js",
-    "view_stays.js",
     "view_width.js",
-    "key_list.js",
-    "tab_title.js",
     "task_list.js",
-    "tab_stays.js",
-    "help.js",
 )
 """Of ``web_assets/``, run by the page."""
 STYLES = "panels/page.css"
@@ -221,34 +213,19 @@ def content_type(name: str) -> str:
 # --- The headers that tell a browser what a served page may do --------------------------------
 
 
-HANDLERS = (
-    "wb.intoSight(this)",
-    "wb.follow(this)",
-    "wb.openTab(this)",
-)
-"""Every handler in ``web_assets/panels``, defined in ``web_assets/into_sight.js``."""
-
-
-def hash_of(script: str) -> str:
-    """As a Content-Security-Policy names a script."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-
-
 def _scripts() -> str:
-    """Scripts in the page and its tags that may run. Of a viser whose page is not known any may (`unknown_page_text`)."""
+    """Scripts in the page that may run. Of a viser whose page is not known any may (`unknown_page_text`)."""
     known = viser_private.page_scripts()
     if known is None:
         return "'unsafe-inline'"
-    allowed = (*(f"sha256-{one}" for one in known), *map(hash_of, HANDLERS))
-    return " ".join(["'unsafe-hashes'", *(f"'{one}'" for one in allowed)])
+    return " ".join(f"'sha256-{one}'" for one in known)
 
 
 # Everything is forbidden that is not listed, and each exception is needed: `tests/ui/server/test_page_policy.py` removes
 # them one by one and finds the page broken.
 # - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not unsafe-inline: HTML from a name,
-#   a note or a file that slipped past escaping still would not run. unsafe-hashes allows the handlers of our templates
-#   and no others. wasm-unsafe-eval is for the program that unpacks the server's messages. eval stays forbidden: viser
-#   needs it for Gaussian splats and Plotly, which the workbench has not (web_assets/browser.js).
+#   a note or a file that slipped past escaping still would not run. wasm-unsafe-eval is for
+#   the program that unpacks the server's messages. eval stays forbidden: viser needs it for Gaussian splats and Plotly, which the workbench has not (web_assets/browser.js).
 # - worker-src blob: viser's connection and its sorting run in workers made from texts.
 # - style-src 'unsafe-inline': viser's widgets and our HTML have styles in their tags; a style runs no code.
 # - img-src data: blob: pictures from the websocket, and viser's icons.

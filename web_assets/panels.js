@@ -1,0 +1,117 @@
+// What viser's tabs, folds and palette lack. To ask viser for: a tab group whose open tab the server can set, and hears of; folds
+// that the server and the keyboard open; an address as what a command of the palette does.
+//
+//   data-which="3f2a"      what the page shows: who comes back to it finds the tab that was open there (data-anew: the first one)
+//     data-says              the server is told which tab is open
+//   data-open-tab="Studio" a tab is opened, and in it data-open-fold
+"use strict";
+{
+  const KEEPS = "workbench tab of ";
+  const COMES = 5000; // milliseconds within which the tabs come
+  const SETTLES = 1000; // from the first of them on; until all are there viser opens the first again
+  const FOLD_COMES = 2000;
+
+  // --- tabs -------------------------------------------------------------------------------------------------------------
+
+  let which = "";
+  let wanted = null; // { name, until }: the tab that was open here before
+  let told = { mark: null, name: "" };
+
+  const nameOf = (tab) => tab.textContent.trim().replace(/ \d+$/, ""); // without the number of findings
+  const marker = () => document.querySelector("[data-which]");
+  const tabsOf = (mark) => [...(mark?.closest(".mantine-Paper-root")?.querySelectorAll("[role=tab]") ?? [])];
+  const isOpen = (tab) => tab.getAttribute("aria-selected") === "true";
+
+  // viser's tabs hear this key, and a pointer that goes down and up.
+  function press(tab) {
+    tab.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", code: "Enter", bubbles: true }));
+  }
+
+  function keep(tab) {
+    wanted = null;
+    if (tabsOf(marker()).includes(tab)) sessionStorage.setItem(KEEPS + which, nameOf(tab));
+  }
+  for (const kind of ["click", "keydown"]) {
+    addEventListener(kind, (event) => {
+      const tab = event.isTrusted && (kind === "click" || event.key === "Enter") && event.target.closest?.("[role=tab]");
+      if (tab) keep(tab);
+    }, true);
+  }
+
+  wb.arrivals.openTab = ({ dataset }) => {
+    const tab = [...document.querySelectorAll("[role=tab]")].find((one) => nameOf(one) === dataset.openTab);
+    if (tab) keep(tab);
+    if (tab) press(tab);
+    if (dataset.openFold) openFold(dataset.openFold, performance.now() + FOLD_COMES);
+  };
+
+  function followTabs() {
+    const mark = marker();
+    const tabs = tabsOf(mark);
+    if (mark && mark.dataset.which !== which) {
+      which = mark.dataset.which;
+      if ("anew" in mark.dataset) sessionStorage.removeItem(KEEPS + which);
+      wanted = { name: sessionStorage.getItem(KEEPS + which), until: performance.now() + COMES };
+    }
+    const again = wanted && tabs.find((tab) => nameOf(tab) === wanted.name);
+    if (again) wanted.until = Math.min(wanted.until, (wanted.since ??= performance.now()) + SETTLES);
+    if (again && performance.now() > wanted.until) wanted = null;
+    else if (again && !isOpen(again)) press(again);
+    const open = mark && "says" in mark.dataset && tabs.find(isOpen);
+    if (!open || (told.mark === mark && told.name === nameOf(open))) return;
+    told = { mark, name: nameOf(open) };
+    wb.ask(["tell_open_tab", { tab: told.name }]);
+  }
+
+  // --- folds: a sheet within a bordered sheet, with an arrow behind its label; it hears a click alone ----------------------
+
+  const ARROW = "svg:is(.tabler-icon-chevron-down, .tabler-icon-chevron-up)";
+  const ICONS = { "list-search": "Commands (Ctrl+K)", adjustments: "Scene tree and settings", "arrow-back": "Back to the panels" };
+  const headings = () => [...document.querySelectorAll(`.mantine-Paper-root[data-with-border] > * > ${ARROW}`)].map((svg) => svg.parentElement);
+  const isUnfolded = (heading) => Boolean(heading.querySelector(":scope > .tabler-icon-chevron-up"));
+
+  function set(element, attributes) {
+    for (const [name, value] of Object.entries(attributes)) if (element.getAttribute(name) !== value) element.setAttribute(name, value);
+  }
+
+  function nameFolds() {
+    for (const heading of headings()) {
+      const isEmpty = heading.querySelector(`:scope > ${ARROW}`).style.display === "none";
+      if (isEmpty) for (const name of ["tabindex", "role", "aria-expanded", "data-fold"]) heading.removeAttribute(name);
+      else set(heading, { tabindex: "0", role: "button", "aria-expanded": String(isUnfolded(heading)), "data-fold": heading.textContent.trim() });
+    }
+    for (const [icon, label] of Object.entries(ICONS)) {
+      for (const svg of document.querySelectorAll(`.mantine-ActionIcon-root svg.tabler-icon-${icon}`)) set(svg.closest("button"), { "aria-label": label });
+    }
+  }
+
+  // It may be in another fold, or in a tab that was just opened.
+  function openFold(label, until) {
+    const heading = document.querySelector(`[data-fold="${CSS.escape(label)}"]`);
+    if (!heading) {
+      if (performance.now() < until) setTimeout(() => openFold(label, until), 50);
+      return;
+    }
+    for (const one of headings()) if (one.parentElement.contains(heading) && !isUnfolded(one)) one.click();
+    // It unfolds for 200 ms, and the palette gives the focus back to where it was.
+    for (const after of [0, 250, 500]) {
+      setTimeout(() => {
+        heading.parentElement.scrollIntoView({ block: "start" });
+        if (document.activeElement === document.body) heading.focus({ preventScroll: true });
+      }, after);
+    }
+  }
+
+  // --- the palette --------------------------------------------------------------------------------------------------------
+
+  // A browser lets a page open a tab only while a press is handled, and the server hears of it later. Enter is a click too.
+  addEventListener("click", ({ target }) => {
+    const label = target.closest?.(".mantine-Spotlight-action")?.querySelector(".mantine-Spotlight-actionLabel");
+    if (label?.textContent === "Help: open the documents") open("/help/", "_blank", "noopener");
+  }, true);
+
+  new MutationObserver(() => {
+    nameFolds();
+    followTabs();
+  }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-which", "aria-selected"] });
+}
