@@ -1,52 +1,29 @@
-// A click on a curve shows its step.
+// A click on a curve shows its step: does the command that the panel names (data-curve). A drag is uPlot's zoom.
 //
-// uPlot's chart is not reachable from the page's elements, and what part of the steps it shows changes with its zoom. Its
-// legend says the step under the pointer, so that is sent, with the command that the panel names (data-curve). A drag is
-// uPlot's zoom.
+// The chart cannot be reached from the page's elements, and after a zoom only it knows what part of the steps it shows. Its legend says the
+// step under the pointer, with the digits of the browser's language. To ask viser for: a click on a chart, with its x.
 "use strict";
 {
   const STILL = 4; // pixels between the two ends of a click
-  const numbers = new Intl.NumberFormat(navigator.language);
-  const digits = new Map([...Array(10).keys()].map((digit) => [numbers.format(digit), digit]));
+  const numbers = new Intl.NumberFormat(navigator.language, { useGrouping: false });
+  const digits = [...numbers.format(9876543210)].reverse();
+  const decimal = numbers.formatToParts(0.5).find(({ type }) => type === "decimal").value;
   let down = null;
 
-  // As uPlot writes it: with the language's digits, and separators between thousands.
-  function whole(text) {
-    const decimal = numbers.formatToParts(1.5).find((part) => part.type === "decimal").value;
-    const [before, after] = text.split(decimal);
-    const read = [...before].filter((one) => digits.has(one)).map((one) => digits.get(one));
-    const half = after && digits.get(after[0]) >= 5 ? 1 : 0;
-    return read.length ? (/^[-\u2212]/.test(before.trim()) ? -1 : 1) * Number(read.join("")) + half : null;
+  const read = (text = "") => [...text].map((one) => digits.indexOf(one)).filter((digit) => digit >= 0).join("");
+  function stepOf(text) {
+    const [whole, part] = text.split(decimal);
+    return read(whole) && Math.round(Number(`${/^[\s\p{Cf}]*[-\u2212]/u.test(text) ? "-" : ""}${read(whole)}.${read(part)}`));
   }
 
-  function markOf(element) {
-    for (let around = element; around; around = around.parentElement) {
-      const mark = around.querySelector("[data-curve]");
-      if (mark) return mark;
-    }
-    return null;
-  }
-
-  window.addEventListener(
-    "pointerdown",
-    (event) => {
-      const over = event.target instanceof Element && event.target.closest(".u-over");
-      down = over && event.button === 0 ? { over, x: event.clientX, y: event.clientY } : null;
-    },
-    true,
-  );
-
-  window.addEventListener(
-    "pointerup",
-    (event) => {
-      const began = down;
-      down = null;
-      if (!began || Math.hypot(event.clientX - began.x, event.clientY - began.y) > STILL) return;
-      const mark = markOf(began.over);
-      const legend = began.over.closest(".uplot")?.querySelector(".u-legend .u-value");
-      const step = legend && whole(legend.textContent);
-      if (mark && step !== null) wb.ask([mark.dataset.curve, { step }]);
-    },
-    true,
-  );
+  addEventListener("pointerdown", ({ target, button, clientX: x, clientY: y }) => {
+    const over = button === 0 && target.closest?.(".u-over");
+    down = over && { over, x, y };
+  }, true);
+  addEventListener("pointerup", ({ clientX, clientY }) => {
+    if (!down || Math.hypot(clientX - down.x, clientY - down.y) > STILL) return;
+    const panel = down.over.closest(":has([data-curve])")?.querySelector("[data-curve]");
+    const step = stepOf(down.over.closest(".uplot")?.querySelector(".u-legend .u-value")?.textContent ?? "");
+    if (panel && step !== "") wb.ask([panel.dataset.curve, { step }]);
+  }, true);
 }

@@ -26,12 +26,9 @@ window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-o
     const end = moment.lastIndexOf("@");
     go(moment.slice(0, end), Number(moment.slice(end + 1)));
   }
-  if (parent !== window) {
-    // It takes the keyboard when it starts; in a panel the keys are the page's until somebody presses into it.
-    const focus = HTMLElement.prototype.focus;
-    let pressed = false;
-    addEventListener("pointerdown", () => { pressed = true; }, true);
-    HTMLElement.prototype.focus = function (...how) { if (pressed) focus.apply(this, how); };
-  }
+  // It takes the keyboard when it starts; in a panel the keys are the page's until somebody presses into it.
+  const giveBack = ({ target }) => { target.blur(); frameElement.blur(); };
+  if (parent !== window) addEventListener("focusin", giveBack);
+  addEventListener("pointerdown", () => removeEventListener("focusin", giveBack), true);
   addEventListener("load", () => { document.title = asked.get("title") || document.title; });
 }

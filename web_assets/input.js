@@ -15,6 +15,8 @@
 //   data-field='["set_seed", {}, "seed"]'    what is entered goes into the last named field: at Enter or when the focus leaves, when
 //                                            it is chosen, or (data-live) as it is typed; Enter does data-enter
 //     data-number="[0, null, 1, true]"         a number: the least, the greatest, what an arrow key adds, whether it is whole
+//   data-search="text.look..."               a list that the field of this name searches: letters go into the field, arrows from it
+//                                            into the list, beginning at data-best
 //   data-shows='[["text.set_seed.seed", "12", false, {}]]'  what the server has for a field of this name: copied into it while nobody
 //                                            uses it; whether it is off; options ([shown, value]) or bounds that it has from now on
 "use strict";
@@ -285,6 +287,7 @@
       if (event.isComposing || event.keyCode === 229) return;
       // A list that was opened by the pointer and closed again would take the letters of keys for its options.
       if (byPointer && event.target.matches?.(CLOSED)) event.target.blur();
+      byPointer = false;
       const at = document.activeElement ?? document.body;
       const now = performance.now();
       if (event.key === "Escape" || at.closest(TYPED)) opening = 0;
@@ -295,15 +298,16 @@
         return;
       }
       const does = at.closest(PRESSED);
-      if (!event.defaultPrevented && (event.key === "Enter" || event.key === " ") && does && !at.closest(TYPED)) {
+      if (!event.defaultPrevented && (event.key === "Enter" || event.key === " ") && does?.contains(event.target) && !at.closest(TYPED)) {
         if (does.dataset.do && !event.repeat) ask(commandOf(does, event));
         else if (!event.repeat) does.click();
         event.preventDefault();
         event.stopImmediatePropagation();
         return;
       }
-      if (STEPS[event.key] && does?.closest("[data-roving]") && !heldOf(event)) {
-        walk(does, STEPS[event.key]);
+      const list = STEPS[event.key] && !heldOf(event) && does?.closest("[data-roving]");
+      if (list || searches(event, at)) {
+        if (list) walk(list, does, event.key);
         event.preventDefault();
         event.stopImmediatePropagation();
         return;
@@ -316,7 +320,7 @@
       }
       const found = keyed(event);
       // Who types keeps all keys, but for Escape in a dialog's field; a focused control keeps those that move it.
-      const typing = at.closest(TYPED) && !(event.key === "Escape" && at.closest("[aria-modal=true]"));
+      const typing = document.activeElement?.closest(TYPED) && !(event.key === "Escape" && at.closest("[aria-modal=true]"));
       if (typing || (MOVES.test(event.key) && !event.altKey && at.closest(CONTROL))) return;
       if (event.key === "?") toggleKeyList();
       if (!found) return;
@@ -328,11 +332,41 @@
     true,
   );
 
-  // In a table or on a strip Tab stops at one part, and the arrows go from there to the others.
+  // In a table or on a strip Tab stops at one part, and the arrows go from there to the others; of cards, up and down to the one
+  // above and below.
   const STEPS = { ArrowLeft: -1, ArrowUp: -1, ArrowRight: 1, ArrowDown: 1 };
-  function walk(from, step) {
-    const parts = [...from.closest("[data-roving]").querySelectorAll("[tabindex][data-do]")];
-    parts[parts.indexOf(from) + step]?.focus();
+  function walk(list, from, key) {
+    const parts = [...list.querySelectorAll("[tabindex][data-do]")];
+    const [step, at, here] = [STEPS[key], parts.indexOf(from), from.getBoundingClientRect()];
+    const next = step > 0 ? parts.slice(at + 1) : parts.slice(0, at).reverse();
+    const isThere = (part) => {
+      const { left, right, top } = part.getBoundingClientRect();
+      return step > 0 ? top > here.top + 4 && right > here.left + 4 : top < here.top - 4 && left <= here.left + 4;
+    };
+    ((/Up|Down/.test(key) && next.find(isThere)) || next[0])?.focus();
+  }
+
+  // Whether nothing is left to do for the key. A letter goes on, into the field that has the focus by then.
+  function searches(event, at) {
+    const list = [...document.querySelectorAll("[data-search]")].at(-1);
+    const dialog = [...document.querySelectorAll("[aria-modal=true]")].at(-1);
+    const field = list && (!dialog || dialog.contains(list)) && [...document.getElementsByName(list.dataset.search)].at(-1);
+    if (!field || event.ctrlKey || event.metaKey || event.altKey) return false;
+    const best = list.querySelector("[data-best]");
+    if (at === field && event.key === "Escape" && field.value && dialog) {
+      field.value = "";
+      typed(field);
+      return true;
+    }
+    if (at === field && best && STEPS[event.key] && (/Up|Down/.test(event.key) || !field.value)) {
+      walk(list, best, event.key);
+      return true;
+    }
+    if (event.key.length === 1 && (at === document.body || list.contains(at))) {
+      field.focus();
+      event.stopImmediatePropagation();
+    }
+    return false;
   }
 
   // --- fields -----------------------------------------------------------------------------------------------------------
@@ -461,7 +495,6 @@
     byPointer = true;
     focused = "";
   }, true);
-  addEventListener("keydown", () => (byPointer = false), true);
   function giveBack(event) {
     if (event.type === "click" && event.detail === 0) return;
     const here = document.activeElement;

@@ -79,6 +79,7 @@ def test_the_palette_finds_places_envs_cameras_and_control_modes(example: At, br
         expect(status).to_contain_text("pd_joint_delta_pos")
         # Keys have the names that people use, also where they are looked for.
         page.keyboard.press("Control+k")
+        expect(page.get_by_placeholder("Search commands...")).to_be_focused()
         page.keyboard.type("left arrow")
         first = page.locator(".mantine-Spotlight-action").first
         expect(first).to_contain_text("One step back")

@@ -21,6 +21,12 @@ class OpenListedTask(Command, frozen=True):
     number: int
 
 
+class OpenFoundTask(Command, frozen=True):
+    """Open the best match of the search."""
+
+    context = "dialog"
+
+
 class ClearTaskSearch(Command, frozen=True):
     """Show all tasks again."""
 

@@ -9,7 +9,13 @@ import pytest
 
 from tests.drive.panels import Panels
 from workbench.authoring.templates.new_task import TEMPLATES
-from workbench.commands.tasks import ClearTaskSearch, OpenListedTask, OpenTaskList, TemplateName
+from workbench.commands.tasks import (
+    ClearTaskSearch,
+    OpenFoundTask,
+    OpenListedTask,
+    OpenTaskList,
+    TemplateName,
+)
 from workbench.jobs.task import TaskOptions
 from workbench.session.tasks.catalogue import Catalogue, CatalogueView, Entry, Section
 from workbench.session.tasks.recents import RecentTasks
@@ -88,7 +94,7 @@ def test_the_search_leaves_what_has_all_words_and_can_be_cleared(panels: Panels,
     panels.type("Search", "PUSH .py")
     listed.draw()
     html = panels.html("wb-tasks")
-    assert 'data-words="PUSH .py"' in html and "push.py" in html and "pull.py" not in html
+    assert "push.py" in html and "pull.py" not in html
     panels.type("Search", "nothing like it")
     listed.draw()
     listed.draw()
@@ -96,6 +102,21 @@ def test_the_search_leaves_what_has_all_words_and_can_be_cleared(panels: Panels,
     panels.ask(ClearTaskSearch())
     listed.draw()
     assert "pull.py" in panels.html("wb-tasks") and panels.typed("Search") == ""
+
+
+def test_enter_opens_the_first_that_is_not_open_or_says_that_there_is_none(
+    panels: Panels, chosen: Chosen
+) -> None:
+    panels.visitors.do = TaskList(panels.server, chosen).do
+    panels.type("Search", ".py")
+    panels.do(OpenFoundTask())
+    assert chosen.numbers == [number_of(chosen, "pull.py")]
+    panels.type("Search", "push.py")
+    panels.do(OpenFoundTask())
+    assert chosen.numbers[1:] == [number_of(chosen, "push.py")]
+    panels.type("Search", "nothing like it")
+    panels.do(OpenFoundTask())
+    assert len(chosen.numbers) == 2 and len(panels.client.notices) == 1
 
 
 def test_a_new_task_is_asked_for_by_its_name_and_its_template(panels: Panels, chosen: Chosen) -> None:

@@ -32,7 +32,6 @@ SCRIPTS = (
     "panels.js",
     "curve_clicks.js",
     "view_width.js",
-    "task_list.js",
 )
 """Of ``web_assets/``, run by the page."""
 STYLES = "panels/page.css"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import viser
@@ -17,6 +17,7 @@ from workbench.commands.tasks import (
     CreateTask,
     LookForTasks,
     NameTask,
+    OpenFoundTask,
     OpenListedTask,
     OpenTaskList,
     TemplateName,
@@ -70,10 +71,18 @@ class Chooser(Protocol):
 class TaskList:
     """A search field and the list, in the present container.
 
-    The arrow keys and Enter act in the browser (``task_list.js``), which asks for what a press on the row would.
+    Enter in the field opens the best match; the arrows lead from the field to the rows.
     """
 
-    does = (OpenListedTask, LookForTasks, ClearTaskSearch, NameTask, ChooseTemplate, CreateTask)
+    does = (
+        OpenListedTask,
+        OpenFoundTask,
+        LookForTasks,
+        ClearTaskSearch,
+        NameTask,
+        ChooseTemplate,
+        CreateTask,
+    )
 
     def __init__(
         self,
@@ -96,6 +105,7 @@ class TaskList:
             "words",
             hint="Words in the name or the folder, all of which must be found; or the path of a file",
             live=True,
+            enter=OpenFoundTask(),
             longest=LONGEST_WORDS,
         )
         with server.gui.add_folder(NEW_TASK, expand_by_default=False):
@@ -123,24 +133,34 @@ class TaskList:
         catalogue = self._chooser.catalogue
         catalogue.follow()
         view, doing = catalogue.view(), self._chooser.doing()
-        typed, why_not = None, ""
-        try:
-            typed = catalogue.typed(self._words)
-        except NotAPath as error:
-            why_not = sentence(str(error))
+        typed, why_not = self._typed()
         wanted = view.serial, self._words, doing, typed, why_not
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        self._html.content = tasks_html(view, self._words, doing, self._chooser.is_open, typed, why_not)
+        self._html.content = tasks_html(
+            view, self._words, doing, self._chooser.is_open, typed, why_not, self._find.name
+        )
+
+    def _typed(self) -> tuple[Entry | None, str]:
+        """The file whose path the words are; or why it cannot be opened."""
+        try:
+            return self._chooser.catalogue.typed(self._words), ""
+        except NotAPath as error:
+            return None, sentence(str(error))
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
             case OpenListedTask(number=number):
                 if self._chooser.catalogue.entry(number) is None:
                     raise Refused("It is no longer in the list.")
-                self._chooser.choose(number)
-                self._on_chosen()
+                self._choose(number)
+            case OpenFoundTask():
+                found = shown_rows(self._chooser.catalogue.view(), self._words, self._typed()[0])
+                best = best_row([row for rows in found.values() for row in rows], self._chooser.is_open)
+                if best is None:
+                    raise Refused("Nothing in the list has these words.")
+                self._choose(best.number)
             case LookForTasks(words=words):
                 self._words = words[:LONGEST_WORDS]
             case ClearTaskSearch():
@@ -158,6 +178,32 @@ class TaskList:
                     raise Refused(str(why)) from None
                 self._on_chosen()
 
+    def _choose(self, number: int) -> None:
+        self._chooser.choose(number)
+        self._on_chosen()
+
+
+def shown_rows(view: CatalogueView, words: str, typed: Entry | None) -> dict[Section, list[Entry]]:
+    """The rows of each section, in the order of the list.
+
+    Args:
+        words: searched for.
+        typed: the file whose path the words are.
+    """
+    wanted = words.lower().split()
+    found = [entry for entry in view.entries if entry.matches(wanted)]
+    if typed is not None and all(entry.reference != typed.reference for entry in found):
+        found.insert(0, typed)
+    rows = {section: [entry for entry in found if entry.section is section] for section in Section}
+    if not wanted:
+        rows[Section.RECENT] = rows[Section.RECENT][:MOST_RECENT]
+    return rows
+
+
+def best_row(rows: Sequence[Entry], is_open: Callable[[Entry], bool]) -> Entry | None:
+    """What Enter opens: the first that is not open."""
+    return next((row for row in rows if not is_open(row)), rows[0] if rows else None)
+
 
 def tasks_html(
     view: CatalogueView,
@@ -166,6 +212,7 @@ def tasks_html(
     is_open: Callable[[Entry], bool] = lambda entry: False,
     typed: Entry | None = None,
     why_not: str = "",
+    search: str = "",
 ) -> str:
     """The list.
 
@@ -175,19 +222,18 @@ def tasks_html(
         is_open: whether a row is the open task, which is marked and which Enter does not choose.
         typed: the file whose path the words are.
         why_not: why the path in the words cannot be opened.
+        search: name of the field of the search.
     """
-    wanted = words.lower().split()
-    found = [entry for entry in view.entries if entry.matches(wanted)]
-    if typed is not None and all(entry.reference != typed.reference for entry in found):
-        found.insert(0, typed)
-    sections = []
-    for section in Section:
-        rows = [entry for entry in found if entry.section is section]
-        shown = rows[:MOST_RECENT] if section is Section.RECENT and not wanted else rows
-        if note := _note(section, view, bool(rows), bool(wanted)):
-            sections.append({"of": section, "rows": shown, "note": note})
-        elif shown:
-            sections.append({"of": section, "rows": shown, "note": ""})
+    found = shown_rows(view, words, typed)
+    every = [row for rows in found.values() for row in rows]
+    notes = {
+        section: _note(section, view, bool(rows), bool(words.split())) for section, rows in found.items()
+    }
+    sections = [
+        {"of": section, "rows": rows, "note": notes[section]}
+        for section, rows in found.items()
+        if rows or notes[section]
+    ]
     return render(
         "tasks",
         view=view,
@@ -195,7 +241,9 @@ def tasks_html(
         doing=doing,
         open_task=lambda number: OpenListedTask(number=number),
         clear=ClearTaskSearch(),
-        found=len(found),
+        found=len(every),
+        best=best_row(every, is_open),
+        search=search,
         why_not=why_not,
         sections=sections,
         pictures=view.registered.pictures,

@@ -114,6 +114,11 @@ class Field:
         )
 
     @property
+    def name(self) -> str:
+        """Of its first input, in the page."""
+        return self._names[0]
+
+    @property
     def visible(self) -> bool:
         return self._input.visible
 
