@@ -569,5 +569,5 @@
     showValues();
   }).observe(document, { childList: true, subtree: true, attributes: true, attributeFilter: ["data-page", "data-shows", "data-title"] });
 
-  window.wb = { ask, sendNewest, arrivals };
+  window.wb = { ask, arrivals };
 }

@@ -16,7 +16,7 @@ the rest of the machine share the cores: *others* is what the rest took, without
 ``--draw none``, the default, is a stand-in for a browser with a graphics card: WebGL's draw calls are replaced by
 nothing, and the page is transparent, so that Chromium does not put it together in software. All else is done. ``--draw page`` replaces the draw calls alone; with ``--draw all`` Chromium rasterises
 everything on the processor, which then is the limit on a machine without a card; ``--draw as-with-a-card`` does so too, and tells
-the page that it has one, which leaves out what the page does to be drawn in less time. Without ``--cameras`` the pictures
+the page that it has one, which is then sent the shapes as they are. Without ``--cameras`` the pictures
 are unticked: on such a machine the renderer, the physics and the browser share the cores.
 
 ``--orbit`` measures a second time, paused, while the mouse turns the camera: what a person does who looks for a mistake.
