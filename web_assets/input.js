@@ -253,7 +253,7 @@
 
   // Over a dialog that is open only the keys of what is in it count.
   function contexts() {
-    const dialog = [...document.querySelectorAll("[aria-modal=true], dialog[open], body > .wb-all-keys")].at(-1);
+    const dialog = [...document.querySelectorAll("[aria-modal=true], dialog[open], body > .wb-all-keys:popover-open")].at(-1);
     const there = [...(dialog ?? document).querySelectorAll("[data-context]")].map((one) => one.dataset.context);
     return dialog ? there : [...there.reverse(), ...always];
   }
@@ -268,7 +268,7 @@
 
   // A copy, which no redraw takes out of the page.
   function toggleKeyList() {
-    const shown = document.querySelector("body > .wb-all-keys");
+    const shown = document.querySelector("body > .wb-all-keys:popover-open");
     if (shown || !keyList) return shown?.hidePopover();
     const list = document.body.appendChild(keyList.cloneNode(true));
     list.removeAttribute("data-keys");
