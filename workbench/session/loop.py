@@ -142,13 +142,17 @@ class Aside:
             queue.SimpleQueue()
         )
         self._thread: threading.Thread | None = None
+        self._ended = False
 
     def begin(self, work: Callable[[], Value]) -> futures.Future[Value]:
-        """Do this after what was begun before; called on the loop."""
+        """Do this after what was begun before; after the end it is cancelled. Called on the loop."""
+        made: futures.Future[Value] = futures.Future()
+        if self._ended:
+            made.cancel()
+            return made
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
             self._thread.start()
-        made: futures.Future[Value] = futures.Future()
         self._work.put((work, made))
         return made
 
@@ -158,6 +162,7 @@ class Aside:
 
     def end(self) -> None:
         """End the thread when all that was begun is done."""
+        self._ended = True
         self._work.put(None)
 
     def close(self) -> None:

@@ -115,14 +115,15 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
     monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: taker)
     recorder = LiveRecorder(tmp_path, lambda: None, lambda envs: None)
     try:
+        given = 0
         for _ in range(2):
             taker.disk.set()
             recorder.start(task, (0,))
             for _ in range(4):
-                taken = taker.taken
                 for _ in range(8):
                     recorder.take(step)
-                until(lambda taken=taken: taker.taken == taken + 8, "the steps to be taken")
+                given += 8
+                until(lambda given=given: taker.taken == given, "the steps to be taken")
                 assert recorder.status().problem is None and recorder.status().active
             taker.disk.clear()
             count = 0
@@ -130,6 +131,7 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
                 recorder.take(step)
                 count += 1
             assert 9 <= count <= 12 and recorder.status().problem is not None
+            given += count - 1  # the last was one too many
             taker.disk.set()
     finally:
         taker.disk.set()

@@ -418,10 +418,10 @@ class Session:
         """End all processes and threads; waits for episodes that are being written. Called on another thread than the loop."""
         stop_listening(self._log)
         self._changes.close()
+        self._worker.stop()
         self.versions.close()
         self._aside.close()
         self._policy_file.close()
-        self._worker.stop()
         self.rescorer.rescoring.close()
         self.checks.close()
         self.profiler.close()
@@ -437,6 +437,8 @@ class Session:
     def _take(self, event: Event) -> None:
         """On the supervisor's thread, which goes on when the event was taken."""
         # Files are read here: a disk that hangs must not keep the loop.
+        if isinstance(event, LoadFailed):
+            self.versions.follow_failure(event)
         on_disk = not isinstance(event, Loaded) or is_on_disk(event.task.source)
         if do(lambda: self._handle(event, on_disk)):
             self._on_event(event)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -377,13 +378,20 @@ class Versions:
         else:
             next_load = self._recovery.next_load() if self._recovery.failed(failed.kept) else None
         request = None if next_load is None else self._state.load_request(*next_load)
-        task = self._state.now.task
         if request is not None:
             self._send(request)
-        if failed.problem.file is not None:
-            # It may be a module that the task has never imported without an error, so it is in no `source_files`; or one of
-            # another folder, and a person mends it there.
-            self._follow(() if task is None else task.source_files, {}, Path(failed.problem.file))
+
+    def follow_failure(self, failed: LoadFailed) -> None:
+        """Watch the file of a problem too, before a person sees it and mends it. Called on another thread than the loop."""
+        if failed.problem.file is None:
+            return
+        file = Path(failed.problem.file)
+        task = self._state.now.task
+        # It may be a module that the task has never imported without an error, so it is in no `source_files`; or one of
+        # another folder, and a person mends it there.
+        followed = do(lambda: self._follow(() if task is None else task.source_files, {}, file))
+        if followed is not None:
+            followed.result()
 
     def died(self, death: Death, printed: str) -> tuple[Problem | None, bool]:
         """The worker is gone.
@@ -415,9 +423,12 @@ class Versions:
         self._aside.close()
         self._watcher.stop()
 
-    def _follow(self, paths: Iterable[str], texts: Mapping[str, str], at_fault: Path | None = None) -> None:
+    def _follow(
+        self, paths: Iterable[str], texts: Mapping[str, str], at_fault: Path | None = None
+    ) -> Future[None] | None:
         if wanted := self._wanted(paths, at_fault):
-            self._aside.begin(partial(self._watcher.follow, wanted, texts))
+            return self._aside.begin(partial(self._watcher.follow, wanted, texts))
+        return None
 
     def _wanted(self, paths: Iterable[str], at_fault: Path | None = None) -> set[Path]:
         """The task's own file, those of `paths` in its folder, and the one that `at_fault` names, wherever it is; none if
