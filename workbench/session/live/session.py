@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,7 @@ from workbench.session.live.solver import Solver
 from workbench.session.live.timeline import TimeTravel
 from workbench.session.live.versions import Versions, is_on_disk
 from workbench.session.live.view import SessionView
-from workbench.session.loop import Aside, Changes, do, on_loop
+from workbench.session.loop import Aside, Changes, do, is_here, on_loop
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.captured_output import PrintedLine, PrintedLog
 from workbench.session.process.heartbeat import Busy
@@ -269,15 +270,22 @@ class Session:
         self._state.set(seed=int(seed))
         self.reset()
 
-    @on_loop
     def change(self, **settings: Any) -> None:
         """Change fields of `Settings`."""
+        followed = do(lambda: self._change(settings))
+        if followed is not None and not is_here():
+            followed.result()  # a save from here on is noticed
+
+    def _change(self, settings: Mapping[str, Any]) -> Future[None] | None:
+        policy = self._state.policy
         if not self._state.change(**settings):
-            return
+            return None
         self._send_settings()
-        # It reads the file.
-        self._aside.begin(partial(self._policy_file.follow, self._state.policy, self._state.folder))
         self._notify()
+        if self._state.policy == policy:
+            return None
+        # It reads the file.
+        return self._aside.begin(partial(self._policy_file.follow, self._state.policy, self._state.folder))
 
     @on_loop
     def tell(
