@@ -1,0 +1,163 @@
+"""Whatever is asked and whatever a worker says, in any order: the state can be drawn, and is the same for who comes late."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.drive.live import Live
+from tests.drive.panels import Clock
+from tests.drive.session import BASE, Told, told_session
+from workbench.authoring.problem import Problem
+from workbench.commands.page import TellUnfolded
+from workbench.session.live.view import SessionView
+from workbench.session.protocol.messages import CameraRequest, LoadFailed, Loading, Status
+from workbench.ui.live.env_panel import TABLE
+
+PROBLEM = Problem("step", "KeyError: 'goal'", "push.py", 7, None, "Traceback")
+Act = Callable[[Told], object]
+
+
+def act(name: str, do: Act) -> st.SearchStrategy[tuple[str, Act]]:
+    return st.just((name, do))
+
+
+def fails(kept: bool, at_run: bool) -> Act:
+    return lambda told: told.tell(LoadFailed(PROBLEM, kept=kept, at_run=at_run))
+
+
+def places(told: Told) -> None:
+    """A camera somewhere else, if there is one that can be placed."""
+    camera = told.view.studio.camera(BASE)
+    if camera is not None and camera.now is not None:
+        x, y, z = camera.now.position
+        told.session.studio.place(BASE, replace(camera.now, position=(x + 0.1, y, z)))
+
+
+EVENTS = st.one_of(
+    st.sampled_from(["same", "patched", "cameras", "rebuilt", "restarted"]).map(
+        lambda level: (f"loaded {level}", lambda told: told.load(level))
+    ),
+    st.integers(1, 4).map(lambda count: (f"{count} steps", lambda told: told.step(count))),
+    st.lists(st.integers(0, 2), unique=True, min_size=1).map(
+        lambda envs: (f"reset of {envs}", lambda told: told.reset(envs))
+    ),
+    act("plays", lambda told: told.tell(Status(True, 20.0, 1.0))),
+    act("is paused", lambda told: told.tell(Status(False, 0.0, 0.0))),
+    act("is loading", lambda told: told.tell(Loading("importing"))),
+    act("does not load", fails(True, False)),
+    act("fails while it runs", fails(True, True)),
+    act("dies", lambda told: told.die()),
+)
+COMMANDS = st.one_of(
+    act("play", lambda told: told.session.play()),
+    act("pause", lambda told: told.session.pause()),
+    act("step", lambda told: told.session.step()),
+    act("undo", lambda told: told.session.past.undo()),
+    act("go on from here", lambda told: told.session.past.continue_from_shown("all")),
+    st.integers(-20, 20).map(lambda by: (f"{by} along", lambda told: told.session.past.seek_by(by))),
+    st.integers(-2, 40).map(lambda at: (f"seek {at}", lambda told: told.session.past.seek(at))),
+    st.integers(-1, 5).map(lambda env: (f"select {env}", lambda told: told.session.change(selected_env=env))),
+    act(
+        "watch a camera",
+        lambda told: told.session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),)),
+    ),
+    act("place a camera", places),
+    act("undo a placement", lambda told: told.session.studio.undo()),
+    st.integers(0, 9).map(lambda seed: (f"seed {seed}", lambda told: told.session.set_seed(seed))),
+    act("reload", lambda told: told.session.versions.reload()),
+)
+SEQUENCES = st.lists(st.one_of(EVENTS, COMMANDS), min_size=1, max_size=25)
+
+
+@contextmanager
+def told_first() -> Iterator[Told]:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        told_session(Path(folder), task=f"{folder}/push.py") as told,
+    ):
+        told.load()
+        told.reset()
+        yield told
+
+
+@contextmanager
+def page() -> Iterator[Live]:
+    live = Live(viser.ViserServer(host="127.0.0.1", port=0, verbose=False), Clock())
+    live.page.do(TellUnfolded(panel=TABLE), live.visitor)  # folded, it is drawn for each task alone
+    try:
+        yield live
+    finally:
+        live.server.stop()
+
+
+def draw(live: Live, told: Told) -> None:
+    past = told.session.past
+    live.session.answers |= {"past.strip": past.strip, "past.episode": past.episode}
+    live.show(told.view, told.session.env_rows())
+
+
+def panels_of(live: Live) -> dict[str, object]:
+    """All but the 3-D view, where the first moment that is drawn decides how far apart the envs stand."""
+    return {name: value for name, value in live.all_drawn().items() if not name.startswith("in the view")}
+
+
+def plain(value: object) -> Any:
+    """What can be compared, without times of the day and what is not of the state."""
+    if isinstance(value, np.ndarray):
+        return value.shape, value.astype(object).ravel().tolist().__repr__()
+    if is_dataclass(value) and not isinstance(value, type):
+        left_out = ("at",) if type(value).__name__ == "PastLoad" else ("printed", "vitals")
+        return {
+            one.name: plain(getattr(value, one.name)) for one in fields(value) if one.name not in left_out
+        }
+    if isinstance(value, dict):
+        return {str(key): plain(one) for key, one in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [plain(one) for one in value]
+    return repr(value)
+
+
+def view_after(sequence: Sequence[tuple[str, Act]]) -> SessionView:
+    with told_first() as told:
+        for _, do in sequence:
+            do(told)
+        return told.view
+
+
+@pytest.mark.thorough
+@settings(max_examples=30)
+@given(SEQUENCES)
+def test_the_same_sequence_gives_the_same_state(sequence: list[tuple[str, Act]]) -> None:
+    first, again = (plain(view_after(sequence)) for _ in range(2))
+    assert first.keys() == again.keys()
+    for name, value in first.items():
+        # The task's file is in another folder each time.
+        if name not in ("task", "recording", "refused", "problem", "loads", "studio"):
+            assert value == again[name], name
+
+
+@pytest.mark.thorough
+@settings(max_examples=12)
+@given(SEQUENCES)
+def test_a_page_that_comes_in_the_middle_shows_what_one_shows_that_was_there_from_the_start(
+    sequence: list[tuple[str, Act]],
+) -> None:
+    with told_first() as told, page() as there, page() as late:
+        for _, do in sequence:
+            do(told)
+            draw(there, told)
+        draw(late, told)
+        one, other = panels_of(there), panels_of(late)
+        assert one.keys() == other.keys()
+        assert {name: (value, other[name]) for name, value in one.items() if value != other[name]} == {}
