@@ -4,15 +4,18 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from tests.drive.session import BASE, camera, in_studio, wait_until
+from tests.drive.session import BASE, camera, in_studio, step, wait_until
+from workbench.authoring.camera_source.disk import SourceEdit
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
+from workbench.session.cameras import file_edits
 from workbench.session.cameras.view import EditRequest, EditState
 from workbench.session.live.session import Session
 
@@ -68,6 +71,38 @@ def there(session: Session, key: CameraKey) -> CameraSettings:
     found = camera(session, key).info.settings
     assert found is not None
     return found
+
+
+@pytest.mark.slow
+def test_while_the_disk_hangs_under_an_edit_the_session_answers(
+    session: Session, task_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on, hangs, apply = threading.Event(), threading.Event(), file_edits.apply
+
+    def slowly(edit: SourceEdit) -> None:
+        hangs.set()
+        goes_on.wait(60)
+        apply(edit)
+
+    monkeypatch.setattr(file_edits, "apply", slowly)
+    session.studio.place(BASE, replace(there(session, BASE), fov=1.05))
+    session.studio.file.plan(EditRequest("edit", BASE))
+    planned(session)
+    session.studio.file.write()
+    try:
+        assert hangs.wait(60)
+        step(session)
+        assert session.view().studio.edit_state.loading
+    finally:
+        goes_on.set()
+    wait_until(session, in_studio(lambda s: s.edit_state.stage == "checked"), "the check")
+    assert "1.05" in task_file.read_text()
+    session.studio.file.undo_write()
+    wait_until(
+        session,
+        in_studio(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
+        "the file as it was",
+    )
 
 
 @pytest.mark.slow

@@ -1,0 +1,76 @@
+"""A disk that hangs keeps what needs it, and nothing else."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.drive.session import Told, told_session
+from tests.drive.waiting import until
+from workbench.authoring.loading.watch import SourceWatcher
+from workbench.session.protocol.messages import SingleStep
+
+
+@pytest.fixture
+def disk() -> Iterator[threading.Event]:
+    """It goes on when this is set."""
+    disk = threading.Event()
+    yield disk
+    disk.set()
+
+
+def answers(told: Told) -> bool:
+    """Whether a press on Step reaches the worker, and what comes of it the page."""
+    told.asked(object)
+    told.session.step()
+    told.step()
+    return len(told.asked(SingleStep)) == 1 and told.view.timeline.last > 0
+
+
+def test_files_that_cannot_be_watched_keep_no_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
+) -> None:
+    with told_session(tmp_path, task=str(tmp_path / "push.py")) as told:
+        told.play(2)
+        hangs = threading.Event()
+
+        def follow(self: SourceWatcher, *_: object) -> None:
+            hangs.set()
+            disk.wait(60)
+
+        monkeypatch.setattr(SourceWatcher, "follow", follow)
+        told.load("patched", source_files=(str(tmp_path / "push.py"),))
+        assert hangs.wait(60)
+        assert answers(told)
+        disk.set()
+
+
+def test_a_recording_that_cannot_be_written_keeps_no_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
+) -> None:
+    with told_session(tmp_path / "kept") as told:
+        told.play(0)
+        told.session.start_recording((0,))
+        hangs = threading.Event()
+        write = os.pwrite
+
+        def pwrite(*what: object) -> int:
+            hangs.set()
+            disk.wait(60)
+            return write(*what)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(os, "pwrite", pwrite)
+        told.reset((0,))
+        told.step(3)
+        assert hangs.wait(60)
+        assert answers(told) and told.view.recording.active
+        told.session.stop_recording()
+        assert answers(told)
+        disk.set()
+        until(
+            lambda: told.view.recording.episodes_written == 1, "the episode", seen=lambda: told.view.recording
+        )
