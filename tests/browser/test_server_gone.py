@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.drive.far_line import line_to
-from tests.drive.page import new_page, open_workbench
+from tests.drive.page import TASK, new_page, open_tab, open_workbench
 from workbench.ui.server.gated_server import ServerOptions, open_server
 from workbench.ui.widgets.visitors import PATH, Visitors
 
@@ -47,3 +48,31 @@ def test_the_notice_goes_when_the_server_can_be_reached_again(browser: Browser) 
             page.close()
     finally:
         gated_server.close()
+
+
+def test_a_page_that_comes_back_has_its_tab_and_its_env_and_is_heard(browser: Browser, tmp_path: Path) -> None:
+    task = shutil.copy(TASK, tmp_path)
+    arguments = (str(task), "--num-envs", "2", "--env", "render_backend=none", "--no-spare")
+    with open_workbench(*arguments, cwd=tmp_path) as opened:
+        page, _ = new_page(browser, drawn=False)
+
+        def is_as_it_was() -> None:
+            expect(page.get_by_role("tab", name="Inspect")).to_have_attribute("aria-selected", "true")
+            expect(page.get_by_text("live env 1").first).to_be_visible()
+
+        with line_to(opened.url) as line:
+            page.goto(line.address(opened.url))
+            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+            page.keyboard.press("n")
+            open_tab(page, "Inspect")
+            is_as_it_was()
+        expect(page.get_by_role("alert").filter(has_text=str(line.port))).to_be_in_viewport()
+        with line_to(opened.url, port=line.port):
+            expect(page.get_by_role("alert").filter(has_text=str(line.port))).to_have_count(0)
+            is_as_it_was()
+            page.keyboard.press("Space")
+            expect(page.get_by_text("running", exact=True).first).to_be_visible()
+            page.keyboard.press("Space")
+            expect(page.get_by_text("paused", exact=True)).to_be_visible()
+            is_as_it_was()
+            page.close()

@@ -149,7 +149,7 @@ class Workplace:
     def _do(self, command: Command, visitor: Visitor) -> None:
         match command:
             case OpenHelp():
-                pass  # The browser itself opens the page (``web_assets/help.js``).
+                pass  # The browser itself opens the page (``web_assets/panels.js``).
             case RenewToken():
                 if self.renew_token is None:
                     raise Refused("This page asks for no token; there is none to renew.")

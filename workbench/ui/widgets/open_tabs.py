@@ -9,7 +9,7 @@ from workbench.ui.widgets.visitors import Visitor, Visitors
 
 
 class OpenTabs:
-    """Which tab is open only the browser knows, which says so where it is asked (``tab_stays.js``)."""
+    """Which tab is open only the browser knows, which says so where it is asked (``panels.js``)."""
 
     def __init__(self, visitors: Visitors) -> None:
         self._visitors = visitors
