@@ -50,7 +50,9 @@ def test_the_notice_goes_when_the_server_can_be_reached_again(browser: Browser) 
         gated_server.close()
 
 
-def test_a_page_that_comes_back_has_its_tab_and_its_env_and_is_heard(browser: Browser, tmp_path: Path) -> None:
+def test_a_page_that_comes_back_has_its_tab_and_its_env_and_is_heard(
+    browser: Browser, tmp_path: Path
+) -> None:
     task = shutil.copy(TASK, tmp_path)
     arguments = (str(task), "--num-envs", "2", "--env", "render_backend=none", "--no-spare")
     with open_workbench(*arguments, cwd=tmp_path) as opened:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 import threading
 from collections.abc import Callable
@@ -28,6 +29,7 @@ from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.side_files import side_files_text
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
+from workbench.session.loop import begin, do
 from workbench.session.review.view import ReviewView
 from workbench.ui.live.banners import is_busy_for_long
 from workbench.ui.review.rescore import RECORDED, TODAYS
@@ -47,6 +49,8 @@ NEW_ENVS = 4
 """Envs of a session that is opened for "all envs"."""
 
 
+_LOOK = 0.05
+"""Seconds between two looks whether a live env is there."""
 MakeSession = Callable[[TaskName, TaskOptions], Session]
 
 
@@ -184,6 +188,14 @@ class GoLive:
         way.problems = session.view().problem_serial
         way.number = session.enter_recording(way.run, self.everywhere, way.info.source_file, way.info.source)
         way.session = session
+        do(lambda: begin(self._change_pages_when_there(way)))
+
+    async def _change_pages_when_there(self, way: _Way) -> None:
+        while self._way is way:
+            if way.is_over():
+                self._way = None
+                self._place.pages.show("live")
+            await asyncio.sleep(_LOOK)
 
     def _give_up(self) -> None:
         way, self._way = self._way, None
@@ -194,12 +206,6 @@ class GoLive:
         """What the transition waits for; empty while there is none."""
         way = self._way
         return "" if way is None else way.words()
-
-    def change_pages_when_there(self) -> None:
-        way = self._way
-        if way is not None and way.is_over():
-            self._way = None
-            self._place.pages.show("live")
 
     def review_is_back(self) -> None:
         """The review page is shown again: forget a transition that waits for no consent."""
@@ -293,7 +299,6 @@ class GoLivePart(PagePart[ReviewView]):
             self._home = gui.add_html("")
 
     def draw(self, view: ReviewView) -> None:
-        self._go_live.change_pages_when_there()
         home = self._go_live.can_go_home()
         self._folder.visible = bool(view.opened) or home
         self._code.show(RECORDED if self._go_live.recorded_source else TODAYS)
