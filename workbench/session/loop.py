@@ -105,6 +105,12 @@ def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lamb
             raise
 
 
+def wait_for_disk(done: futures.Future[Any] | None) -> None:
+    """Wait for what an `Aside` does, at most for a second: a disk may hang. Called on another thread than the loop."""
+    if done is not None and not is_here():
+        futures.wait([done], timeout=1.0)
+
+
 class Changes:
     """Counts the changes of something, for pages that wait for the next. Thread-safe."""
 

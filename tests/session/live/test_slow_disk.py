@@ -12,7 +12,8 @@ import pytest
 from tests.drive.session import Told, told_session
 from tests.drive.waiting import until
 from workbench.authoring.loading.watch import SourceWatcher
-from workbench.session.protocol.messages import SingleStep
+from workbench.authoring.problem import Problem
+from workbench.session.protocol.messages import LoadFailed, SingleStep
 
 
 @pytest.fixture
@@ -31,7 +32,7 @@ def answers(told: Told) -> bool:
     return len(told.asked(SingleStep)) == 1 and told.view.timeline.last > 0
 
 
-def test_files_that_cannot_be_watched_keep_no_step(
+def test_files_that_cannot_be_watched_keep_neither_a_step_nor_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
 ) -> None:
     with told_session(tmp_path, task=str(tmp_path / "push.py")) as told:
@@ -46,7 +47,9 @@ def test_files_that_cannot_be_watched_keep_no_step(
         told.load("patched", source_files=(str(tmp_path / "push.py"),))
         assert hangs.wait(60)
         assert answers(told)
-        disk.set()
+        problem = Problem("import", "SyntaxError", str(tmp_path / "module.py"), 1, None, "")
+        told.tell(LoadFailed(problem, kept=True))
+        assert told.view.problem == problem and answers(told)
 
 
 def test_a_recording_that_cannot_be_written_keeps_no_step(

@@ -24,6 +24,8 @@ READ_S = 0.25
 within one tick of a file system's clock have the same one."""
 GONE_S = 0.3
 """How long a file must be missing or empty before that is its new content, and not half of a save."""
+STOP_S = 1.0
+"""Longest wait for the end of the thread: reading a file on a disk that hangs cannot be ended."""
 POLL_SHARE, READ_SHARE = 0.003, 0.001
 """Shares of one core for ``stat`` and for reading; with hundreds of files both are done less often."""
 NEWEST, TURN = 8, 32
@@ -81,10 +83,10 @@ class SourceWatcher:
             self._seen = None  # something may have been saved since `texts` was read
 
     def stop(self) -> None:
-        """Return when the thread has ended (at once, when called from `on_change`)."""
+        """Return when the thread has ended; at once, when called from `on_change`, and soon, where it reads a disk that hangs."""
         self._stopped.set()
         if threading.current_thread() is not self._thread:
-            self._thread.join()
+            self._thread.join(timeout=STOP_S)
 
     def _run(self) -> None:
         pause = read_again = 0.0

@@ -29,7 +29,7 @@ from workbench.session.live.solver import Solver
 from workbench.session.live.timeline import TimeTravel
 from workbench.session.live.versions import Versions, is_on_disk
 from workbench.session.live.view import SessionView
-from workbench.session.loop import Aside, Changes, do, is_here, on_loop
+from workbench.session.loop import Aside, Changes, do, on_loop, wait_for_disk
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.captured_output import PrintedLine, PrintedLog
 from workbench.session.process.heartbeat import Busy
@@ -272,9 +272,7 @@ class Session:
 
     def change(self, **settings: Any) -> None:
         """Change fields of `Settings`."""
-        followed = do(lambda: self._change(settings))
-        if followed is not None and not is_here():
-            followed.result()  # a save from here on is noticed
+        wait_for_disk(do(lambda: self._change(settings)))  # then a save of the policy is noticed
 
     def _change(self, settings: Mapping[str, Any]) -> Future[None] | None:
         policy = self._state.policy
@@ -428,7 +426,7 @@ class Session:
         self._changes.close()
         self._worker.stop()
         self.versions.close()
-        self._aside.close()
+        self._aside.end()
         self._policy_file.close()
         self.rescorer.rescoring.close()
         self.checks.close()

@@ -17,7 +17,7 @@ from workbench.authoring.problem import Problem
 from workbench.jobs.policy import NoPolicy, find_policy
 from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
 from workbench.session.live.live_state import LiveState
-from workbench.session.loop import Aside, do, on_loop
+from workbench.session.loop import Aside, do, on_loop, wait_for_disk
 from workbench.session.process.supervisor import Death, End
 from workbench.session.protocol.messages import (
     Load,
@@ -389,9 +389,7 @@ class Versions:
         task = self._state.now.task
         # It may be a module that the task has never imported without an error, so it is in no `source_files`; or one of
         # another folder, and a person mends it there.
-        followed = do(lambda: self._follow(() if task is None else task.source_files, {}, file))
-        if followed is not None:
-            followed.result()
+        wait_for_disk(do(lambda: self._follow(() if task is None else task.source_files, {}, file)))
 
     def died(self, death: Death, printed: str) -> tuple[Problem | None, bool]:
         """The worker is gone.
@@ -420,7 +418,7 @@ class Versions:
 
     def close(self) -> None:
         """Stop watching. Called on another thread than the loop."""
-        self._aside.close()
+        self._aside.end()
         self._watcher.stop()
 
     def _follow(
