@@ -31,19 +31,19 @@ class PlannedEpisode:
     fail: NDArray[np.bool_]
     """(T,) likewise."""
     best: NDArray[np.float32]
-    """(T,) what the best rollout earned, before each step."""
+    """(T,) return of the best rollout, before each step."""
     hold: NDArray[np.float32]
-    """(T,) what the rollout earned that holds still; NaN where a reward was."""
+    """(T,) return of the rollout that holds still; NaN if one of its rewards was NaN."""
     worst: NDArray[np.float32]
-    """(T,) what the worst of the rollouts earned that have a finite return."""
+    """(T,) return of the worst rollout among those with a finite return."""
     terms: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """(T,) for each term of ``info["reward_terms"]``: how far apart the rollouts' sums of it are."""
+    """(T,) per term of ``info["reward_terms"]``: range of the rollouts' sums of the term."""
     evaluate: Mapping[str, float] = field(default_factory=dict)
-    """What ``evaluate`` said at the last step, as far as it is one number an env."""
+    """Entries of ``evaluate`` at the last step that have one number per env."""
     plan_seconds: float = 0.0
     """Wall time of all plans."""
     cut_off: bool = False
-    """It was ended because its wall time was up, which says nothing of the task."""
+    """Whether the episode ended because its wall time was up, which says nothing about the task."""
 
     @property
     def steps(self) -> int:
@@ -72,7 +72,7 @@ class EpisodeLog:
         self._last: Plan | None = None
         self._seconds = 0.0
         self.cut_off = False
-        """As of the episode."""
+        """Whether the wall time ran out; see `PlannedEpisode.cut_off`."""
 
     def add_plan(self, plan: Plan) -> None:
         """Note the plan whose action comes next."""

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 Method = Literal["mppi", "predictive", "cem"]
 _FEWEST_ROLLOUTS = 4
-"""The plan itself, holding still, and the two best of the round before."""
+"""Fewest rollouts: the plan itself, holding still, and the two best of the round before."""
 _STEPS = 8, 20
 """Fewest and most control steps of the usual horizon."""
 
@@ -46,7 +46,7 @@ class PlanArguments:
 
 @dataclass(frozen=True)
 class PlanOptions(PlanArguments):
-    """The same, with values that are within their ranges."""
+    """Validated `PlanArguments`: every value is within its range."""
 
     def __post_init__(self) -> None:
         """Raises ValueError with a sentence that names the option."""

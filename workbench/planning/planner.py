@@ -69,9 +69,9 @@ class Planner:
             raise
         self._parts = actions.action_parts(self._live)
         self.plans: dict[int, Plan] = {}
-        """The last plan of each env, with what its rollouts earned."""
+        """Last plan of each env, with the results of its rollouts."""
         self._taken: dict[int, int] = {}
-        """Actions of each plan that were given out."""
+        """Number of actions of each plan that were returned."""
 
     def reset(self, env_idx: Sequence[int] | int | None = None, seed: int | None = None) -> None:
         """Begin an episode of these envs, or of all: forget their plans.
@@ -113,7 +113,7 @@ class Planner:
         return actions.to_env_action(self._live, self._parts, self.flat_actions(chosen))
 
     def flat_actions(self, env_idx: Sequence[int] | int) -> NDArray[np.float32]:
-        """As `actions`, as one array (N, A), robots side by side."""
+        """Next actions like `actions`, as one array (N, A), robots side by side."""
         chosen = self._chosen(env_idx)
         self.reset([env for env in chosen if env not in self._taken])
         flat = actions.hold_action(self._parts, self._live.num_envs)

@@ -14,31 +14,31 @@ from workbench.planning.verdicts import ENOUGH_SEEDS, MOST_OF, RewardVerdict
 
 @dataclass(frozen=True)
 class SolvedSeed:
-    """What came of one seed."""
+    """Result of one seed."""
 
     seed: int
     solved_at: int
-    """The control step of its success, from 1 on; 0 without one."""
+    """Control step of the first success, from 1 on; 0 without success."""
     steps: int
     total_reward: float
-    """Over all steps, those after its success too."""
+    """Sum of the rewards of all steps, including the steps after success."""
     seconds: float
-    """Wall time of its plans."""
+    """Wall time of all plans of the seed."""
     in_the_way: str
     """Why it was not solved; empty if it was."""
     path: Path
     """Its recording."""
     cut_off: bool = False
-    """Its wall time was up."""
+    """Whether the seed ended because its wall time was up."""
 
 
 @dataclass(frozen=True)
 class SolveReport:
-    """What came of all seeds that were tried to the end."""
+    """Results of all seeds that were tried to the end."""
 
     seeds: tuple[SolvedSeed, ...]
     verdicts: tuple[RewardVerdict, ...]
-    """Of these seeds, if that `tells`: with further ones, one may come or go."""
+    """Verdicts over the seeds so far; empty unless there are enough seeds (`tells`). May change with more seeds."""
     seconds: float
     """Wall time, opening the task included."""
     stopped: bool
@@ -52,7 +52,7 @@ class SolveReport:
 
     @property
     def median_steps(self) -> float | None:
-        """Of the solved seeds, to their success; None without one."""
+        """Median control steps to success over the solved seeds; None without one."""
         return median(one.solved_at for one in self.solved) if self.solved else None
 
     @property

@@ -25,10 +25,10 @@ from workbench.planning.options import PlanOptions
 from workbench.planning.sampling import Sampler
 
 _OF_ABSOLUTE = 0.2
-"""Of the noise, for absolute joint positions: they range over the whole joint, which no plan crosses."""
+"""Factor on the noise for absolute joint positions: they range over the whole joint, which no plan crosses."""
 _PLANNED_MODE = "pd_ee_delta_pose"
 _NOT_FOR_ROLLOUTS = ("num_envs", "obs_mode", "render_mode", "render_backend", "sim_backend")
-"""Arguments of the live env that its rollouts have in their own way: they draw nothing, and nobody observes them."""
+"""Arguments of the live env that its rollouts replace: rollouts need no pictures and no observations."""
 
 
 class NotAlike(ValueError):
@@ -168,7 +168,7 @@ class RolloutPlanner:
         self._scale = torch.tensor([_noise_scale(part) for part in dimensions])
         self._samplers: dict[int, Sampler] = {}
         self._alike: tuple[object, set[int]] = (None, set())
-        """The scene of the live batch, and its envs that were found to be built alike."""
+        """Scene of the live batch, and the envs of it that are known to have the same bodies."""
 
     def begin(self, env: int, seed: int) -> None:
         """Begin an episode in this env of the live batch: forget its plan, and draw candidates from this seed."""
@@ -188,10 +188,10 @@ class RolloutPlanner:
             known.add(env)
 
     def require_bodies(self, wanted: Mapping[str, bytes]) -> None:
-        """As `require_alike`, of a live env in another process.
+        """Check like `require_alike`, for a live env in another process.
 
         Args:
-            wanted: of that env, from `bodies_of`.
+            wanted: bodies of the live env, from `bodies_of`.
         """
         for bodies in bodies_of(self.env):
             if bodies == wanted:
@@ -313,8 +313,8 @@ def _noise_scale(part: actions.ActionPart) -> float:
 
 @once_a_scene
 def bodies_of(env: BaseEnv) -> list[dict[str, bytes]]:
-    """Of each env, by name: a hash of what decides how a body moves and collides, apart from its state. It is the same in
-    every process."""
+    """Hash of each body by name, one dict per env; covers what decides how the body moves and collides, not its state.
+    Equal in every process."""
     index = scene_index(env)
     return [
         {

@@ -7,26 +7,27 @@ import torch
 from workbench.planning.options import PlanOptions
 
 _SMALL = 0.05, 0.5
-"""Least and most of the noise, for a third of the candidates: what is nearly right is not improved by large steps."""
+"""Smallest and largest factor on the noise, for a third of the candidates: large steps do not improve a nearly right
+plan."""
 _MOVED = 0.5
-"""Of the dimensions, for a third of the candidates, those that differ from the plan."""
+"""Probability that a dimension differs from the plan, in a third of the candidates."""
 _FLIPS = 0.3
-"""Of the knots of a dimension that switches, those that are drawn anew, in half of the candidates: what carries
-something away is not found by candidates that let it fall."""
+"""Probability that a knot of a switching dimension is redrawn, in half of the candidates: candidates that drop an
+object do not find how to carry it."""
 _TOP = 0.25
-"""Of the candidates, the best ones, whose spread is the measure of MPPI's temperature: where many drop what they hold, the
-spread of all is so wide that the good ones count the same."""
+"""Fraction of the candidates, the best ones, whose spread of returns scales MPPI's temperature: where many candidates
+drop an object, the spread of all is so wide that the good ones all get the same weight."""
 _KEPT = 2
 """Best candidates of a round that are tried again in the next."""
 _QUIET = 1.0
-"""Of MPPI, in spreads of the best candidates: what moving in every dimension as much as may be must earn more than holding
-still. Turns that earn nothing would else add up, and a hand that came aslant grasps badly."""
+"""MPPI's penalty on motion, in spreads of the best candidates: what full motion in every dimension must earn more than
+holding still. Without the penalty, turns that earn nothing add up, and a hand that arrives tilted grasps badly."""
 _LEAST_SPREAD = 0.2
-"""Of CEM, of the noise: a spread that has vanished never finds anything again."""
+"""CEM's smallest spread, as a fraction of the noise: a spread of zero finds nothing new."""
 
 
 class Sampler:
-    """The plan of one env: knots of actions from -1 to 1, and candidates around them.
+    """Plan of one env: knots of actions from -1 to 1, and candidates around the plan.
 
     A knot is an action at a time of the horizon: the first is now, the last at its end. Between knots a dimension goes along
     a straight line; one that switches (a gripper) stays as at the knot before, since what is half closed holds nothing.
@@ -40,7 +41,7 @@ class Sampler:
             steps: H, control steps of the horizon.
             switches: (A,) bool, dimensions that switch.
             scale: (A,) factor on the noise of each dimension.
-            seed: of the candidates.
+            seed: seed of the random candidates.
         """
         self._options, self._steps, self._switches = options, steps, switches
         self._generator = torch.Generator().manual_seed(seed)

@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from workbench.planning.episodes import PlannedEpisode
 
 _SAME = 0.002
-"""Of the range of rewards that were seen: what differs by less is the same."""
+"""Rewards count as equal if they differ by less than this fraction of the range of all rewards seen."""
 _FALL = 0.25
-"""Of the rise from the first reward to that at success: a fall on the way that counts."""
+"""Smallest fall of the reward that counts, as a fraction of the rise from the first reward to the reward at success."""
 MOST_OF = 3
-"""Episodes from which on it says something that most of them show it."""
+"""Fewest episodes among which a majority counts as evidence."""
 ENOUGH_SEEDS = 8
-"""Seeds from which on it says something that no verdict came: what pays without success is known only where some of them
-are solved and others are not."""
+"""Fewest seeds from which a report without verdicts is evidence: reward that pays without success shows only where some
+seeds are solved and others are not."""
 _LAST = 10
-"""Control steps at the end of an episode that are looked at, but no more than half of them."""
+"""Control steps at the end of an episode that are compared, at most half of the episode."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class RewardVerdict:
     """What some episodes show."""
 
     rule: str
-    """Its id in the table of rules."""
+    """Id of the rule in the table of rules."""
     message: str
     seeds: tuple[int, ...]
-    """Of the episodes that show it."""
+    """Seeds of the episodes that show it."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +229,7 @@ RULES: dict[str, Callable[[PlannedEpisodes], RewardVerdict | None]] = {
     "success-lost": lost,
     "failing-pays": failing_pays,
 }
-"""By the ids of the rules, in the order in which they are told."""
+"""Check of each rule by its id, in the order of the report."""
 
 
 # --- what is looked at -----------------------------------------------------------------------------------
