@@ -28,7 +28,7 @@ from workbench.recording.episode.row import UnreadableRecording
 
 MOST_FRAMES = 100_000
 MOST_BYTES = 1 << 29
-"""Of all encoded frames of one part."""
+"""Limit of all encoded frames of one part, in bytes."""
 MOST_SECONDS = 60.0
 """Time limit of ffmpeg for one part."""
 

@@ -26,7 +26,7 @@ LONGEST = 2000
 _ABOUT = b"workbench.sweep"
 _FORMAT = 1
 _Z = 1.959964
-"""Of a normal distribution, the middle 95 % lie within so many standard deviations."""
+"""Standard deviations around the mean that contain 95 % of a normal distribution."""
 
 T = TypeVar("T")
 
@@ -52,7 +52,7 @@ class SweepEpisode:
     """Control steps; None without an episode."""
     total_reward: float | None = None
     means: Mapping[str, float] = field(default_factory=dict)
-    """As `Episode.means`."""
+    """Mean of each entry over the episode; see `Episode.means`."""
     recording: str = ""
     """Its .rrd, relative to the results' folder."""
     failure: str = ""
@@ -61,23 +61,24 @@ class SweepEpisode:
 
 @dataclass(frozen=True)
 class SweepResults:
-    """All rows, and what they are of."""
+    """All rows of a sweep, with its task, actions and points."""
 
     task: str
     actions: str
     seeds: int
-    """How many were asked for, for each point."""
+    """Number of seeds requested for each point."""
     points: tuple[Mapping[str, str], ...]
-    """Of each point the set values by name, in JSON."""
+    """Set values of each point by name, in JSON."""
     episodes: tuple[SweepEpisode, ...]
-    """By point and seed."""
+    """Episodes ordered by point and seed."""
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(self.points[0]) if self.points else ()
 
     def summaries(self) -> list[PointSummary]:
-        """Of each point, the best first: by the rate of success, then by the mean return; those without an episode last."""
+        """Summary of each point, best first: by the rate of success, then by the mean return; points without an episode
+        last."""
         rows: dict[int, list[SweepEpisode]] = {}
         for one in self.episodes:
             rows.setdefault(one.point, []).append(one)
@@ -87,23 +88,23 @@ class SweepResults:
 
 @dataclass(frozen=True)
 class PointSummary:
-    """What the episodes of a point tell."""
+    """Statistics over the episodes of a point."""
 
     index: int
     values: Mapping[str, str]
-    """In JSON."""
+    """Set values by name, in JSON."""
     episodes: int
     solved: int | None
     """Episodes with success in any state; None for a task without ``success``."""
     solved_at_end: int | None
-    """Those with success in their last state."""
+    """Episodes with success in their last state."""
     mean_return: float | None
     means: Mapping[str, float]
-    """Over the episodes, of `SweepEpisode.means`."""
+    """Mean of `SweepEpisode.means` over the episodes."""
     failed: int
     """Seeds without an episode."""
     failure: str
-    """Why the first of them has none; empty if each has one."""
+    """Why the first of the failed seeds has no episode; empty if each seed has one."""
 
     @property
     def rate(self) -> float | None:
@@ -116,7 +117,7 @@ class PointSummary:
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
-    """Wilson's interval, which holds with 95 % a rate of which `successes` in `count` were seen."""
+    """Wilson's 95 % confidence interval of a rate with `successes` in `count`."""
     rate, part = successes / count, _Z * _Z / count
     middle = (rate + part / 2) / (1 + part)
     half = _Z / (1 + part) * math.sqrt(rate * (1 - rate) / count + part / (4 * count))

@@ -134,7 +134,7 @@ def _column(parts: Sequence[NDArray | int]) -> NDArray:
 TEXT = "entry"
 """Kind of a journal entry that holds a text."""
 MOST_BYTES = 64 << 10
-"""Of one episode's texts."""
+"""Limit of one episode's texts, in bytes."""
 MOST_LINES = MOST_BYTES
 """A line has at least a byte; a recording with more was not written by the workbench."""
 CUT_MESSAGE = "not recorded from here on: it changes too often"

@@ -77,7 +77,7 @@ class CameraJson(Struct, frozen=True):
     mount: Name | None
     modalities: Annotated[tuple[Name, ...], Entries]
     replaced_shader: Name = ""
-    """As `CameraInfo.replaced_shader`."""
+    """Shader pack of the task's config, if another one drew the pictures; see `CameraInfo.replaced_shader`."""
 
     @classmethod
     def of(cls, camera: CameraInfo) -> CameraJson:
@@ -227,7 +227,7 @@ class EpisodeJson(Struct, frozen=True):
     success: bool | list[bool] | None = None
     fail: bool | list[bool] | None = None
     workbench_id: Name | None = None
-    """Of the recording that it was exported from."""
+    """Id of the recording that the episode was exported from."""
 
     @property
     def seed(self) -> int | None:
@@ -484,7 +484,8 @@ def wrong_size(checksums: Mapping[str, Checksum], suffix: str, size: int) -> str
 
 
 MOST_NOTES_BYTES = 16 << 20
-"""Of a ``.notes``, and of the ``.json`` of a recording of ours, which holds its task's source and one small picture."""
+"""Limit in bytes of a ``.notes``, and of the workbench's own ``.json`` files, which hold the task's source and one
+small picture."""
 _NOTES = "workbench_notes"
 
 

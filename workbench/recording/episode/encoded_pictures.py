@@ -20,13 +20,13 @@ MODALITIES: tuple[Modality, ...] = ("rgb", "depth", "segmentation")
 JPEG_QUALITY = 85
 MILLIMETRES_PER_METRE = 1000.0
 MOST_PIXELS = 1 << 24
-"""Of one picture: 4096 x 4096. A PNG of 100 kB can claim a hundred times as many."""
+"""Limit of one picture: 4096 x 4096 pixels. A PNG of 100 kB can claim a hundred times as many."""
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREYSCALE = 0
 _UP = 2
 _LEVEL = 3
-"""Of zlib. Level 1 makes no smaller files and takes longer on smooth depth; the default 6 takes three times as long
-(measured)."""
+"""Compression level of zlib. Level 1 makes no smaller files and takes longer on smooth depth; the default 6 takes three
+times as long (measured)."""
 
 
 @dataclass(frozen=True)

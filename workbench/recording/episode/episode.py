@@ -25,11 +25,11 @@ Name = Annotated[str, Meta(max_length=1000)]
 PathText = Annotated[str, Meta(max_length=4096)]
 SmallInt = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Seconds = Annotated[float, Meta(ge=1e-4, le=1e3)]
-"""Of a control step; films have such frame rates too."""
+"""Duration of a control step; the frame rates of films are in the same range."""
 MOST_ENTRIES = 10_000
-"""Of anything that a recording names: entries of ``evaluate()``, files, actions."""
+"""Limit of every list in a recording: entries of ``evaluate()``, files, actions."""
 MOST_BODIES = 20_000
-"""Of a scene; a reader takes some seconds for so many."""
+"""Limit of the bodies of a scene; a reader takes some seconds for so many."""
 DEEPEST = 32
 """Nesting of keywords and options."""
 Entries = Meta(max_length=MOST_ENTRIES)
@@ -235,7 +235,7 @@ class Episode:
 
     @property
     def means(self) -> dict[str, float]:
-        """Of each entry of ``evaluate()`` with one number per state, over the states after the reset that have it."""
+        """Mean of each entry of ``evaluate()`` with one number per state, over the states after the reset that have it."""
         found: dict[str, float] = {}
         for name, values in self.evaluate.items():
             if values.ndim == 1 and name not in ("success", "fail"):

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 KEY_FILE = "recordings.key"
 _KEY_BYTES = 32
 _COVERED = {*SHARED, "seed", "source"} - {"acted_by", "pictures", "moved_cameras", "observed_by"}
-"""Without what earlier versions did not seal: a seal of theirs stays valid."""
+"""Fields that a seal covers, without the fields that earlier versions did not seal: their seals stay valid."""
 _logged: set[str] = set()
 
 
@@ -38,7 +38,7 @@ class MadeHere(Enum):
     CONTENT = "content"
     """This installation recorded it, but the task's file is at another path, or missing."""
     CONTENT_AND_PLACE = "content and place"
-    """And the task's file is the one that was open then, with possibly another text."""
+    """This installation recorded it, and the task's file is the one that was open then, with possibly another text."""
 
 
 def seal(description: Description, source_file: str | None) -> SealJson | None:
@@ -96,7 +96,7 @@ def is_sealed(text: str, found: object, what: str = "text") -> bool:
 
 
 def _content(values: Mapping[str, Any], main: Any, files: Any, acted_by: Sequence[Sequence[Any]]) -> str:
-    """The same text for values that are equal as JSON."""
+    """Canonical JSON text: equal for values that are equal as JSON."""
     return json.dumps(as_json([values, main, files, acted_by]), sort_keys=True)
 
 

@@ -1,4 +1,4 @@
-"""How far a job is that records into a folder: the command writes it there, and a library of the folder shows it."""
+"""Progress of a job that records into a folder: the command writes it there, and a library of the folder shows it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from workbench.recording.episode.row import clean_text
 _PREFIX, _SUFFIX = ".job-", ".status"
 _MOST_BYTES = 1 << 18
 _MOST = 64
-"""Files that are looked at: a job in 64 parts has as many."""
+"""Most status files that are read: a job in 64 parts has as many."""
 _WRITE_SECONDS = 1.0
 SILENT_SECONDS = 20.0
-"""Without a word for so long, a job is taken for dead."""
+"""A job whose status is older than this counts as dead."""
 _KEPT_SECONDS = 3600.0
-"""How long the last word of a job is shown."""
+"""How long the last status of a job is shown."""
 _MOST_FAILURES = 5
 
 JobState = Literal["running", "done", "stopped", "failed"]
@@ -31,10 +31,10 @@ JobState = Literal["running", "done", "stopped", "failed"]
 
 @dataclass(frozen=True)
 class JobFailure:
-    """Items that failed alike."""
+    """Items that failed with the same error."""
 
     items: str
-    """Their names."""
+    """Names of the items."""
     count: int
     message: str
     traceback: str = ""
@@ -42,20 +42,20 @@ class JobFailure:
 
 @dataclass(frozen=True)
 class JobStatus:
-    """A job at one moment."""
+    """Status of a job at one moment."""
 
     command: str
-    """As in ``record``."""
+    """Name of the command, for example ``record``."""
     task: str
     done: int
     total: int
-    """Episodes that are over, and that are wanted."""
+    """Requested episodes; `done` of them are over."""
     rate: float = 0.0
     """Episodes a second since it began; 0 if unknown."""
     failures: tuple[JobFailure, ...] = ()
     state: JobState = "running"
     part: str = ""
-    """Of a part, as in ``3/64``."""
+    """Which part of a divided job it is, for example ``3/64``; empty if the job is not divided."""
     written_at: float = 0.0
     """Seconds since 1970."""
     place: str = ""

@@ -37,7 +37,7 @@ from workbench.recording.reader.scan import DATASET_KEY, NOTES, RecordingFiles, 
 log = logging.getLogger(__name__)
 
 _MOST_PLACES = 64
-"""Folders below that are looked at for jobs."""
+"""Most subfolders that are searched for jobs."""
 
 SCAN_SECONDS = 1.0
 """Seconds between two checks of the folders' times."""

@@ -31,7 +31,7 @@ class OtherDemonstration(ValueError):
 
 @dataclass
 class Demonstrations:
-    """What was written."""
+    """Result of an export."""
 
     file: Path
     episodes: int = 0
@@ -41,9 +41,9 @@ class Demonstrations:
     not_fitting: list[str] = field(default_factory=list)
     """A sentence for each episode that was left out since it does not fit."""
     lossy: bool = False
-    """Its colour pictures are those of recordings, which keep them as JPEG."""
+    """Whether colour pictures come from recordings, which keep them as JPEG."""
     incomplete: list[str] = field(default_factory=list)
-    """A sentence for each episode of whose observations something is not in its recording."""
+    """A sentence for each episode whose recording lacks some of its observations."""
 
 
 def export_maniskill(
@@ -159,7 +159,7 @@ def _shape(episode: Episode) -> dict[str, Any]:
 
 
 def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
-    """In what an episode differs from the first one, as a sentence; empty if in nothing."""
+    """How an episode differs from the first one, as a sentence; empty if it does not."""
     for what, wanted in first.items():
         if other[what] != wanted:
             found, expected = short_line(repr(other[what]), 300), short_line(repr(wanted), 300)
@@ -168,7 +168,7 @@ def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
 
 
 def _flat(episode: Episode) -> Episode:
-    """With one vector of state observations where the env gives one."""
+    """Copy of the episode whose state observations are one vector, where the env gives one."""
     mode = episode.info.env_kwargs.get("obs_mode")
     if not episode.obs or not isinstance(mode, str) or _FLAT not in mode.split("+"):
         return episode

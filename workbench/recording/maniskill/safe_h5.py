@@ -240,6 +240,6 @@ class H5Dataset:
 
 
 def _native(numbers: NDArray) -> NDArray:
-    """In this machine's byte order, which torch requires."""
+    """Numbers in this machine's byte order, which torch requires."""
     array = np.asarray(numbers)
     return array.astype(array.dtype.newbyteorder("="), copy=False)

@@ -17,9 +17,9 @@ _NO_PICTURES = {"state", "state_dict", "none"}
 _FROM_OPENGL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 """Axes of ManiSkill's camera frame (x forward, y left, z up) in OpenGL's (x right, y up, z backward)."""
 _FROM_OPENCV = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""The same in OpenCV's (x right, y down, z forward)."""
+"""Axes of ManiSkill's camera frame (x forward, y left, z up) in OpenCV's (x right, y down, z forward)."""
 _LEVEL = 1
-"""Of zlib."""
+"""Compression level of zlib."""
 
 
 def observed_pictures(episode: Episode) -> dict[str, tuple[Modality, ...]]:

@@ -45,7 +45,7 @@ MOST_MEMORY = 3 << 30
 """Bytes that a reader may allocate; an episode has at most a third of it as numbers."""
 LONGEST = 1 << 20
 MOST_RECOVERY_MEMORY = 4 << 30
-"""The same for a reader that recovers recordings."""
+"""Bytes that a reader may allocate while it recovers recordings."""
 MOST_SHARED = 4
 """Groups of episodes (`OpenEpisode.sharing`) whose shapes are kept."""
 LONGEST_MESSAGE = 600

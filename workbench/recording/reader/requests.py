@@ -39,7 +39,7 @@ class ReadRows(msgspec.Struct, frozen=True):
     sizes: dict[str, int]
     times: dict[str, int]
     only_names: bool = False
-    """As of `read_rows.read_found`."""
+    """Leave out what takes long to read; see `read_rows.read_found`."""
 
 
 class OpenEpisode(msgspec.Struct, frozen=True):

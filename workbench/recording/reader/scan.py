@@ -10,7 +10,7 @@ from pathlib import Path
 from workbench.recording.episode.row import Facts, LibraryEntry, clean_text
 
 SUFFIXES = (".json", ".h5", ".rrd")
-"""In the order of preference for opening a recording."""
+"""Suffixes of a recording, in the order of preference for opening it."""
 NOTES = ".notes"
 """Suffix of the JSON file with tags and notes of other programs' recordings; a ``.json`` would be taken for a
 recording's."""
@@ -77,11 +77,11 @@ class Scan:
     """
 
     found: dict[str, RecordingFiles] = field(default_factory=dict)
-    """By key."""
+    """Files of each recording, by key."""
     folders: dict[str, int] = field(default_factory=dict)
     """Every scanned folder, and its time in nanoseconds."""
     unsettled: dict[str, RecordingFiles] = field(default_factory=dict)
-    """By key: those whose ``.json`` may still come."""
+    """Files whose ``.json`` may still come, by key."""
     fresh: bool = False
     """Something was written so recently that it must be scanned again."""
     problem: str | None = None

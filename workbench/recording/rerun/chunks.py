@@ -18,7 +18,7 @@ SIM_TIME = "sim_time"
 LOOK = "look"
 """Component of a visual, JSON: its name, its colour as red, green, blue and alpha, how metallic and how rough it is."""
 _MOST_KEPT_STEPS = 2000
-"""Times of more are not kept: those of hours would be a hundred megabytes, for as long as the process lives."""
+"""Most steps whose times are cached: those of hours would be a hundred megabytes, for as long as the process lives."""
 SERIES_COLORS = (
     (86, 180, 233),
     (230, 159, 0),

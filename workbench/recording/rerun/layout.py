@@ -196,7 +196,8 @@ def _world() -> Chunk:
 
 _TEXTURE_QUALITY = 64
 VIEWER_TEXELS = 96
-"""On the longest side of a texture as rerun shows it; the workbench reads the full one, beside it as WebP."""
+"""Texels on the longest side of a texture as rerun shows it; the workbench reads the full one, which is stored next to
+it as WebP."""
 _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 """Results of `_mesh_chunk` by the visual's id, while the visual lives: the next episode of the scene reuses them, since
 textures are megabytes to convert."""
@@ -243,7 +244,7 @@ def _is_large(texture: NDArray[np.uint8]) -> bool:
 
 
 def _webp(texture: NDArray[np.uint8]) -> bytes:
-    """Kept by its content: a texture takes 0.2 s, and every recorder reads the scene anew."""
+    """WebP bytes, cached by content: encoding a texture takes 0.2 s, and every recorder reads the scene again."""
     pixels = np.ascontiguousarray(texture[..., :3])
     digest = xxhash.xxh3_128_digest(pixels.data)
     if digest not in _encoded:

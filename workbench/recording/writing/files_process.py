@@ -19,7 +19,7 @@ from workbench.recording.writing.from_journal import Header, read_header
 from workbench.recording.writing.journal import SCENE_SUFFIX, Journal, JournalReader, read_visuals
 
 _LONGEST = 1 << 16
-"""Bytes of a message."""
+"""Limit of a message, in bytes."""
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class _Make:
     journal: Path
     states: int
     visuals: int
-    """Meshes of the scene; a file of it that lacks some is broken."""
+    """Number of meshes of the scene; a scene file with fewer is broken."""
 
 
 @dataclass(frozen=True)
 class _Ready:
-    """It has done its imports."""
+    """The subprocess has finished its imports."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,14 @@ class _Made:
     rrd: str
     h5: str
     json: str
-    """Names."""
+    """File names of the recording."""
     solved_at: int | None
     means: dict[str, float]
 
 
 @dataclass(frozen=True)
 class _NotMade:
-    """Whoever asked finds out why, by making them."""
+    """Export failed in the subprocess. The caller retries in-process to get the real error."""
 
 
 class FilesProcess:
@@ -66,7 +66,7 @@ class FilesProcess:
 
     @property
     def is_ready(self) -> bool:
-        """False until it has done its imports, and once it has ended."""
+        """False until the subprocess has finished its imports, and after it has ended."""
         with self._asking:
             if not self._is_ready and has_come(self._end):
                 self._is_ready = isinstance(self._receive(), _Ready)

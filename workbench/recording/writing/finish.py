@@ -28,7 +28,7 @@ from workbench.recording.writing.publish import RecordingError, candidates, publ
 
 SUFFIXES = (".rrd", ".h5", ".json")
 DAMAGED_SUFFIX = ".damaged"
-"""Of a journal that was damaged, which nothing reads."""
+"""Suffix of a damaged journal; nothing reads such a file."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class EpisodeFiles:
     h5: Path
     json: Path
     solved_at: int | None
-    """As `Episode.solved_at`."""
+    """First step with success; see `Episode.solved_at`."""
     means: Mapping[str, float]
-    """As `Episode.means`."""
+    """Mean of each entry of ``evaluate()``; see `Episode.means`."""
 
 
 def make_files(
@@ -106,7 +106,7 @@ def episode_stem(info: EpisodeInfo) -> str:
 
 
 def stem_begin(task: str, seed: int) -> str:
-    """What the stems of all episodes of a task from one seed begin with."""
+    """Common beginning of the file stems of all episodes of a task with one seed."""
     name = re.sub(r"[^A-Za-z0-9_-]+", "-", task).strip("-_")[:80] or "task"
     return f"{name}_{f'seed{seed:04d}' if seed >= 0 else 'noseed'}_env"
 

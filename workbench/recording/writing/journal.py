@@ -39,7 +39,7 @@ _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa
 _BEGIN = _SCHEMA.serialize().size
 """Offset of the first batch."""
 _MARK = b"\xff\xff\xff\xff"
-"""With it each message of Arrow begins."""
+"""Marker at the beginning of each Arrow message."""
 
 
 class JournalEntry(NamedTuple):
@@ -96,7 +96,7 @@ class Journal:
 
     @property
     def descriptor(self) -> int:
-        """Of the open file, which holds its lock."""
+        """File descriptor of the open journal; it holds the lock."""
         return self._descriptor
 
     @property
@@ -344,7 +344,7 @@ class JournalReader:
         self._file = _BoundedFile(open_regular_file(path))
         self._batch = lru_cache(maxsize=_MOST_BATCHES)(self._read)
         self._end = _BEGIN
-        """Of the last complete batch that was read."""
+        """Offset of the end of the last complete batch that was read."""
 
     def __iter__(self) -> Iterator[tuple[int, list[JournalEntry]]]:
         """Offset and entries of each batch. Raises OSError."""
