@@ -34,7 +34,7 @@ class ChosenBackend:
 class Renderer:
     render_backend: str
     name: str
-    """Of the device, for example ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
+    """Name of the device, for example ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
 
 
 def gpu_library_path() -> Path:

@@ -117,7 +117,7 @@ class BrokenRules:
         self.more = 0
         """Breaches at places beyond `MOST_ROWS`."""
         self.serial = 0
-        """Grows with every change."""
+        """Increases with every change."""
         self.step: int = 0
         """Control steps made."""
 
@@ -168,7 +168,7 @@ class BrokenRules:
         }
 
     def returned(self, rule: str, hook: str, problem: str, place: Place | None) -> None:
-        """As `report_breach`, for the return value of a hook."""
+        """Report a wrong return value of a hook, like `report_breach`."""
         message = f"{hook}() {problem}."
         if self._degrees[rule] == "off" or self._is_silenced(rule, message, place):
             return
@@ -206,7 +206,7 @@ class BrokenRules:
 
     @contextmanager
     def during(self, occasion: Occasion, confirms: bool = True) -> Iterator[None]:
-        """Within this, breaches belong to `occasion`; unconfirmed rows of it that do not break again are dropped.
+        """Context in which breaches belong to `occasion`; unconfirmed rows of it that do not break again are dropped.
 
         Args:
             confirms: whether every rule of this occasion could have been broken.

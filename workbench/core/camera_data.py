@@ -49,7 +49,7 @@ class CallSite:
 
     file: str
     line: int
-    """Of the call, counted from 1: its first line."""
+    """First line of the call, counted from 1."""
     function: str
     """Qualified name of the code that it is in, as Python has it: ``PushCubeEnv._default_sensor_configs``."""
 
@@ -92,7 +92,7 @@ class MovedCamera:
     """A camera whose placement in a recorded episode is not the file's, or is the file's again, from a state on."""
 
     state: int
-    """0: from the start."""
+    """State index from which on the placement holds; 0 is the start."""
     kind: CameraKind
     name: str
     used: CameraSettings
@@ -121,7 +121,7 @@ def _value(settings: CameraSettings, what: str) -> object:
 
 NOT_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 MOST_PIXELS = 4096
-"""On a side; a digit too many would take the memory of all envs."""
+"""Limit of pixels per side; a digit too many would take the memory of all envs."""
 
 
 _FURTHEST = 1e6
@@ -181,7 +181,7 @@ class CameraInfo:
     modalities: tuple[str, ...]
     """What its shader gives, of ``rgb depth segmentation position normal albedo``."""
     settings: CameraSettings | None = None
-    """Of the task's own config, even if the camera was moved since; env 0's where they differ. None if
+    """Settings of the task's own config, even if the camera was moved since; env 0's where they differ. None if
     `CameraSettings` cannot express it (a lens that differs between envs)."""
     varies: bool = False
     """Its pose differs between envs or from its config: the task's code moves it."""
@@ -225,11 +225,11 @@ class Picture:
 
     @property
     def nbytes(self) -> int:
-        """Roughly what it takes in memory."""
+        """Approximate memory in bytes."""
         planes = self.rgb, self.depth, self.segmentation, self.position, self.normal, self.albedo
         return 300 + sum(plane.nbytes for plane in planes if plane is not None)
 
     @property
     def key(self) -> CameraKey:
-        """Of its camera."""
+        """Kind and name of the picture's camera."""
         return self.kind, self.camera

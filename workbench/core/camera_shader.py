@@ -52,7 +52,7 @@ _made_with: WeakKeyDictionary[sapien.render.RenderCameraComponent, _Selection] =
 
 @contextmanager
 def selected(shader: ShaderConfig, folder: Path | None = None) -> Iterator[None]:
-    """Within this, SAPIEN makes cameras with `shader`.
+    """Context in which SAPIEN makes cameras with `shader`.
 
     Args:
         folder: of a shader that replaces `shader` and has the same textures.

@@ -33,7 +33,7 @@ def require_env(env: int, num_envs: int) -> None:
 
 
 def envs_of_batch(env_idx: Any, num_envs: int) -> list[int]:
-    """As `env_numbers`, each existing and named once.
+    """Env indices from `env_numbers`, checked: each exists and is named once.
 
     Raises:
         IndexError, ValueError: `env_idx` names an env that does not exist, one twice, or none.

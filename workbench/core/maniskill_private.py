@@ -96,12 +96,12 @@ PRIVATE_NAMES = (
     *_all(_ENV, WRITING, "_default_sensor_configs _default_human_render_camera_configs"),
     *_all("mani_skill.agents.base_agent:BaseAgent", WRITING, "_sensor_configs"),
 )
-"""Without a name that disables nothing in particular no task can be opened."""
+"""Private names that the workbench uses. If a name that disables no single feature is missing, no task can be opened."""
 
 
 @cache
 def moved_names() -> tuple[PrivateName, ...]:
-    """Those that the installed ManiSkill does not have."""
+    """Names in `PRIVATE_NAMES` that the installed ManiSkill does not have."""
     return tuple(each for each in PRIVATE_NAMES if not each.exists())
 
 

@@ -198,7 +198,7 @@ class Finding:
     """Its id."""
     degree: Degree
     message: str
-    """Of the first breach: what was done, its effect, and what to write instead."""
+    """Message of the first breach: what was done, its effect, and what to write instead."""
     file: str | None
     """File of the line; None if unknown."""
     line: int | None

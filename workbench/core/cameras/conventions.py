@@ -185,7 +185,7 @@ def pose_in_env(settings: CameraSettings, mount: ArrayLike | None) -> Floats:
 
 
 def with_pose(settings: CameraSettings, pose: ArrayLike) -> CameraSettings:
-    """The same camera at another pose (7,) in the frame of its mount."""
+    """Copy of the settings with another pose (7,) in the frame of the mount."""
     p = _vector(pose, 7, "a pose")
     qw, qx, qy, qz = map(float, normalised(p[3:]))
     return replace(settings, position=triple(p[:3]), quaternion=(qw, qx, qy, qz))

@@ -25,9 +25,9 @@ from workbench.core.simulation.cpu_system import batched_system
 @dataclass
 class _PlacedCamera:
     camera: Any
-    """ManiSkill's."""
+    """ManiSkill's camera."""
     config: Any
-    """The task's own."""
+    """The task's own config."""
     poses: list[sapien.Pose]
     """Local poses of the envs' components before: the task's code may have moved them."""
     settings: CameraSettings
@@ -56,7 +56,7 @@ class PlacedCameras:
         return {key: placed.settings for key, placed in self._placed.items()}
 
     def settings(self, key: CameraKey) -> CameraSettings | None:
-        """Of a placed camera; None if it is as the task has it."""
+        """Settings of a placed camera; None if it is as the task has it."""
         placed = self._placed.get(key)
         return None if placed is None else placed.settings
 
@@ -165,7 +165,7 @@ def _exchanged(config: Any, old: list[Any]) -> list[Any]:
 
 
 def _set_lens(component: Any, config: Any, env_index: int) -> None:
-    """As ``ManiSkillScene.add_camera`` does it, on a component that may have had another lens."""
+    """Set the lens like ``ManiSkillScene.add_camera``, on a component that may have had another lens."""
     component.near, component.far = _of_env(config.near, env_index), _of_env(config.far, env_index)
     if config.fov is not None:
         component.set_fovy(_of_env(config.fov, env_index), compute_x=True)

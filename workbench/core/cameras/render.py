@@ -223,12 +223,12 @@ def begin_pictures(
 
 
 def _degree_of(scene: Any, component: Any, asked: PictureDegree | None = None) -> PictureDegree:
-    """What a picture of a camera is, if this is asked for: only a batch on the CPU has fast ones."""
+    """Degree of a picture for which `asked` is requested: only a batch on the CPU has fast ones."""
     return scene.degree_of(component, asked) if isinstance(scene, BatchedCpuScene) else "exact"
 
 
 def _textures(camera: Any, modalities: Sequence[str]) -> set[str]:
-    """Those of its shader that give the modalities."""
+    """Textures of the camera's shader that give the modalities."""
     of = camera.config.shader_config.texture_names
     return {texture for texture, gives in of.items() if set(gives) & set(modalities)}
 
@@ -283,7 +283,7 @@ def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[Camera
 
 @contextmanager
 def show_hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
-    """Within this, draw the task's hidden objects in this env, or do not.
+    """Context in which the task's hidden objects are drawn in this env, or are not.
 
     ManiSkill hides ``_hidden_objects`` from sensors and shows them to human cameras: on the CPU by visibility, in GPU
     simulation by moving the object 99999 m away. Here visibility is used, and an object that was moved away is put back
@@ -408,7 +408,7 @@ def step_pictures(task: TaskEnv, env_idx: Sequence[int], requests: Sequence[Requ
 
 
 def _observed(task: TaskEnv, env_idx: Sequence[int], request: Request) -> list[Picture] | None:
-    """Of each env; None where they have to be drawn."""
+    """Pictures of each env from its last observation; None where they must be drawn."""
     name, kind, modalities = request
     seen: Any = task.obs.get("sensor_data", {}) if isinstance(task.obs, Mapping) else {}
     images = seen.get(name) if kind == "sensor" else None

@@ -148,13 +148,13 @@ class CameraReport:
     size: tuple[int, int]
     """Width and height of the camera's own picture."""
     measured_size: tuple[int, int]
-    """Of the measured pictures. In smaller ones, anything below a pixel is not seen."""
+    """Width and height of the measured pictures. In smaller ones, anything below a pixel is not seen."""
     envs: tuple[int, ...]
     """(E,) an env may come several times: at several moments, or with several seeds."""
     objects: tuple[ObjectSeen, ...]
     depth: DepthReport
     pictures: int
-    """Number rendered."""
+    """Number of rendered pictures."""
     milliseconds: float
 
     def env_marks(self, wanted: Collection[str] | None = None) -> NDArray[np.float32]:
@@ -196,7 +196,7 @@ class SearchSpace:
     objects: tuple[str, ...]
     """Names of actors, articulations and single links (``cabinet/handle``) that must be seen."""
     low: tuple[float, float, float]
-    """Of the box for the eye, metres in the frame of the mount, or the env's if there is none."""
+    """Lower corner of the box for the eye, metres in the frame of the mount, or the env's if there is none."""
     high: tuple[float, float, float]
     lens: CameraSettings
     """The camera without its pose; on a mount, the pose gives which way the picture is up."""
@@ -239,7 +239,7 @@ class OfferedPlacement:
     """What it sees, in a sentence."""
     report: CameraReport
     picture: Picture
-    """From there, of its worst env."""
+    """Picture from the placement, in its worst env."""
 
 
 _Part = TypeVar("_Part", ObjectSeen, DepthReport)
@@ -320,7 +320,7 @@ def _least(values: NDArray[np.float32]) -> float | None:
 
 
 def _rounded(value: float, up: bool) -> float:
-    """To two digits."""
+    """Round up or down to two digits."""
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     digits = (np.ceil if up else np.floor)(np.round(value / step, 6))
     return float(np.round(digits * step, 9))

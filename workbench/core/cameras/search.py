@@ -48,13 +48,13 @@ ROOM = 0.1
 FROM_THE_ROBOT = 0.2
 """Least distance in metres of an eye from the origin of every robot link, in the searched envs."""
 FROM_ITS_MOUNT = 0.05
-"""The same for an eye on a mount, which is meant to be near a link."""
+"""Least distance in metres of an eye on a mount from the origin of every robot link; it is meant to be near one."""
 GOOD_ENOUGH = 0.995
 """Score at which no further round is sampled."""
 ROUNDS = 2
-"""Of samples around the best."""
+"""Rounds of samples around the best candidates."""
 TRIES = 50
-"""To sample an eye clear of the robot; a box within the robot is searched anyway."""
+"""Attempts to sample an eye clear of the robot; a box within the robot is searched anyway."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
 

@@ -111,7 +111,7 @@ def temporary_camera(
 
 @contextmanager
 def undrawn(entities: Sequence[Any]) -> Iterator[None]:
-    """Within this, do not draw these entities; None is ignored."""
+    """Context in which these entities are not drawn; None is ignored."""
     bodies = [body for entity in entities if entity is not None for body in entity.components]
     drawn = [body for body in bodies if isinstance(body, sapien.render.RenderBodyComponent)]
     with temporarily((body, "visibility", 0.0) for body in drawn):

@@ -39,7 +39,7 @@ class SceneObject:
     scenery: bool
     """The ground, a static body, or a kinematic one of ManiSkill's scene builders (its table)."""
     hidden: bool
-    """From the sensors."""
+    """Whether the task hides it from the sensors."""
 
 
 @dataclass(frozen=True)
@@ -315,7 +315,7 @@ def measure(
 def _depths(
     depth: NDArray[np.float32], something: NDArray[np.bool_], counts: NDArray[np.bool_]
 ) -> DepthReport:
-    """Of one picture (H, W); masks `something` (no background) and `counts` (robot or object)."""
+    """Depth report of one picture (H, W), from masks `something` (no background) and `counts` (robot or object)."""
     far, of_objects = depth[something], depth[counts]
     limit = float(of_objects.max()) if len(of_objects) else np.nan
     histogram, _ = np.histogram(np.clip(far, DEPTH_EDGES[0], DEPTH_EDGES[-1]), DEPTH_EDGES)

@@ -1,1 +1,1 @@
-"""What is read out of a running env: for a person, and for a recording."""
+"""Data read from a running env: for a person, and for a recording."""

@@ -156,7 +156,7 @@ def _touching(bodies: tuple[str, str], contacts: list[tuple[Contact, int]]) -> T
 
 
 def _state_parts(row: NDArray) -> Iterator[tuple[str, NDArray]]:
-    """As `Actor.get_state` and `Articulation.get_state` lay them out."""
+    """Named parts of a state row, as `Actor.get_state` and `Articulation.get_state` lay them out."""
     joints = (len(row) - 13) // 2
     widths = [("p", 3), ("q", 4), ("v", 3), ("w", 3), ("qpos", joints), ("qvel", joints)]
     if 13 + 2 * joints != len(row):

@@ -28,7 +28,7 @@ ROUNDING = 1e-4
 
 
 class OutlierKind(Enum):
-    """Of what, with the id of the rule that it breaks; None for an action, which comes from a policy."""
+    """(quantity, rule id). The rule is None for actions: they come from the policy."""
 
     rule: str | None
 
@@ -78,7 +78,7 @@ class OutlierSighting:
     reason: Callable[[int], str]
     """The text for one of these envs. Called only for the first outlier of a kind: texts cost more than the checks."""
     body: Callable[[int], str] | None = None
-    """The name of the body that does it, in one of these envs; None for what is no body's."""
+    """Name of the body that is the outlier, in one of these envs; None for outliers that are not bodies."""
 
 
 class OutlierWatch:

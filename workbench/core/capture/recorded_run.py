@@ -24,7 +24,7 @@ class RecordedRun:
     """
 
     name: str
-    """For people."""
+    """Name to show."""
     seed: int
     """Episode seed; negative if unknown."""
     reset_options: dict[str, Any]

@@ -46,12 +46,12 @@ class StateReading:
     asked: dict[str, Any]
     """Further columns, and flattened observations."""
     flat: dict[str, Any]
-    """Parts of each flattened observation, as of `flat_names`."""
+    """Parts of each flattened observation, from `flat_names`."""
     num_envs: int
     device: torch.device
 
     def columns(self) -> dict[str, NDArray]:
-        """As `read_state_columns`."""
+        """Columns as `read_state_columns` returns them."""
         states = {} if self.rows is None else self.rows.states()
         values = {**{STATE + name: value for name, value in states.items()}, **self.asked}
         columns: dict[str, NDArray] = {}
@@ -104,7 +104,7 @@ def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
 
 
 def _fetched(values: Mapping[str, Any], count: int, device: torch.device) -> dict[str, NDArray]:
-    """On the host, in one copy a dtype: on a GPU each single fetch waits for the device."""
+    """Values on the host, in one copy per dtype: on a GPU each single fetch waits for the device."""
     if device.type == "cpu":
         # Arrays are copies already.
         return {

@@ -37,7 +37,7 @@ class ActionPart:
     low: NDArray[np.float32]
     high: NDArray[np.float32]
     shape: tuple[int, ...]
-    """Of the controller's action of one env, which has a row of the flat one."""
+    """Shape of the controller's action in one env; in the flat action it is a row."""
 
 
 @once_a_scene
@@ -158,7 +158,7 @@ def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> 
 
 
 def _columns_of_robots(parts: tuple[ActionPart, ...]) -> dict[str | None, int]:
-    """How wide the action of each robot is; of a single one under None."""
+    """Width of the action of each robot; that of a single robot under None."""
     found: dict[str | None, int] = {}
     for part in parts:
         found[part.robot] = found.get(part.robot, 0) + len(part.names)

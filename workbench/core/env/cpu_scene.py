@@ -121,9 +121,9 @@ class CpuCameraGroup:
         self._cameras, self._scene, self.key = cameras, scene, key
 
         self.textures = {"Color"}
-        """Those of a fast picture: what was ever read."""
+        """Textures of a fast picture: all that were ever read."""
         self._drawn = cameras
-        """By the last `take_picture`, with `_has`."""
+        """Cameras that drew the last picture (`take_picture`), with textures `_has`."""
         self._has: set[str] = set()
 
     def take_picture(self) -> None:
@@ -233,7 +233,7 @@ class BatchedCpuScene(ManiSkillScene):
         cameras.follow(env, sensor.config, components[env], textures)
 
     def forget_fast_shapes(self) -> None:
-        """Make them anew for the next picture: the cameras are others now."""
+        """Discard the fast shapes; the next picture makes new ones, since the cameras have changed."""
         if self._fast is not None:
             self._fast[0].remove()
             self._fast = None
@@ -458,7 +458,7 @@ class BatchedCpuMixin:
 
     @contextmanager
     def _in_turn(self, what: str) -> Iterator[None]:
-        """Within this the env is stepped or reset."""
+        """Context in which the env is stepped or reset."""
         if self._nested >= _MOST_NESTED:
             raise RefusedCall(
                 f"{what}() was called {_MOST_NESTED} times within itself: a hook that it runs calls it again."
@@ -614,7 +614,8 @@ def batched_class(
 
 
 _SPARE = 8
-"""For threads, drivers and libraries that start later, and the second scene during a restore."""
+"""Thread-local keys kept free: for threads, drivers and libraries that start later, and the second scene during a
+restore."""
 
 
 def require_scenes(count: int) -> None:

@@ -34,7 +34,7 @@ _DEEPEST = 16
 _NOT_SHOWN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters and surrogates, which no file and no browser takes."""
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
-"""In a default repr: differs in every run."""
+"""Memory address in a default repr: differs in every run."""
 
 _short = reprlib.Repr()
 _short.maxlevel = 4

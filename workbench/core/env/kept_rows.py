@@ -245,7 +245,7 @@ class ResetWatch:
         self._chosen: tuple[int, ...] = ()
         self._task: type | None = None
         self._tries = 0
-        """Left of `_TRIES`."""
+        """Remaining attempts of `_TRIES`."""
         self._seeks = False
         """Trace lines in the next reset."""
         self.whole = False

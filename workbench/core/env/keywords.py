@@ -39,11 +39,11 @@ class Keyword:
     name: str
     kind: KeywordKind
     value: str
-    """What is in effect, in JSON; of one that JSON cannot hold, its ``repr``."""
+    """Value in effect, in JSON; the ``repr`` of a value that JSON cannot hold."""
     default: str = ""
     """The class's own value, in the same form; empty if it has none, or it is not known."""
     choices: tuple[str, ...] = ()
-    """Of kind ``choice``: what it may be, in JSON."""
+    """Allowed values of kind ``choice``, in JSON."""
     optional: bool = False
     """``null`` is a value too."""
     fixed: str = ""
@@ -57,7 +57,7 @@ class HowMade:
     robot: str = ""
     """Names of the robots; empty without one."""
     modes: tuple[Keyword, ...] = ()
-    """Those of `MODES` that the task has."""
+    """Keywords in `MODES` that the task has."""
     own: tuple[Keyword, ...] = ()
     """The task's own keyword arguments."""
 

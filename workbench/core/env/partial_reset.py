@@ -120,7 +120,7 @@ def _rows(value: Any, order: list[int]) -> Any:
 
 @contextmanager
 def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
-    """Within this a reset of these envs, lowest first, starts their episodes from these seeds.
+    """Context in which a reset of these envs, lowest first, starts their episodes from these seeds.
 
     ``BaseEnv.reset(seed=[...])`` takes the list as the seeds of the whole batch.
     """

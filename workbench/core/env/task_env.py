@@ -50,7 +50,7 @@ class EnvOptions:
     threads: int | None = None
     """Threads that step the envs on the CPU; None for one on each core that the process may use."""
     pictures: PictureDegree = "exact"
-    """Of which degree the pictures are that the env itself draws: observations and ``render``."""
+    """Degree of the pictures that the env itself draws: observations and ``render``."""
     rules: Degree | None = None
     """The degree of all rules of GPU simulation (on the CPU); None for each rule's own, see `rules`."""
     on_finding: Callable[[Finding], None] = warn_of

@@ -29,7 +29,7 @@ _OBS_PARTS = (
 _CORE = f"{Path(__file__).parents[1]}{os.sep}"
 """The folder of the core, which wraps constructors."""
 _MOST_NAMES = 12
-"""Named in a message where none is near."""
+"""Most names that a message lists where none is similar."""
 
 
 class WrongOption(CoreRefusal, ValueError):

@@ -21,7 +21,7 @@ ALL = frozenset({"Color", "PositionSegmentation", "GbufferDepth"})
 """Textures of the minimal shader that a fast camera has: those of `COLOR` alone, or all."""
 
 Edits = tuple[tuple[str, str], ...]
-"""Passages of a shader's text, each of which is there once, and what stands in place of them."""
+"""Replacements in a shader's text: (old, new); each old passage occurs once."""
 
 # Without an environment map, which adds black: two cube maps are looked up for each pixel, and a third in the last pass,
 # which then only copies. w of a position is 1. The transposed inverse is, but for its scale, the cofactors.
@@ -124,16 +124,17 @@ class _Fast:
     exact: sapien.render.RenderCameraComponent
     component: sapien.render.RenderCameraComponent
     scene: sapien.Scene
-    """Of its own, which shares the render system: in the env's an entity would change the order that snapshots rely on."""
+    """Separate scene that shares the render system: an entity in the env's scene would change the order that snapshots
+    rely on."""
 
 
 class FastCameras:
-    """A second camera beside each exact one of a scene, of one size with it and moved to where it is."""
+    """A second camera for each exact camera of a scene, with the same size; it follows the exact one."""
 
     def __init__(self, sub_scenes: Sequence[sapien.Scene]) -> None:
         self._sub_scenes = sub_scenes
         self._made: dict[tuple[int, frozenset[str]], _Fast] = {}
-        """By the id of the exact component, and the textures."""
+        """Fast cameras by the id of the exact component, and the textures."""
 
     def follow(
         self, env: int, config: Any, exact: sapien.render.RenderCameraComponent, textures: Collection[str]

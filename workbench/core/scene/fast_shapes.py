@@ -1,4 +1,4 @@
-"""Simplified shapes beside the exact ones, for pictures that may differ a little and take a fraction of the time."""
+"""Simplified shapes for fast pictures, which may differ a little from exact ones."""
 
 from __future__ import annotations
 
@@ -31,28 +31,32 @@ from workbench.core.scene.simplify import drop_uvs
 from workbench.core.simulation.drawn_poses import NOWHERE_ELSE, Places
 
 HEAVY = 500
-"""Bodies with meshes of more triangles are simplified; the others stay exact, and so do cylinders, spheres and the like: what
-is layered of thin discs, as ManiSkill's targets are, would lose a layer."""
+"""Triangles above which a body's mesh is simplified. Cylinders, spheres and the like stay exact too: layered thin
+discs, such as ManiSkill's targets, would lose a layer."""
 TOLERANCE = 0.6
-"""Pixels that a surface may be off in a picture of `_SMALL` pixels; in larger ones more, since fewer of all pixels are edges."""
+"""Pixels that a surface may be off in a picture of `_SMALL` pixels; more in larger pictures, where fewer of the pixels
+are on edges."""
 _SMALL = 128
 _NEAREST = 0.02
-"""Metres. Nothing is looked at from nearer for long, and a camera within its own mount would forbid any simplification."""
+"""Smallest distance in metres that tolerances assume: no camera stays nearer for long, and one within its own mount
+would forbid any simplification."""
 _FINEST = 1e-4
-"""Metres. Tolerances are this times powers of the fourth root of two, so that poses that differ a little give the same meshes."""
+"""Unit of the tolerances in metres: they are this times powers of the fourth root of two, so that similar poses give
+the same meshes."""
 
 _WORTH_FEWER_TEXTURES = 256 * 256
-"""Pixels. In a smaller picture a texture less saves no more than it costs to look whether the author has changed the material."""
+"""Pixels of a picture below which fewer textures save no more than it costs to check whether the author changed the
+material."""
 _SAME_PLACE = 1e-5, 1e-4
-"""Metres and radians, about: a body that is so near to where it was, as seen from a camera, has not moved."""
+"""Tolerance in metres and (roughly) radians: a body that moved less, as seen from a camera, has not moved."""
 
 Bodies = tuple[tuple[sapien.render.RenderBodyComponent, sapien.render.RenderBodyComponent | None], ...]
-"""The exact component of each body of an env that is drawn otherwise, and what is drawn instead; None for nothing."""
+"""The exact component of each body of an env that is drawn differently, and what is drawn instead; None for nothing."""
 
 
 @contextmanager
 def shown(bodies: Bodies) -> Iterator[None]:
-    """Within this, the simplified shapes are drawn in place of the exact ones, hidden where those are hidden."""
+    """Context in which the simplified shapes are drawn in place of the exact ones, hidden where those are hidden."""
     was = [exact.visibility for exact, _ in bodies]
     try:
         for (exact, fast), visibility in zip(bodies, was, strict=True):
@@ -82,22 +86,22 @@ class FastShapes:
         self._chosen = _Chosen()
         self._parts = {id(body): tuple(_parts_of(body)) for _, body in chain.from_iterable(self._heavy)}
         self._corner_points = [[self._corners_of_parts(body) for _, body in of_env] for of_env in self._heavy]
-        """(P, 3) of each body of each env, in its frame."""
+        """(P, 3) corner points of each body of each env, in the frame of the body."""
         self._boxes = [
             np.array([(points.min(axis=0), points.max(axis=0)) for points in of_env], np.float32)
             for of_env in self._corner_points
         ]
-        """(B, 2, 3) of each env, in the frames of its bodies."""
+        """(B, 2, 3) bounding boxes of each env, in the frames of its bodies."""
         self._components: dict[Hashable, tuple[Any, Any]] = {}
-        """By the id of the exact one, which is kept beside it, and by how it is simplified."""
+        """Simplified components by the id of the exact component, which is kept with each, and by how it is simplified."""
         self._tolerances: dict[Hashable, dict[str, float]] = {}
-        """By camera and name of the body."""
+        """Tolerances by camera and name of the body."""
         self._cut: dict[tuple[Hashable, str], _Cut] = {}
-        """By camera and name of a body that it is fixed to."""
+        """Cuts by camera and name of a body that the camera is fixed to."""
         self._corners: dict[tuple[int, float], NDArray[np.float64]] = {}
-        """By the id of an exact component and its tolerance."""
+        """Corners by the id of an exact component and its tolerance."""
         self._of_camera: dict[tuple[Hashable, int], Bodies] = {}
-        """By camera and env."""
+        """Chosen bodies by camera and env."""
 
     def prepare(
         self,
@@ -174,7 +178,7 @@ class FastShapes:
         self._cut.clear()
 
     def _tolerances_of(self, camera: Sequence[sapien.render.RenderCameraComponent]) -> dict[str, float]:
-        """In metres, by the name of the body: the same in all envs, where equal states are to look alike."""
+        """Tolerances in metres, by the name of the body: the same in all envs, where equal states are to look alike."""
         finest: dict[str, float] = {}
         for env, (component, of_env) in enumerate(zip(camera, self._heavy, strict=True)):
             position = np.asarray(component.get_global_pose().p, np.float32)
@@ -245,7 +249,7 @@ def _add_hidden(component: Any, body: Any) -> None:
 
 
 def _lean_bodies(sub_scenes: Sequence[sapien.Scene]) -> list[list[tuple[Any, LeanBody]]]:
-    """Of each env, bodies that stay as fine as they are, and what is drawn with fewer textures instead."""
+    """Bodies of each env that are not simplified, each with a body of fewer textures to draw in its place."""
     materials, found = LeanMaterials(), []
     for sub_scene in sub_scenes:
         light = [body for body in _bodies(sub_scene) if not _is_heavy(body)]
@@ -258,11 +262,11 @@ def _lean_bodies(sub_scenes: Sequence[sapien.Scene]) -> list[list[tuple[Any, Lea
 
 @dataclass(frozen=True)
 class _Cut:
-    """Where a body was, as seen from the camera, when it was cut to the view."""
+    """Pose of a body relative to the camera when it was cut to the view."""
 
     pose: sapien.Pose
     nearest: float
-    """Metres to what is in view, infinite where nothing is."""
+    """Metres to the nearest point in view; infinite where nothing is in view."""
     planes: Planes
 
     def is_for(self, pose: sapien.Pose, planes: Planes) -> bool:
@@ -319,11 +323,11 @@ def _has_tangents(body: Any) -> bool:
 
 @dataclass(frozen=True)
 class _Part:
-    """Of what is drawn of a body."""
+    """Part of a drawn body: its shape, exact mesh and scale."""
 
     shape: Any
     part: Any
-    """SAPIEN's, whose material the author may exchange."""
+    """SAPIEN's shape part; the author may exchange its material."""
     exact: Mesh
     scale: tuple[float, float, float]
     placed: NDArray[np.float64]
@@ -347,7 +351,7 @@ def _moved(points: NDArray[np.floating], by: NDArray[np.floating]) -> NDArray[np
 
 
 class _Chosen:
-    """Simplified meshes by the exact one, which is often that of all envs."""
+    """Simplified meshes by exact mesh, which is often shared by all envs."""
 
     def __init__(self) -> None:
         self._made: dict[tuple[int, bool, float], tuple[Mesh, Mesh]] = {}

@@ -17,14 +17,14 @@ from trimesh.convex import hull_points
 from workbench.core.scene.shapes import Mesh
 
 _MARGIN = 1.0
-"""Pixels around the picture that count as seen, for what is not quite where it was measured."""
+"""Pixels around the picture that count as in view: a tolerance for poses that moved since they were measured."""
 
 Planes = NDArray[np.float64]
 """(5, 4) left, right, top, bottom and near: a point is in view where all of ``planes @ (x, y, z, 1)`` are positive."""
 
 
 def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
-    """Of a camera, in its own frame: x forward, y left, z up."""
+    """View planes of a camera, in its own frame: x forward, y left, z up."""
     k = np.asarray(camera.get_intrinsic_matrix(), np.float64)
     # Times x, the column and the row of a point's pixel.
     column, row, x = (

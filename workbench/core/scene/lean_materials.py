@@ -21,18 +21,18 @@ _VALUES = (
 _TEXTURES = ("base_color", "emission", "normal", "roughness", "metallic", "transmission")
 _KNOWN_FORMATS = ("R8G8B8A8Unorm", "R8Unorm")
 _MOST_TEXELS = 1 << 24
-"""That are looked at in a scene: a million take 10 to 20 ms, and a furnished house has hundreds of millions."""
+"""Limit of texels that are read in a scene: a million take 10 to 20 ms, and a furnished house has hundreds of millions."""
 
 
 @dataclass(frozen=True)
 class LeanBody:
-    """A component beside an exact one of the same meshes, which has materials of its own."""
+    """Copy of an exact component with the same meshes and with materials of its own."""
 
     component: sapien.render.RenderBodyComponent
     _exact: list[Any]
-    """Materials."""
+    """Materials of the exact component."""
     _copied: list[list[Any]]
-    """What they said when they were copied."""
+    """Values of these materials when they were copied."""
 
     def is_like_exact(self) -> bool:
         """Whether the author has changed nothing of the exact materials. SAPIEN does not draw each later change of a material
@@ -46,9 +46,10 @@ class LeanMaterials:
 
     def __init__(self) -> None:
         self._constants: list[tuple[Any, float | None]] = []
-        """By texture, which has no hash. A texture that the author changes in place is not looked at again."""
+        """Textures with their constant value, a list since a texture has no hash. A texture that the author changes in
+        place is not read again."""
         self._texels = 0
-        """Looked at."""
+        """Texels that were read."""
 
     def beside(self, body: Any) -> LeanBody | None:
         """None where all textures say something, and where the body is not of files alone: SAPIEN shares the materials of
@@ -106,7 +107,7 @@ def _constant(texture: Any) -> float | None:
 
 
 def _from_file(shape: Any) -> Any:
-    """The same shape with materials of its own; None where it is no longer what its file gives."""
+    """Copy of the shape with materials of its own; None where the shape is no longer what its file gives."""
     if not isinstance(shape, sapien.render.RenderShapeTriangleMesh) or not shape.filename:
         return None
     try:

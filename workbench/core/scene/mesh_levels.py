@@ -31,32 +31,34 @@ from workbench.core.scene.simplify import (
 from workbench.machine.folders import cache_folder, read_private, write_private
 
 _VERSION = 3
-"""Of the files; another one for other levels."""
+"""Version of the cached files; increase it when the levels change."""
 _FEWEST_FACES = 24
 _LOST, _USELESS = 0.01, 0.1
-"""Errors, in sizes of the mesh: from the first on a piece of it may be missing, from the second on no level is made."""
+"""Errors relative to the size of the mesh: above the first, a piece of the mesh may be missing, so coarsening by pieces
+is tried too; above the second, no level is made."""
 _SIMPLE = 150
-"""Triangles. What is layered of thin discs, as ManiSkill's targets are, would lose a layer (see `from_afar`)."""
+"""Triangles up to which a mesh stays as it is: layered thin discs, such as ManiSkill's targets, would lose a layer (see
+`from_afar`)."""
 _FEW = 32, 48, 72, 100, 144, 200, 280, 400, 800, 1600
-"""Triangles that are tried from afar, and of these grids, in cells."""
+"""Triangle counts that `from_afar` tries, fewest first; for each it tries grids of `_GRIDS` cells."""
 _GRIDS = 12, 24, 48
 _LARGE = 20_000
-"""Triangles."""
+"""Triangles above which a level is made from the level before: making it from the exact mesh takes too long."""
 _CHECKED_POINTS = 1500
-"""On the exact surface, whose distance from a level is measured."""
+"""Points on the exact surface at which the distance to a level is measured."""
 _SAMPLES = 10_000
-"""Of a level, among which the nearest triangle to a point is found."""
+"""Most points on a level that are searched for the triangle nearest to a point."""
 _MOST_KEPT = 500
-"""Meshes in memory."""
+"""Most meshes in memory."""
 _MOST_ON_DISK = 512 << 20
-"""Bytes, with what other versions have left; the files that were not used for longest go first."""
+"""Limit of the cache in bytes, including files of other versions; the least recently used files are deleted first."""
 
 
 @dataclass(frozen=True)
 class Level:
     mesh: Mesh
     error: float
-    """Within which distance of it 99 % of the exact surface are, in the mesh's own units."""
+    """Distance from the level within which 99 % of the exact surface are, in the mesh's own units."""
 
 
 def content_hash(mesh: Mesh) -> str:

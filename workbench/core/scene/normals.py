@@ -15,17 +15,19 @@ from workbench.core.scene.shapes import Mesh
 _CREASE_COSINE = float(np.cos(np.deg2rad(40.0)))
 """Neighbouring faces at a smaller angle are shaded as one smooth surface."""
 _ON_EXACT = 2_000, 10, 20_000
-"""Points on an exact surface by area, besides one on each triangle: so many, so many more for each triangle, and at most."""
+"""Points sampled on an exact surface by area, in addition to one on each triangle: a constant, a number per triangle,
+and the limit of both."""
 _ON_COARSE = 2_000
-"""Points on a coarse one by area, besides some on each triangle."""
+"""Points sampled on a coarse surface by area, in addition to some on each triangle."""
 _NEAREST = 8
-"""Points of the exact surface among which the one is sought that faces the same way."""
+"""Nearest points of the exact surface, among which one that faces the same way is chosen."""
 _ALIKE_COSINE = 0.3
 _SHARED_DEGREES = 20.0
-"""Between the normals of a coarse mesh's own faces at a vertex, which then gets one: a seventh fewer vertices, for a twentieth of what
-the shading is off."""
+"""Angle between normals of a coarse mesh's faces at a vertex, below which they share one normal: a seventh fewer
+vertices, for a twentieth of the shading error."""
 _OWN_WEIGHT = 0.02
-"""Of a vertex's own normal beside all that the surface around it says: it decides where that says nothing."""
+"""Weight of a vertex's own normal relative to the normals of the surface around it: it decides only where they
+determine nothing."""
 
 
 def with_normals(mesh: Mesh) -> Mesh:
@@ -99,7 +101,7 @@ def share_smooth(mesh: Mesh, degrees: float = 10.0) -> Mesh:
 
 
 class ShadedSurface:
-    """How an exact mesh, which has normals, is shaded: points on it with the normals there."""
+    """Shading of an exact mesh that has normals: points on the mesh, with the normals there."""
 
     def __init__(self, mesh: Mesh) -> None:
         assert mesh.normals is not None

@@ -30,7 +30,7 @@ _KEPT_MESHES = 1000
 MOST_FACES = 375
 """Most faces of a visual: a Panda of 136,000 triangles becomes 9,000 and looks the same."""
 MOST_TEXELS = 1024
-"""On the longest side of a texture."""
+"""Texels on the longest side of a texture."""
 
 
 _GREY: dict[BodyKind, float] = {"link": 0.55, "dynamic": 0.32, "kinematic": 0.22, "static": 0.12}

@@ -245,7 +245,7 @@ class StateRows(NamedTuple):
     """States that are in none of these tensors."""
 
     def states(self) -> dict[str, Any]:
-        """As `present_states`."""
+        """States as `present_states` returns them."""
         data = self.data
         if self.still:
             data[:, self.still, 7:] = 0.0

@@ -116,10 +116,10 @@ class SharedShapes:
         self._known: dict[str, tuple[Mesh, Material]] = {}
         self._marked: dict[Hashable, tuple[str, Mesh, Material]] = {}
         self._kept: dict[tuple[int, int], tuple[Mesh, Material]] = {}
-        """By their ids: those given out, which need no digest again."""
+        """Shared shapes by the ids of mesh and material; they need no new digest."""
 
     def share(self, geometry: SceneGeometry) -> SceneGeometry:
-        """The same scene, with earlier meshes and materials that look the same."""
+        """Copy of the scene that uses earlier meshes and materials where they look the same."""
         return replace(geometry, visuals=tuple(self._shared(geometry.visuals)))
 
     def shared(self, mesh: Mesh, material: Material) -> tuple[Mesh, Material]:

@@ -132,7 +132,7 @@ def rounded(mesh: Mesh) -> Mesh:
 
 
 def flat_rectangle(mesh: Mesh) -> Mesh | None:
-    """The same rectangle as two triangles, or None if `mesh` is not one. ManiSkill's floor is a grid of 100 x 100 squares.
+    """`mesh` as two triangles, or None if it is not a flat rectangle. ManiSkill's floor is a grid of 100 x 100 squares.
 
     Only rectangles along the axes of the mesh's own frame, one layer, with uv linear in position.
     """

@@ -299,12 +299,13 @@ FIXED_ONCE_BUILT: dict[type, tuple[str, ...]] = {
         *("set_limit_x", "set_limit_y", "set_limit_z"),
     ),
 }
-"""Setters and methods of what is no state; the GPU refuses most of them once it runs."""
+"""Setters and methods of properties that are not state; the GPU refuses most of them once it runs."""
 _WORK_ON_THE_GPU = {"friction", "set_drive_properties", "set_collision_group_bit", "set_collision_group"}
 
 
 def _of_chosen(stock: Callable[..., Any], name: str) -> Callable[..., Any]:
-    """In a partial reset ManiSkill's changes all envs: here those that are being reset."""
+    """Wrap a method of ManiSkill that changes all envs: in a partial reset it changes only the envs that are being
+    reset."""
 
     @wraps(stock)
     def call(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -416,7 +417,8 @@ _OF_CAMERAS = (
 
 
 def _of_chosen_cameras(stock: Callable[..., Any]) -> Callable[..., Any]:
-    """In a partial reset, of the envs that are being reset; the matrices that ManiSkill keeps are computed again."""
+    """Wrap a method of cameras to apply to the envs that are being reset; the matrices that ManiSkill keeps are
+    computed again."""
 
     @wraps(stock)
     def call(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -476,10 +478,10 @@ GUARDED: dict[type, dict[str, str]] = {
         "add_force_torque": "Actor.apply_force()",
     },
 }
-"""Properties (also their ``set_...``) and methods, and what to use instead."""
+"""Properties (and their ``set_...``) and methods of SAPIEN, each with what to use instead."""
 
 _systems: weakref.WeakSet[BatchedCpuSystem] = weakref.WeakSet()
-"""Their scenes are read at each call, since a restored snapshot gives an env another scene."""
+"""Systems of batched scenes; their scenes are read at each call, since a restored snapshot gives an env another scene."""
 
 
 def guard_scenes(system: BatchedCpuSystem) -> None:

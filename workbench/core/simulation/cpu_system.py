@@ -99,11 +99,11 @@ class BatchedCpuSystem:
         self.static_moves = 0
         """Poses that static actors were given."""
         self._version = 0
-        """Grows when the simulation may differ from what was fetched."""
+        """Increases when the simulation may differ from what was fetched."""
         self._beginning: list[bytes] = []
-        """Of each env the packed state that it was built with."""
+        """Packed state of each env as it was built."""
         self.layout_version = 0
-        """Grows when rows belong to other bodies."""
+        """Increases when rows belong to other bodies."""
         self._read_at: dict[str, int] = {}
         """`_version` at the last read of each value that is read on demand."""
 
@@ -179,7 +179,7 @@ class BatchedCpuSystem:
 
     @contextmanager
     def holding_back(self) -> Iterator[None]:
-        """Within this, setters write to the tensors alone, and the simulation sees it if it is applied."""
+        """Context in which setters write to the tensors alone; the simulation changes only when they are applied."""
         self.held_back = True
         try:
             yield

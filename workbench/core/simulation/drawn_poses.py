@@ -20,7 +20,7 @@ NOWHERE_ELSE: Places = {}
 
 @contextmanager
 def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callable[[], None]]:
-    """Within this, draw entities and their cameras at `places`; the entities stay where they are.
+    """Context in which entities and their cameras are drawn at `places`; the entities stay where they are.
 
     Yields a function that moves what is drawn: call it after ``update_render``, which draws entities where they are.
     Cameras are moved before it.
@@ -43,7 +43,7 @@ def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callabl
 
 @contextmanager
 def temporarily(changes: Iterable[tuple[Any, str, Any]]) -> Iterator[None]:
-    """Within this, attributes (owner, name, value) have these values."""
+    """Context in which attributes (owner, name, value) have these values."""
     was: list[tuple[Any, str, Any]] = []
     try:
         for owner, name, value in changes:

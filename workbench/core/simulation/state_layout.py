@@ -48,18 +48,18 @@ class StateLayout:
     target_qpos_at: NDArray[np.int64]
     target_qvel_at: NDArray[np.int64]
     entities: list[Any]
-    """(R,) of each row."""
+    """(R,) entity of each row."""
     env_of_row: NDArray[np.int64]
     names: list[str]
-    """(R,) of the body in each row, the same in every env."""
+    """(R,) name of the body in each row, the same in every env."""
     articulation_names: list[str]
-    """(A,) likewise."""
+    """(A,) name of each articulation, the same in every env."""
     row_of: dict[int, int]
     index_of: dict[int, int]
     size: int
     """Numbers in the packs of all envs."""
     parts: list[list[slice]]
-    """Of each env: the numbers of each body and articulation in its pack."""
+    """Numbers of each body and articulation in the pack of its env, for each env."""
 
 
 def lay_out(systems: Sequence[physx.PhysxCpuSystem]) -> StateLayout:

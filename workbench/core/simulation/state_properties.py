@@ -34,7 +34,7 @@ class StateProperty:
     group: Group
     mirror: MirrorName
     columns: slice
-    """Of the mirror's tensor; of a single joint's properties it is the column of that joint."""
+    """Columns of the mirror's tensor; for a property of a single joint, the column of that joint."""
     read: Callable[[Any, int], Any]
     """Reads the numbers of the struct's i-th object from SAPIEN."""
     write: Callable[[Any, int, Floats], None] | None = None

@@ -1,4 +1,4 @@
-"""A batched CPU system that reports what GPU simulation does otherwise."""
+"""A batched CPU system that reports where GPU simulation behaves differently."""
 
 from __future__ import annotations
 
@@ -96,14 +96,14 @@ class StrictCpuSystem(BatchedCpuSystem):
     def __init__(self, scenes: Sequence[sapien.Scene], *args: Any, **kwargs: Any) -> None:
         self._writes = Writes()
         self._held: dict[int, Floats] = {}
-        """What a GPU's simulation would hold of a tensor that was written or handed out since it was applied or fetched, by
-        the ``id`` of the tensor's array."""
+        """What a GPU's simulation would hold, for each tensor that was written or handed out after its last apply or
+        fetch; by the ``id`` of the tensor's array."""
         self._stale: set[Group] = set()
         """Groups that moved since they were fetched."""
         self._moved_unfetched: dict[Group, str] = {}
-        """Of those that were refreshed meanwhile: a body that had moved."""
+        """Name of a body that had moved, for each stale group that was refreshed since then."""
         self._frames_of_step: tuple[Frame, ...] = ()
-        """Of the task's own last step, where it was not ManiSkill's."""
+        """Frames of the task's own last step; empty if ManiSkill made the step."""
         self.being_reset: torch.Tensor | None = None
         """(N,) bool while ``_initialize_episode`` runs for some envs and not for others."""
         self.reported_elsewhere: set[str] = set()

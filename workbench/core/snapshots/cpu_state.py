@@ -24,7 +24,7 @@ _ROOT_POSE_ATTEMPTS = 4
 _EXACT_POINT_ATTEMPTS = 40
 """Attempts to find a state that reads back as written; all but some humanoids need one."""
 _LAST_BIT = np.float32(2**-24)
-"""Of the numbers of a quaternion, and of a metre."""
+"""Last bit (2**-24) of the numbers of a quaternion, and of a position of about a metre."""
 
 
 @dataclass(frozen=True)
@@ -99,21 +99,23 @@ class CpuStatePlan:
     """Parts, bodies and rows of each env of a built scene."""
 
     contents: list[Contents]
-    """Of each env; envs with the same parts share one object."""
+    """Contents of each env; envs with the same parts share one object."""
     sleepers: list[list[tuple[int, Callable[[], bool], Any]]]
-    """Of each env: index into its contents, function that returns whether it sleeps, component that can be put to sleep."""
+    """For each env: index into its contents, function that returns whether the part sleeps, component that can be put
+    to sleep."""
     articulations: list[range]
-    """Of each env: its rows in the (A, D) tensors."""
+    """Rows of each env in the (A, D) tensors."""
     names: dict[int, tuple[int, str]]
     """Env and name of a body, by the ``id`` of its component."""
     bodies: list[dict[str, int]]
-    """Of each env: the ``id`` of the component, by name."""
+    """``id`` of each component by its name, for each env."""
     statics: list[dict[str, Any]]
-    """Of each env: entities of static actors, by name."""
+    """Entities of static actors by name, for each env."""
     held: list[Any]
     """Objects whose ids are used, kept alive: ids are reused once an object is gone."""
     settled: list[dict[int, tuple[bytes, bytes]]]
-    """Of each env, by offset in its packed bytes: a root pose, and the pose to set so that it reads back as that."""
+    """For each env, by offset in its packed bytes: a root pose, and the pose to set so that it reads back as the
+    former."""
 
 
 @once_a_scene

@@ -19,7 +19,7 @@ _HAS_GAUSS = 3
 """Index in ``RandomState.get_state()`` of the flag for a normal number kept aside."""
 
 RngState = tuple[Any, ...]
-"""As returned by ``RandomState.get_state()``."""
+"""State of a generator, as returned by ``RandomState.get_state()``."""
 
 
 class SharedRng(NamedTuple):
@@ -39,7 +39,7 @@ class SharedRng(NamedTuple):
 @dataclass
 class _ReadStates:
     generators: list[np.random.RandomState]
-    """Kept alive, since their memory is read by address."""
+    """Generators, kept alive since their memory is read by address."""
     memory: list[ctypes.Array[ctypes.c_char]]
     """Views of what tells each state from others: some words of its key, its position."""
     copied: bytes

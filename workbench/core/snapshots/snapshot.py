@@ -261,7 +261,7 @@ def _pairs(
 
 @contextmanager
 def step_only(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iterator[None]:
-    """Within this, control steps move these envs only.
+    """Context in which control steps move these envs only.
 
     The task's hooks run for all envs or for none, but on the CPU PhysX has a scene an env, and the others are not stepped. What
     hooks did to them (a step counted, targets, a buffer) is restored from `others`; their physics only where it was written
@@ -300,7 +300,7 @@ def step_only(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iter
 
 
 _JOINT_TENSORS = ("qf", "target_qpos", "target_qvel")
-"""Of an articulation, in addition to ``get_state()``: ``px.cuda_articulation_NAME``."""
+"""Tensors of an articulation that a snapshot has in addition to ``get_state()``: ``px.cuda_articulation_NAME``."""
 
 
 @dataclass(frozen=True)

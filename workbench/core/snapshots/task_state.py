@@ -24,7 +24,7 @@ class Buffer(NamedTuple):
     """Rows of the chosen envs (numpy array or list of plain values), or the value for the whole batch."""
     per_env: bool
     dtype: torch.dtype | None
-    """Of a tensor, else None."""
+    """dtype of a tensor; None for other values."""
 
     def is_as(self, other: Buffer) -> bool:
         """Whether both are equal to the last bit."""
