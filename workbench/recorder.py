@@ -37,12 +37,13 @@ from workbench.recording.writing.publish import RecordingError
 
 logger = logging.getLogger(__name__)
 _MOST_PENDING = 2048
-"""Steps times envs that wait at most: 3 MB; fewer after half a second, or when an episode begins."""
+"""Maximum number of steps times envs that wait for the gatherer: 3 MB. Fewer wait after half a second, or when an
+episode begins."""
 _MOST_PICTURES = 1 << 25
-"""Bytes of pictures that wait at most."""
+"""Maximum size in bytes of the pictures that wait for the gatherer."""
 
 _MANY_ENVS = 4
-"""From here on the files are made in a process: those of fewer envs are made before one has started, or cost the env little."""
+"""Env count from which a subprocess makes the files; below it, start-up costs more than it saves."""
 
 
 class _PendingStep(NamedTuple):
@@ -124,13 +125,13 @@ class Recorder(gym.Wrapper):
         """Files of finished episodes that are being written."""
         self._gatherer: EpisodeGatherer | None = None
         self._pending: deque[_PendingStep] = deque()
-        """Steps that the gatherer does not have yet. Given one by one, while the env waits and the caches are full of physics,
-        they cost twice as much."""
+        """Steps that the gatherer does not have yet. Gathering them one by one, while the env waits and the caches
+        are full of physics, costs twice as much."""
         self._waiting_pictures = 0
-        """Bytes, approximate: another thread may gather at the same time."""
+        """Approximate bytes of the waiting pictures: another thread may gather at the same time."""
         self._gathering = threading.Lock()
         self._failure: Exception | None = None
-        """Of gathering, perhaps on another thread."""
+        """Exception that gathering raised, perhaps on another thread."""
         before_writing(self._gather)
         self._scene: Any = None
         self._description: TaskDescription | None = None
@@ -138,7 +139,7 @@ class Recorder(gym.Wrapper):
         self._elapsed = np.zeros(base.num_envs, np.int32)
         self._finished = False
         self.problem: str | None = None
-        """Why the recording ended because of an error; None if it did not."""
+        """Reason why an error ended the recording; None if no error did."""
 
     @property
     def episodes_written(self) -> int:

@@ -107,7 +107,8 @@ class ActionChooser:
         return actions.hold_action(task.parts, task.num_envs)
 
     def slider_action(self, task: TaskEnv) -> NDArray[np.float32]:
-        """(N, A) what sliders tell the robots next: targets of joints stay, and what has none and was not moved holds still."""
+        """(N, A) action that the sliders set: joint targets stay, and other dimensions that no slider has moved
+        hold still."""
         low, high = actions.bounds(task.parts)
         action = actions.hold_action(task.parts, task.num_envs)
         is_target = actions.is_target(task.parts)
@@ -119,7 +120,8 @@ class ActionChooser:
     def tell(
         self, task: TaskEnv, env_idx: Sequence[int], dimensions: Sequence[int], values: Sequence[float]
     ) -> None:
-        """Tell these envs these values of the action, by slider; without any to hold still where they are."""
+        """Set dimensions of these envs' actions to these values, by slider; without values the envs hold still
+        where they are."""
         shape = task.num_envs, actions.width(task.parts)
         if self._sliders is None or self._targets is None:
             self._sliders = np.full(shape, np.nan, np.float32)
@@ -144,7 +146,7 @@ class ActionChooser:
             self._targets[env] = action
 
     def new_scene(self) -> None:
-        """Forget what all envs were told: there may be another number of them."""
+        """Forget the slider values of all envs; the new scene may have another number of envs."""
         self._sliders = self._targets = None
 
     @property
@@ -153,7 +155,8 @@ class ActionChooser:
 
     @contextmanager
     def _imported(self) -> Iterator[Policy]:
-        """The policy. An exception within this becomes its TaskError, and it is imported again the next time."""
+        """Give the policy. An exception inside the block becomes the policy's TaskError, and the next call imports
+        the policy again."""
         try:
             if self._policy is None:
                 with self._folder.again():
@@ -234,7 +237,8 @@ class RecordActionChooser:
 
 
 class PlannedActions:
-    """Plans the actions of a batch's episodes, each as it would be planned alone, and keeps what the rollouts earned."""
+    """Plans the actions of a batch's episodes, each as if it were planned alone, and records the returns of the
+    rollouts."""
 
     def __init__(
         self, loaded: LoadedTask, task: TaskEnv, env_kwargs: Mapping[str, Any], plan: PlanOptions
@@ -279,7 +283,7 @@ class PlannedActions:
         return action
 
     def add_step(self, step: StepResult, env_idx: Sequence[int]) -> None:
-        """Note what a step gave these envs."""
+        """Record the result of a step of these envs."""
         for env in env_idx:
             self._logs[env].add_step(step, env)
 
@@ -300,9 +304,9 @@ class PlannedActions:
 
 KINDS = ("random", "zero", "hold")
 SOLVE = "solve"
-"""What ``--actions`` names where they are planned."""
+"""Value of ``--actions`` for planned actions."""
 STEPS_WITHOUT_LIMIT = 200
-"""Of an episode whose task has no time limit."""
+"""Control steps of an episode whose task has no time limit."""
 
 
 def find_actions(name: str, task: str) -> tuple[Sequence[RecordedRun], dict[str, Any]]:
@@ -323,7 +327,7 @@ def find_actions(name: str, task: str) -> tuple[Sequence[RecordedRun], dict[str,
 
 
 def plain_chooser(name: str, task: str, seed: int, here: CurrentFolder) -> ActionChooser:
-    """Chooses what ``--actions`` names where that is neither random, planned nor a file.
+    """Make the chooser for an ``--actions`` value that is neither random, planned nor a file.
 
     Raises:
         TaskError: the policy cannot be imported.
@@ -393,7 +397,7 @@ def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Need
 
 
 MOST_BYTES = 2**30
-"""Limit of a NumPy file, also unpacked: 20 million steps of a Panda."""
+"""Maximum size of a NumPy file in bytes, also unpacked: 20 million steps of a Panda."""
 SUFFIXES = (".npy", ".npz", ".h5")
 
 

@@ -85,7 +85,7 @@ class Opening:
     on_finding: Callable[[Finding], None] = warn_of
     """Called once for each place that breaks a rule without being stopped."""
     begins_anew: bool = False
-    """Whether each reset is an exact point (`BatchedCpuMixin.begins_anew`), for a session that goes back."""
+    """Whether each reset is an exact point (`BatchedCpuMixin.begins_anew`), for a session that seeks back."""
     clock: Clock = field(default_factory=Clock)
 
 
@@ -123,11 +123,11 @@ def with_advice(
 
 
 _MOST_TRIED = 8
-"""Seeds with which one env is tried: an error of 16 envs may be of the state of one of them."""
+"""Maximum number of seeds with which one env is tried: an error of 16 envs may come from the state of one of them."""
 
 
 def _may_be_of_the_batch(error: TaskError) -> bool:
-    """Whether it is what torch, numpy or a check says of a wrong shape, and does not already say what to do."""
+    """Whether torch, numpy or a check raised the error for a wrong shape, and the error has no advice yet."""
     cause = error.__cause__
     if isinstance(cause, BrokenRule):
         return True
@@ -204,7 +204,8 @@ def import_task(
 
 
 def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
-    """Build, rehearse and reset an imported task: with one env if it does what exists for one only, and a notice says so.
+    """Build, rehearse and reset an imported task. A task that uses what exists for one env only gets one env, and a
+    notice says so.
 
     On TaskError the caller undoes the import (`undo_load`).
     """
@@ -340,7 +341,7 @@ def notices_of(loaded: LoadedTask, options: TaskOptions, cameras: Iterable[Camer
 
 
 def _rerun_notice() -> str:
-    """What an untested rerun does not allow; empty if nothing."""
+    """Notice of what a rerun version without tests does not allow; empty if nothing."""
     if not untested(["rerun-sdk"]):
         return ""  # rerun is not imported to open a task: it takes 0.3 s
     try:
@@ -361,12 +362,12 @@ def _rules(loaded: LoadedTask, options: TaskOptions) -> Degree | None:
 # --- warming up a process ------------------------------------------------------------------------------
 
 _SMALL_TASK = "PickCube-v1"
-"""Needs no download, has a sensor and a human camera, and the robot that most tasks have."""
+"""A task that needs no download, has a sensor and a human camera, and has the robot that most tasks have."""
 
 
 def warm_up(options: TaskOptions, keep_going: Callable[[], bool]) -> None:
-    """Do the slow first things of a process: make a small env, draw it, and close it. Ends early when `keep_going` returns
-    False.
+    """Do the slow first steps of a process: make a small env, draw it, and close it. Ends early when `keep_going`
+    returns False.
 
     The first env of a process and its shapes take 1.2 s with N = 4 on two cores, the second 0.12 s, and the first picture
     of each kind of camera compiles its shaders. The robot's files, the render system and the shaders are the same for

@@ -33,7 +33,7 @@ Policy = Callable[[Any], Any]
 for all envs, or a dict for several robots."""
 
 _warned: set[Path] = set()
-"""Files with a library's name that a warning named."""
+"""Files whose name is that of a library and that a warning has named."""
 
 
 class NoPolicy(ValueError):
@@ -172,9 +172,9 @@ def _find(name: str, task_folder: Path | None) -> Path:
 
 
 MOST_FILES, MOST_LISTED = 100, 40
-"""Of a folder that are read, and policies that are listed."""
+"""Maximum number of files that are read of a folder, and of policies that are listed."""
 _MOST_BYTES = 256 * 1024
-"""Of a file that is looked through: a larger one is no policy that a person wrote."""
+"""Maximum size in bytes of a file that is searched for policies; a larger file was not written by a person."""
 
 
 def list_policies(here: Path, task_folder: Path | None) -> tuple[str, ...]:
@@ -189,7 +189,7 @@ def list_policies(here: Path, task_folder: Path | None) -> tuple[str, ...]:
     folders = [here.resolve()] if task_folder is None else [here.resolve(), task_folder.resolve()]
     for folder in folders if folders[0] != folders[-1] else folders[:1]:
         for file in _python_files(folder):
-            # As `find_policy` finds it: a file of the first folder hides one of the same name.
+            # Same lookup as `find_policy`: a file of the first folder hides one of the same name.
             name = str(file) if file.name in taken else file.name
             taken.add(file.name)
             found += [(not likely, f"{name}:{function}") for function, likely in _functions_that_fit(file)]
@@ -205,7 +205,7 @@ def _python_files(folder: Path) -> list[Path]:
 
 
 def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
-    """Names of public functions of one required parameter, and whether it is called as an observation."""
+    """Names of public functions of one required parameter, and whether the parameter is named as an observation."""
     try:
         tree = parse_python(read_regular_file(file, _MOST_BYTES))
     except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
@@ -223,7 +223,7 @@ def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
 
 
 class PolicyFile:
-    """Watches the file of the current policy, as the task's is watched. Thread-safe."""
+    """Watches the file of the current policy, as the task's file is watched. Thread-safe."""
 
     def __init__(self, on_save: Callable[[], None]) -> None:
         """

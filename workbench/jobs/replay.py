@@ -41,15 +41,15 @@ class ReplayResult:
     way: Way
     steps: int
     metres: float | None
-    """Largest distance of a body from the recorded state; None if the recording has no states."""
+    """Largest distance in metres of a body from the recorded state; None if the recording has no states."""
     radians: float | None
-    """Largest rotation of a body or joint from the recorded state."""
+    """Largest rotation in radians of a body or joint from the recorded state."""
     corrected: int = 0
-    """Steps after which the recorded state was restored."""
+    """Number of steps after which the recorded state was restored."""
     start_differs: bool = False
-    """The reset with its seed gave another state, and the recorded one was restored."""
+    """Whether the reset with its seed gave another state, and the recorded one was restored."""
     missed: dict[str, str] = field(default_factory=dict)
-    """What could not be restored, with the reason."""
+    """Name and reason of each part of the state that could not be restored."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,9 @@ class Beginning:
     """How an env came to the first state of a run."""
 
     differs: bool
-    """The reset gave another state, and the recorded one was restored."""
+    """Whether the reset gave another state, and the recorded one was restored."""
     missed: dict[str, str]
-    """What could not be restored, with the reason."""
+    """Name and reason of each part of the state that could not be restored."""
 
 
 def begin_run(loaded: LoadedTask, task: TaskEnv, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
@@ -193,7 +193,7 @@ def why_not_replayable(opened: OpenedTask, run: RecordedRun) -> str:
 
 
 def _snapshot_of(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None, str]:
-    """A snapshot of the envs that do not take part; if it cannot be made, why no step is allowed."""
+    """Snapshot of the envs that do not take part; if it cannot be made, the reason why no step is allowed."""
     if not others:
         return None, ""
     try:
@@ -217,7 +217,7 @@ def _is_off(env: object, chosen: list[int], wanted: Mapping[str, NDArray]) -> bo
 def _distance(
     env: object, chosen: list[int], wanted: Mapping[str, NDArray]
 ) -> tuple[float | None, float | None]:
-    """Metres and radians of the env that is furthest; None if nothing was recorded."""
+    """Distance in metres and radians of the env that is furthest; None if nothing was recorded."""
     if not wanted:
         return None, None
     now = read_states(env)

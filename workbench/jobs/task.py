@@ -23,7 +23,7 @@ Backend = Literal["auto", "cpu", "gpu"]
 ShownPictures = Literal["auto", "exact", "fast"]
 """What the page shows of the cameras. ``auto``: fast pictures while something moves, exact ones when it stands still."""
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy", "solve"]
-"""``solve``: planned by rollouts of the task; elsewhere than an `ActionChooser`."""
+"""``solve``: planned by rollouts of the task, outside of `ActionChooser`."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +36,15 @@ class TaskOptions:
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
     pictures: PictureDegree = "exact"
-    """Of what the envs draw for observations and recordings."""
+    """Quality of the pictures that the envs draw for observations and recordings."""
     rules: Degree | None = None
-    """The degree of all rules of GPU simulation; None for each rule's own, see `core.rules`."""
+    """Degree of all rules of GPU simulation; None keeps each rule's own degree, see `core.rules`."""
     imports: tuple[str, ...] = ()
-    """Modules to import before the task, as they may register its id."""
+    """Modules to import before the task; they may register its id."""
 
 
 def changed_options(before: TaskOptions, after: TaskOptions) -> list[str]:
-    """Names of the options that differ, keyword arguments by their own names; the seed is none of them."""
+    """Names of the options that differ, except the seed; keyword arguments are listed by their own names."""
     names = [
         one.name
         for one in fields(TaskOptions)
@@ -165,14 +165,14 @@ class Restored:
     not_carried: dict[str, str]
     """What could not be restored, with the reason; empty within one version of a task."""
     recording: str = ""
-    """Of an `EnterRecording`: text for the episode and the state. Its `origin` is `NO_MOMENT`."""
+    """Description of the episode and the state that an `EnterRecording` restored; `origin` is then `NO_MOMENT`."""
     how: str = ""
     """How the state was reached, as a sentence; empty if it was restored."""
     number: int = 0
-    """Of the `EnterRecording` that it answers; 0 for a `Restore`."""
+    """Number of the `EnterRecording` that this result answers; 0 for a `Restore`."""
     replayed: tuple[int, ...] = ()
-    """The envs that were replayed up to it. For them it is no exact point (from which the same actions give the same
-    bits), as a restored state is."""
+    """Indices of the envs that were replayed up to the state. For them the state is not an exact point, from which
+    the same actions give the same bits; a restored state is one."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class Stepped:
     """(N, ...) each, as `core.capture.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
     capturing."""
     acted_by: str = ""
-    """The source of this step's action, for a recording; empty if it is known before the episode."""
+    """Source of this step's action, for a recording; empty if the source is known before the episode."""
     placed: dict[CameraKey, CameraSettings] = field(default_factory=dict)
     """The cameras that are placed by hand (only while capturing)."""
     resumed: bool = False

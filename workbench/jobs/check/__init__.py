@@ -1,1 +1,1 @@
-"""Checks a task: what a check is, what one process of it does, and what all come to."""
+"""Checks a task: the items of a check, the work of one process, and the report."""

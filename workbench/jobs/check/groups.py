@@ -1,4 +1,4 @@
-"""One process of a check: looks at the rules that it gets, on an env of its own."""
+"""One process of a check: runs the rules that it is dealt, on an env of its own."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def _described(loaded: LoadedTask) -> CheckedTask:
 
 
 class _Given:
-    """Acts as ``--actions`` says: a policy in an episode of each seed, or the episodes of a file."""
+    """Acts as ``--actions`` says: a policy runs an episode of each seed, or the episodes of a file are replayed."""
 
     kind = "given"
 

@@ -1,4 +1,4 @@
-"""What a check is, and how it is cut into items: rules on parts of the seeds."""
+"""Options of a check, and how it is cut into items: rules on parts of the seeds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from workbench.jobs.actions import SOLVE
 from workbench.jobs.task import TaskOptions
 
 SEEDS_OF_PART = 32
-"""Seeds that are looked at together, in one set of envs."""
+"""Seeds that are checked together, in one set of envs."""
 
 
 @dataclass(frozen=True)
@@ -23,14 +23,15 @@ class CheckOptions:
     task: str
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=8))
     seeds: int = 32
-    """How many are tried, from ``options.seed`` on."""
+    """Number of seeds that are checked, from ``options.seed`` on."""
     select: tuple[str, ...] = ()
     """Only these rules; empty for all."""
     ignore: tuple[str, ...] = ()
     actions: str = "random"
-    """As `RecordArguments.actions`. In further episodes, beside random ones, what it names acts."""
+    """Source of the actions of further episodes, which run in addition to the random ones; see
+    `RecordArguments.actions`."""
     workers: int | None = None
-    """Processes, if no executor is given; None for as many as cores and chunks allow."""
+    """Number of processes, if no executor is given; None for as many as cores and chunks allow."""
     solve: bool = False
     """Whether the rules that need planned episodes are checked too."""
 
@@ -51,27 +52,27 @@ class CheckedTask:
 
 @dataclass(frozen=True)
 class CheckUpdate:
-    """Progress of a process; one of these."""
+    """Progress of a process; exactly one field is set."""
 
     task: CheckedTask | None = None
-    """It is imported, and the checks begin."""
+    """The imported task, sent when the checks begin."""
     activity: str = ""
-    """What is being looked at."""
+    """Name of the work that is being done."""
 
 
 @dataclass(frozen=True)
 class ItemOutcome:
-    """What an item came to: a rule for one part of the seeds, or all rules of GPU simulation."""
+    """Result of an item: of a rule for one part of the seeds, or of all rules of GPU simulation."""
 
     results: tuple[RuleResult, ...]
     findings: tuple[Finding, ...] = ()
-    """Of rules of GPU simulation."""
+    """Findings of the rules of GPU simulation."""
     silenced: tuple[Silenced, ...] = ()
-    """Likewise, with a comment that silences it."""
+    """Findings of the rules of GPU simulation that a comment silences."""
     picture_seconds: float = 0.0
-    """For the first pictures of a process."""
+    """Seconds that the first pictures of a process took."""
     task: CheckedTask | None = None
-    """With the first item of each chunk."""
+    """The checked task; set in the first item of each chunk."""
 
 
 def groups_of(degrees: Mapping[str, Degree]) -> list[RuleGroup]:
@@ -86,7 +87,7 @@ def groups_of(degrees: Mapping[str, Degree]) -> list[RuleGroup]:
 
 
 def count_rules(degrees: Mapping[str, Degree]) -> int:
-    """How many rules a check gives a result of."""
+    """Number of rules that a check gives a result for."""
     return sum(degree != "off" for degree in degrees.values())
 
 
@@ -105,25 +106,25 @@ def degrees_of_request(what: CheckOptions) -> dict[str, Degree]:
 
 @dataclass(frozen=True)
 class Item:
-    """What is looked at at once."""
+    """Rules and seeds that are checked together."""
 
     part: int
     group: RuleGroup
     rules: tuple[str, ...]
-    """One of the group, or all of GPU simulation for `CORE`."""
+    """A single rule of the group, or all rules of GPU simulation for `CORE`."""
 
 
 @dataclass(frozen=True)
 class CheckPlan:
-    """The items of a check, by number. A chunk has the rules of one group, which look at the same evidence; of several parts of
-    the seeds all rules of a part, which look at the same episodes. Rules that do not depend on the seeds are looked at in the
-    first part alone."""
+    """The items of a check, by number. A chunk holds the rules of one group, which use the same evidence; with
+    several parts of the seeds, all rules of one part, which use the same episodes. Rules that do not depend on the
+    seeds are checked in the first part only."""
 
     items: Mapping[int, Item]
     chunk: int
-    """Numbers of a chunk; not each stands for an item."""
+    """Count of numbers in a chunk; not every number stands for an item."""
     part: int
-    """Seeds of a part. What compares whole batches takes one for each env."""
+    """Number of seeds of a part. A rule that compares whole batches uses one seed for each env."""
     parts: int
 
     @property
@@ -131,7 +132,7 @@ class CheckPlan:
         return len({number // self.chunk for number in self.items})
 
     def episodes(self, part: int, seeds: int) -> range:
-        """Which of so many seeds are in a part, from 0 on."""
+        """Range of the seeds in a part, counted from 0, out of `seeds` seeds."""
         return range(part * self.part, min((part + 1) * self.part, seeds))
 
 

@@ -27,32 +27,32 @@ from workbench.jobs.pool.deal import Deal, Executor, Failure, ThisProcess, Work
 from workbench.jobs.pool.processes import Processes
 
 _TRIES = 3
-"""How often rules are begun whose workers die."""
+"""Maximum number of times that a chunk of rules is started when its workers die."""
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What the checks came to."""
+    """Result of a check."""
 
     task: CheckedTask
     results: tuple[RuleResult, ...]
-    """In the order of the table, without rules that are off."""
+    """Results in the order of the table of rules, without rules that are off."""
     seconds: float
     start_seconds: float
-    """Of those, until the first process had imported the task."""
+    """Part of `seconds` until the first process had imported the task."""
     picture_seconds: float = 0.0
-    """Of those, for the first pictures."""
+    """Part of `seconds` that the first pictures took."""
     stopped: bool = False
     ignored: tuple[str, ...] = ()
     """Rules that would have been checked without `CheckOptions.ignore`."""
     comments: tuple[Comment, ...] = ()
     """Silencing comments that silence nothing."""
     missing: int = 0
-    """Rules, counted for each part of the seeds, that were not looked at."""
+    """Number of rules that were not checked, counted for each part of the seeds."""
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Those that stop first; then in the order of the table."""
+        """All findings, by degree with ``stop`` first, then in the order of the table of rules."""
         found = [finding for result in self.results for finding in result.findings]
         return tuple(sorted(found, key=lambda finding: DEGREES.index(finding.degree)))
 
@@ -125,7 +125,7 @@ def check(
 
 
 def report_of(what: CheckOptions, known: Mapping[int, ItemOutcome]) -> CheckReport:
-    """The report of a check of which these items are known. Runs nothing. Raises ValueError as `degrees_of_request`."""
+    """Report of a check from the results of these items. Runs nothing. Raises ValueError as `degrees_of_request`."""
     found = _Results(what)
     for number in sorted(known):
         found.take(number, known[number])
@@ -133,7 +133,7 @@ def report_of(what: CheckOptions, known: Mapping[int, ItemOutcome]) -> CheckRepo
 
 
 class _Results:
-    """Collects what all processes give."""
+    """Collects the results of all processes."""
 
     def __init__(
         self,
@@ -166,8 +166,8 @@ class _Results:
             self._on_progress(len(self._outcomes))
 
     def fail(self, failure: Failure) -> None:
-        """Take rules that gave no result: their process died. Raises TaskError for a policy that cannot be imported, which is no
-        matter of one rule."""
+        """Record rules that gave no result because their process died. Raises TaskError for a policy that cannot
+        be imported, since that concerns every rule."""
         if failure.problem.stage != "worker":
             raise TaskError(failure.problem)
         for number in failure.numbers:
@@ -192,7 +192,7 @@ class _Results:
         now = time.monotonic()
         seconds, started = (0.0, 0.0) if began is None else (now - began, (self._started or now) - began)
         missing = len(self._plan.items) - len(self._outcomes)
-        # Of what is not looked at yet nobody knows what it silences.
+        # Which comments silence something is known only when every rule was checked.
         decided = () if missing else ordered
         return CheckReport(
             task,

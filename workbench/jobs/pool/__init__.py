@@ -1,1 +1,1 @@
-"""Items dealt to workers: in this process, in others, or on a cluster; and the file that keeps what came of them."""
+"""Deals items to workers in this process, in others, or on a cluster, and keeps their results in a job file."""

@@ -35,11 +35,11 @@ from workbench.machine.versions import package_versions
 
 _LOOK_SECONDS = 0.1
 _ANSWER_SECONDS = 1.0
-"""How long to wait for the post before the cluster is looked at: of one that ended no answer comes."""
+"""Seconds to wait for the post before the cluster is checked; a post that has ended never answers."""
 _SAY_SECONDS = 1.0
-"""How often a worker says what it has made: the post takes some thousand messages a second from all of them."""
+"""Seconds between two messages of a worker: the post takes some thousand messages a second from all workers."""
 _END_SECONDS = 120.0
-"""How long a stopped worker may take to write the items that have ended."""
+"""Seconds that a stopped worker may take to write the items that have ended."""
 _EXIT_SECONDS = 10.0
 _FOLDER = "workbench-job-"
 
@@ -49,21 +49,21 @@ class Cluster:
     """An executor whose workers are actors of a Ray cluster."""
 
     address: str = AUTO
-    """``local`` starts one on this machine that only this user can connect to and that ends with the job; ``auto`` takes one
-    that is there, else does that."""
+    """``local`` starts a cluster on this machine that only this user can connect to and that ends with the job;
+    ``auto`` takes a running cluster, or else starts one like ``local``."""
     workers: int | None = None
-    """How many; None for as many as the cluster has room for now."""
+    """Number of workers; None for as many as the cluster has room for now."""
     cpus_per_worker: float = 1
     gpus_per_worker: float = 0
     on_death: Callable[[str], None] = lambda text: None
-    """As of `Listener`."""
+    """Called with a sentence when a worker has died and the job goes on; see `Listener`."""
 
     @property
     def elsewhere(self) -> bool:
         return True
 
     def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
-        """As `Executor.run`.
+        """Run the work on the cluster; see `Executor.run`.
 
         Raises:
             NoCluster: as `connected`; or the cluster has no room for a worker.
@@ -89,7 +89,7 @@ class Cluster:
 
 
 def versions_here() -> dict[str, str]:
-    """What must be the same on all machines of a job."""
+    """Versions that must be the same on all machines of a job."""
     return {"Python": ".".join(platform.python_version_tuple()[:2]), **package_versions()}
 
 
@@ -102,11 +102,11 @@ class OtherVersions(RuntimeError):
 
 @dataclass(eq=False)
 class _Started:
-    """A worker, seen from here."""
+    """A worker as the dealing process sees it."""
 
     handle: Any
     ended: Any
-    """Reference that is ready when it has ended."""
+    """Reference that is ready when the actor has ended."""
 
 
 class _ActorPool:
@@ -132,7 +132,7 @@ class _ActorPool:
         )(RayWorker)
         self._busy: dict[int, _Started] = {}
         self._ending: list[_Started] = []
-        """Those that have said their last word, and put their folders away."""
+        """Workers that have sent their last message and removed their folders."""
         self._started = 0
 
     def serve(self) -> None:
@@ -162,7 +162,8 @@ class _ActorPool:
             raise failure
 
     def end(self) -> None:
-        """Wait for the actors that are done, and end the others at once, as after a second Ctrl-C: they may not respond."""
+        """Wait for the actors that are done, and end the others at once, as after a second Ctrl-C: they may not
+        respond."""
         if self._ending:
             ended = [actor.ended for actor in self._ending]
             self._ray.wait(ended, num_returns=len(ended), timeout=_EXIT_SECONDS)
@@ -171,14 +172,14 @@ class _ActorPool:
         self._ray.kill(self._post)
 
     def _said(self, seconds: float) -> list[tuple[int, bytes]]:
-        """What the workers have said, as of `Post.take`. Raises ClusterLost."""
+        """Messages of the workers since the last call; see `Post.take`. Raises ClusterLost."""
         said = self._post.take.remote(seconds)
         while not self._ray.wait([said], timeout=_ANSWER_SECONDS)[0]:
             self._pulse.check()
         return self._ray.get(said)
 
     def _reap(self) -> None:
-        """End the actors that have put their folders away: as long as they live they keep their cores."""
+        """End the actors that have removed their folders: an actor keeps its cores as long as it lives."""
         if not self._ending:
             return
         ended = [actor.ended for actor in self._ending]
@@ -188,7 +189,8 @@ class _ActorPool:
             self._ending.remove(actor)
 
     def _guarded(self, number: int, failure: Any, act: Any) -> Any:
-        """Do this for a worker; after an error that ends the job the others finish what they have."""
+        """Call `act` for a worker; after an error that ends the job the other workers finish the items that they
+        have."""
         try:
             act()
         except (TaskError, PoolError) as error:
@@ -198,7 +200,7 @@ class _ActorPool:
         return failure
 
     def _room(self) -> int:
-        """How many workers the cluster has room for.
+        """Number of workers that the cluster has room for.
 
         Raises:
             NoCluster: for none.
@@ -246,7 +248,7 @@ class _ActorPool:
         return [by_ref[ref] for ref in ready]
 
     def _died(self, number: int) -> None:
-        """Take its last words, and account for its end.
+        """Read the last messages of the worker, and handle its end.
 
         Raises:
             TaskError, PoolError: the job is over.
@@ -272,7 +274,7 @@ class _ActorPool:
 
 
 class Post:
-    """An actor through which workers and the process that deals talk. It keeps what nobody has taken yet."""
+    """Actor that passes messages between the workers and the dealing process. It keeps messages until they are taken."""
 
     def __init__(self) -> None:
         self._said: deque[tuple[int, bytes]] = deque()
@@ -281,13 +283,13 @@ class Post:
         self._limit = NO_LIMIT
 
     async def put(self, worker: int, messages: list[bytes]) -> int:
-        """Take messages of a worker; returns the limit."""
+        """Store messages of a worker; returns the limit."""
         self._said.extend((worker, message) for message in messages)
         self._came.set()
         return self._limit
 
     async def ask(self, worker: int, messages: list[bytes]) -> tuple[Chunk | None, int]:
-        """Take messages of which the last asks for a chunk; returns it, and the limit."""
+        """Store messages of which the last asks for a chunk; returns the chunk and the limit."""
         future: asyncio.Future[Chunk | None] = asyncio.get_running_loop().create_future()
         self._answers[worker] = future
         await self.put(worker, messages)
@@ -298,7 +300,7 @@ class Post:
             future.set_result(chunk)
 
     async def take(self, seconds: float) -> list[tuple[int, bytes]]:
-        """What has come, waiting so long for the first message."""
+        """New messages; waits up to `seconds` for the first one."""
         if not self._said and seconds:
             self._came.clear()
             try:
@@ -320,7 +322,7 @@ class RayWorker:
     """A worker, in its own process."""
 
     def __init__(self, post: Any, number: int, cpus: float) -> None:
-        # The software renderer starts a thread for each core of the machine otherwise.
+        # Without this the software renderer starts a thread for each core of the machine.
         os.environ["LP_NUM_THREADS"] = str(max(1, int(cpus)))
         self._post, self._number = post, number
 
@@ -356,7 +358,7 @@ class RayWorker:
 
 
 def _remove_left_folders() -> None:
-    """Remove what actors that were killed on this machine have left."""
+    """Remove the folders that killed actors have left on this machine."""
     for path in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*-*"):
         pid = path.name.removeprefix(_FOLDER).partition("-")[0]
         if pid.isdigit() and not psutil.pid_exists(int(pid)):
@@ -383,7 +385,7 @@ class _PostQueue(WorkerQueue):
         self._said = 0.0
         self._limit: int = NO_LIMIT
         self._put: Any = None
-        """Of the messages that were put last; its value is the limit then."""
+        """Ray reference to the last `Post.put` call; its value is the limit at that time."""
 
     def next(self) -> Chunk | None:
         import ray
@@ -407,7 +409,7 @@ class _PostQueue(WorkerQueue):
             self._send()
 
     def flush(self) -> None:
-        """Wait until all is said."""
+        """Wait until all messages are sent."""
         import ray
 
         self._send()

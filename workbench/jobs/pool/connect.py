@@ -16,11 +16,12 @@ from typing import Any
 
 AUTO, LOCAL = "auto", "local"
 BREAKPOINT = "PYTHONBREAKPOINT"
-"""Ray writes it, for its workers and whoever connects."""
+"""Environment variable that Ray sets for its workers and for processes that connect."""
 _DEAF_SECONDS = 5.0
 _PROBE_SECONDS = 2.0
 _GONE_SECONDS = 20.0
-"""For which the head may refuse connections: it may be restarted. After 60 s Ray ends this process by itself."""
+"""Seconds for which the head may refuse connections, since it may be restarting. After 60 s Ray ends this process
+by itself."""
 _INSTALL = "pip install 'maniskill-workbench[cluster]'"
 _AUTH_MODE = "RAY_AUTH_MODE"
 
@@ -30,7 +31,7 @@ class NoCluster(OSError):
 
 
 class ClusterLost(OSError):
-    """The cluster ended while it was used; the text says what of it."""
+    """The cluster ended while it was used; the text gives what is known of the reason."""
 
 
 class Pulse:
@@ -109,7 +110,7 @@ def connected(address: str = AUTO) -> Iterator[Any]:
 
 @contextmanager
 def _token_given(ray: Any, address: str) -> Iterator[None]:
-    """Within this, give this user's token if the cluster asks for one and ``RAY_AUTH_MODE`` says nothing.
+    """Within this block, give this user's token if the cluster asks for one and ``RAY_AUTH_MODE`` is not set.
 
     ``ray start`` asks for one wherever this user has one. Who connects gives none without being told, and is refused after
     twenty seconds; given to a cluster that asks for none, no worker starts.
@@ -137,7 +138,7 @@ def _asks_for_token(ray: Any, address: str) -> bool:
 
 
 def _why_deaf(address: str) -> str | None:
-    """Why nothing can be there; None if something listens. Ray itself tries for minutes."""
+    """Reason why no cluster can be at the address; None if something listens there. Ray itself retries for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
         with socket.create_connection((host, int(port)), timeout=_DEAF_SECONDS):
@@ -181,7 +182,7 @@ def _connect(ray: Any, address: str, how: Mapping[str, Any]) -> None:
 
 @contextmanager
 def _standard_output_kept() -> Iterator[None]:
-    """Keep Ray's words on workers that died off it, where results are: the pool tells of them."""
+    """Keep Ray's messages about dead workers off stdout, which holds the results; the pool reports dead workers."""
     from ray._private import worker
 
     before = worker.print_to_stdstream
@@ -194,7 +195,8 @@ def _standard_output_kept() -> Iterator[None]:
 
 @contextmanager
 def _breakpoints_kept() -> Iterator[None]:
-    """Keep what ``breakpoint()`` does: Ray names its own debugger to this process and all that it starts from now on."""
+    """Keep the behaviour of ``breakpoint()``: Ray sets its own debugger for this process and all that it starts
+    afterwards."""
     before = os.environ.get(BREAKPOINT)
     try:
         yield
@@ -214,9 +216,9 @@ def _only_for_this_user() -> Iterator[None]:
 
     before = ray_constants.ENABLE_RAY_CLUSTER
     ray_constants.ENABLE_RAY_CLUSTER = False
-    # The first for the daemons, which import the constant anew.
+    # The first is for the daemons, which import the constant again.
     os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"
-    # As local processes have it; Ray's own 15 is for machines that others work on.
+    # Same value as for local processes; Ray's own 15 is for machines that others work on.
     os.environ.setdefault("RAY_worker_niceness", "0")
     # Else Ray writes one into the home folder, where others may read it. It asks for tokens by itself.
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))

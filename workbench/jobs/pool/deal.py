@@ -1,4 +1,4 @@
-"""Deals a job's numbered items in fixed chunks, and keeps account of what came of them."""
+"""Deals a job's numbered items in fixed chunks, and keeps account of their results."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from workbench.authoring.problem import Problem, TaskError
 
 NO_LIMIT = sys.maxsize
 FIRST_ALIKE, LATER_ALIKE = 5, 20
-"""Chunks that may fail alike one after another, before the first result and after it: then the others would fail too."""
+"""Maximum number of chunks that fail alike one after another, before the first result and after it; then the
+others would fail too."""
 _STARTS = 3
-"""Workers that may die before their first chunk."""
+"""Number of workers that may die before their first chunk."""
 _BEFORE_ANY = -1
 """Stands for the group of a worker that has no chunk yet."""
 
@@ -39,11 +40,11 @@ class Chunk:
     """
 
     numbers: tuple[int, ...]
-    """Ascending."""
+    """Item numbers, ascending."""
     wanted: frozenset[int]
-    """Those whose results are not there yet."""
+    """Items whose results are still missing."""
     again: bool = False
-    """Another worker, or an earlier run of the job, may have begun it: what it wrote may be there."""
+    """Whether another worker, or an earlier run of the job, may have begun the chunk; files that it wrote may exist."""
 
 
 class ItemQueue(Protocol):
@@ -51,7 +52,7 @@ class ItemQueue(Protocol):
 
     @property
     def origin(self) -> Mapping[str, str]:
-        """Where files have travelled to this worker: each folder here, to the one that the submitting side has."""
+        """Folder on this worker, to the folder of the submitting side that its files came from."""
         ...
 
     def next(self) -> Chunk | None:
@@ -59,7 +60,7 @@ class ItemQueue(Protocol):
         ...
 
     def limit(self) -> int:
-        """Items from this number on are not needed, even if they have begun. It never rises."""
+        """First item number that is not needed, even if that item has begun. The limit never rises."""
         ...
 
     def send_result(self, number: int, result: Any) -> None:
@@ -80,7 +81,7 @@ class Failure:
 
 
 def kind_of(problem: Problem) -> object:
-    """In what failures are alike: where they were raised."""
+    """Key that is equal for failures that are alike: where they were raised."""
     return problem.stage, problem.file, problem.line
 
 
@@ -101,7 +102,8 @@ class Shard:
     count: int = 1
 
     def part(self, total: int) -> range:
-        """Its part of so many chunks: the parts follow each other, and no two differ by more than one."""
+        """Range of the chunks in this part, out of `total` chunks: the parts follow each other, and their sizes
+        differ by at most one."""
         return range(total * (self.index - 1) // self.count, total * self.index // self.count)
 
     def __str__(self) -> str:
@@ -122,11 +124,11 @@ class _Held:
 
     chunk: Chunk
     missing: set[int]
-    """Wanted items whose results did not come yet."""
+    """Wanted items that have no result yet."""
 
 
 class Deal(Generic[Result, Update]):
-    """The chunks of a job, and the callbacks for what comes of its items. Used on one thread.
+    """The chunks of a job, and the callbacks for the results of its items. Used on one thread.
 
     Chunks are dealt in ascending order. From the limit on no item is needed: a caller that has enough lowers it, and stopping
     is a limit of 0. A chunk whose worker died is dealt again, after the others.
@@ -161,20 +163,20 @@ class Deal(Generic[Result, Update]):
         self._with_results: set[int] = set()
         """Groups that have a result."""
         self._given_up: dict[int, Problem] = {}
-        """Of each group whose chunks fail alike, why."""
+        """Problem of each group that was given up because its chunks failed alike."""
         self._known: Mapping[int, Result] = {}
         self._keep: Callable[[int, Result], None] = lambda number, result: None
         self._left = self._chunks()
         self._ahead: deque[Chunk] = deque()
-        """Taken of `_left` already."""
+        """Chunks that were already taken from `_left`."""
         self._alone: deque[Chunk] = deque()
-        """Items of a chunk that failed, each by itself: dealt first, to know which ones fail."""
+        """Items of a failed chunk, one per chunk: dealt first, to find out which of them fail."""
         self._returned: deque[Chunk] = deque()
         self._held: dict[Hashable, list[_Held]] = {}
         self._deaths: dict[int, int] = {}
-        """Of the chunk that begins with this item."""
+        """Number of workers that died with a chunk, by the chunk's first item."""
         self._failed_alike: dict[int, list[tuple[object, int]]] = {}
-        """Of the failures of each group since its last result: in what they are alike, and the first item of the chunk."""
+        """Failures of each group since its last result: the kind of each, and the first item of its chunk."""
         self._limit = NO_LIMIT
         self.is_going_on = False
         """Whether results of an earlier run are being taken."""
@@ -221,7 +223,7 @@ class Deal(Generic[Result, Update]):
         return None
 
     def count_left(self, most: int) -> int:
-        """Chunks that can be dealt, counted up to `most`."""
+        """Number of chunks that can be dealt, counted up to `most`."""
         limit = self.limit()
         again = sum(min(chunk.wanted) < limit for chunk in (*self._alone, *self._returned))
         return min(self._look(most) + again, most)
@@ -254,13 +256,14 @@ class Deal(Generic[Result, Update]):
         self._on_update(update)
 
     def ended(self, worker: Hashable) -> None:
-        """The worker says that it is done. Raises PoolError if it is not."""
+        """Handle the message that a worker is done. Raises PoolError if it still has items."""
         held = self._held.pop(worker, [])
         if min((number for one in held for number in one.missing), default=NO_LIMIT) < self.limit():
             raise PoolError("ended before it was done")
 
     def failed(self, worker: Hashable, error: TaskError) -> None:
-        """The author's code failed in the last chunk of this worker, which has ended. Its items are dealt one by one then.
+        """Handle that the author's code failed in the last chunk of this worker, which has ended. The items of that
+        chunk are then dealt one by one.
 
         Raises:
             TaskError: the job is over: no item was begun, or the failure is one too many of its kind.
@@ -280,7 +283,7 @@ class Deal(Generic[Result, Update]):
             self._give_up_group(last, error, error.problem)
 
     def died(self, worker: Hashable, how: str, code: int | None) -> None:
-        """The worker is gone without a word.
+        """Handle that the worker died without a message.
 
         Args:
             how: the end of a sentence that begins with its name.
@@ -326,7 +329,7 @@ class Deal(Generic[Result, Update]):
             yield tuple(numbers)
 
     def _look(self, most: int) -> int:
-        """Have up to `most` chunks in `_ahead`; how many of them are needed."""
+        """Have up to `most` chunks in `_ahead`; returns how many of them are needed."""
         while len(self._ahead) < most and (numbers := next(self._left, None)) is not None:
             if wanted := frozenset(numbers) - self._known.keys():
                 if (problem := self._given_up.get(numbers[0] // self._group)) is not None:
@@ -373,7 +376,8 @@ class Deal(Generic[Result, Update]):
             self._on_failure(failure)
 
     def _alike(self, key: object, held: _Held) -> bool:
-        """Note a failure of this kind; whether that many chunks of its group failed alike one after another."""
+        """Record a failure of this kind; returns whether enough chunks of its group failed alike one after another
+        to give it up."""
         first = held.chunk.numbers[0]
         group = first // self._group
         before = self._failed_alike.setdefault(group, [])
@@ -384,7 +388,7 @@ class Deal(Generic[Result, Update]):
 
 @dataclass(frozen=True)
 class Work(Generic[Setup, Result, Update]):
-    """What each worker does."""
+    """Work of each worker of a job."""
 
     run: Callable[[Setup, ItemQueue], None]
     """A function that can be imported by its name. It returns when its queue has no next chunk and none is under way.
@@ -395,11 +399,11 @@ class Work(Generic[Setup, Result, Update]):
     """The first argument of `run`; can be pickled."""
     result: Any
     update: Any
-    """Types of results and progress, against which `wire` checks what comes of other processes."""
+    """Types of results and progress, against which `wire` checks the messages of other processes."""
     name: str
-    """As in "a process *that records* was killed by SIGKILL"."""
+    """Clause that names the process in messages: "a process *that records* was killed by SIGKILL"."""
     folders: Sequence[Path] = ()
-    """What workers on other machines need: folders of the author, each with what is below it."""
+    """Folders of the author that workers on other machines need, each with all that is below it."""
     files: Sequence[Path] = ()
     """Likewise, further files. Paths in `setup` that are in neither must be places of all machines; what is below a folder
     that travels and must not be taken for it, such as where results go, stands there as bytes."""

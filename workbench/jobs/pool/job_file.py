@@ -1,4 +1,4 @@
-"""Keeps the results of a job in a file as they come: a job that was stopped goes on from there, and parts are put together.
+"""Keeps the results of a job in a file as they come: a stopped job resumes from it, and parts are merged.
 
 An SQLite database: each result is in it as a whole or not at all, also where the process is killed.
 """
@@ -33,7 +33,7 @@ CREATE TABLE kept (name TEXT PRIMARY KEY, value BLOB NOT NULL);
 CREATE TABLE result (number INTEGER PRIMARY KEY, value BLOB NOT NULL);
 """
 _DIFFERENT = 5
-"""Differences that are named."""
+"""Number of differences that a message names."""
 
 Request = TypeVar("Request")
 
@@ -44,15 +44,15 @@ class JobFileError(ValueError):
 
 @dataclass(frozen=True)
 class JobKey:
-    """What a job file is for."""
+    """Identity of the job that a job file belongs to."""
 
     command: str
     about: Mapping[str, str]
-    """Names and values of all that the results depend on."""
+    """Names and values of everything that the results depend on."""
     request: bytes
-    """What the command asks for, packed: `merge` reads it."""
+    """Options of the command, packed; `merge` reads them."""
     folder: str = ""
-    """Where the episodes go."""
+    """Folder that the episodes are written to."""
 
 
 def job_of(
@@ -112,12 +112,12 @@ class JobFile:
         path.absolute().parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self.count = 0
-        """Results that were in it."""
+        """Number of results that the file held when it was opened."""
         with _named(path):
             self._database = sqlite3.connect(path, timeout=0, isolation_level=None)
         try:
             with _named(path):
-                # As long as it is open: of two processes that do the same items, each would do all.
+                # The lock lasts while the file is open: two processes with the same job would each do all items.
                 self._database.execute("PRAGMA locking_mode = EXCLUSIVE")
                 self._database.execute("BEGIN EXCLUSIVE")
                 if not self._database.execute("PRAGMA schema_version").fetchone()[0]:
@@ -140,7 +140,7 @@ class JobFile:
         self._database.executemany("INSERT INTO kept VALUES (?, ?)", kept.items())
 
     def results(self, kind: Any) -> dict[int, Any]:
-        """What is in it, by item. Raises JobFileError if a result cannot be read as this type."""
+        """Results in the file, by item. Raises JobFileError if a result cannot be read as this type."""
         return _results(self.path, self._database, kind)
 
     def keep(self, number: int, result: object) -> None:
@@ -149,7 +149,7 @@ class JobFile:
             self._database.execute("INSERT OR REPLACE INTO result VALUES (?, ?)", (number, pack(result)))
 
     def put(self, packed: Mapping[int, bytes]) -> None:
-        """Write results that are packed already, those that are there too. Raises JobFileError."""
+        """Write packed results; results of items that are in the file already are written too. Raises JobFileError."""
         with _named(self.path):
             self._database.execute("BEGIN")
             self._database.executemany("INSERT OR REPLACE INTO result VALUES (?, ?)", packed.items())
@@ -161,13 +161,13 @@ class JobFile:
 
 @dataclass(frozen=True)
 class Kept:
-    """An executor that leaves out what a job file holds, and keeps there what comes."""
+    """Executor that skips the items in a job file, and writes new results to it."""
 
     executor: Executor
     file: JobFile | None = None
     shard: Shard = Shard()
     is_there: Callable[[Any], bool] = lambda result: True
-    """Whether what a result names still exists; else its item is done again."""
+    """Whether the files that a result names still exist; if not, its item is done again."""
 
     @property
     def elsewhere(self) -> bool:
@@ -193,20 +193,20 @@ class JobParts:
     about: Mapping[str, str]
     request: bytes
     values: dict[int, bytes]
-    """Packed, by item."""
+    """Packed results, by item."""
     folders: dict[int, str]
-    """Where the episode of each item was written."""
+    """Folder that the episode of each item was written to."""
     files: tuple[Path, ...] = field(default=())
 
     def requested(self, kind: type[Request]) -> Request:
-        """What the command asked for. Raises JobFileError."""
+        """Options of the command. Raises JobFileError."""
         try:
             return Unpacker().unpack(self.request, kind)
         except Unreadable as error:
             raise JobFileError(f"{self.files[0]} holds a request that cannot be read ({error})") from error
 
     def results(self, kind: Any) -> dict[int, Any]:
-        """By item. Raises JobFileError."""
+        """Results by item. Raises JobFileError."""
         unpacker = Unpacker()
         try:
             return {number: unpacker.unpack(value, kind) for number, value in sorted(self.values.items())}
@@ -300,7 +300,7 @@ def _results(path: Path, database: sqlite3.Connection, kind: Any) -> dict[int, A
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Say which file an error of the database is of."""
+    """Add the name of the file to an error of the database."""
     try:
         yield
     except sqlite3.OperationalError as error:

@@ -24,7 +24,7 @@ from workbench.machine.text import guard_terminal
 
 _LOOK_SECONDS = 0.1
 _END_SECONDS = 120.0
-"""How long a stopped process may take to write the items that have ended."""
+"""Seconds that a stopped process may take to write the items that have ended."""
 _EXIT_SECONDS = 10.0
 
 
@@ -58,9 +58,9 @@ class _Process:
     line: MessageSocket
     keeper: subprocess.Popen[bytes]
     place: int
-    """Which share of the cores it has."""
+    """Index of the process's share of the cores."""
     heard: bool = True
-    """Whether it is listened to: it did not end yet."""
+    """Whether its messages are read; False after it has ended."""
 
 
 class _ProcessPool:
@@ -135,7 +135,7 @@ class _ProcessPool:
         end_family(process.keeper)
 
     def _replace(self, process: _Process) -> None:
-        """End a process that failed, and start another one for what is left."""
+        """End a process that failed, and start another one for the remaining chunks."""
         self._leave(process)
         if self._deal.count_left(1):
             self._start(process.place)

@@ -1,4 +1,4 @@
-"""Takes the author's files to workers on other machines: a task with all that lies beside it, a policy, recordings."""
+"""Packs the author's files for workers on other machines: a task with the files of its folder, a policy, recordings."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from typing import Any, TypeVar
 from workbench.machine.files import read_regular_file
 
 MOST_BYTES = 256 << 20
-"""Of all files together, which each machine of a cluster gets."""
+"""Maximum size in bytes of all files together; each machine of a cluster gets them all."""
 _LEFT_OUT = {"__pycache__", "node_modules", "site-packages", "venv", "recordings", "sweeps"}
-"""Folders that hold what others made."""
+"""Names of folders that do not travel: packages, caches and recordings."""
 
 Value = TypeVar("Value")
 
 
 class TooMuch(ValueError):
-    """The files beside the task are more than travel; the text says which are large."""
+    """The files of the task's folder exceed the maximum size; the text names the large ones."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,16 @@ class Baggage:
     """Folders and files of the submitting side, as one zip."""
 
     roots: tuple[str, ...]
-    """Absolute paths; what is below them has travelled."""
+    """Absolute paths of the folders and files that have travelled."""
     current: str
-    """The current folder there."""
+    """Current folder on the submitting side."""
     data: bytes
-    """Names are the absolute paths, without their first slash: so what names another file relatively still finds it."""
+    """The zip. Names are the absolute paths without their first slash, so that relative paths between files still
+    hold."""
 
     def unpack(self, folder: Path) -> dict[str, str]:
-        """Write all below `folder`, which is empty, and make the place of the current folder the current one.
+        """Write all files below `folder`, which is empty, and change to the place there of the submitting side's
+        current folder.
 
         Returns:
             each root's place here.
@@ -54,7 +56,7 @@ class Baggage:
 
 
 def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage:
-    """What a job needs.
+    """Pack the files that a job needs.
 
     Args:
         folders: each with all that is below it; not what is hidden, a virtual environment, or recordings.
@@ -85,7 +87,7 @@ def pack_baggage(folders: Iterable[Path], files: Iterable[Path] = ()) -> Baggage
 
 
 def _outermost(folders: Iterable[Path]) -> list[Path]:
-    """Without those that lie in another one."""
+    """The folders that do not lie in another one of them."""
     kept: list[Path] = []
     for folder in sorted(set(folders)):
         if not any(folder.is_relative_to(one) for one in kept):
@@ -111,7 +113,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def relocated(value: Value, places: Mapping[str, str]) -> Value:
-    """`value` with each of these paths replaced, wherever a text or a path in it names it.
+    """Copy of `value` with each of these paths replaced, in every text and path.
 
     Of dataclasses, sequences and mappings of them; arrays and bytes stay.
     """

@@ -1,4 +1,5 @@
-"""What a worker of a pool says, and how it is taken where the chunks are dealt. All of it is data, never a pickle."""
+"""Messages of a worker of a pool, and the code that handles them in the dealing process. Messages are data, never
+a pickle."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ class Updates:
     """Progress of a worker."""
 
     value: bytes
-    """Packed, as `Work.update`."""
+    """Progress, packed as `Work.update`."""
 
 
 @dataclass(frozen=True)
@@ -32,17 +33,17 @@ class Gives:
 
     number: int
     value: bytes
-    """Packed, as `Work.result`."""
+    """Result, packed as `Work.result`."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """The last message of a worker: it does nothing any more."""
+    """The last message of a worker: it does no further work."""
 
     why: str = ""
-    """Why it failed; empty if it did not."""
+    """Reason of its failure; empty if it did not fail."""
     problem: Problem | None = None
-    """What the author's code raised, if that is the reason."""
+    """Exception of the author's code, if that is the reason."""
 
 
 Message = Asks | Updates | Gives | Ended
@@ -50,10 +51,10 @@ MESSAGES = get_args(Message)
 
 
 class WorkerQueue(ABC):
-    """The chunks of a worker in another process than the one that deals."""
+    """The chunks of a worker in another process than the dealing one."""
 
     origin: Mapping[str, str] = {}
-    """As `ItemQueue.origin`."""
+    """Folder on this worker, to the folder of the submitting side; see `ItemQueue.origin`."""
 
     @abstractmethod
     def next(self) -> Chunk | None: ...
@@ -72,7 +73,7 @@ class WorkerQueue(ABC):
 
 
 def work_on(run: Callable[[Setup, ItemQueue], None], setup: Setup, queue: WorkerQueue) -> None:
-    """Do the work of `Work.run`, and say how it ended."""
+    """Call `Work.run`, and send how it ended."""
     try:
         run(setup, queue)
         queue.send(Ended())
@@ -85,14 +86,14 @@ def work_on(run: Callable[[Setup, ItemQueue], None], setup: Setup, queue: Worker
 
 @dataclass(frozen=True)
 class Listener:
-    """Takes what workers say, for the deal."""
+    """Handles the messages of workers for a deal."""
 
     kind: str
-    """As in "*a process* that records was killed"."""
+    """Name of a worker in messages: "*a process* that records was killed"."""
     work: Work[Any, Any, Any]
     deal: Deal[Any, Any]
     on_death: Callable[[str], None]
-    """Called with a sentence where a worker is gone and the job goes on."""
+    """Called with a sentence when a worker has died and the job goes on."""
     _unpacker: Unpacker = field(default_factory=Unpacker)
 
     def take(self, worker: Hashable, message: Message) -> Literal["asks", "goes on", "failed", "done"]:
@@ -123,13 +124,13 @@ class Listener:
         return "done"
 
     def died(self, worker: Hashable, how: str, code: int | None) -> None:
-        """It is gone. Raises PoolError if the job is over."""
+        """Handle the death of a worker. Raises PoolError if the job is over."""
         self._named(lambda: self.deal.died(worker, how, code))
         if self.deal.limit():
             self.on_death(f"{self.kind} {self.work.name} {how}; what it had begun is dealt again")
 
     def _named(self, act: Callable[[], None]) -> None:
-        """Begin the sentence of the deal's error."""
+        """Call `act`; prefix a PoolError of the deal with the name of the worker."""
         try:
             act()
         except PoolError as error:

@@ -51,7 +51,7 @@ from workbench.recording.writing.publish import RecordingError
 from workbench.recording.writing.upload import remove_uploaded_id, upload_episode
 
 _TRIES = 100
-"""For each requested success."""
+"""Episodes that are tried for each requested success."""
 _SAME_START = 1e-4
 """Metres or radians: a start further from the demonstration's is a different one."""
 
@@ -62,13 +62,13 @@ class RecordOptions(RecordArguments):
 
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=4))
     plan: PlanOptions = PlanOptions()
-    """Of actions that are planned."""
+    """Options of planned actions."""
     after_success: int = 0
-    """Control steps that an episode goes on after its success."""
+    """Control steps that an episode continues after its success."""
     workers: int = 1
-    """Processes that record, if no executor is given; the episodes are the same with any number."""
+    """Number of processes that record, if no executor is given; the episodes are the same with any number."""
     source: dict[str, str] = field(default_factory=dict)
-    """Texts by path that replace the task's files on disk."""
+    """Text by path that replaces the task's files on disk."""
 
 
 @dataclass(frozen=True)
@@ -76,44 +76,46 @@ class RecordSetup:
     """What one worker of a job records."""
 
     wanted: tuple[RecordOptions, ...]
-    """One or several recordings, each as `with_given_actions` completes it."""
+    """Options of each recording of the job, as completed by `with_given_actions`."""
     folders: tuple[bytes, ...]
-    """Absolute path of each recording's folder. As bytes: it does not travel, see `Work.files`."""
+    """Absolute path of each recording's folder. Bytes, so that it is not relocated on another machine; see
+    `Work.files`."""
     stride: int
     """Item k is episode ``k % stride`` of recording ``k // stride``."""
     run: str
-    """Names the job: the ids of its episodes are made of it, so that one that is made again takes the first one's place."""
+    """Name of the job. The ids of its episodes derive from it, so that an episode that is recorded again replaces
+    the first one."""
     mark: str = ""
-    """A file in the folders, by which a worker on another machine knows that it sees the same ones."""
+    """Name of a file in the folders, by which a worker on another machine checks that it sees the same folders."""
 
 
 def episode_id(run: str, number: int) -> str:
-    """Of the episode that is item `number` of a job."""
+    """Id of the episode that is item `number` of a job."""
     return uuid.uuid5(uuid.NAMESPACE_OID, f"{run} {number}").hex
 
 
 @dataclass(frozen=True)
 class Underway:
-    """The episodes that one process runs at the moment."""
+    """Episodes that one process runs at the moment."""
 
     steps: tuple[tuple[int, int], ...]
-    """Number and control steps so far, of each."""
+    """Number and control steps so far of each episode."""
     limit: int
-    """Control steps after which an episode ends at the latest."""
+    """Maximum number of control steps of an episode."""
     made: int
-    """Control steps since the last of these messages, over all envs with an episode."""
+    """Control steps since the previous message, over all envs with an episode."""
 
 
 @dataclass(frozen=True)
 class RecordUpdate:
-    """One thing that a process which records has to say."""
+    """Progress message of a process that records."""
 
     activity: str = ""
-    """What it does before its first episode."""
+    """Work that is done before the first episode."""
     underway: Underway | None = None
     finding: Finding | None = None
     notice: str = ""
-    """About the task, as a sentence."""
+    """Notice about the task, as a sentence."""
 
 
 @dataclass(frozen=True)
@@ -121,29 +123,29 @@ class Written:
     """An episode on disk."""
 
     index: int
-    """Its number in the recording."""
+    """Number of the episode in the recording."""
     path: Path
-    """Its .rrd; the .h5 and .json have the same name."""
+    """Path of its .rrd file; the .h5 and .json files have the same name."""
     seed: int
     steps: int
     total_reward: float | None
-    """None for a task without a reward."""
+    """Return of the episode; None for a task without a reward."""
     success: bool | None
-    """At its last state; None for a task without ``success``."""
+    """Success at its last state; None for a task without ``success``."""
     start_corrected: bool = False
-    """Its seed gave another start than the demonstration's, and the demonstration's first state was restored."""
+    """Whether its seed gave another start than the demonstration's, and the demonstration's first state was restored."""
     planned: PlannedEpisode | None = None
-    """What is known of it where its actions were planned."""
+    """Data about the planning, where the actions were planned."""
     address: str = ""
-    """Where its .rrd was uploaded to; `path` is not there then."""
+    """Address that its .rrd file was uploaded to; `path` then does not exist."""
     solved_at: int | None = None
     """Control steps until its first state with success; None without one."""
     means: dict[str, float] = field(default_factory=dict)
-    """As `recording.episode.episode.Episode.means`."""
+    """Mean over the episode of each entry of ``evaluate()``, by name; see `recording.episode.episode.Episode.means`."""
 
     @property
     def shown(self) -> str:
-        """What to print for it."""
+        """Path or address to print for the episode."""
         return self.address or str(self.path)
 
 
@@ -218,7 +220,7 @@ def record_items(setup: RecordSetup, queue: ItemQueue, given: Sequence[RecordedR
 
 @contextmanager
 def _scratch(folder: Path, what: RecordOptions) -> Iterator[Path]:
-    """Where files are written: the folder, or one of this worker alone if they are uploaded."""
+    """Folder for the files: the recording's folder, or one of this worker alone if the files are uploaded."""
     if not what.upload:
         yield folder
         return
@@ -287,7 +289,7 @@ class _Episodes:
         if given:
             limit = min(max(run.length for run in given), what.max_steps or 10**9)
         self._limit = limit
-        """Control steps after which an episode ends at the latest."""
+        """Maximum number of control steps of an episode."""
         upload = partial(upload_episode, address=what.upload) if what.upload else None
         self._finisher = EpisodeFinisher(then=upload)
         self._envs = list(range(opened.env.num_envs))
@@ -299,30 +301,31 @@ class _Episodes:
             queue.send_update(RecordUpdate("building the envs of the rollouts"))
             self._planned = PlannedActions(opened.loaded, opened.env, what.options.env_kwargs, what.plan)
         self._acts_on_batch = not given and what.actions not in ("random", SOLVE)
-        """Whether what acts sees the whole batch: an episode's actions may depend on its row, and on how many there are."""
+        """Whether the action source sees the whole batch: an episode's actions may then depend on its row and on
+        the number of envs."""
         self._chooser = RecordActionChooser(
             plain_chooser(what.actions, what.task, what.options.seed, here) if self._acts_on_batch else None,
             self._planned,
         )
         self._wanted = recorded_pictures(opened.description.cameras) if what.pictures else ()
         self._waiting: deque[int] = deque()
-        """Items of the chunk that have no env yet."""
+        """Items of the chunk that wait for an env."""
         self._chunk = Chunk((), frozenset())
         self._running: dict[int, int] = {}
-        """The item in each env that has one."""
+        """Item of each env that runs an episode."""
         self._steps: dict[int, int] = {}
         self._began: dict[int, float] = {}
-        """Of each env with an episode, ``time.monotonic()`` at its begin."""
+        """``time.monotonic()`` at the start of each env's episode."""
         self._start_corrected: set[int] = set()
         """Items with `Written.start_corrected`."""
         self._succeeded: dict[int, int] = {}
-        """Of each env with an episode, the steps since its success."""
+        """Control steps since the success of each env's episode."""
         self._plans: dict[int, PlannedEpisode] = {}
-        """Of the episodes that are over, by item, where actions are planned."""
+        """Planning data of finished episodes with planned actions, by item."""
         self._made: dict[int, tuple[GatheredEpisode, Future[EpisodeFiles | str]]] = {}
 
     def run(self, chunk: Chunk | None, end: int) -> Chunk | None:
-        """Run chunks, from this one on. After a failure the episodes under way are dropped.
+        """Run chunks, starting with this one. After a failure the running episodes are dropped.
 
         Args:
             end: the first item that is not of this recording.
@@ -368,7 +371,7 @@ class _Episodes:
         return bool(self._running)
 
     def _tell(self, made: int) -> None:
-        """Send how far the episodes are, after so many control steps more."""
+        """Send the progress of the episodes after `made` further control steps."""
         at = tuple((number, self._steps[env]) for env, number in self._running.items())
         self._queue.send_update(RecordUpdate(underway=Underway(at, self._limit, made)))
 
@@ -450,7 +453,7 @@ class _Episodes:
         return restore_recorded(self._opened, {env: first})
 
     def _step(self) -> None:
-        """Make a control step of all envs, and end the episodes that are over."""
+        """Make a control step of all envs, and end the finished episodes."""
         task, loaded = self._opened.env, self._opened.loaded
         action = self._chooser.next_action(task, {env: self._steps[env] for env in self._running})
         with blamed("step", loaded, task):

@@ -34,22 +34,22 @@ NOWHERE: Mapping[str, str] = MappingProxyType({})
 
 @dataclass
 class GatheredEpisode:
-    """An episode with its writer; on disk there is only its journal so far."""
+    """An episode with its writer; only its journal is on disk so far."""
 
     writer: EpisodeWriter
     env: int
     seed: int
-    """Below 0 if unknown."""
+    """Seed of the reset; negative if unknown."""
     steps: int = 0
     total_reward: float = 0.0
     success: bool | None = None
-    """At its last state; None for a task without ``success``."""
+    """Success at its last state; None for a task without ``success``."""
     state_names: frozenset[str] = frozenset()
     """Names of the env states in its first row."""
     acted_by: str = ""
-    """The source of its last action."""
+    """Source of its last action."""
     placed: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
-    """The cameras that are placed by hand, at its last state."""
+    """Cameras that are placed by hand, at its last state."""
     begun: bool = False
     """Whether it has its first state."""
 
@@ -158,9 +158,9 @@ class EpisodeGatherer:
         self.reset_options: Mapping[str, Any] = reset_options or {}
         """Options of the next resets."""
         self.acted_by = ""
-        """The source of actions of the next episodes, where the steps do not name it."""
+        """Source of the actions of the next episodes, where the steps do not name it."""
         self.next_id = ""
-        """Of the next episode, where it is not a random one."""
+        """Id of the next episode; empty for a random one."""
         self._episodes: dict[int, GatheredEpisode | None] = {int(env): None for env in env_idx}
         self._packer = BatchPacker()
 
@@ -171,7 +171,7 @@ class EpisodeGatherer:
 
     @property
     def under_way(self) -> tuple[GatheredEpisode, ...]:
-        """The episodes that have begun."""
+        """Episodes that have begun."""
         return tuple(episode for episode in list(self._episodes.values()) if episode is not None)
 
     def take(self, stepped: Stepped) -> None:
@@ -339,7 +339,7 @@ class Finished:
     bytes_written: int = 0
     last: EpisodeFiles | None = None
     problem: str | None = None
-    """Why the last failed one failed."""
+    """Reason why the last failed episode failed."""
 
 
 class EpisodeFinisher:
@@ -388,7 +388,8 @@ class EpisodeFinisher:
             return len(self._waiting) + self._at_work
 
     def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | str]:
-        """Write the files; the result is the reason if that failed. `finished` has it too, until another one succeeds."""
+        """Write the files; the future gives the reason as text if writing failed. `finished` also holds the
+        reason, until another episode succeeds."""
         made: Future[EpisodeFiles | str] = Future()
         with self._lock:
             self._waiting.append((episode, made))
@@ -407,7 +408,7 @@ class EpisodeFinisher:
         self._finish_one(self._process if self._process is not None and self._process.is_ready else None)
 
     def _finish_one(self, process: FilesProcess | None) -> bool:
-        """Whether one waited."""
+        """Write the files of one waiting episode; returns whether one waited."""
         with self._lock:
             if not self._waiting:
                 return False
@@ -434,7 +435,7 @@ class EpisodeFinisher:
     def _finish(
         self, episode: GatheredEpisode, process: FilesProcess | None
     ) -> tuple[EpisodeFiles | str, int]:
-        """The files, or why there are none, and their bytes."""
+        """The files, or the reason why writing failed, and the number of bytes."""
         try:
             made = episode.writer.finish(process)
             size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))

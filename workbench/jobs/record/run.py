@@ -25,32 +25,34 @@ from workbench.jobs.record.episodes import (
 from workbench.recording.writing.upload import remove_uploaded
 
 TRIES = 2
-"""How often a chunk of episodes is begun whose workers die, before they are tried one by one."""
+"""Maximum number of times that a chunk of episodes is started when its workers die, before they are tried one by one."""
 _LONG_JOB = 256
-"""Batches. From here on a chunk has several: the envs of one wait for each other only at its end."""
+"""Number of batches from which on a chunk holds several: the envs of a batch wait for each other only at the end
+of a chunk."""
 _BATCHES = 4
 
 
 @dataclass(frozen=True)
 class RecordProgress:
-    """How far a recording is."""
+    """Progress of a recording."""
 
     kept: int
     """Episodes kept so far."""
     steps: int
     """Control steps so far, over all envs with an episode."""
     over: tuple[int, Written | None] | None = None
-    """The episode that has just ended: its number, and what was kept of it; None where none has."""
+    """Number of the episode that has just ended, and its files (None if they were not kept); None where none has
+    ended."""
     running: Mapping[int, int] = field(default_factory=dict)
-    """Control steps so far of the episodes under way, by number, in all processes."""
+    """Control steps so far of the running episodes, by number, in all processes."""
     limit: int = 0
-    """Control steps after which one of them ends at the latest."""
+    """Maximum number of control steps of an episode."""
     done: float = 0.0
-    """As `kept`; where every episode is kept, those under way count in part."""
+    """Episodes kept so far; where every episode is kept, running episodes count in part."""
     failures: tuple[Failure, ...] = ()
     """Episodes so far, by number, that gave no result."""
     was_there: bool = False
-    """The episode that is over is one of an earlier run of the job."""
+    """Whether the episode that has ended comes from an earlier run of the job."""
 
     def by_seed(self, first: int) -> dict[int, int]:
         """`running` by seed, where episode 0 has seed `first`."""
@@ -64,19 +66,19 @@ class Recorded:
     written: tuple[Written, ...]
     """By number."""
     tried: int
-    """Episodes that were run."""
+    """Number of episodes that were run."""
     stopped: bool
-    """It was stopped early."""
+    """Whether it was stopped early."""
     start_corrected: int = 0
     """Episodes with `Written.start_corrected`."""
     failures: tuple[Failure, ...] = ()
-    """Episodes, by number, that the author's code failed in, or whose workers died."""
+    """Episodes, by number, in which the author's code failed or whose workers died."""
     missing: int = 0
-    """Episodes that were asked for and did not end."""
+    """Number of requested episodes that did not end."""
 
 
 def chunk_of(episodes: int, num_envs: int) -> int:
-    """How many episodes a worker with so many envs runs together, of so many in all."""
+    """Number of episodes that a worker with `num_envs` envs runs together, for `episodes` episodes in all."""
     return num_envs * (_BATCHES if episodes >= _LONG_JOB * num_envs else 1)
 
 
@@ -122,7 +124,7 @@ def record(
 
 
 def collect(what: RecordOptions, known: Mapping[int, Written | None]) -> Recorded:
-    """The recording of which these episodes are known. Runs nothing.
+    """Recording from the results of these episodes. Runs nothing.
 
     Args:
         what: as `with_given_actions` completes it.
@@ -173,7 +175,7 @@ def do_record(
 
 
 class ToldByWorkers:
-    """What the workers of a job tell of its episodes, for its progress."""
+    """Collects the workers' messages about episodes, and computes the progress of the job."""
 
     def __init__(
         self,
@@ -183,14 +185,14 @@ class ToldByWorkers:
     ) -> None:
         self._on_activity, self._on_finding, self._on_notice = on_activity, on_finding, on_notice
         self._running: dict[int, int] = {}
-        """Control steps so far of each item under way."""
+        """Control steps so far of each running item."""
         self._steps = self._limit = 0
         self._found: set[object] = set()
         """Findings and notices of all workers, to report each once."""
         self._failures: tuple[Failure, ...] = ()
 
     def take(self, update: RecordUpdate) -> bool:
-        """Take what one of them says; whether the progress is another one."""
+        """Handle a message of a worker; returns whether the progress has changed."""
         if update.activity:
             self._on_activity(update.activity)
         if (finding := update.finding) is not None and finding.key not in self._found:
@@ -206,11 +208,11 @@ class ToldByWorkers:
         return True
 
     def over(self, number: int) -> None:
-        """An item has ended."""
+        """Handle that an item has ended."""
         self._running.pop(number, None)
 
     def failed(self, failure: Failure) -> None:
-        """Items gave no result."""
+        """Handle items that gave no result."""
         self._failures += (failure,)
         for number in failure.numbers:
             self._running.pop(number, None)
@@ -282,7 +284,7 @@ class _Recording:
         self._ended += 1
         self._told.over(number)
         if written is not None:
-            # As the person named the folder.
+            # The path as the person wrote the folder.
             self._kept[number] = replace(written, path=self._out / written.path.name)
         if self._wanted is not None and len(self._kept) >= self._wanted:
             last = sorted(self._kept)[self._wanted - 1]

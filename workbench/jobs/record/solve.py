@@ -1,4 +1,4 @@
-"""Solves a task from many seeds by planning, and says what that tells of its reward."""
+"""Solves a task from many seeds by planning, and reports what the results show about its reward."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from workbench.planning.report import SolvedSeed, SolveReport
 from workbench.planning.verdicts import in_the_way, of_episodes
 
 _AFTER_SUCCESS = 5
-"""Control steps that an episode goes on after its success: does it stay solved?"""
+"""Control steps that an episode continues after its success, to see whether it stays solved."""
 
 
 @dataclass(frozen=True)
@@ -28,25 +28,26 @@ class SolveOptions:
     """What to solve, and how."""
 
     task: str
-    """As `RecordArguments.task`."""
+    """Reference of the task; see `RecordArguments.task`."""
     out: Path = Path("recordings")
     seeds: int = 32
-    """How many, from ``options.seed`` on."""
+    """Number of seeds, from ``options.seed`` on."""
     workers: int = 1
-    """Processes, each with a live env, if no executor is given; the result is the same with any number."""
+    """Number of processes, each with a live env, if no executor is given; the result is the same with any number."""
     pictures: bool = False
     max_steps: int | None = None
-    """As `RecordArguments.max_steps`."""
+    """Maximum number of control steps of an episode; see `RecordArguments.max_steps`."""
     plan: PlanOptions = PlanOptions()
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=1))
-    """Its number of envs is that of the seeds which each process is at; a seed comes to the same with any."""
+    """Options of the task. Its number of envs is the number of seeds that each process solves at once; the result
+    of a seed does not depend on it."""
     seconds_per_seed: float | None = None
-    """As `RecordArguments.seconds_per_seed`."""
+    """Wall time in seconds after which an episode ends at its next step; see `RecordArguments.seconds_per_seed`."""
     upload: str = ""
-    """As `RecordArguments.upload`."""
+    """Address that episodes are uploaded to; see `RecordArguments.upload`."""
 
     def recording(self) -> RecordOptions:
-        """The recording that solves it."""
+        """Options of the recording that solves the task."""
         return RecordOptions(
             self.task,
             self.out,
@@ -100,7 +101,7 @@ def solve(
 
 
 def report_of(what: SolveOptions, recorded: Recorded, seconds: float) -> SolveReport:
-    """What a recording of planned episodes tells."""
+    """Report of a recording of planned episodes."""
     return _report(what, recorded.written, seconds, recorded.stopped)
 
 

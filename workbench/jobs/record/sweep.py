@@ -30,16 +30,16 @@ from workbench.planning.options import PlanOptions
 from workbench.recording.sweeps import MOST_POINTS, SweepEpisode, SweepResults, value_text
 
 _CHUNKS = 64
-"""Of the whole sweep, at least, where there are so many episodes: each opens the task once in its worker."""
+"""Minimum number of chunks of a whole sweep that has enough episodes; each chunk opens the task once in its worker."""
 _AFTER_SUCCESS = 5
-"""Control steps that a planned episode goes on after its success, as `jobs.solve` has it."""
+"""Control steps that a planned episode continues after its success, as in `jobs.record.solve`."""
 _LONGEST_NAME = 80
-"""Characters of a folder's name."""
+"""Maximum length of a folder's name in characters."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A name and the values that it is given, each in JSON's types."""
+    """Name of a constant or argument and its values, each in JSON's types."""
 
     name: str
     values: tuple[Any, ...]
@@ -50,23 +50,23 @@ class SweepOptions:
     """What to record, and what varies."""
 
     task: str
-    """As `RecordArguments.task`."""
+    """Reference of the task; see `RecordArguments.task`."""
     settings: tuple[Setting, ...]
     out: Path = Path("sweeps")
     seeds: int = 100
-    """How many for each point, from ``options.seed`` on."""
+    """Number of seeds for each point, from ``options.seed`` on."""
     actions: str = "random"
-    """As `RecordArguments.actions`, but no file."""
+    """Source of the actions; see `RecordArguments.actions`. A file is not allowed."""
     pictures: bool = False
     max_steps: int | None = None
-    """As `RecordArguments.max_steps`."""
+    """Maximum number of control steps of an episode; see `RecordArguments.max_steps`."""
     plan: PlanOptions = PlanOptions()
-    """Of actions that are planned."""
+    """Options of planned actions."""
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=4))
     workers: int = 1
-    """Processes, if no executor is given; the result is the same with any number."""
+    """Number of processes, if no executor is given; the result is the same with any number."""
     upload: str = ""
-    """As `RecordArguments.upload`; each point has a folder there."""
+    """Address that episodes are uploaded to, with a folder for each point; see `RecordArguments.upload`."""
 
     @property
     def points(self) -> tuple[Point, ...]:
@@ -78,7 +78,7 @@ class SweepOptions:
 
     @property
     def chunk(self) -> int:
-        """Episodes that a worker runs together. It depends on nothing of how the job runs."""
+        """Number of episodes that a worker runs together. It does not depend on how the job runs."""
         envs = self.options.num_envs
         points = math.prod(len(one.values) for one in self.settings)
         enough = -(-self.seeds * points // (_CHUNKS * envs)) * envs
@@ -101,7 +101,7 @@ class Point:
     index: int
     values: dict[str, Any]
     folder: str
-    """Of its recordings, below that of the sweep."""
+    """Path of the folder of the point's recordings, relative to that of the sweep."""
 
     @property
     def json(self) -> dict[str, str]:
@@ -121,11 +121,11 @@ class SweepReport:
     """The result of a sweep."""
 
     results: SweepResults
-    """Each seed at most once for each point."""
+    """Results of the episodes, each seed at most once for each point."""
     stopped: bool
     failures: tuple[Failure, ...] = ()
     missing: int = 0
-    """Episodes that were asked for and neither ended nor failed."""
+    """Number of requested episodes that neither ended nor failed."""
 
 
 def recordings_of(what: SweepOptions) -> tuple[RecordOptions, ...]:
@@ -223,7 +223,7 @@ def sweep(
     run: str = "",
     on_notice: Callable[[str], None] = lambda notice: None,
 ) -> SweepReport:
-    """Record every point of a sweep. A point that fails is told in its rows.
+    """Record every point of a sweep. The rows of a point that fails hold the failure.
 
     Other arguments as of `record`.
 
@@ -242,7 +242,7 @@ def sweep(
 
 
 def collect_sweep(what: SweepOptions, known: Mapping[int, Written | None]) -> SweepReport:
-    """The sweep of which these episodes are known. Runs nothing."""
+    """Report of a sweep from the results of these episodes. Runs nothing."""
     collected = _Sweep(what, lambda _: None, lambda _: None, lambda: False, lambda _: None, lambda _: None)
     collected.deal.go_on(known, lambda number, written: None)
     return collected.report(stopped=False)
@@ -265,7 +265,7 @@ class _Sweep:
         self._told = ToldByWorkers(on_activity, on_finding, on_notice)
         self._rows: dict[int, SweepEpisode] = {}
         self._kept = 0
-        """Rows that are no failures."""
+        """Number of rows that are not failures."""
         self.deal: Deal[Written | None, RecordUpdate] = Deal(
             what.items,
             self._over,

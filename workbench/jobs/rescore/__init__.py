@@ -1,1 +1,1 @@
-"""Rescores recorded runs with another version of their task, and says what differs."""
+"""Rescores recorded runs with another version of their task, and lists the differences."""

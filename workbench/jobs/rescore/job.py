@@ -32,24 +32,24 @@ from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
 
 _TRIES = 3
-"""How often a chunk is begun whose workers die."""
+"""Maximum number of times that a chunk is started when its workers die."""
 _PERIOD = 0.2
-"""Seconds between two messages of how far a worker is."""
+"""Seconds between two progress messages of a worker."""
 _SIDE = (".rrd", ".h5", ".json")
-"""Files of one recording."""
+"""Suffixes of the files of one recording."""
 
 
 @dataclass(frozen=True)
 class RescoredBy:
-    """What rescores some recordings."""
+    """Code and options that rescore some recordings."""
 
     task: TaskName
-    """May run: whoever submits the job has asked."""
+    """The task. Its code may run: the side that submits the job has asked for consent."""
     options: TaskOptions
     or_else: TaskOptions
-    """In place of `options` where the task cannot be opened with them."""
+    """Options to use where the task cannot be opened with `options`."""
     recorded: EpisodeInfo | None = None
-    """Open the text that this recording holds instead."""
+    """Recording whose text is opened instead of today's code."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,12 @@ class Recording:
     """A recording that is to be rescored."""
 
     place: int
-    """In the order of the files."""
+    """Place in the order of the files."""
     path: bytes
-    """As bytes: where it does not travel it is a place of all machines, see `Work.files`."""
+    """Path as bytes, so that it is not relocated where the recording does not travel: then all machines see it
+    there; see `Work.files`."""
     travels: Path | None
-    """The same, if it travels."""
+    """The path, if the recording travels to the workers; else None."""
     part: str | None
     id: str
     name: str
@@ -69,14 +70,14 @@ class Recording:
     note: str = ""
     """Options that differ from the recorded ones on purpose."""
     why_not: str = ""
-    """Why it cannot be rescored, if that is known before."""
+    """Reason why it cannot be rescored, if that is known before the job."""
     refused: bool = False
-    """Because its code may not run."""
+    """Whether it is not rescored because its code may not run."""
     damaged: bool = False
-    """Because it cannot be read."""
+    """Whether it is not rescored because it cannot be read."""
 
     def source(self) -> Source:
-        """Where it is on the submitting side."""
+        """Source of the recording on the submitting side."""
         return Source(Path(os.fsdecode(self.path)), self.part, self.id, self.name)
 
     def verdict(self, why_not: str) -> Verdict[Source]:
@@ -85,15 +86,15 @@ class Recording:
 
 @dataclass(frozen=True)
 class RescoredRecording:
-    """What an item gives."""
+    """Result of an item."""
 
     place: int
     verdict: Verdict[Source]
     note: str = ""
     failed: bool = False
-    """Its code could not be opened, may not run, or raised."""
+    """Whether its code could not be opened, may not run, or raised."""
     problem: Problem | None = None
-    """What it raised."""
+    """Exception that the code raised."""
 
 
 @dataclass(frozen=True)
@@ -102,20 +103,20 @@ class RescoreUpdate:
 
     activity: str = ""
     steps: int = 0
-    """Control steps since the last message, over all episodes."""
+    """Control steps since the previous message, over all episodes."""
     finding: Finding | None = None
 
 
 @dataclass(frozen=True)
 class RescoreSetup:
-    """What the workers rescore."""
+    """Recordings and codes of a job."""
 
     codes: tuple[RescoredBy | None, ...]
-    """None for recordings that are not rescored."""
+    """Codes that rescore; None for recordings that are not rescored."""
     of_chunk: tuple[int, ...]
-    """Which of the codes each chunk has."""
+    """Index in `codes` for each chunk."""
     items: Mapping[int, Recording]
-    """By number; the numbers of chunk k begin with ``k * chunk``."""
+    """Recordings by number; the numbers of chunk k begin with ``k * chunk``."""
     chunk: int
     use_env_states: bool = False
     elsewhere: bool = False
@@ -127,7 +128,7 @@ class RescoreSetup:
 def setup_of(
     groups: Sequence[tuple[RescoredBy | None, Sequence[Recording]]], chunk: int, use_env_states: bool
 ) -> RescoreSetup:
-    """Number the recordings so that each chunk has those of one group alone."""
+    """Number the recordings so that each chunk has recordings of one group only."""
     items: dict[int, Recording] = {}
     of_chunk: list[int] = []
     for at, (_, recordings) in enumerate(groups):
@@ -145,7 +146,7 @@ def rescore_recordings(
     on_progress: Callable[[int, int, int], None] = lambda episodes, total, steps: None,
     on_finding: Callable[[Finding], None] = warn_of,
 ) -> list[RescoredRecording]:
-    """What the recordings come to, in the order of the files.
+    """Verdicts of the recordings, in the order of the files.
 
     Args:
         on_progress: gets the rescored episodes, all episodes, and the control steps so far.
@@ -201,7 +202,7 @@ def rescore_recordings(
 
 
 def _needed(setup: RescoreSetup) -> tuple[list[Path], list[Path]]:
-    """Folders and files of the codes."""
+    """Folders and files that the codes need."""
     folders: list[Path] = []
     files: list[Path] = []
     for code in filter(None, setup.codes):
@@ -236,11 +237,11 @@ def _travelling(setup: RescoreSetup) -> tuple[RescoreSetup, list[Path]]:
 
 
 class _Stopped(Exception):
-    """No result is needed any more."""
+    """Raised when no further result is needed."""
 
 
 def rescore_items(setup: RescoreSetup, queue: ItemQueue) -> None:
-    """Rescore the chunks that one worker gets. What the author's code raises is the verdict of its recordings."""
+    """Rescore the chunks that one worker gets. An exception of the author's code is the verdict of its recordings."""
     torch.set_num_threads(1)  # see workbench.session.worker.loop.work
     here = CurrentFolder()  # a task may change it
     chunk = queue.next()
@@ -265,7 +266,7 @@ class _Rescorer:
 
     setup: RescoreSetup
     at: int
-    """Which code."""
+    """Index of the code."""
     queue: ItemQueue
 
     def run(self, code: RescoredBy, chunk: Chunk | None) -> Chunk | None:
@@ -286,8 +287,8 @@ class _Rescorer:
             return chunk
 
     def _rescore(self, opened: OpenedTask, chunk: Chunk) -> bool:
-        """Rescore all of the chunk, also what is known: episodes of one batch may differ by their last bits in another one.
-        Returns False if the task raised."""
+        """Rescore the whole chunk, including recordings with a known result: in another batch an episode may
+        differ in the last bits. Returns False if the task raised."""
         sources = [self._source(number) for number in chunk.numbers]
         missing, told, reported = set(chunk.wanted), 0, time.monotonic()
 
@@ -319,7 +320,7 @@ class _Rescorer:
         return True
 
     def _source(self, number: int) -> Source:
-        """Where a recording is on this machine; its id is the number."""
+        """Source of a recording on this machine; its id is the number."""
         of = self.setup.items[number]
         path = of.travels or of.source().path
         if self.setup.elsewhere and not path.parent.is_dir():
@@ -339,7 +340,7 @@ class _Rescorer:
 
 @contextmanager
 def _opened(code: RescoredBy, queue: ItemQueue) -> Iterator[OpenedTask]:
-    """Raises TaskError, CannotEnterRecording."""
+    """Open the task of a code. Raises TaskError, CannotEnterRecording."""
     if code.recorded is not None:
         with recorded_source(code.recorded) as reference:
             with _opened(replace(code, task=reference, recorded=None), queue) as opened:

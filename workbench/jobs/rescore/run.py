@@ -26,7 +26,7 @@ from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.reader.reading import read_recording
 
 _PROGRESS_PERIOD = 0.2
-"""Seconds."""
+"""Seconds between two progress messages."""
 
 
 @dataclass
@@ -37,21 +37,21 @@ class _Rescoring:
     task: str
     run: RecordedRun
     missed: dict[str, str]
-    """What cannot be read or put into the env, with the reason."""
+    """Name and reason of each entry that cannot be read or put into the env."""
     damaged: bool = False
     start_differs: bool = False
     has_reward: bool = True
-    """Of today's code."""
+    """Whether today's code has a reward."""
     reward: list[float] = field(default_factory=list)
     """(T,) new rewards."""
     evaluate: dict[str, list[float]] = field(default_factory=dict)
-    """(T + 1,) each, new."""
+    """(T + 1,) new values of each entry of evaluate."""
     drift: list[tuple[float, float]] = field(default_factory=list)
     """(T + 1,) metres and radians from the recorded state, if there is one."""
 
     @property
     def at(self) -> int:
-        """Number of the state that it is in."""
+        """Number of the state that the env is in."""
         return len(self.reward)
 
     def verdict(self) -> Verdict[Source]:

@@ -29,7 +29,7 @@ class Scores:
     reward: NDArray
     """(T,); empty if none was recorded."""
     evaluate: Mapping[str, NDArray]
-    """(T + 1,) each; NaN in a state without it."""
+    """(T + 1,) values of each entry; NaN in a state without it."""
     has_reward: bool = True
     """False for a task without a reward (``reward_mode="none"``), whose `reward` is zeros."""
 
@@ -49,33 +49,33 @@ class Verdict(Generic[Of]):
     length: int = 0
     """Control steps."""
     success: tuple[int | None, int | None] = (None, None)
-    """The first step of the episode after which it was true, then and now; None if never."""
+    """First step of the episode after which success was true, then and now; None if never."""
     fail: tuple[int | None, int | None] = (None, None)
     has: tuple[str, ...] = ("reward",)
-    """Those of reward, success and fail that the record or today's code has."""
+    """Names among reward, success and fail that the record or today's code has."""
     returns: tuple[float, float] = (0.0, 0.0)
     largest: float = 0.0
-    """The largest change of one reward."""
+    """Largest change of one reward."""
     first_difference: int | None = None
     """The first step whose reward, success or fail differs; None if all are equal."""
     look_at: int | None = None
-    """The step to show: where success or fail differs, else where the reward differs most."""
+    """Step to show: where success or fail differs, else where the reward differs most."""
     differing: tuple[str, ...] = ()
     """``reward`` and the entries of ``evaluate`` that differ somewhere."""
     metres: float | None = None
-    """Largest distance of a body from the recorded state; None if there are no states."""
+    """Largest distance in metres of a body from the recorded state; None if there are no states."""
     radians: float = 0.0
-    """Largest rotation of a body or joint from the recorded state."""
+    """Largest rotation in radians of a body or joint from the recorded state."""
     drift_at: int | None = None
-    """The step after which the body was furthest."""
+    """Step after which the body was furthest from the recorded state."""
     start_differs: bool = False
-    """The reset with its seed gave another first state, and the recorded one was restored."""
+    """Whether the reset with its seed gave another first state, and the recorded one was restored."""
     missed: dict[str, str] = field(default_factory=dict)
-    """What could not be put into the env, with the reason."""
+    """Name and reason of each part of the state that could not be put into the env."""
     why_not: str = ""
-    """Why it was not rescored; all else is then empty."""
+    """Reason why the run was not rescored; all other fields are then empty."""
     damaged: bool = False
-    """Its files, or some of them, cannot be read."""
+    """Whether some of its files cannot be read."""
     old_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     new_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
@@ -95,7 +95,7 @@ class Verdict(Generic[Of]):
 
     @property
     def drifted(self) -> bool:
-        """Whether a difference may come from other states and not from the code."""
+        """Whether a difference may come from different states and not from the code."""
         return self.metres is not None and not (
             self.metres <= DOUBTFUL_METRES and self.radians <= DOUBTFUL_RADIANS
         )
@@ -224,7 +224,8 @@ def numbers_differ(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> ND
 def _too_far(
     old: NDArray, apart: NDArray, least: float = SAME_NUMBER, axis: int | None = None
 ) -> NDArray[np.bool_]:
-    """True where `apart` is too much, measured by the largest of `old`; with `axis` 1 by the largest of each row."""
+    """True where `apart` is too large, relative to the largest of `old`; with `axis` 1 relative to the largest of
+    each row."""
     if not apart.any():
         return apart > 0
     scale = np.abs(old).max(axis=axis, initial=0.0, where=np.isfinite(old), keepdims=True)
@@ -251,11 +252,11 @@ class Rescored:
     """Progress or end of a `Rescore`."""
 
     verdicts: tuple[Verdict[Source], ...]
-    """New ones."""
+    """New verdicts."""
     steps: int
     """Control steps so far, over all episodes."""
     problem: Problem | None = None
-    """What the task's code raised; it ends there."""
+    """Exception of the task's code; the rescoring ends with it."""
 
 
 @dataclass(frozen=True)
