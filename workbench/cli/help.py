@@ -16,7 +16,7 @@ from workbench.machine.text import plain_text
 from workbench.ui.app.help_pages import GROUPS, RULE_PAGES, Topic, by_path, find_topic, topics, topics_about
 
 WIDEST = 100
-"""Columns: longer lines are hard to read."""
+"""Maximum width of the text in columns: longer lines are hard to read."""
 _HIDDEN = re.compile(r"^<picture>.*?^</picture>\n|^!\[.*?\]\(.*?\)\n|^<!--.*?-->\n", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"\[([^]]+)\]\(([^)]+)\)")
 
@@ -71,7 +71,7 @@ def _not_found(name: str) -> str:
 
 
 def for_terminal(topic: Topic) -> str:
-    """The text without pictures; a link to another topic names the command that shows it."""
+    """Text of the topic without pictures; a link to another topic names the command that shows it."""
 
     def link(match: re.Match[str]) -> str:
         path, _ = topic.link(match[2])

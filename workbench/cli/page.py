@@ -137,7 +137,7 @@ def review_in_terminal(
 
 
 def _start_server(at: ServerOptions, label: str) -> GatedServer | int:
-    """The started server, or the exit code if it cannot start."""
+    """Start the server; returns it, or the exit code if it cannot start."""
     try:
         gated_server = open_server(at, label=label)
     except (ValueError, ServerError) as error:
@@ -151,7 +151,7 @@ def _start_server(at: ServerOptions, label: str) -> GatedServer | int:
 
 @dataclass(frozen=True)
 class _HowToOpen:
-    """How sessions of this run are made."""
+    """Makes the sessions of this run."""
 
     recordings: Path
     worker: WorkerOptions
@@ -166,7 +166,7 @@ class _HowToOpen:
         kept: KeptWork | None = None,
         on_event: Callable[[Event], None] = print_event,
     ) -> Session:
-        """A session of a task that a person chose; it is noted among the recent ones once it runs."""
+        """Open a session of a task that a person chose; the task is noted among the recent ones once it runs."""
         noted: list[TaskOptions] = []
 
         def on_event_and_note(event: Event) -> None:
@@ -182,7 +182,7 @@ class _HowToOpen:
         return self._session(task, options, self.worker, kept, on_event_and_note)
 
     def open_for_recording(self, task: TaskName, options: TaskOptions) -> Session:
-        """A session for the task of a recording."""
+        """Open a session for the task of a recording."""
         return self._session(task, options, WorkerOptions(self.worker.memory_limit), None, print_event)
 
     def _session(
@@ -203,7 +203,7 @@ class _HowToOpen:
 
 
 def _for_others(options: TaskOptions) -> TaskOptions:
-    """Options of one task for another: its own keyword arguments are left out."""
+    """Options of one task for another, without its own keyword arguments."""
     kwargs = {name: value for name, value in options.env_kwargs.items() if name in HOW_IT_IS_RUN}
     return replace(options, env_kwargs=kwargs)
 

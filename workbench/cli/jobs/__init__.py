@@ -1,1 +1,1 @@
-"""The commands whose work is cut into items: where it runs, how it is reported."""
+"""The commands that run a job in items: where the job runs, and how its results are reported."""

@@ -56,12 +56,12 @@ from workbench.machine.folders import CurrentFolder
 from workbench.machine.text import plain_text
 
 MOST_NAMED = 3
-"""Rules before their common reason."""
+"""Maximum number of rules that are named before their common reason."""
 
 
 @dataclass(frozen=True)
 class CheckOutput:
-    """What a check gives besides its text."""
+    """Output of a check in addition to its text."""
 
     json: bool = False
     """Print JSON in place of the text."""
@@ -69,7 +69,7 @@ class CheckOutput:
     junit: Path | None = None
     sarif: Path | None = None
     fail_on: FailOn = "stop"
-    """The lowest degree of a finding that makes the exit code 1."""
+    """Lowest degree of a finding that makes the exit code 1."""
 
 
 def check_in_terminal(
@@ -165,7 +165,7 @@ def write_reports(said: Reported, output: CheckOutput) -> None:
 
 
 def exit_code(said: Reported) -> int:
-    """2 where nothing was checked, 1 for a finding of the degree that fails."""
+    """Exit code of a check: 2 where nothing was checked, 1 for a finding of the degree that fails."""
     if said.error is not None:
         return Exit.REFUSED
     return Exit.FAILED if said.report.fails(said.fail_on) else Exit.DONE
@@ -178,7 +178,7 @@ def _job_of(what: CheckOptions) -> JobKey:
 def _without_result(
     what: CheckOptions, output: CheckOutput, root: Path, problem: Problem, began: float
 ) -> Reported:
-    """What reports say where nothing was checked."""
+    """Content of the reports where nothing was checked."""
     file = named_file(what.task)
     named = str(file) if file is not None and file.is_file() else None
     seconds = time.monotonic() - began
@@ -254,7 +254,7 @@ def _print_summary(report: CheckReport, root: Path) -> None:
 
 
 def _print_by_reason(label: str, results: tuple[RuleResult, ...]) -> None:
-    """A line for each reason; the reason first where many rules share it."""
+    """Print a line for each reason; the reason comes first where many rules share it."""
     rules: dict[str, list[str]] = {}
     for result in results:
         rules.setdefault(result.why, []).append(result.rule)
@@ -267,7 +267,7 @@ def _print_by_reason(label: str, results: tuple[RuleResult, ...]) -> None:
 
 
 def _print_names(label: str, names: Sequence[str]) -> None:
-    """The names behind the label, in lines as wide as the terminal."""
+    """Print the names behind the label, in lines as wide as the terminal."""
     lines = textwrap.wrap(", ".join(names), max(40, out.width - 6), break_on_hyphens=False)
     _print(f"{label} {lines[0]}" if len(lines) == 1 else label)
     for line in lines if len(lines) > 1 else ():

@@ -1,4 +1,4 @@
-"""What a check came to as JSON, as JUnit's XML for CI, and as SARIF for code scanning."""
+"""Reports of a check as JSON, as JUnit's XML for CI, and as SARIF for code scanning."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from workbench.ui.app.help_pages import find_topic
 DISTRIBUTION = "maniskill-workbench"
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 LEVELS = {"stop": "error", "warn": "warning", "off": "none"}
-"""Degree to SARIF's level."""
+"""SARIF's level of each degree."""
 REPORT_IT = (
     "an error of the workbench, not of the task; please report it, with the traceback that --json-file writes"
 )
 CANNOT_CHECK = "cannot-check"
-"""In a report the id of what ends a check before a rule is looked at; no rule has it."""
+"""Id, in a report, of an error that ends a check before a rule is checked; no rule has this id."""
 _UNDECIDED: tuple[State, ...] = ("failed", "not_known")
 _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True)
 class Reported:
-    """A report, and what its texts say of files."""
+    """A report with the paths and options that its texts need."""
 
     report: CheckReport
     what: CheckOptions
@@ -45,14 +45,14 @@ class Reported:
     """The current folder of the command."""
     fail_on: FailOn
     error: Problem | None = None
-    """Why nothing was checked; the report then has no result."""
+    """Reason why nothing was checked; the report then has no result."""
 
     def fails(self, finding: Finding) -> bool:
         return fails(finding.degree, self.fail_on)
 
     @property
     def place_of_error(self) -> tuple[str, int | None] | None:
-        """File and line of the error; without a line where none is known, and then of the task's file at least."""
+        """File and line of the error; if no line is known, the task's file without a line."""
         error, file = self.error, self.report.task.file
         if error is not None and error.file is not None:
             return error.file, error.line
@@ -65,7 +65,7 @@ def count_text(count: int, what: str) -> str:
 
 
 def shown_path(file: str, root: Path) -> str:
-    """Relative to `root` if it is below it."""
+    """Path of the file, relative to `root` if it is below it."""
     path = Path(file)
     return str(path.relative_to(root)) if path.is_relative_to(root) else file
 
@@ -79,7 +79,7 @@ def repository_of(folder: Path) -> Path:
 
 
 def as_json(said: Reported) -> str:
-    """All that is known, as one object."""
+    """The whole report as one JSON object."""
     report, what = said.report, said.what
     task = report.task
     return json_text(
@@ -194,7 +194,7 @@ def as_junit(said: Reported) -> str:
 
 
 def _case(result: RuleResult, said: Reported, root: Path) -> ElementTree.Element:
-    """A rule that was looked at."""
+    """Test case of a rule that was checked."""
     task = said.report.task
     place = next((f for f in result.findings if f.file is not None), None)
     file = task.file if place is None else place.file
@@ -261,7 +261,7 @@ def _text(finding: Finding, root: Path) -> str:
 
 
 def xml_text(text: str) -> str:
-    """The text with what XML cannot hold escaped."""
+    """The text with the characters escaped that XML cannot hold."""
     return _NOT_IN_XML.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
@@ -388,7 +388,7 @@ def _fingerprint(key: list[str]) -> str:
 
 
 def _location(file: str, line: int | None, root: Path) -> dict[str, Any]:
-    """Without a known line it is the first: code scanning shows no result without one."""
+    """SARIF's location. Where no line is known it is the first: code scanning shows no result without a line."""
     path = Path(file)
     if path.is_relative_to(root):
         place = {"uri": quote(path.relative_to(root).as_posix()), "uriBaseId": "%SRCROOT%"}

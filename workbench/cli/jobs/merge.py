@@ -1,4 +1,4 @@
-"""Runs ``workbench merge``: puts the parts of a job together, and prints what the whole command would have printed."""
+"""Runs ``workbench merge``: merges the parts of a job, and prints the output of the whole command."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ from workbench.recording.writing.publish import RecordingError
 
 @dataclass(frozen=True)
 class MergeOutput:
-    """What it gives besides its text, where the command that was run in parts has that."""
+    """Output in addition to the text, where the command that was run in parts has it."""
 
     json_file: Path | None = None
     csv_file: Path | None = None
     junit: Path | None = None
     sarif: Path | None = None
     fail_on: FailOn = "stop"
-    """As of `CheckOutput` and `SolveOutput`."""
+    """Lowest degree of a finding that makes the exit code 1; see `CheckOutput` and `SolveOutput`."""
 
 
 _GIVES = {
@@ -60,7 +60,7 @@ _GIVES = {
     "solve": ("json_file", "csv_file", "junit"),
     "sweep": ("json_file", "csv_file"),
 }
-"""The files that each command makes, as fields of `MergeOutput`."""
+"""Files that each command writes, as fields of `MergeOutput`."""
 
 
 def merge_in_terminal(files: Sequence[Path], job: Path | None, out: Path | None, output: MergeOutput) -> int:
@@ -78,7 +78,7 @@ def merge_in_terminal(files: Sequence[Path], job: Path | None, out: Path | None,
 
 
 def _require_known(merged: JobParts, output: MergeOutput) -> None:
-    """Raise JobFileError for a command or a file that there is not."""
+    """Raise JobFileError for a command that does not exist or a file that the command does not write."""
     if merged.command not in _GIVES:
         raise JobFileError(f"{merged.files[0]} is of workbench {merged.command}, which merge does not know")
     for name in ("json_file", "csv_file", "junit", "sarif"):
@@ -88,13 +88,13 @@ def _require_known(merged: JobParts, output: MergeOutput) -> None:
 
 
 def _together(merged: JobParts, out: Path | None) -> JobParts:
-    """With all episodes in one folder."""
+    """The merged results, with all episodes in one folder; JobFileError if they are in several and `out` is None."""
     if merged.command not in ("record", "solve", "sweep"):
         return merged
     results: dict[int, Written | None] = merged.results(Written | None)
     local = {number: one for number, one in results.items() if one is not None and not one.address}
     if out is not None:
-        # Those of a sweep are in a folder for each point.
+        # The episodes of a sweep are in a folder for each point.
         below = _folder_of_point(merged) if merged.command == "sweep" else lambda number: ""
         for number, one in local.items():
             _copy(Path(merged.folders[number], below(number), one.path.name), out / below(number))
@@ -163,7 +163,7 @@ def _print(merged: JobParts, output: MergeOutput) -> int:
 
 
 def _with_missing(code: int, missing: int, what: str, names: Iterable[str] = ()) -> int:
-    """Say what is missing; returns the exit code."""
+    """Print what is missing; returns the exit code."""
     if missing:
         told = listed(list(names), 20)
         print_text(f"{missing} of the job's {what} are in none of these files{told and ': '}{told}")

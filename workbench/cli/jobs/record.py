@@ -72,9 +72,9 @@ class RecordBar:
         self._total = total
         self.stop_requested = False
         self._began: float | None = None
-        """When the first episode began."""
+        """Time when the first episode began."""
         self._said = time.monotonic()
-        """When something was last printed that is no bar."""
+        """Time when something other than the bar was last printed."""
 
     def __enter__(self) -> RecordBar:
         self._before = signal.signal(signal.SIGINT, self._on_signal)
@@ -94,9 +94,8 @@ class RecordBar:
         self._bar.update(self._row, description=text, completed=kept)
 
     def _say(self, line: str) -> None:
-        """Where there is no terminal: a bar in a file or a pipe is drawn once, at the end, and a log would say nothing for
-        hours.
-        """
+        """Print a progress line where there is no terminal: a bar in a file or a pipe is drawn once, at the end,
+        and a log would be silent for hours."""
         if not err.is_terminal:
             self._said = time.monotonic()
             err.print(escape(line), soft_wrap=True)
@@ -124,7 +123,7 @@ class RecordBar:
 
 
 _SAY_EVERY = 30.0
-"""Seconds after which a log is told again how far it is."""
+"""Seconds between two progress lines in a log."""
 
 
 def _ended_text(kept: Written | None) -> str:
@@ -134,7 +133,7 @@ def _ended_text(kept: Written | None) -> str:
 
 
 def _outcome_texts(kept: Written) -> tuple[str, ...]:
-    """Its return and its success, as far as the task has them."""
+    """Texts of the return and success, where the task has them."""
     earned = "no reward" if kept.total_reward is None else f"return {kept.total_reward:.3f}"
     return (earned, *{None: (), True: ("success",), False: ("no success",)}[kept.success])
 
@@ -199,7 +198,7 @@ def record_in_terminal(what: RecordOptions, run: JobArguments = ONE_WORKER) -> i
 
 
 def job_of_record(requested: RecordOptions) -> JobKey:
-    """What a job file of this recording is for. Raises OSError."""
+    """Key of the job file of this recording. Raises OSError."""
     files = needed_by(requested.task, requested.actions).files
     return job_of("record", requested.task, requested, ("out", "workers", "upload"), files)
 
@@ -214,7 +213,7 @@ def _print_kept(requested: RecordOptions, before: set[Path]) -> None:
 
 
 def print_recorded(requested: RecordOptions, recorded: Recorded) -> int:
-    """Print the episodes and what came of the request; returns the exit code."""
+    """Print the episodes and the result of the request; returns the exit code."""
     for episode in recorded.written:
         print_text("  ".join((episode.shown, f"{episode.steps} steps", *_outcome_texts(episode))))
     kept = len(recorded.written)

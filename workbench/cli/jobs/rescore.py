@@ -66,7 +66,7 @@ from workbench.session.rescore.recordings import (
 )
 
 _MOST_ALIKE = 30
-"""Recordings up to which those are listed too that do not differ."""
+"""Maximum number of recordings at which unchanged ones are listed too."""
 
 
 @dataclass(frozen=True)
@@ -74,36 +74,36 @@ class RescoreOptions:
     places: tuple[Path, ...]
     """Files and folders."""
     task: str | None = None
-    """The task for all of them, instead of the one that each names."""
+    """Reference of the task for all recordings, instead of the one that each names."""
     recorded_source: bool = False
     use_env_states: bool = False
     num_envs: int = 16
     base: TaskOptions = field(default_factory=TaskOptions)
-    """The backend and other options that are the same for all."""
+    """Backend and other options that are the same for all recordings."""
 
 
 @dataclass(frozen=True)
 class RescoreOutput:
-    """What is given besides the table as text."""
+    """Output in addition to the table as text."""
 
     csv: bool = False
-    """Print it as CSV instead."""
+    """Print CSV instead of text."""
     csv_file: Path | None = None
     json: bool = False
-    """Print it as JSON instead."""
+    """Print JSON instead of text."""
     json_file: Path | None = None
 
 
 @dataclass(frozen=True)
 class RescoreRequest:
-    """What a rescoring asks for, and all that its verdicts depend on."""
+    """Options of a rescoring, with everything that its verdicts depend on."""
 
     recordings: int
-    """How many."""
+    """Number of recordings."""
     recorded: str
-    """A sum of their names and sizes."""
+    """Hash of the names and sizes of the recordings."""
     code: str
-    """A sum of the texts that rescore them."""
+    """Hash of the texts of the code that rescores them."""
     use_env_states: bool
     recorded_source: bool
     num_envs: int
@@ -157,7 +157,7 @@ def rescore_all(
         results = rescore_recordings(setup, executor, on_activity, on_progress, on_finding)
     place = {file.id: number for number, file in enumerate(files)}
     _require_success(groups, place, results)
-    # Of what a worker says only the numbers are taken.
+    # Only the numbers of a worker's verdict are used; its file is the local one.
     found = [replace(result.verdict, of=files[result.place]) for result in results]
     return found, tuple(dict.fromkeys(group.note for group in groups if group.note))
 
@@ -249,7 +249,7 @@ def _require_success(
 
 
 def _cleared(groups: list[RescoreGroup], clearances: Clearances) -> list[TaskName | NotCleared]:
-    """The task to open for each group, decided before any of them runs: all or nothing if no one can be asked."""
+    """Task to open for each group, decided before any of them runs: all or nothing where no one can be asked."""
     cleared = clearances.clear_all([group.code for group in groups])
     not_cleared = [one for one in cleared if isinstance(one, NotCleared)]
     refused = [one.question for one in not_cleared if one.question is not None]
@@ -275,7 +275,7 @@ def rescore_in_terminal(what: RescoreOptions, output: RescoreOutput, trust: bool
 
 
 def _rescore(what: RescoreOptions, output: RescoreOutput, trust: bool, run: JobArguments) -> int:
-    """The exit code. Raises as `rescore_all`, and OSError for a table."""
+    """Rescore and print; returns the exit code. Raises as `rescore_all`, and OSError for a table."""
     here = CurrentFolder()  # a task may change it
     if (left_alone := unused_gpu_text(what.base.backend)) is not None:
         warn(left_alone)
@@ -330,7 +330,7 @@ def write_tables(verdicts: list[Verdict[Source]], output: RescoreOutput) -> None
 
 
 def warn_of_verdicts(verdicts: list[Verdict[Source]], notes: Iterable[str]) -> None:
-    """Warn of what makes the comparison another one than it seems."""
+    """Warn where the comparison has limits that the table does not show."""
     for note in (*notes, *verdict_text.not_carried(verdicts)):
         warn(note)
     if verdict_text.count_drifted(verdicts):

@@ -26,7 +26,7 @@ from workbench.recording.library.jobs import JobFailure, JobState, JobStatus, St
 
 EPISODES_KEPT = "finished episodes were kept"
 JOB_ENDS = (TaskError, OSError, ValueError, PoolError, KeyboardInterrupt)
-"""What ends a command early: see `exit_after`."""
+"""Exceptions that end a command early: see `exit_after`."""
 
 
 def exit_after(error: BaseException, kept: str = EPISODES_KEPT) -> int:
@@ -46,7 +46,7 @@ def exit_after(error: BaseException, kept: str = EPISODES_KEPT) -> int:
 
 
 def require_job(arguments: JobArguments) -> None:
-    """Raise ValueError, with a message that names the argument, for one that makes no sense."""
+    """Raise ValueError, with a message that names the argument, for an invalid argument."""
     if arguments.workers is not None and arguments.workers < 1:
         raise ValueError(f"--workers must be at least 1, not {arguments.workers}")
     for name, number, least in (
@@ -59,18 +59,18 @@ def require_job(arguments: JobArguments) -> None:
 
 
 def shard_of(arguments: JobArguments) -> Shard:
-    """The part of the job that is to be done. Raises ValueError."""
+    """Part of the job that is to be done. Raises ValueError."""
     return Shard() if arguments.shard is None else parse_shard(arguments.shard)
 
 
 def items_of(arguments: JobArguments, count: int, chunk: int) -> int:
-    """How many of so many items, in chunks of this size, are in the part that is to be done."""
+    """Number of items in the part that is to be done, out of `count` items in chunks of size `chunk`."""
     part = shard_of(arguments).part(-(-count // chunk))
     return min(part.stop * chunk, count) - min(part.start * chunk, count)
 
 
 def job_path(arguments: JobArguments, command: str) -> Path | None:
-    """The job file; None if none is kept."""
+    """Path of the job file; None if none is kept."""
     if arguments.job is not None or arguments.shard is None:
         return arguments.job
     shard = shard_of(arguments)
@@ -90,7 +90,7 @@ def run_by(
     job: Callable[[], JobKey],
     is_there: Callable[[Any], bool] = lambda result: True,
 ) -> Iterator[tuple[Executor, str]]:
-    """What runs the work of a command, and the name of the run (`episodes.RecordSetup.run`).
+    """Executor of a command, and the name of the run (`episodes.RecordSetup.run`).
 
     Args:
         chunks: of the whole job.
@@ -123,17 +123,17 @@ def run_by(
 
 
 class ToldStatus:
-    """Tells a folder how far the job is that records into it: `told_in_folder`."""
+    """Writes the progress of a job into the folder that it records to: `told_in_folder`."""
 
     def __init__(self, file: StatusFile | None, status: JobStatus, names: Callable[[int], str]) -> None:
         self._file, self._status, self._names = file, status, names
         self._began: float | None = None
         self._first = 0
-        """Episodes that were there when it began."""
+        """Number of episodes that were there when the job began."""
         self._last: RecordProgress | None = None
 
     def beside(self, show: Callable[[RecordProgress], None]) -> Callable[[RecordProgress], None]:
-        """Progress goes to `show` too."""
+        """Progress callback that writes the status and also calls `show`."""
 
         def both(now: RecordProgress) -> None:
             show(now)
@@ -147,7 +147,7 @@ class ToldStatus:
         return both
 
     def end(self, state: JobState) -> None:
-        """Tell the last word; of a job that was refused before its first episode there is none."""
+        """Write the final status; a job that was refused before its first episode has none."""
         if self._file is not None and (self._last is not None or state != "failed"):
             self._write(state)
 
@@ -175,7 +175,7 @@ def told_in_folder(
     total: int,
     names: Callable[[int], str],
 ) -> Iterator[ToldStatus]:
-    """Write into a folder of recordings how far the job is, for a page that shows it.
+    """Write the progress of a job into its folder of recordings, for a page that shows it.
 
     Args:
         out: None for no folder.
@@ -195,7 +195,7 @@ def told_in_folder(
 
 
 def print_part(arguments: JobArguments, command: str, stopped: bool) -> None:
-    """Say how the job goes on where it was stopped, and what to do with a part."""
+    """Print how a stopped job is resumed, and what to do with a part."""
     path = job_path(arguments, command)
     if stopped:
         how = (

@@ -62,7 +62,7 @@ _COLUMNS = ("seed", "solved_at", "steps", "return", "seconds", "in_the_way", "ru
 
 @dataclass(frozen=True)
 class SolveOutput:
-    """What it gives besides its text."""
+    """Output in addition to the text."""
 
     json: bool = False
     """Print JSON in place of the text."""
@@ -72,7 +72,7 @@ class SolveOutput:
     csv_file: Path | None = None
     junit: Path | None = None
     fail_on: FailOn = "stop"
-    """The lowest degree of a broken rule that makes the exit code 1."""
+    """Lowest degree of a broken rule that makes the exit code 1."""
 
     def fails(self, report: SolveReport) -> bool:
         """Whether the exit code is 1: the reward breaks a rule of that degree, or no seed was solved."""
@@ -154,7 +154,7 @@ def _job_of(what: SolveOptions) -> JobKey:
 
 
 def print_report(report: SolveReport) -> None:
-    """Print the seeds, what they tell of the reward, and a summary."""
+    """Print the seeds, the verdicts on the reward, and a summary."""
     table = Table(box=None, pad_edge=False)
     for name in ("seed", "solved at", "steps", "return", "seconds"):
         table.add_column(name, justify="right")
@@ -203,7 +203,7 @@ def write_reports(report: SolveReport, what: SolveOptions, output: SolveOutput) 
 
 
 def as_json(report: SolveReport, what: SolveOptions, output: SolveOutput) -> str:
-    """All that is known, as one object."""
+    """The whole report as one JSON object."""
     return json_text(
         {
             "task": what.task,

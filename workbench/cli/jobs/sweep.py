@@ -52,20 +52,20 @@ from workbench.recording.writing.publish import try_folder
 from workbench.recording.writing.upload import require_place, upload_file
 
 _MOST_POINTS = 50
-"""That are printed."""
+"""Maximum number of points that are printed."""
 _TERMS = "reward_terms/"
 
 
 @dataclass(frozen=True)
 class SweepOutput:
-    """What it gives besides its text and ``results.parquet``."""
+    """Output in addition to the text and ``results.parquet``."""
 
     json_file: Path | None = None
     csv_file: Path | None = None
 
 
 def parse_settings(given: Sequence[str]) -> tuple[Setting, ...]:
-    """The ``--set`` of a command line. Raises ValueError with a message that names the argument."""
+    """Parse the ``--set`` values of a command line. Raises ValueError with a message that names the argument."""
     if not given:
         raise ValueError("--set takes what varies, as in --set reach_weight=0.5,1,2; repeatable")
     settings: list[Setting] = []
@@ -84,7 +84,7 @@ def parse_settings(given: Sequence[str]) -> tuple[Setting, ...]:
 
 
 def _values(text: str) -> list[Any]:
-    """The values of a list: each in JSON, else as text."""
+    """Values of a list: each in JSON, else as text."""
     try:
         # Lists and texts in quotes have commas of their own.
         values = json.loads(f"[{text}]", parse_constant=_no_constant)
@@ -186,14 +186,14 @@ def _named(what: SweepOptions, points: Sequence[Point], number: int) -> str:
 
 
 def job_of_sweep(what: SweepOptions) -> JobKey:
-    """What a job file of this sweep is for. Raises OSError."""
+    """Key of the job file of this sweep. Raises OSError."""
     return job_of(
         "sweep", what.task, what, ("out", "workers", "upload"), needed_by(what.task, what.actions).files
     )
 
 
 def keep_results(what: SweepOptions, results: SweepResults) -> None:
-    """Write the table beside the recordings. Raises OSError."""
+    """Write the table next to the recordings. Raises OSError."""
     what.out.mkdir(parents=True, exist_ok=True)
     write_results(what.out / RESULTS, results)
     if what.upload:
@@ -204,7 +204,7 @@ def keep_results(what: SweepOptions, results: SweepResults) -> None:
 
 
 def print_report(report: SweepReport, what: SweepOptions, has_table: bool) -> int:
-    """Print the points, the best first, and what failed; returns the exit code.
+    """Print the points, the best first, and the failures; returns the exit code.
 
     Args:
         has_table: whether its table of results was written.

@@ -1,1 +1,1 @@
-"""What all commands take, and how they print and ask."""
+"""Arguments that all commands share, and how commands print and ask."""

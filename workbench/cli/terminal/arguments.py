@@ -80,7 +80,7 @@ class JobArguments:
 
 ONE_WORKER = JobArguments(workers=1)
 _OLD_NAMES = {"--envs-per-worker": "--num-envs"}
-"""Options that have another name since this release; the next one drops them."""
+"""New name of each option that was renamed in this release; the next release drops the old names."""
 
 
 def with_new_names(arguments: Sequence[str]) -> tuple[list[str], list[str]]:

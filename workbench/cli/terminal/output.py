@@ -77,9 +77,9 @@ err = SafeConsole(stderr=True, highlight=False)
 
 _LINES = "\n\t"
 _MOST_FAILED = 100
-"""Items that failed alike and are named."""
+"""Maximum number of items with the same failure that are named."""
 _printed_notices: set[str] = set()
-"""Notices of the task that were printed; each reload repeats them."""
+"""Notices of the task that were printed; each reload sends them again."""
 
 
 def print_text(text: object) -> None:
@@ -89,7 +89,8 @@ def print_text(text: object) -> None:
 
 @contextmanager
 def stdout_to_stderr() -> Iterator[None]:
-    """Within this, what the author's code, native libraries and child processes print goes to stderr: stdout is for results."""
+    """Within this block, output of the author's code, native libraries and child processes goes to stderr: stdout
+    is for results."""
     sys.stdout.flush()
     before = os.dup(1)
     try:
@@ -129,7 +130,7 @@ def interrupted(kept: str = "") -> int:
 
 
 def end_quietly() -> int:
-    """The exit code where whoever read our output has left, as that of a command that SIGPIPE ends.
+    """Exit code where the reader of our output has closed it, as of a command that SIGPIPE ends.
 
     To be called while the BrokenPipeError is handled, which is raised again if it is of another pipe.
     """
@@ -148,7 +149,8 @@ def warn(message: str) -> None:
 
 
 def lacks_maniskill(command: str) -> bool:
-    """Say what to type where the command cannot do its work for want of ManiSkill, and warn of two that are mixed."""
+    """Print what to type where the command cannot run without ManiSkill, and warn of two installed distributions
+    of ManiSkill. Returns whether ManiSkill is missing."""
     lines = lines_if_lacking(f"workbench {command}", sys.argv[1:])
     for line in lines or ():
         refuse(line)
@@ -169,7 +171,7 @@ def print_problem(problem: Problem) -> None:
 
 
 def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> None:
-    """Print what failed in a job that went on, each kind once with the items that it failed in.
+    """Print the failures of a job that went on, each kind once with its items.
 
     Args:
         names: the name of an item.
@@ -221,7 +223,7 @@ def print_event(event: Event) -> None:
 
 
 def _what_runs(failed: LoadFailed) -> str:
-    """What runs after a failure that leaves a version, and how to go on."""
+    """Text: which version runs after a failure, and how to go on."""
     if failed.at_run:
         of = "the policy" if failed.problem.stage == "policy" else "the version"
         process = f"; another process loads the version again: {failed.spoiled}" if failed.spoiled else ""
@@ -243,7 +245,7 @@ def print_line(line: PrintedLine) -> None:
 
 
 MOST_NAMED = 20
-"""Most questions that are listed if they cannot be asked."""
+"""Maximum number of questions that are listed where they cannot be asked."""
 _TAB = "\t"
 _SHOW = ("s", "show")
 _ANSWERS = {
@@ -331,7 +333,7 @@ def print_texts(question: TrustQuestion, out: Console) -> None:
 
 
 def not_trusted_lines(error: NotTrusted) -> list[str]:
-    """Lines: why nothing was run, and what to do."""
+    """Lines that say why nothing was run, and what to do."""
     lines = [
         f"Nothing was run: {reason}. Add it, which agrees to all in this run, if you know where the recording comes from."
         for reason in error.reasons
