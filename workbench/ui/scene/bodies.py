@@ -20,9 +20,10 @@ from workbench.ui.scene.pixels import Eye, SentPoses, eyes_of
 from workbench.ui.widgets.parts import Clock
 
 NAMES = ("/envs", "/floor")
-"""Roots of its nodes in viser's tree."""
+"""Roots of the nodes in viser's tree."""
 LEAVES_AFTER = 0.7
-"""Seconds for which shapes stay whose place finer or coarser ones take: until the page has read those, nothing would be there."""
+"""Seconds for which old shapes stay when finer or coarser ones replace them: until the page has read the new ones,
+nothing would be there."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +31,11 @@ class Looks:
     """How a scene is drawn."""
 
     triangles: int = 200_000
-    """Approximate limit; rich shapes are simplified to fit."""
+    """Approximate maximum number of triangles; rich shapes are simplified to fit."""
     dark: bool = True
     """The page's theme: in the light one a dark floor is lighter than the task's."""
     error: float = 0.0
-    """Metres by which shapes may be off, so that they have fewer triangles."""
+    """Error in metres that shapes may have, so that they have fewer triangles."""
 
 
 class SceneView:
@@ -164,7 +165,7 @@ def _is_simpler(group: VisualGroup, error: float) -> bool:
 @dataclass(frozen=True)
 class _DrawnAs:
     limit: int
-    """Triangles of a visual."""
+    """Maximum number of triangles of a visual."""
     error: float
     lighter: bool
 
@@ -198,7 +199,7 @@ class _DrawnGroup:
         self._group, self._once = group, once
         corners = [np.abs(visual.mesh.vertices).max(axis=0) for visual in group.visuals]
         self.reach = float(max(np.linalg.norm(corner) for corner in corners))
-        """Metres around its frame within which it lies."""
+        """Radius in metres around its frame that contains it."""
 
     @property
     def is_plane(self) -> bool:

@@ -19,13 +19,13 @@ FLOOR_WIDTH = 8.0
 largest table 2.4 m."""
 FLOOR_THICKNESS = 0.05
 LEVEL = 0.9
-"""Least upward component of a floor's normal; below it a plane is a wall."""
+"""Minimum upward component of a floor's normal; below it a plane is a wall."""
 WIDER = 1.4
-"""Width over depth of the grid: a view is wider than tall, and depth is foreshortened."""
+"""Ratio of width to depth of the grid: a view is wider than tall, and depth is foreshortened."""
 MARGIN = 0.35
-"""Metres between two envs at rest; a robot that reaches out needs some of it."""
+"""Distance in metres between two envs at rest; a robot that reaches out needs some of it."""
 ACTING_MARGIN = np.float32(0.08)
-"""Metres around the frames of links and bodies."""
+"""Margin in metres around the frames of links and bodies."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class EnvLayout:
     low: NDArray[np.float32]
     """(3,) lowest corner of one env's contents without the floor, in the env's frame."""
     high: NDArray[np.float32]
-    """(3,)"""
+    """(3,) highest corner of one env's contents without the floor, in the env's frame."""
     floor_height: float
-    """z of the floor, or of the lowest point of the env."""
+    """Height (z) of the floor, or of the lowest point of the env."""
     has_floor: bool
 
     def box_of_all(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -202,7 +202,7 @@ class InView:
     def __init__(self, add: Callable[..., Any], *names: str) -> None:
         self._add, self._names = add, names
         self.handle: Any = None
-        """viser's, while it is shown."""
+        """Handle of viser's node while it is shown."""
 
     def draw(self, *values: Any) -> None:
         """Show it with these values; without values, remove it."""

@@ -14,15 +14,16 @@ from trimesh.visual.material import PBRMaterial
 from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
 
 LARGEST_TEXTURE = 1024
-"""Pixels. A page loads every texture before it shows anything; 4k scans are megabytes each."""
+"""Maximum size of a texture in pixels. A page loads every texture before it shows anything; 4k scans are megabytes
+each."""
 
 
 LIGHT = 0.6
-"""Mean of the sRGB channels from which on a floor counts as light."""
+"""Minimum mean of the sRGB channels of a floor that counts as light."""
 DARKNESS_KEPT = 0.3
 
 LAYER = 4e-4
-"""Metres between painted layers; two steps of a 24 bit depth buffer at ten metres."""
+"""Distance in metres between painted layers; two steps of a 24 bit depth buffer at ten metres."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ class VisualGroup:
     name: str
     visuals: tuple[Visual, ...]
     envs: NDArray[np.int32]
-    """(K,)"""
+    """(K,) indices of the envs."""
     bodies: NDArray[np.int32]
-    """(K,)"""
+    """(K,) indices of the bodies."""
 
 
 def group_visuals(geometry: SceneGeometry) -> tuple[VisualGroup, ...]:

@@ -1,4 +1,4 @@
-"""Pages that draw their view in software, and how a scene is drawn for them: of few triangles."""
+"""Pages that draw their view in software, and the simplified scene for them."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.visitors import Visitor
 
 TOLERANCE = 0.75
-"""Pixels within which 99 % of a surface stay. With 1.5 a white part comes through the black one around it."""
+"""Pixels within which 99 % of a surface must stay. With 1.5 a white part comes through the black one around it."""
 FEW = 25_000
-"""Triangles in the view that are drawn as they are: pixels, not triangles, then take the time."""
+"""Number of triangles in the view below which shapes are not simplified: pixels, not triangles, then take the time."""
 STEADY = 1.6
-"""A tolerance stays until another is wanted that differs by this factor: each one is other meshes for the page."""
+"""Factor by which a wanted tolerance must differ before the tolerance is changed: each tolerance is other meshes
+for the page."""
 AT_REST = 0.4
-"""Seconds without a motion of any page's camera."""
+"""Seconds without a motion of any page's camera after which the view counts as still."""
 PATIENCE = 3.0
-"""Seconds within which a page says that it draws in software. Until then nothing changes: a page that is loaded again would
-be sent fine shapes and then simple ones."""
+"""Timeout in seconds within which a page says that it draws in software. Until then nothing changes: a reloaded
+page would be sent fine shapes and then simple ones."""
 
 
 class InSoftware:
@@ -44,12 +45,12 @@ class InSoftware:
         self._server, self._clock = server, clock
         self._told: set[int] = set()
         self._came: dict[int, float] = {}
-        """By page: when it was seen first."""
+        """Time when each page was seen first, by page."""
         self._all = False
         self._eyes: tuple[Hashable, ...] = ()
         self._since = clock()
         self._made: tuple[SceneGeometry, float] | None = None
-        """What the simplified shapes are ready for: scene and tolerance."""
+        """Scene and tolerance for which the simplified shapes are ready."""
         self._unfit: SceneGeometry | None = None
         """The scene whose shapes cannot be simplified."""
         self._making: threading.Thread | None = None
@@ -59,7 +60,7 @@ class InSoftware:
         self._server.gui.add_html(render("tell", command=TellDrawnInSoftware(), only="drawn-in-software"))
 
     def told_by(self, visitor: Visitor) -> None:
-        """A page says that it draws its view in software."""
+        """Handle that a page draws its view in software."""
         self._told.add(visitor.client.client_id)
 
     @property

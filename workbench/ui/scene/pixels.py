@@ -1,4 +1,4 @@
-"""Which motions a page can see: poses that moved by less than a pixel are not sent again."""
+"""Determines which motions a page can see: poses that moved by less than a pixel are not sent again."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import viser
 from numpy.typing import NDArray
 
 AT_REST = 0.15
-"""Seconds without a change after which a pose is sent as it is."""
+"""Seconds without a change after which the exact pose is sent."""
 NEAREST = 0.05
-"""Metres from an eye, as the near plane: what is nearer is not drawn."""
+"""Minimum distance in metres from an eye, as the near plane: nearer bodies are not drawn."""
 COARSEST = 2.0**-6
-"""Of a quaternion's components."""
+"""Maximum rounding step of a quaternion's components."""
 
 
 @dataclass(frozen=True)
 class Eye:
-    """From where a page looks at the scene."""
+    """Eye point of a page in the scene."""
 
     position: NDArray[np.float64]
-    """(3,) metres."""
+    """(3,) position in metres."""
     pixel: float
-    """Metres that a pixel covers, for each metre of distance."""
+    """Size in metres that a pixel covers, for each metre of distance."""
 
 
 def eyes_of(server: viser.ViserServer) -> tuple[Eye, ...]:
-    """Where the open pages look from."""
+    """Eye points of the open pages."""
     cameras = [client.camera for client in server.get_clients().values()]
     # A page whose view is folded away has no height.
     return tuple(
@@ -56,7 +56,7 @@ def pixel_sizes(
 def displacements(
     poses: NDArray[np.float32], others: NDArray[np.float32], reach: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """(R,) metres by which a point of each body is apart at most in two poses (R, 7); NaN for an absent body."""
+    """(R,) largest distance in metres between a point of each body in two poses (R, 7); NaN for an absent body."""
     turned = np.minimum(
         np.linalg.norm(poses[:, 3:] - others[:, 3:], axis=1),
         np.linalg.norm(poses[:, 3:] + others[:, 3:], axis=1),

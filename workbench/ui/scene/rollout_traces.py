@@ -1,4 +1,4 @@
-"""The ways of a body in the rollouts of a plan, as lines in the 3-D view: the best bright, the others faint."""
+"""Paths of a body in the rollouts of a plan, as lines in the 3-D view: the best bright, the others faint."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from workbench.ui.scene.env_grid import InView
 
 BEST, CHOSEN = (10, 255, 25), (255, 0, 110)
-"""Linear, not sRGB: viser's page draws the colours of single lines much lighter than other colours."""
+"""Colours of the best and the chosen path. Linear, not sRGB: viser's page draws the colours of single lines much
+lighter than other colours."""
 GOOD, BAD = (10, 60, 200), (70, 75, 85)
-"""Of the others, from the second best to the worst."""
+"""Colours of the other paths, from the second best to the worst."""
 STEPS = 12
-"""Most segments of a way: half a second of a hand's way is smooth."""
+"""Maximum number of segments of a path: half a second of a hand's path is smooth."""
 THICKNESS = 2.5
-"""Pixels."""
+"""Width of the lines in pixels."""
 
 
 class RolloutTraces:
@@ -31,7 +32,7 @@ class RolloutTraces:
         self._drawn: tuple[object, int, bytes] | None = None
 
     def draw(self, paths: NDArray[np.float32] | None, offset: NDArray[np.float32], chosen: int = 0) -> None:
-        """Draw these, or nothing.
+        """Draw these paths, or nothing.
 
         Args:
             paths: (P, T, 3) best first, metres in the env's frame.

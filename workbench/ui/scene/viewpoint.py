@@ -27,11 +27,11 @@ from workbench.ui.widgets.parts import Clock, PagePart
 from workbench.ui.widgets.visitors import Visitor
 
 FOV = 0.75
-"""Vertical, radians. viser's own 75 degrees distorts the edges of a grid."""
+"""Vertical field of view in radians. viser's own 75 degrees distorts the edges of a grid."""
 USUAL_ASPECT = 1.25
-"""Of the view in a 1280 x 720 window, until a page has sent its own."""
+"""Aspect (width over height) of the view in a 1280 x 720 window, used until a page has sent its own."""
 USUAL_HEIGHT = 720.0
-"""Pixels."""
+"""Height of the view in pixels, used until a page has sent its own."""
 MOST_COVERED = 0.45
 FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
 """ManiSkill's robots face +x, so they are seen from there; a little from the side."""
@@ -124,7 +124,7 @@ Frame = Callable[[float, float], Viewpoint]
 
 
 MOST_LEFT = 8
-"""Scenes whose viewpoints are remembered."""
+"""Maximum number of scenes whose viewpoints are remembered."""
 
 
 class Framing:
@@ -139,9 +139,9 @@ class Framing:
         self._pointed: dict[int, tuple[np.ndarray, float]] = {}
         self._framed: Hashable = None
         self._left: dict[Hashable, dict[int, tuple[NDArray, NDArray]]] = {}
-        """By what was framed: position and look-at of the pages, by client id, on which a person had moved the view."""
+        """Position and look-at of pages on which a person had moved the view, by framed object and client id."""
         self._came_back: frozenset[int] = frozenset()
-        """Pages that look again from where they did when the framed thing was left."""
+        """Pages that returned to the viewpoint that they had when the framed object was left."""
 
     def is_new(self, what: Hashable) -> bool:
         """Whether this differs from the last call's: then it has to be framed. Where a person had moved the view of it
@@ -165,7 +165,8 @@ class Framing:
         return True
 
     def frame_new(self, frame: Frame) -> None:
-        """Point every open page at what is new, but for those that came back to where they looked from, and those to come."""
+        """Point every open page, and those to come, at the new scene, except pages that returned to their earlier
+        viewpoint."""
         self.frame(frame, but=self._came_back)
 
     def follow(self) -> int:
@@ -277,7 +278,7 @@ class Stage:
 
 
 DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
-"""Triangles in the view. A browser without a graphics card wants the fewest."""
+"""Number of triangles in the view, by level of detail. A browser without a graphics card needs the fewest."""
 ALL, ONE = "all envs", "the selected env"
 DARK, LIGHT = "dark", "light"
 BRAND = (28, 112, 190)
@@ -285,7 +286,8 @@ BRAND = (28, 112, 190)
 
 @dataclass
 class ViewChoice:
-    """What a person chose in the View panel. A page is made anew with each change to the review and back."""
+    """Choices in the View panel. They outlive a page, which is built again with each change between review and
+    live page."""
 
     show: str = ALL
     detail: str = "normal"

@@ -24,7 +24,7 @@ class AccessRules:
     """
 
     token: str | None
-    """None: no token is needed (loopback only, see `ServerOptions`)."""
+    """The token; None if no token is needed (loopback only, see `ServerOptions`)."""
     names: frozenset[str] = frozenset()
     """Lower-case host names and addresses, without a port, that are ours; loopback always is."""
     any_address: bool = False
@@ -37,7 +37,7 @@ class RequestParts:
     twice tries to make two programs read two different things."""
 
     path: str
-    """As sent: percent-encoded, with the query."""
+    """Path as the client sent it: percent-encoded, with the query."""
     host: Sequence[str]
     origin: Sequence[str] = ()
     cookie: Sequence[str] = ()

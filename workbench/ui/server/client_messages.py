@@ -10,11 +10,11 @@ import msgspec
 T = TypeVar("T")
 
 MAX_BYTES = 256 * 1024
-"""The largest message is a pasted text. viser's pictures of a view are never requested."""
+"""Maximum size of a message in bytes; the largest is a pasted text. viser's pictures of a view are never requested."""
 FARTHEST = 1e12
-"""Largest number of a camera, a ray or a gizmo, in any unit."""
+"""Maximum number of a camera, a ray or a gizmo, in any unit."""
 LARGEST_PICTURE = 100_000
-"""Pixels along one side of a page."""
+"""Maximum size in pixels of one side of a page."""
 
 Name = Annotated[str, msgspec.Meta(max_length=1024)]
 Uuid = Annotated[str, msgspec.Meta(max_length=64)]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from workbench.ui.server.gated_server import GatedServer
 
 BLOCK = 1 << 18
-"""Bytes read and sent at a time."""
+"""Number of bytes that are read and sent at a time."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,12 @@ class FileReply:
 
     path: Path
     kind: str
-    """Content type of what the browser gets."""
+    """Content type that the browser gets."""
     gzipped: bool = False
-    """The file holds the gzip of it (rerun's viewer: 43 MB, 14 packed); it is sent packed where the browser takes that."""
+    """Whether the file holds gzipped content (rerun's viewer: 43 MB, 14 packed). It is sent packed where the
+    browser accepts gzip."""
     download_as: str | None = None
-    """The browser saves it under this name instead of showing it."""
+    """Name under which the browser saves the file instead of showing it."""
 
 
 class _Sent(Response):
@@ -111,7 +112,7 @@ async def _pour(connection: ServerConnection, file: BinaryIO, head: bytes, lengt
         try:
             # Never more than announced: a recording may grow while it is read.
             block = await asyncio.to_thread(file.read, min(BLOCK, left))
-        except (OSError, EOFError, zlib.error):  # of the disk, and of a gzip that is cut short
+        except (OSError, EOFError, zlib.error):  # an error of the disk, or a gzip that is cut short
             block = b""
         if not block:
             # Shorter than announced: aborted, so that the browser does not take a part for the whole.

@@ -1,4 +1,4 @@
-"""The line to one page: how much may be on the way, by what the page has answered, and what is compressed."""
+"""The line to one page: how many bytes may be unanswered, and whether messages are compressed."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from websockets.frames import Frame
 from websockets.typing import ExtensionParameter
 
 FAR = 0.003
-"""Seconds of a round trip from which on a page is far away."""
+"""Minimum round trip in seconds of a page that is far away."""
 QUEUED = 0.05
 """Seconds that a message may wait behind others on the line."""
 LATE = 0.25
-"""Seconds, beyond the quickest round trip, after which a missing answer stops all further messages: the line has become
-slower than it was."""
+"""Timeout in seconds, beyond the quickest round trip, after which a missing answer stops all further messages: the
+line has become slower."""
 SAMPLES = 20
-"""Answers from which the line's rate is known."""
+"""Number of the last answers from which the line's rate is computed."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Line:
         self._rates: deque[float] = deque(maxlen=SAMPLES)
         self._trip = math.inf
         self.unanswered = 0
-        """Bytes that were sent and that the page has not answered."""
+        """Bytes that were sent and that the page has not acknowledged."""
 
     async def send(self, message: bytes) -> None:
         """Send a message, as soon as there is room for it; ends with `websockets`' error when the page has left."""

@@ -19,7 +19,7 @@ import psutil
 DEFAULT_PORT = 8080
 PORTS_TO_TRY = 100
 LONGEST_PATH = 107
-"""Bytes of the path of a Unix socket (unix(7)); ssh cannot reach a longer one either."""
+"""Maximum length of the path of a Unix socket in bytes (unix(7)); ssh cannot reach a longer one either."""
 BACKLOG = 100
 
 
@@ -33,14 +33,14 @@ class Listening:
 
     socket: socket.socket
     host: str
-    """As a browser needs it: a name or an address, IPv6 in brackets."""
+    """Host in the address that a browser opens: a name or an address, IPv6 in brackets."""
     port: int
-    """As a browser on this machine or behind `ssh_hint` needs it."""
+    """Port in the address that a browser on this machine or behind `ssh_hint` opens."""
     bound_host: str
     loopback: bool
-    """Only this machine can connect."""
+    """Whether only this machine can connect."""
     path: Path | None = None
-    """Of a Unix socket."""
+    """Path of the Unix socket; None for a TCP port."""
     inode: int = 0
 
     @property

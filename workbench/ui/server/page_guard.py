@@ -16,14 +16,14 @@ from workbench.ui.server.client_messages import (
 from workbench.ui.server.strangers import RareLog
 
 RATE = 200.0
-"""Sustained messages a second of a page; a drag sends about twenty."""
+"""Maximum sustained rate of a page in messages a second; a drag sends about twenty."""
 BURST = 400.0
 BYTES_EACH = 2048
 """A message counts once for each block of this many bytes."""
 PATIENCE = 5.0
-"""Seconds for which a page may be slowed down without a pause; then its connection is closed."""
+"""Maximum time in seconds that a page is slowed down without a pause; then its connection is closed."""
 TURN = 16
-"""Messages after which the event loop serves the other pages."""
+"""Number of messages after which the event loop serves the other pages."""
 
 
 class PageGuard:

@@ -33,14 +33,15 @@ SCRIPTS = (
     "curve_clicks.js",
     "view_width.js",
 )
-"""Of ``web_assets/``, run by the page."""
+"""Names of the scripts in ``web_assets/`` that the page runs."""
 STYLES = "panels/page.css"
-"""Of ``web_assets/``. In the page's head: viser removes an HTML element while its panel is folded."""
+"""Style sheet in ``web_assets/``. It goes into the page's head: viser removes an HTML element while its panel is
+folded."""
 
 LONGEST_NAME = 255
-"""Bytes of a file's name, in every usual file system."""
+"""Maximum length of a file's name in bytes, in every usual file system."""
 LONGEST_PATH = 3000
-"""Bytes of a path below a folder."""
+"""Maximum length in bytes of a path below a folder."""
 
 
 def request_parts(request: Request) -> access.RequestParts:
@@ -213,7 +214,8 @@ def content_type(name: str) -> str:
 
 
 def _scripts() -> str:
-    """Scripts in the page that may run. Of a viser whose page is not known any may (`unknown_page_text`)."""
+    """Source list of the scripts that may run in the page. All scripts may run in the page of an unknown viser
+    (`unknown_page_text`)."""
     known = viser_private.page_scripts()
     if known is None:
         return "'unsafe-inline'"
@@ -276,7 +278,8 @@ EVERY_REPLY = {
     + ", clipboard-write=(self), fullscreen=(self)",
     "Connection": "close",
 }
-"""Of refusals too: no guessing of types, no referrer, no framing, opening or embedding by other sites, no devices."""
+"""Headers of every reply, refusals included: no guessing of types, no referrer, no framing, opening or embedding
+by other sites, no devices."""
 PAGE_OF_OURS = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'self'",

@@ -24,11 +24,12 @@ from workbench.machine.text import short_line
 log = logging.getLogger("workbench.door")
 
 PATIENCE = 10.0
-"""Seconds until a connection must have shown the token."""
+"""Timeout in seconds until a connection must have shown the token."""
 MOST = 64
-"""Connections without a token at a time. A browser has about ten to one host."""
+"""Maximum number of connections without a token at a time. A browser has about ten to one host."""
 LONGEST_HEAD = 64 * 1024
-"""Bytes of a request's head. It carries cookies of other programs on the same host name, up to 4 kB each."""
+"""Maximum size of a request's head in bytes. The head carries cookies of other programs on the same host name, up
+to 4 kB each."""
 READ_AT_ONCE = 16 * 1024
 """Bytes. `websockets` parses everything that was read before anything else runs, and a quarter of a megabyte of frames
 of six bytes holds the event loop for a third of a second."""
@@ -135,9 +136,10 @@ def of_peer(peer: str) -> str:
 # --- stalled clients ---------------------------------------------------------------------------------
 
 READ_WITHIN = 30.0
-"""Seconds. A busy page (a large scene drawn by the processor) reads nothing for some seconds."""
+"""Timeout in seconds within which a client must read something. A busy page (a large scene drawn by the processor)
+reads nothing for some seconds."""
 _LOOKS = 30
-"""Number of looks at the unsent bytes in that time."""
+"""Number of checks of the unsent bytes in that time."""
 
 
 def unsent(connection: ServerConnection) -> int:
@@ -186,10 +188,10 @@ async def close_when_stalled(
 PAUSE = 60.0
 """Seconds between two lines of the same kind, at first."""
 LONGEST_PAUSE = 3600.0
-"""Seconds. A tab that was left open reconnects once a second."""
+"""Maximum pause in seconds between two lines of the same kind. A tab that was left open reconnects once a second."""
 MOST_KINDS = 256
 LONGEST_LINE = 300
-"""Characters of a line."""
+"""Maximum length of a line in characters."""
 
 
 class RareLog:

@@ -97,7 +97,7 @@ PRIVATE_ATTRIBUTES = (
 """Attributes of a `viser.ViserServer` that this module relies on."""
 
 STOP_SECONDS = 1.0
-"""Time for a page to answer the closing handshake."""
+"""Timeout in seconds for a page to answer the closing handshake."""
 
 _making = threading.Lock()
 
@@ -176,7 +176,7 @@ def _missing(root: object, dotted: tuple[str, ...]) -> list[str]:
 
 
 def missing_names() -> list[str]:
-    """Those of `PRIVATE_NAMES` that the installed viser does not have."""
+    """Names in `PRIVATE_NAMES` that the installed viser does not have."""
     roots = SimpleNamespace(
         infra=infra,
         messages=viser._messages,
@@ -192,7 +192,7 @@ def page_scripts() -> tuple[str, str] | None:
 
 
 def unknown_page_text() -> str:
-    """What is lost with a viser whose page is not known; empty if it is known."""
+    """Text: what does not work with a viser whose page is not known; empty if it is known."""
     if page_scripts() is not None:
         return ""
     return (

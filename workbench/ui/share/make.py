@@ -47,7 +47,7 @@ from workbench.ui.share.scene_html import seconds_a_step, write_scene_html
 from workbench.ui.widgets.templates import counted, sentence
 
 MOST_SAID = 5
-"""Sentences about recordings that the page shows."""
+"""Maximum number of sentences about recordings that the page shows."""
 EVERY_CAMERA = ""
 
 
@@ -58,17 +58,18 @@ class MakeRequest:
     what: What
     sources: tuple[Source, ...]
     folder: Path
-    """Of the files; for a dataset the folder that it becomes, for ManiSkill's demonstrations their ``.h5``."""
+    """Folder of the files; for a dataset the folder that becomes the dataset, for ManiSkill's demonstrations their
+    ``.h5`` file."""
     camera: str = EVERY_CAMERA
-    """Of a film."""
+    """Camera of a film."""
     eye: FilmEye | None = None
     """The viewpoint of a scene; None: a usual one."""
     export: ExportOptions = ExportOptions()
-    """Of a dataset."""
+    """Options of a dataset."""
 
     @property
     def is_dataset(self) -> bool:
-        """Whether all recordings become one thing."""
+        """Whether all recordings become one dataset."""
         return self.what in ("lerobot", "maniskill")
 
 
@@ -78,7 +79,7 @@ class Made:
 
     paths: tuple[Path, ...]
     words: str
-    """Summary."""
+    """Summary of what was made."""
     left_out: tuple[str, ...] = ()
     """A sentence for each recording that nothing was made of, with its name and the reason."""
     damaged: tuple[str, ...] = ()
@@ -88,7 +89,7 @@ class Made:
 
     @property
     def said(self) -> tuple[str, ...]:
-        """What the page shows of these sentences."""
+        """Sentences that the page shows."""
         said = (*self.damaged, *self.left_out, *self.incomplete)
         more = len(said) - MOST_SAID
         return said[:MOST_SAID] + ((f"And {more} more.",) if more > 0 else ())
@@ -151,7 +152,7 @@ def file_name(what: What, source: str, camera: str = "") -> str:
 
 @contextlib.contextmanager
 def _reading() -> Iterator[None]:
-    """What the system refuses within it is about the recording, and not about the disk that is written to."""
+    """Raise an error of the system within the block as an error of the recording, not of the disk that is written to."""
     try:
         yield
     except OSError as error:
@@ -192,7 +193,7 @@ def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: 
 
 
 def _moved(episode: Episode) -> str:
-    """Which cameras were moved by hand while it was recorded; empty if none."""
+    """Text: which cameras were moved by hand during the recording; empty if none."""
     moved = moved_cameras_text(episode.info.moved_cameras)
     return moved and f"Cameras moved by hand: {moved}"
 
@@ -232,13 +233,13 @@ def _demonstrations(wanted: MakeRequest, on_progress: OnProgress) -> Made:
 
 
 def zip_name(names: Sequence[str]) -> str:
-    """Of the archive of recordings with these names."""
+    """Name of the archive of recordings with these names."""
     return f"{names[0]}.zip" if len(names) == 1 else f"{names[0]}_and_{len(names) - 1}_more.zip"
 
 
 def _zip(wanted: MakeRequest, on_progress: OnProgress) -> Made:
     """The recordings' own files in one archive: unpacked they are recordings again."""
-    # Of several recordings in one file, once.
+    # A file that holds several recordings is taken once.
     files = list(dict.fromkeys(file for source in wanted.sources for file in _files_of(source)))
     # Below what all have in common: recordings in two folders may have the same name.
     root = Path(os.path.commonpath([source.path.parent for source in wanted.sources]))
@@ -267,7 +268,7 @@ def _files_of(source: Source) -> list[Path]:
 
 
 def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:
-    """Progress of one of several."""
+    """Progress callback of one of several recordings."""
     return lambda done, doing: on_progress((number + done) / count, doing)
 
 
@@ -289,7 +290,7 @@ def _counted(
 
 END_SECONDS = 5.0
 SAY_EVERY = 0.1
-"""Seconds. For a sheet of pictures, a message a frame would cost more than the frame."""
+"""Seconds between two progress messages. For a sheet of pictures, a message a frame would cost more than the frame."""
 
 
 @dataclass(frozen=True)
@@ -298,12 +299,12 @@ class MakingView:
 
     running: bool = False
     done: float = 0.0
-    """0..1"""
+    """Part that is done, 0..1."""
     doing: str = ""
     problem: str = ""
     """Why it failed, in a sentence; empty if it succeeded or was stopped."""
     made: tuple[Made, ...] = ()
-    """All that was made so far, newest first."""
+    """Results so far, newest first."""
 
 
 class Making:

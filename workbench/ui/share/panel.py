@@ -61,7 +61,7 @@ WHAT: dict[str, What] = {
 }
 WHEN = "\u2039date and time\u203a"
 DATASETS: tuple[What, ...] = ("lerobot", "maniskill")
-"""One of all recordings, kept in the folder of recordings."""
+"""Kinds for which one dataset is made of all recordings, in the folder of recordings."""
 ALL_CAMERAS = "every camera"
 SHARED = {"the selected recordings": False, "the open recordings": True}
 SUCCESSES_HINT = "Leave out recordings that reach success at no step"
@@ -70,7 +70,7 @@ FITTING_HINT = (
 )
 TASK_HINT = "In words, for policies that take a language instruction; empty: the task's id"
 MOST_SHOWN = 6
-"""Results in the list; the newest."""
+"""Maximum number of results in the list, the newest."""
 MOST_NAMED = 5
 """Recordings and files that are named before they are made; the others are counted."""
 
@@ -81,21 +81,21 @@ class Chosen:
 
     sources: tuple[Source, ...] = ()
     cameras: tuple[str, ...] = ()
-    """Known only for recordings that are open."""
+    """Names of the cameras; known only for open recordings."""
     selected: bool = False
-    """They are those selected in the library."""
+    """Whether they are the recordings selected in the library."""
     in_view: bool = False
-    """It is the one recording in the 3-D view: a film of the view uses the page's viewpoint."""
+    """Whether it is the one recording in the 3-D view: a film of the view uses the page's viewpoint."""
     successes: int | None = None
-    """How many of them reach success at some step; None where it is not known of each."""
+    """Number of recordings that reach success at some step; None where it is not known of each."""
 
 
 @dataclass(frozen=True)
 class ShareChoices:
-    """What a person chose."""
+    """Choices of a person."""
 
     opened: bool = False
-    """The open recordings instead of the selected ones."""
+    """Whether the open recordings are used instead of the selected ones."""
     what: What = "film"
     camera: str = EVERY_CAMERA
     only_successes: bool = True
@@ -200,11 +200,11 @@ class SharePanel:
         self._made.content = self._html(view)
 
     def _camera(self) -> str:
-        """As chosen, if there is one of this name."""
+        """Chosen camera if these recordings have it, else every camera."""
         return self._choices.camera if self._choices.camera in self._chosen.cameras else EVERY_CAMERA
 
     def _only_successes(self) -> bool:
-        """As chosen, unless none of them reaches success."""
+        """Whether only successes are used: as chosen, unless none of the recordings reaches success."""
         return self._choices.only_successes and self._chosen.successes != 0
 
     def _will_make(self) -> dict[str, Any]:
@@ -282,7 +282,7 @@ def will_make(
 
 
 def dataset_name(what: What, when: str) -> str:
-    """Of the folder or file below ``datasets``."""
+    """Name of the folder or file below ``datasets``."""
     return f"lerobot_{when}" if what == "lerobot" else f"demonstrations_{when}.h5"
 
 

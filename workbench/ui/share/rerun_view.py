@@ -29,9 +29,9 @@ from workbench.ui.widgets.visitors import Visitor
 log = logging.getLogger(__name__)
 
 SHARE, LEAST = 0.66, 480
-"""Share of the width between the other panels, and least pixels. The scene and the timeline have the rest."""
+"""Share of the width between the other panels, and minimum width in pixels. The scene and the timeline have the rest."""
 SETTLES = 0.3
-"""Seconds from a page's request for the panel's content until the panel has its place."""
+"""Seconds from a page's request for the panel's content until the panel is placed."""
 Moments = Mapping[Path, int]
 """The step at which each recording is looked at."""
 

@@ -20,10 +20,11 @@ from workbench.ui.server.gated_server import ServerOptions, open_server
 from workbench.ui.widgets.templates import counted, render
 
 TRIANGLES = 80_000
-"""Approximate limit. A robot's own meshes have twice that, and the file would be three times the size."""
+"""Approximate maximum number of triangles. A robot's own meshes have twice that, and the file would be three times
+the size."""
 
 PAUSE = 1.0
-"""Seconds at the end."""
+"""Seconds for which the last state is held."""
 
 
 def write_scene_html(

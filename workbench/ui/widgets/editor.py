@@ -22,14 +22,14 @@ _RUNS_CODE = ("javascript", "vbscript", "data", "blob", "about", "view-source", 
 
 @dataclass(frozen=True)
 class EditorLink:
-    """Where a press on a file's line leads."""
+    """Link to a line of a file."""
 
     address: str
-    """Empty: the file is not linked."""
+    """Address; empty if the file is not linked."""
     copied: str
-    """``/home/me/push.py:88``."""
+    """Text that is copied: ``/home/me/push.py:88``."""
     new_tab: bool = False
-    """The address is a web page: opened in the same tab it would take the place of this one."""
+    """Whether the address is a web page: opened in the same tab it would replace this one."""
 
 
 LinkTo = Callable[[str | None, int | None], EditorLink]

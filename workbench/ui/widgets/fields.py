@@ -13,7 +13,7 @@ from workbench.commands.command import Command, name_of
 from workbench.ui.widgets.templates import render
 
 LONGEST = 4096
-"""Characters."""
+"""Maximum number of characters."""
 Plain = str | float | bool | None
 Look = Literal["text", "choice", "tick", "slider"]
 
@@ -61,7 +61,7 @@ class Field:
         first = value if isinstance(value, (tuple, list)) else (value,)
         number = _number(kind, field, type(first[0])) if look in ("text", "slider") else None
         self._bounds: tuple[float, float] | None = None
-        """Of a slider."""
+        """Bounds of a slider."""
         self._input = server.gui.add_html(
             render(
                 "field",
@@ -115,7 +115,7 @@ class Field:
 
     @property
     def name(self) -> str:
-        """Of its first input, in the page."""
+        """Name of its first input, in the page."""
         return self._names[0]
 
     @property
@@ -189,7 +189,7 @@ def slider(
     given: Mapping[str, Plain] | None = None,
     hint: str = "",
 ) -> Field:
-    """A slider with its number beside it, at its lower end until `Field.show` says otherwise.
+    """A slider with its number next to it, at its lower end until `Field.show` sets a value.
 
     Args:
         bounds: its ends, by default those of the command's field.

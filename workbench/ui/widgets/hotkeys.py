@@ -16,7 +16,7 @@ from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.visitors import Visitors
 
 _LAST = 2e6
-"""viser's order of elements: after all others of the panel."""
+"""Order of the elements in viser's panel: after all others."""
 
 
 def with_key(kind: type[Command], hint: str = "") -> str:

@@ -29,7 +29,7 @@ LONGEST_LEGEND = 10
 
 @dataclass(frozen=True)
 class DepthRange:
-    """Metres at the two ends of the colour scale."""
+    """Depth in metres at the two ends of the colour scale."""
 
     near: float
     far: float

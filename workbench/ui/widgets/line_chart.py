@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from workbench.ui.server.viser_private import send_lines
 
 TAKING_TURNS = 3
-"""Charts, one of them shown. With two, a busy browser may miss that two changes followed each other."""
+"""Number of charts, one of them shown. With two, a busy browser may miss that two changes followed each other."""
 LONGEST = 600
-"""Points of a curve. More do not fit in the panel's 300 pixels."""
+"""Maximum number of points of a curve. More do not fit in the panel's 300 pixels."""
 SELECTED_COLOUR = "#228be6"
 STEP = uplot.Series(label="step")
 """The x axis; the first of every chart's series."""
@@ -25,7 +25,7 @@ CURSOR = uplot.Series(
 
 Span = tuple[float, float]
 YES_OR_NO: Span = (-0.05, 1.05)
-"""The range of a curve that is 0 or 1."""
+"""Range of a curve of 0 and 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class ChartLine:
 
     name: str
     values: NDArray
-    """(K,), with a gap where it is not finite."""
+    """(K,) values, with a gap where one is not finite."""
     colour: str = SELECTED_COLOUR
     width: float = 1.8
 

@@ -1,4 +1,4 @@
-"""Which tab of the main panel each page has open; opens another."""
+"""Keeps which tab of the main panel each page has open, and opens another."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from workbench.ui.widgets.visitors import Visitor, Visitors
 
 
 class OpenTabs:
-    """Which tab is open only the browser knows, which says so where it is asked (``panels.js``)."""
+    """Open tab of each page. Only the browser knows it and reports it when asked (``panels.js``)."""
 
     def __init__(self, visitors: Visitors) -> None:
         self._visitors = visitors
         self._open: dict[str, str] = {}
-        """Name of the tab, by page."""
+        """Name of the open tab, by page."""
         self._opening: dict[str, viser.GuiHtmlHandle] = {}
-        """By page: the element that opened a tab last."""
+        """Element that opened a tab last, by page."""
 
     def pages_at(self, name: str) -> frozenset[int]:
         """The pages that have this tab open, by client id."""
@@ -31,5 +31,5 @@ class OpenTabs:
         self._opening[visitor.name] = visitor.client.gui.add_html(render("open_tab", tab=name, fold=fold))
 
     def said(self, visitor: Visitor, name: str) -> None:
-        """A page says which tab it has open."""
+        """Store the open tab that a page reports."""
         self._open[visitor.name] = name

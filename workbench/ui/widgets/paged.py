@@ -8,7 +8,7 @@ from workbench.commands.command import Command
 
 
 class Paged:
-    """`most` rows at a time."""
+    """A part of a list, `most` rows at a time."""
 
     def __init__(self, most: int) -> None:
         self._most, self.first, self._count = most, 0, 0

@@ -23,26 +23,26 @@ class PagePart(Generic[View]):
     """
 
     every: ClassVar[float] = 0.0
-    """Seconds."""
+    """Minimum seconds between two drawings."""
     does: tuple[type[Command], ...] = ()
-    """What a person can ask this part for."""
+    """Commands that this part carries out."""
     of_the_moment: ClassVar[bool] = False
     """It shows numbers of the shown moment. Such parts are drawn together, from one view: while a task plays, a page whose
     parts are drawn at rates of their own shows several moments at once."""
 
     def key(self, view: View) -> object:
-        """What it shows of the view; equal keys mean equal drawings."""
+        """Key of what it shows of the view; equal keys mean equal drawings."""
         return object()
 
     def urgent(self, view: View) -> object:
-        """What a person waits for; a change is drawn at once."""
+        """Value that a person waits for; a change is drawn at once."""
         return None
 
     def draw(self, view: View) -> None:
         raise NotImplementedError
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        """Do what a page asks for, one of `does`. On any thread. Raises `Refused`."""
+        """Carry out a command in `does`. Runs on any thread. Raises `Refused`."""
         raise NotImplementedError
 
 
@@ -57,7 +57,7 @@ class DrawDue:
     def __init__(self, every: float, clock: Clock = time.monotonic) -> None:
         self._every, self._clock = every, clock
         self._drawn: tuple[object, object, float] | None = None
-        """Key, urgent, and when."""
+        """Key, urgent value and time of the last drawing."""
 
     def drawn(self, key: object, urgent: object = None) -> None:
         """Remember this as drawn."""
@@ -92,11 +92,12 @@ class Parts(Generic[View]):
 
     @property
     def does(self) -> frozenset[type[Command]]:
-        """What a person can ask these parts for."""
+        """Commands that these parts carry out."""
         return frozenset(self._owners)
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        """Let the part do it whose command it is. Raises `Refused`, also for a command that none of them does."""
+        """Let the part carry out the command that has it in `does`. Raises `Refused`, also for a command that no
+        part has."""
         owner = self._owners.get(type(command))
         if owner is None:
             raise Refused(f"Not on this page: {command.help()}.")

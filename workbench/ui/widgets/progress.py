@@ -14,7 +14,7 @@ from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.tools import tool, tools_html
 
 JUST = 1.0
-"""Seconds."""
+"""Seconds for which a result counts as new."""
 
 
 class NewResult:

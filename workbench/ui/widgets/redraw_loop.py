@@ -14,7 +14,7 @@ from workbench.ui.server.viser_private import wait_until_taken
 from workbench.ui.widgets.notices import tell_all
 
 FRAME = 1 / 30
-"""Seconds. More pushes make a browser slower (measured: 350 a second leave it 13 to 30 frames a second)."""
+"""Seconds of a frame. More pushes make a browser slower (measured: 350 a second leave it 13 to 30 frames a second)."""
 SENT_WITHIN = 0.01
 """Seconds of a frame that the 3-D view may wait for the panels to be sent."""
 AGAIN_AFTER = 1.0

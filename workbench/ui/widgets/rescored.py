@@ -21,14 +21,15 @@ from workbench.ui.widgets.tools import tool, tools_html
 from workbench.ui.widgets.visitors import Visitor
 
 MOST_ROWS = 10
-"""Of the list, at a time."""
+"""Maximum number of rows of the list that are shown at a time."""
 RECORD_COLOUR = "#adb5bd"
 View = TypeVar("View")
 Of = TypeVar("Of")
 
 
 class RescoredPanel(PagePart[View], Generic[View, Of]):
-    """Its parts, to be put into the present container in an order of its own; a row of the list goes to its run.
+    """Parts of a rescoring panel, which a subclass puts into the present container in its order; a row of the list goes
+    to its run.
 
     Args:
         server: The page.
@@ -38,13 +39,13 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
     every = 0.25
     does: tuple[type[Command], ...] = (ShowRescored, TurnRescored, StopRescoring)
     advice = ""
-    """A sentence for where the bodies came far from the record."""
+    """Sentence that is shown where bodies were far from the record."""
 
     def __init__(self, server: viser.ViserServer, column: str) -> None:
         self._server, self._column = server, column
         self._listed: Sequence[Verdict[Of]] = ()
         self._failed_since = ""
-        """As the status says it; the rows need not say it again."""
+        """Reason of a failed rescoring, as the status shows it; the rows do not repeat it."""
 
     def _add_status(self, label: str, stop: Callable[[], None]) -> None:
         self._stop_rescoring = stop
@@ -104,15 +105,15 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
                 self._stop_rescoring()
 
     def _key_of(self, verdict: Verdict[Of]) -> str:
-        """What tells its run from the others."""
+        """Key that distinguishes its run from the others."""
         raise NotImplementedError
 
     def _of_row(self, verdict: Verdict[Of]) -> dict[str, Any]:
-        """What the run is called, a hint, and whether it is selected."""
+        """Name of the run, a hint, and whether it is selected."""
         raise NotImplementedError
 
     def _show(self, verdict: Verdict[Of]) -> None:
-        """Go there."""
+        """Show the run."""
         raise NotImplementedError
 
 

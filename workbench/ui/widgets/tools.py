@@ -16,20 +16,20 @@ class Tool:
     name: str
     command: Command
     hint: str = ""
-    """By default the command's help and key."""
+    """Hint; by default the command's help and key."""
     on: bool = False
-    """It is one of several, and the chosen one."""
+    """Whether it is the chosen one of several."""
     off: bool = False
-    """It would do nothing."""
+    """Whether it is disabled because it would do nothing."""
     style: Literal["button", "pill"] = "button"
     tone: Literal["", "main", "danger"] = ""
-    """Of what is done most, and of what cannot be undone."""
+    """Tone: ``main`` for the most frequent action, ``danger`` for one that cannot be undone."""
     is_label: bool = False
 
 
 @dataclass(frozen=True)
 class Label:
-    """What the tools after it are about."""
+    """Label of the tools after it."""
 
     name: str
     hint: str

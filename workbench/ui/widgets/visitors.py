@@ -1,4 +1,4 @@
-"""The open pages, and what they ask for: numbered commands on a WebSocket of ours, in order, one reply each."""
+"""The open pages, and their numbered commands on a WebSocket of ours: in order, one reply each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 PATH = "/do"
 TOLD_SECONDS = 8.0
-"""How long a refusal is shown."""
+"""Seconds for which a refusal is shown."""
 
 
 class Message(msgspec.Struct, forbid_unknown_fields=True):
@@ -46,19 +46,20 @@ class Visitor:
     """One open page: a browser's tab."""
 
     name: str
-    """Random, and told to the page only."""
+    """Random name, sent to the page only."""
     client: viser.ClientHandle
     page_width: int = 0
-    """Pixels of CSS when it connected last; 0 before."""
+    """Width of the page in CSS pixels when it connected last; 0 before."""
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
-    """Held while a command of this page is done: they are done in the order in which they came."""
+    """Lock that is held while a command of this page is carried out: commands are carried out in the order in
+    which they came."""
 
     def tell(self, text: str, title: str = "Not possible") -> None:
         self.client.add_notification(title, text, color="orange", auto_close_seconds=TOLD_SECONDS)
 
 
 Do = Callable[[Command, Visitor], None]
-"""Does what a page asks for, on any thread. Raises `Refused` with a sentence for the person."""
+"""Carries out a command of a page, on any thread. Raises `Refused` with a sentence for the person."""
 
 
 class Visitors:
