@@ -50,7 +50,7 @@ NEW_ENVS = 4
 
 
 _LOOK = 0.05
-"""Seconds between two looks whether a live env is there."""
+"""Seconds between two checks whether a live env exists."""
 MakeSession = Callable[[TaskName, TaskOptions], Session]
 
 
@@ -63,12 +63,12 @@ class _Way:
     state: int
     given_up: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
-    """Waits for the consent to run the code."""
+    """Thread that waits for the consent to run the code."""
     number: int = 0
-    """`TimelineView.entered` when the env has the recorded state."""
+    """Value of `TimelineView.entered` once the env has the recorded state."""
     problems: int = 0
     session: Session | None = None
-    """Gets the recorded state; None until the consent is given. Set last."""
+    """Session that gets the recorded state; None until the consent is given. Set last."""
 
     def is_over(self) -> bool:
         """Whether to show the live page now: the state is there, the task failed, or it may have to be interrupted."""
@@ -80,7 +80,7 @@ class _Way:
         return arrived or failed or is_busy_for_long(view)
 
     def words(self) -> str:
-        """What it waits for, for the page."""
+        """Text for the page: what the transition waits for."""
         task = self.info.task
         if self.session is None:
             return f"waiting for permission to run the code of {task}"
@@ -203,22 +203,22 @@ class GoLive:
             way.given_up.set()
 
     def going(self) -> str:
-        """What the transition waits for; empty while there is none."""
+        """Text: what the transition waits for; empty without a transition."""
         way = self._way
         return "" if way is None else way.words()
 
     def review_is_back(self) -> None:
-        """The review page is shown again: forget a transition that waits for no consent."""
+        """Forget a transition that waits for no consent, because the review page is shown again."""
         if self._way is not None and self._way.session is not None:
             self._way = None
 
     def can_go_home(self) -> bool:
-        """Whether the live session is one that was opened here."""
+        """Whether the live session was opened here."""
         home = self._place.home
         return home is not None and self._place.session is not home
 
     def go_home(self) -> None:
-        """Return to the session that a person opened; the other ends."""
+        """Return to the session that a person opened; the other session ends."""
         if self._place.home is None:
             return
         self._place.session = self._place.home
@@ -227,7 +227,7 @@ class GoLive:
             self._let_go()
 
     def let_go(self) -> None:
-        """Give up a transition, and end a session that was opened here: a person opens another task."""
+        """Give up a transition, and end a session that was opened here, because a person opens another task."""
         self._give_up()
         with self._lock:
             self._let_go()
@@ -273,7 +273,7 @@ class GoLivePart(PagePart[ReviewView]):
         self._go_live = go_live
         go_live.review_is_back()
         self._about: object = None
-        """The recording and the code that the note below the code is about."""
+        """Recording and code that the note below the choice of code is about."""
         gui = server.gui
         self._folder = gui.add_folder("Continue live", expand_by_default=False, visible=False)
         with self._folder:

@@ -28,7 +28,7 @@ HEADERS = {
     "Cache-Control": "no-cache",
 }
 _BEGINNING = 1000
-"""Characters of a page that say what it is about."""
+"""Number of characters of a page that say what the page is about."""
 _LITTLE_WORDS = frozenset("a an and for how i in is it my of on or the to with your".split())
 OVERVIEW = "overview"
 """The topic that is README."""
@@ -38,7 +38,7 @@ GROUPS = (
     ("reference", "Look something up"),
     ("developers", "Change the workbench"),
 )
-"""Folders of the documents, and what a reader wants who looks there."""
+"""Folders of the documents, and what a reader who opens the folder wants."""
 RULE_PAGES = "rules"
 """Folder with a page for each rule of `checks`. They are no list to read: the topic ``rules`` has them in a table."""
 FIRST = (
@@ -90,7 +90,7 @@ def topics() -> tuple[Topic, ...]:
 
 
 def _overview_file(folder: Path) -> Path:
-    """README lies in the folder in a wheel, and beside it in a checkout."""
+    """Path of README: in the folder in a wheel, next to the folder in a checkout."""
     inside = folder / "README.md"
     return inside if inside.is_file() else folder.parent / "README.md"
 

@@ -93,16 +93,16 @@ DOES: frozenset[type[Command]] = frozenset(
         *CamerasPanel.does,
     }
 )
-"""What the page itself does; the rest is done by its parts."""
+"""Commands that the page itself carries out; its parts carry out the others."""
 PANELS_EVERY = 0.06
-"""Seconds between two drawings of the panels while the envs play, every second frame: faster, nobody reads numbers."""
+"""Seconds between two drawings of the panels while the envs play, every second frame; numbers cannot be read faster."""
 PICTURES_HINT = (
     "Exact ones are SAPIEN's own; fast ones take a fraction of the time without a graphics card, of simplified meshes. "
     "Auto: fast while something moves, exact when it stands still. What this page records is exact."
 )
 PANEL_WIDTH = 372
 ENVS_WIDTHS = 220, 640
-"""Pixels of the table of envs, at least and at most; the view keeps half of the page."""
+"""Minimum and maximum width in pixels of the table of envs; the view keeps half of the page."""
 
 
 class Page:
@@ -259,7 +259,7 @@ class Page:
         self._env_window.minimize()
         self._envs_open = False
         self._envs_fitted = 0
-        """Width of the page for which the table got its width."""
+        """Width of the page in pixels for which the width of the table was set last."""
 
     # --- start and stop --------------------------------------------------------------------------
 
@@ -278,7 +278,8 @@ class Page:
         return self._view_panel.dark
 
     def redraw(self) -> None:
-        """Draw the present state of the session; where only steps go on, the panels less often than the view."""
+        """Draw the present state of the session; where only steps advance, the panels are drawn less often than
+        the view."""
         view = self._session.view()
         panels = (lambda: self._draw_panels(view)) if self._panels_due.is_due(*_shown_of(view)) else None
         draw_apart(self._server, panels, lambda: self._draw_scene(view))
@@ -291,7 +292,7 @@ class Page:
     # --- what a person does ----------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        """Do what a page asks for. Raises `Refused`."""
+        """Carry out a command of a page. Raises `Refused`."""
         session = self._session
         match command:
             case ShowRecordings():
@@ -339,7 +340,7 @@ class Page:
                 self._parts.do(command, visitor)
 
     def _unfolded(self, panel: str) -> None:
-        """A page shows this panel."""
+        """Handle that a page shows this panel."""
         if panel == ENVS:
             self._fit_envs()
             self._envs.unfold()
@@ -349,7 +350,7 @@ class Page:
             self._inspect.unfold()
 
     def _fit_envs(self) -> None:
-        """Give the table the width of its columns, once for each width of the page: a person may have dragged its edge."""
+        """Set the table's width to that of its columns, once for each page width: a person may have dragged its edge."""
         wanted = self._envs.wanted_width()
         page = min((visitor.page_width for visitor in self._visitors.all() if visitor.page_width), default=0)
         if page in (0, self._envs_fitted) or not wanted:
@@ -459,7 +460,7 @@ class Page:
 
 
 def _shown_of(view: SessionView) -> tuple[object, object]:
-    """What the panels show, and what of it a person waits for, as `DrawDue` takes them."""
+    """Keys of what the panels show and of what a person waits for in it, as `DrawDue` takes them."""
     steps_go_on = view.playing and view.state == "running" and view.timeline.shown is None
     waited_for = (
         view.settings,

@@ -30,12 +30,12 @@ OpenSession = Callable[[TaskName, TaskOptions, KeptWork | None], Session]
 
 @dataclass(frozen=True)
 class Choices:
-    """What the list of tasks offers beside what is found, and how a chosen task is opened."""
+    """Content of the list of tasks in addition to the tasks that are found, and how a chosen task is opened."""
 
     recents: RecentTasks
     open_session: OpenSession
     options: TaskOptions
-    """For tasks without options of their own."""
+    """Options of tasks without options of their own."""
 
 
 _SHOWN_WITHIN = 10.0
@@ -66,9 +66,9 @@ class OpenTask:
         self._doing = ""
         self._closing = False
         self._ran: set[str] = set()
-        """References that were open in this run: going back to one asks nothing."""
+        """References of tasks that were open in this run; opening one again asks for no consent."""
         self._kept: dict[str, KeptWork] = {}
-        """By `lasting` reference: what was done in sessions of this run."""
+        """Work kept of sessions of this run, by `lasting` reference."""
         self._thread = watched_thread("open-task", self._serve)
         self._thread.start()
 
@@ -90,7 +90,7 @@ class OpenTask:
         self._want(self.catalogue.add_file(made.file, made.env_id))
 
     def doing(self) -> str:
-        """What it is doing, for the page; empty if nothing."""
+        """Text for the page: what is being done; empty if nothing."""
         return self._doing
 
     def is_open(self, entry: Entry) -> bool:

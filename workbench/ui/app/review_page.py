@@ -57,22 +57,23 @@ if TYPE_CHECKING:
     from workbench.ui.app.workplace import Workplace
 
 TOLD_EVERY = 0.1
-"""Seconds between two drawings of the panels while it plays. Faster, numbers cannot be read."""
+"""Seconds between two drawings of the panels while a recording plays; numbers cannot be read faster."""
 SWEEP_EVERY = 1.0
-"""Seconds between two looks for the results of a sweep."""
+"""Seconds between two checks for the results of a sweep."""
 PANEL_WIDTH = 340
 LIBRARY_WIDTH = 520
 LEAST_VIEW = 240
-"""Least pixels of the view between the library and another panel."""
+"""Minimum width in pixels of the view between the library and another panel."""
 LEAST_BESIDE_SWEEP = 400
-"""Least pixels of the view in which an episode of a sweep is watched beside its table; the timeline needs most of it."""
+"""Minimum width in pixels of the view in which an episode of a sweep is watched next to its table; the timeline
+needs most of it."""
 NARROW = 700
 """Pixels of the view next to the library; below this there is no room for both."""
 TOLD_WIDTH = 20.0
 """Seconds within which a page reports the new width of its view."""
 BACK = "Back to the live env"
 LIBRARY = "library"
-"""The panel, as a page tells that it was unfolded."""
+"""Name of the panel in the page's report that the panel was unfolded."""
 DOES: frozenset[type[Command]] = frozenset(
     {
         ShowLive,
@@ -87,7 +88,7 @@ DOES: frozenset[type[Command]] = frozenset(
         *CamerasPanel.does,
     }
 )
-"""What the page itself does; the rest is done by its parts."""
+"""Commands that the page itself carries out; its parts carry out the others."""
 
 
 class ReviewPage:
@@ -109,12 +110,12 @@ class ReviewPage:
         self._pictures_serial = 0
         self._had_opened = tuple(one.id for one in review.view().opened)
         self._awaited: tuple[str, ...] = ()
-        """The newest recording, until it is open."""
+        """Ids of the newest recording until it is open."""
         self._fold_other: Callable[[bool], None] = lambda folded: None
         """Folds and unfolds rerun's panel."""
         self._other_folded = False
         self._unfolded = "", 0.0
-        """Which of the two panels was unfolded last, and when, until the width was checked."""
+        """Name of the panel (library or rerun) that was unfolded last, and when, until the width was checked."""
         self._told = DrawDue(TOLD_EVERY, clock)
         self._looked = DrawDue(SWEEP_EVERY, clock)
         self._framing = place.stage.framing
@@ -353,7 +354,7 @@ class ReviewPage:
                 self._fold_other(False)
 
     def _panel_unfolded(self, panel: str) -> None:
-        """A page shows this panel."""
+        """Handle that a page shows this panel."""
         if panel == LIBRARY:
             self._library_open = True
         self._unfolded = panel, self._clock()
@@ -415,7 +416,7 @@ class ReviewPage:
     # --- what a person does ------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        """Do what a page asks for. Raises `Refused`."""
+        """Carry out a command of a page. Raises `Refused`."""
         match command:
             case ShowLive():
                 if self._place.session is None:

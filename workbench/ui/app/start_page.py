@@ -50,7 +50,7 @@ class StartPage:
         register(server, place.visitors, kinds, "start page")
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        """Do what a page asks for. Raises `Refused`."""
+        """Carry out a command of a page. Raises `Refused`."""
         match command:
             case ShowRecordings():
                 self._place.pages.show("review")

@@ -23,7 +23,8 @@ DO_NOT, ONCE, ALWAYS = (
     "Run it, and don't ask again unless it changes",
 )
 MOST_OF_ONE, MOST_OF_ALL = 200_000, 1_000_000
-"""Characters of one text, and of all texts, that go to the page; it says how much is left out."""
+"""Maximum number of characters of one text, and of all texts, that go to the page; the page says how much is left
+out."""
 _LOOK = 0.1
 """Seconds between two checks whether the answer is still wanted."""
 
@@ -47,7 +48,7 @@ class TrustDialog:
         self._server = server
         self._lock = threading.RLock()
         self._waiting: list[_Pending] = []
-        """The first is shown."""
+        """Pending questions; the first is shown."""
         self._window: Dialog | None = None
         self._closed = False
 

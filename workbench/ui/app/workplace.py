@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ENOUGH_MEMORY = 4 << 30
-"""Bytes that must be free for pictures of tasks to be drawn beside an open one."""
+"""Minimum free memory in bytes for drawing pictures of tasks while a task is open."""
 
 Which = Literal["start", "live", "review"]
 
@@ -99,12 +99,12 @@ class Workplace:
         self.visitors.do = self._do
         gated_server.add_channel(PATH, self.visitors.serve)
         self.session = session
-        """Shown by the live page when it is next built."""
+        """Session that the live page shows when it is next built."""
         self.home = session
         """The session that a person opened, by command or from the list. `session` is another one while a recording of
         another task is continued."""
         self.newest_opened = False
-        """The review has begun with the newest recording; it does so once."""
+        """Whether the review has opened the newest recording; it does so once."""
         self.wanted: Path | None = None
         """A file of the recording that a person wants to look at, until the review has opened it."""
         self.dialog = TrustDialog(self.server)
@@ -143,7 +143,7 @@ class Workplace:
 
     @property
     def does(self) -> frozenset[type[Command]]:
-        """What is done whichever page is shown."""
+        """Commands that are carried out whichever page is shown."""
         return frozenset({OpenHelp} if self.renew_token is None else {OpenHelp, RenewToken})
 
     def _do(self, command: Command, visitor: Visitor) -> None:
@@ -182,7 +182,7 @@ class Workplace:
         return tuple(file.absolute() for file in (*live, *self._tasks))
 
     def is_idle(self) -> bool:
-        """Whether the machine may be used for something else than an open task."""
+        """Whether the machine is free for other work than an open task."""
         session = self.session
         if session is None:
             return True
@@ -280,7 +280,7 @@ class Pages:
             anew: build it also if it is shown: it has another session.
         """
         with self._wake:
-            # Until it is built, a page that has to be made anew has to be.
+            # A requested rebuild stays requested until the page is built.
             self._wish, self._anew = which, anew or (self._anew and self._wish == which)
             self._wake.notify_all()
 
@@ -295,7 +295,7 @@ class Pages:
             return self._wake.wait_for(lambda: self._wish is None and not self._building, timeout)
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        """Let the page that is shown do it."""
+        """Let the page that is shown carry out a command."""
         page = self._page
         if page is None:
             raise Refused("Nothing is shown yet.")

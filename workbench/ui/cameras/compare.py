@@ -44,7 +44,7 @@ class CameraCompare(PagePart[SessionView]):
         self._kept: dict[CameraKey, CameraSettings] = {}
         self._in_file: dict[CameraKey, CameraSettings] = {}
         self._before: dict[CameraKey, CameraSettings] = {}
-        """As the file placed it before the newest change of that."""
+        """Placement of a camera in the file before its newest change there, by camera."""
         self._asked: tuple[CameraKey, CameraSettings, CameraSettings, str] | None = None
         self._other: Other = "file"
         with server.gui.add_folder("Compare", expand_by_default=False) as self.folder:

@@ -49,7 +49,7 @@ DIRECTIONS: dict[str, Direction] = {
 }
 FORMS: dict[str, Form] = {"JSON": "json", "OpenCV YAML": "opencv", "ROS CameraInfo": "ros"}
 UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
-"""Metres in one of each: calibrations are often in the unit of the calibration board."""
+"""Length in metres of each unit: calibrations are often in the unit of the calibration board."""
 WHICH = {"this camera": False, "all cameras": True}
 CONVENTION_HINT = "The convention of the camera's own axes, for what is shown and what is pasted."
 DIRECTION_HINT = "OpenCV's extrinsic maps world to camera; a pose maps camera to world."

@@ -59,7 +59,7 @@ RPY, WXYZ, AXES = ROTATIONS = get_args(RotationForm)
 FOV, INTRINSIC = LENSES = get_args(LensForm)
 XYZ, ANGLES = get_args(Axis), get_args(Angle)
 UNIT, DEGREES, QUATERNION, PIXELS = 4, 2, 6, 2
-"""Digits of the shown numbers."""
+"""Number of digits of the shown numbers, by kind."""
 GOES_ALONG = "The target moves with the position. To keep it fixed, set Handles to eye and target."
 STAYS = "Each moves alone: the camera keeps looking at its target."
 SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")

@@ -20,12 +20,12 @@ CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 )
 LARGEST_IMAGE = 128
-"""Pixels along the longer side of the picture on a frustum."""
+"""Maximum size in pixels of the longer side of the picture on a frustum."""
 SMALL, LARGE = 0.07, 0.14
-"""Depth of a frustum, metres: small for one env, larger for a view of the whole grid."""
+"""Depth in metres of a frustum: small for one env, large for a view of the whole grid."""
 COLOURS: dict[CameraKind, tuple[int, int, int]] = {"sensor": (245, 159, 0), "human": (132, 94, 247)}
 THIN, THICK = 2.0, 4.0
-"""Pixels of a frustum's lines; the chosen one's are thick."""
+"""Width in pixels of a frustum's lines; the chosen frustum's lines are thick."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class PlacedFrustum:
     """A camera that is being placed: drawn at its present place, which its newest picture may not have yet."""
 
     pose: NDArray[np.float64]
-    """(7,) in the view."""
+    """(7,) pose in the view."""
     settings: CameraSettings
     hidden: bool = False
-    """A page looks through it, and would see nothing but its picture."""
+    """Whether a page looks through the camera, and would see nothing but the camera's picture."""
 
 
 class CameraFrustums:

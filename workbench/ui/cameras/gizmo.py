@@ -32,7 +32,7 @@ from workbench.ui.scene.viewpoint import USUAL_ASPECT
 from workbench.ui.widgets.notices import refusals_told
 
 LEFT_ALONE = 60.0
-"""Seconds without a movement until a gizmo that was never released (its page was closed) is free again."""
+"""Seconds without a movement after which a gizmo is free that was never released (its page was closed)."""
 PIXELS = 76.0
 TARGET_PIXELS = 44.0
 """Sizes of the gizmos on the screen."""
@@ -42,15 +42,15 @@ UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """A camera as it was when a gizmo was taken: until it is released, all is one step of undo."""
+    """State of a camera when a gizmo was taken. All movements until the release are one step of undo."""
 
     key: CameraKey
     settings: CameraSettings
     frame: Frame
     pose: Floats
-    """(7,) in the view."""
+    """(7,) pose in the view."""
     target: Floats
-    """(3,) in the view."""
+    """(3,) target in the view."""
 
 
 class CameraGizmo:
@@ -144,7 +144,7 @@ class CameraGizmo:
         return True
 
     def _went_on(self, phase: str) -> _Taken | None:
-        """The camera as it was taken, for an update of a drag; else None."""
+        """State of the camera when the gizmo was taken, for an update of a drag; else None."""
         self._held_at = time.monotonic()
         if (phase == "start" or self._start is None) and not self._take():
             return None

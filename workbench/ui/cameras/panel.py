@@ -39,9 +39,9 @@ PICTURE_PERIOD = 1 / 15
 """Seconds between two pictures of one camera. A picture that is replaced before the browser has loaded it is never seen
 (measured: at 1,000 a second the page shows one in five seconds)."""
 SHOWN_WIDTH = 400
-"""Pixels; a panel is some 340 wide."""
+"""Width in pixels of a shown picture; a panel is some 340 wide."""
 FOLLOWS = 0.4
-"""Seconds within which a picture follows another."""
+"""Seconds within which a picture counts as following another."""
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "human view"}
 
 
@@ -62,7 +62,7 @@ class CameraImage:
         self._handle: viser.GuiImageHandle | None = None
         self._drawn_at = -math.inf
         self._whole: tuple[str, NDArray[np.uint8]] | None = None
-        """What is shown smaller than it is."""
+        """Picture in full size, where it is shown smaller."""
 
     @property
     def visible(self) -> bool:
@@ -106,11 +106,11 @@ class _Camera:
     drawn: tuple[Picture, tuple[str, ...]] | None = None
     """The picture and the modalities that its images show."""
     stale: bool = False
-    """Whether its pictures are marked as of another moment."""
+    """Whether its pictures are marked as pictures of another moment."""
     failed: str = ""
-    """Why it cannot be drawn."""
+    """Reason why it cannot be drawn."""
     hidden: tuple[str, ...] = ()
-    """What the task hides from it."""
+    """Names of objects that the task hides from the camera."""
 
 
 class CamerasPanel:
@@ -140,7 +140,7 @@ class CamerasPanel:
         self._server, self._ask_for, self._clock = server, ask, clock
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._ticked: dict[tuple[CameraKind, str, str], bool] = {}
-        """Of each modality of each camera, also of those that are gone and may come back."""
+        """Whether each modality of each camera is ticked; cameras that are gone are kept, since they may come back."""
         self._cameras_serial = -1
         self._due = DrawDue(PICTURE_PERIOD, clock)
         self._asked: tuple[CameraRequest, ...] | None = None
@@ -398,7 +398,7 @@ def facts(camera: _Camera) -> str:
 
 MARK_COLOUR = (230, 73, 128)
 MARK_SIZE = 0.05
-"""Metres from the point to each end of its cross."""
+"""Distance in metres from the point to each end of its cross."""
 
 
 class CameraPick:
@@ -454,7 +454,7 @@ class CameraPick:
 
 
 def picked_here(view: SessionView) -> PickedPixel | None:
-    """The pick, if it is of the selected camera and env."""
+    """The pick, if it belongs to the selected camera and env."""
     picked = view.studio.results.picked
     if picked is None or picked.key != view.studio.selected or picked.env != view.selected_env:
         return None

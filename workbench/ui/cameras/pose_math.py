@@ -35,7 +35,7 @@ from workbench.session.live.session import Session
 Floats = NDArray[np.float64]
 
 SAME = 1e-7
-"""Metres, and parts of a unit quaternion: rounding of viser's 32 bit numbers."""
+"""Tolerance, in metres and for the parts of a unit quaternion: rounding of viser's 32 bit numbers."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Frame:
     """The frame of a camera's numbers (its mount's, or the env's), as seen in the 3D view."""
 
     mount: NDArray[np.float32] | None
-    """(7,) of its link, in the env's frame; None for a camera that is not mounted."""
+    """(7,) pose of the link of the camera, in the env's frame; None for a camera that is not mounted."""
     offset: NDArray[np.float32]
-    """(3,) of its env in the view."""
+    """(3,) offset of the env in the view."""
 
     def to_view(self, settings: CameraSettings) -> Floats:
         """(7,) pose of the camera in the view."""

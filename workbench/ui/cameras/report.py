@@ -46,7 +46,7 @@ OVER_HINT = (
 )
 STEPS_HINT = "The most steps of the episode to measure, evenly spaced: each takes a few pictures."
 MOST_PICTURES = 64
-"""Pictures on the sheet, worst first."""
+"""Maximum number of pictures on the sheet, worst first."""
 THUMBNAIL = 128
 """Pixels along the longer side of a picture on the sheet."""
 
@@ -252,7 +252,7 @@ class CameraReportPanel(PagePart[SessionView]):
 # worst object.
 
 MOSTLY_HIDDEN = 0.1
-"""Least hidden share of an object that is reported."""
+"""Minimum hidden share of an object that is reported."""
 SMALL = 30.0
 """Pixels below which an object counts as small."""
 
@@ -262,7 +262,7 @@ class Histogram:
     """Bars of equal width over logarithmic depth; metres at both ends."""
 
     bars: tuple[tuple[float, bool], ...]
-    """Height in 0..1 of the highest, and whether the bar lies behind every object."""
+    """Height of each bar as a share of the highest, and whether the bar lies behind every object."""
     low: float
     high: float
     near: float | None
@@ -283,7 +283,7 @@ def percent(share: float) -> str:
 
 
 def metres(value: float) -> str:
-    """To three digits."""
+    """Text of a length in metres, to three digits."""
     return f"{value:.3g} m"
 
 

@@ -67,9 +67,9 @@ SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 
 SCALES = {"full": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
 TAB = "Studio"
 STEP = 0.01
-"""Metres by which a key moves the camera."""
+"""Distance in metres that a key moves the camera."""
 TURN = 1.0
-"""Degrees by which a key turns it."""
+"""Angle in degrees that a key turns the camera."""
 MOVES: dict[type[Command], tuple[float, float, float]] = {
     MoveCameraLeft: (0, STEP, 0),
     MoveCameraRight: (0, -STEP, 0),
@@ -78,14 +78,14 @@ MOVES: dict[type[Command], tuple[float, float, float]] = {
     MoveCameraForward: (STEP, 0, 0),
     MoveCameraBack: (-STEP, 0, 0),
 }
-"""Forward, left and up in the camera's own frame."""
+"""Direction (forward, left, up) of each command, in the camera's own frame."""
 TURNS: dict[type[Command], tuple[float, float]] = {
     TurnCameraLeft: (TURN, 0),
     TurnCameraRight: (-TURN, 0),
     TurnCameraUp: (0, TURN),
     TurnCameraDown: (0, -TURN),
 }
-"""Left and up."""
+"""Turn (left, up) of each command."""
 VIEW = "Envs in the 3D view (O). With one alone the handles are large."
 HANDLES = (
     "pose: move or rotate the camera; its target moves with it.\n"
@@ -144,7 +144,7 @@ class StudioPanel(PagePart[SessionView]):
         self._placing = Placing(session)
         self._in_its_eye = False
         self._is_empty = False
-        """No camera is chosen, and everything below the choice is hidden."""
+        """Whether no camera is chosen and everything below the choice is hidden."""
         self._look_at, self._own_axes, self._snap = False, False, "none"
         gui = server.gui
         above = gui.add_folder(None)
@@ -461,7 +461,8 @@ def _placed(camera: StudioCamera) -> CameraSettings:
 
 
 def _took(camera: StudioCamera, view: SessionView) -> str:
-    """Of the camera's picture: how it is drawn, and how long that took; empty for one of another size than the camera's."""
+    """How the camera's picture is drawn, and how long that took; empty where the preview has another size than the
+    camera."""
     picture = view.pictures.get(camera.key)
     if picture is None or picture.degree is None or view.studio.preview_scale != 1.0:
         return ""

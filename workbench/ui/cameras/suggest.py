@@ -36,11 +36,12 @@ from workbench.ui.widgets.tools import tool, tools_html
 from workbench.ui.widgets.visitors import Visitor
 
 ROOM, ROOM_ON_MOUNT = 0.3, 0.1
-"""Metres from the eye to each side of the first box; less for a camera on a body, which has to carry it."""
+"""Distance in metres from the eye to each side of the first box; smaller for a camera on a body, which has to
+carry it."""
 MOST_LINKS = 12
-"""An articulation with more links offers none of them alone."""
+"""Maximum number of links of an articulation for which each link is offered alone."""
 OF_THE_ROBOT = 4
-"""Links of a robot that are offered at first, its hand's; the others on demand."""
+"""Number of a robot's links that are offered at first, those of its hand; the others are offered on demand."""
 LARGEST = 160
 ALIKE = 0.995
 """Scores of at least this are shown as 1.00."""
@@ -60,7 +61,7 @@ class VisibleObject:
     name: str
     label: str
     first: bool
-    """Chosen by default."""
+    """Whether it is chosen by default."""
     robot: str = ""
     """The robot that it is a link of; empty for the task's objects."""
 
@@ -85,9 +86,9 @@ class CameraSuggest(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._wanted: dict[CameraKey, frozenset[str]] = {}
-        """Names of the objects that must be visible, of cameras for which they were chosen."""
+        """Names of the objects that each camera must see, for cameras for which a person chose them."""
         self._boxes: dict[CameraKey, Box] = {}
-        """The bounds, of cameras for which they were written."""
+        """Bounds of each camera, for cameras for which a person wrote them."""
         self._all_links, self._draws_box, self._resets = False, False, 8
         self._drawn_names: object = None
         gui = server.gui
@@ -161,7 +162,7 @@ class CameraSuggest(PagePart[SessionView]):
         return by_default if key is None else self._wanted.get(key, by_default)
 
     def _box_of(self, camera: StudioCamera, now: CameraSettings) -> Box:
-        """As it was written, or else around the eye."""
+        """Bounds that a person wrote for this camera, or else a box around its eye."""
         room = ROOM if camera.info.mount is None else ROOM_ON_MOUNT
         low, high = (np.round(np.add(now.position, by), 2) for by in (-room, room))
         return self._boxes.get(camera.key, (triple(low), triple(high)))
@@ -253,12 +254,12 @@ class CameraSuggest(PagePart[SessionView]):
 
 
 def ordered(box: Box) -> Box:
-    """Its lowest and its highest corner."""
+    """The box as its lowest and its highest corner."""
     return triple(np.minimum(*box)), triple(np.maximum(*box))
 
 
 def choices_in(view: SessionView) -> tuple[VisibleObject, ...]:
-    """What the chosen camera can be asked to see."""
+    """Objects that the chosen camera can be asked to see."""
     key = view.studio.selected
     return () if view.task is None or key is None else choices_of(view.task, key[0])
 

@@ -203,7 +203,7 @@ class WriteToFile(PagePart[SessionView]):
         gui, folder = server.gui, session.studio.file.folder
         self._name = ""
         self._named: EditState | None = None
-        """The last change after which the field for a name was emptied."""
+        """Last change after which the field for a name was emptied."""
         with above:
             self._plan = gui.add_html("", visible=False)
             self._change = CameraChange(server, folder)
@@ -339,11 +339,11 @@ def free_name(studio: StudioView, kind: CameraKind, like: str) -> str:
 # fill the picture; if the view is from about there, the eye is the page's viewpoint.
 
 AROUND = 0.1
-"""Metres of room around the origins of the objects."""
+"""Margin in metres around the origins of the objects."""
 ROOM = 1.25
 """Factor on the distance at which the objects just fill the picture."""
 NEAREST = 0.6
-"""Least metres: a hand that reaches for one small object has to be in the picture too."""
+"""Minimum distance in metres: a hand that reaches for one small object has to be in the picture too."""
 NEAR_ENOUGH = 1.5
 """Factor on the wanted distance up to which the page's viewpoint is kept."""
 NEAREST_TARGET = 0.1

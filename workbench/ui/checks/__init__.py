@@ -1,1 +1,1 @@
-"""The Checks tab: rules that the task breaks, and where a step goes."""
+"""The Checks tab: rules that the task breaks, and the time of each part of a step."""

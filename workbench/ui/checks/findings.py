@@ -1,4 +1,4 @@
-"""What the Checks tab lists: findings of the checks and those seen while playing, a card a rule."""
+"""Content of the Checks tab: findings of the checks and of playing, one card for each rule."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workbench.ui.checks.rule_pages import RulePage, rule_page
 _SUMMED: tuple[State, ...] = ("kept", "silenced", "not_known", "not_applicable", "failed")
 _UNDECIDED: tuple[State, ...] = ("not_known", "not_applicable")
 MOST_SHOWN = 5
-"""Findings of one rule."""
+"""Maximum number of findings of one rule that are shown."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Row:
 
     finding: Finding
     played: str = ""
-    """How often it was seen while playing; empty for a finding of the checks alone."""
+    """Count of the times that it was seen while playing, as text; empty for a finding of the checks alone."""
     old: bool = False
-    """Of an earlier version: its rule is not checked anew."""
+    """Whether the finding is of an earlier version and its rule is not checked again yet."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Card:
 
 
 def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
-    """What stops first, then what warns, then findings of an earlier version.
+    """Cards by degree, ``stop`` first, then ``warn``, then the findings of an earlier version.
 
     Args:
         played: what was found while playing.
@@ -78,7 +78,8 @@ def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
 
 
 def _same(finding: Finding, rows: Sequence[Row]) -> int | None:
-    """The row that tells the same: an outlier is seen at its hook while playing, and at its line by the checks."""
+    """Index of the row with the same finding: an outlier is seen at its hook while playing, and at its line by the
+    checks."""
     of_rule = [place for place, row in enumerate(rows) if row.finding.rule == finding.rule]
     alike = [place for place in of_rule if rows[place].finding.key == finding.key]
     if not alike and finding.rule in OUTLIER_RULES:
@@ -87,7 +88,7 @@ def _same(finding: Finding, rows: Sequence[Row]) -> int | None:
 
 
 def count(shown: Iterable[Card]) -> int:
-    """How many findings there are; those of an earlier version count until their rule is checked anew."""
+    """Number of findings; findings of an earlier version count until their rule is checked again."""
     return sum(len(card.rows) for card in shown)
 
 
@@ -99,10 +100,10 @@ def without_finding(checks: ChecksView, shown: list[Card]) -> list[RuleResult]:
 
 @dataclass(frozen=True)
 class Undecided:
-    """Rules that came to the same for the same reason."""
+    """Rules with the same state for the same reason."""
 
     state: str
-    """As `state_text`."""
+    """State, as `state_text` gives it."""
     why: str
     rules: tuple[str, ...]
 

@@ -1,4 +1,4 @@
-"""The Checks tab, and what the mark of findings says."""
+"""The Checks tab, and the content of the mark of findings."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ChecksPanel(PagePart[SessionView]):
     ) -> None:
         self._session, self._tab, self._link = session, tab, link
         self._open: set[str] = set()
-        """Ids of rules, and `REST`, that are folded out."""
+        """Ids of unfolded rules, and `REST`."""
         self._status = server.gui.add_html("")
         self._tools = server.gui.add_html("")
         self._after_save = tick(server, AFTER_SAVE, CheckAfterSave, "on", True, hint=AFTER_SAVE_HINT)
@@ -101,14 +101,14 @@ def _toggle(rule: str) -> ToggleRule:
 
 @dataclass(frozen=True)
 class FindingsMark:
-    """What the mark of findings says."""
+    """Content of the mark of findings."""
 
     count: int
     newest: str
-    """Where the worst is, with the number of others."""
+    """Place of the worst finding, with the number of the others."""
     stops: bool
     old: bool
-    """All were found before the last change, and that is not checked yet."""
+    """Whether all were found before the last change, and that change is not checked yet."""
 
 
 def findings_mark(view: SessionView) -> FindingsMark | None:
@@ -125,12 +125,12 @@ def findings_mark(view: SessionView) -> FindingsMark | None:
 
 
 def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) -> str:
-    """How far the checks are, and what they came to."""
+    """HTML of the progress and the result of the checks."""
     return render("checks_status", checks=checks, told=summary(checks, found), link=link)
 
 
 def _comments(view: SessionView) -> list[Comment]:
-    """The comments that silence nothing; whether one is needed is known when all rules are checked."""
+    """Comments that silence nothing; known when all rules are checked."""
     task, checks = view.task, view.checks
     if task is None:
         return []
@@ -147,7 +147,7 @@ def list_html(
     link: LinkTo = no_links,
     comments: Sequence[Comment] = (),
 ) -> str:
-    """The findings, and the rules without one if that is folded out.
+    """HTML of the findings, and of the rules without one if that part is unfolded.
 
     Args:
         more: breaches seen while playing at lines that are not listed.

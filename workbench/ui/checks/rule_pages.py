@@ -1,4 +1,4 @@
-"""Why and how to mend, as the page of a rule says it."""
+"""Reads the reason and the remedy of a rule from the rule's page."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class RulePage:
     why: str
     mend: str
     address: str
-    """Of the whole page."""
+    """Address of the whole page."""
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The folder *Solve many seeds* of the Checks tab: what planning comes to from each seed, and what that tells of the reward."""
+"""The folder *Solve many seeds* of the Checks tab: result of planning from each seed, and verdicts on the reward."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class SolveSeedsPanel(PagePart[SessionView]):
     ) -> None:
         self._session, self._on_look, self._link = session, on_look, link
         self._open: set[str] = set()
-        """Ids of rules that are folded out."""
+        """Ids of unfolded rules."""
         # Who comes back from a recording finds the rows that led there.
         before = session.seeds_solver.view
         self._count = before.total or ENOUGH_SEEDS
@@ -115,7 +115,7 @@ def _toggle(rule: str) -> ToggleVerdict:
 
 
 def seeds_html(seeds: SeedsView, link: LinkTo = no_links) -> str:
-    """How far it is, and a row for each seed, which opens its recording in the review."""
+    """HTML of the progress and of a row for each seed, which opens its recording in the review."""
     running = seeds.state in RUNNING
     show = lambda seed: ShowSolved(seed=seed)  # noqa: E731
     return render("solve_seeds", seeds=seeds, running=running, show=show, link=link)

@@ -1,4 +1,4 @@
-"""Where a step goes: hooks and lines of a control step by their share."""
+"""Time of a control step, as shares of its hooks and lines."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ TITLE = "Where does a step go"
 PROFILE, STOP_PROFILE = "Time a step", "Stop timing"
 MOST_HOOKS, MOST_LINES = 12, 12
 FEWEST_LINES, SMALL = 5, 0.01
-"""Lines beyond the first ones are shown down to this share."""
+"""Number of lines that are always shown, and minimum share of the lines after these."""
 
 
 class StepProfilePanel(PagePart[SessionView]):
-    """A button that times a step in the background process, and two tables of what it came to.
+    """A button that times a step in the background process, and two tables of the result.
 
     Args:
         server: The page.
@@ -58,7 +58,7 @@ class StepProfilePanel(PagePart[SessionView]):
 
 
 def profile_html(shown: ProfileView, link: LinkTo = no_links) -> str:
-    """The tables, or what to do for them."""
+    """HTML of the tables, or of what to do for them."""
     lines = () if shown.profile is None else shown.profile.lines[:MOST_LINES]
     lines = [line for place, line in enumerate(lines) if place < FEWEST_LINES or line.share >= SMALL]
     known = {"lines": lines, "most_hooks": MOST_HOOKS, "ms": milliseconds, "part": share_text}

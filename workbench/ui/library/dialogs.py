@@ -38,7 +38,7 @@ class Dialog:
 
 
 MOST_KNOWN = 12
-"""Tags in use that are listed."""
+"""Maximum number of tags in use that are listed."""
 
 
 class LibraryEdits:
@@ -159,7 +159,7 @@ class LibraryEdits:
             gui.add_html(tools_html([Tool(do, AnswerDialog(), tone=tone), Tool("Cancel", CloseDialog())]))
 
     def type(self, text: str) -> None:
-        """What is typed into the question so far."""
+        """Store the text that is typed into the question so far."""
         self._typed = text
 
     def answer(self) -> None:
@@ -174,7 +174,7 @@ class LibraryEdits:
         return [row for row in rows if row is not None]
 
     def _do(self, work: Callable[[], object]) -> bool:
-        """Whether it succeeded; a LibraryError is shown on every page."""
+        """Do the work; returns whether it succeeded. A LibraryError is shown on every page."""
         try:
             work()
         except LibraryError as error:

@@ -37,12 +37,12 @@ class LibraryList:
         self.pages = Paged(MOST_ROWS)
         self.selected: frozenset[str] = frozenset()
         self.cursor: str | None = None
-        """The row that was pressed or moved to last."""
+        """Id of the row that was pressed or moved to last."""
         self.follow = False
-        """Whether a browser shall scroll to the cursor: after keys, which may leave the visible rows."""
+        """Whether browsers scroll to the cursor: after keys, which may leave the visible rows."""
         self._anchor: str | None = None
         self._place = 0
-        """Row number of the cursor when it was set: where to continue when its row is deleted."""
+        """Row number of the cursor when it was set; the cursor goes there when its row is deleted."""
         self._arranged: tuple[object, list[LibraryRow]] = (None, [])
 
     # --- rows ----------------------------------------------------------------------------------------
@@ -69,20 +69,20 @@ class LibraryList:
             return rows[places.start : places.stop]
 
     def state(self) -> object:
-        """Changes whenever anything here changes."""
+        """A value that changes whenever anything here changes."""
         with self.lock:
             self.rows()
             return self._arranged[0], self.pages.first, self.selected, self.cursor
 
     def selected_ids(self) -> tuple[str, ...]:
-        """In the order of the list."""
+        """Ids of the selected rows, in the order of the list."""
         with self.lock:
             return tuple(row.id for row in self.rows() if row.id in self.selected)
 
     # --- selecting -----------------------------------------------------------------------------------
 
     def select(self, ids: Iterable[str]) -> None:
-        """Select those of these that are listed."""
+        """Select the rows of these ids that are listed."""
         with self.lock:
             self.selected = frozenset(ids) & {row.id for row in self.rows()}
 
@@ -161,15 +161,15 @@ class LibraryList:
 
 @dataclass(frozen=True)
 class Action:
-    """Something to do with the selected recordings."""
+    """An operation on the selected recordings."""
 
     label: str
     command: Command
     hint: str
     run: Callable[[tuple[str, ...]], None]
     most: int | None = None
-    """Most recordings at once."""
+    """Maximum number of recordings at once; None for any number."""
     reads: bool = True
     """Whether it reads the recordings; False for what also applies to files that cannot be read."""
     salvages: bool = False
-    """Whether it takes what is left of a damaged recording."""
+    """Whether it uses the readable part of a damaged recording."""

@@ -62,9 +62,9 @@ from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.visitors import Visitor
 
 MOST_JOBS = 6
-"""Jobs that are shown at once."""
+"""Maximum number of jobs that are shown at once."""
 MOST_OPEN = 4
-"""Recordings that a review shows at once."""
+"""Maximum number of recordings that a review shows at once."""
 ALL_TASKS = "all tasks"
 HELD = {"": 0, "ctrl": TOGGLE, "shift": RANGE, "ctrl+shift": TOGGLE | RANGE}
 LIST = (
@@ -89,7 +89,7 @@ LIST = (
     TypeAnswer,
     AnswerDialog,
 )
-"""What the list itself does."""
+"""Commands that the list itself carries out."""
 
 
 class LibraryPanel(PagePart[object]):
@@ -154,11 +154,11 @@ class LibraryPanel(PagePart[object]):
         self._trash = server.gui.add_html("")
 
         self._number_of: dict[str, int] = {}
-        """Number of each recording's row, from 1 on, in the order in which they came."""
+        """Number of each recording's row, from 1 on, in the order of arrival."""
         self._drawn: object = None
         self._jobs_drawn: object = None
         self._filters_drawn: object = None
-        """What the filters were counted for: with thousands of rows counting takes long."""
+        """Key of the data that the filters were counted for: with thousands of rows, counting takes long."""
         self._table_drawn: object = None
 
     # --- for the page that has it ----------------------------------------------------------------------
@@ -178,7 +178,7 @@ class LibraryPanel(PagePart[object]):
 
     @property
     def does(self) -> tuple[type[Command], ...]:  # type: ignore[override]
-        """What it can be asked for; the actions are those that there are by now."""
+        """Commands that the panel carries out; the actions are those added so far."""
         return (*LIST, *(type(action.command) for action in self._actions))
 
     def close(self) -> None:
@@ -253,7 +253,7 @@ class LibraryPanel(PagePart[object]):
             self._trash.content = render("library_trash", trash=view.trash, empty=EmptyTrash())
 
     def _draw_jobs(self, view: LibraryView) -> None:
-        """How far the jobs are that record into the folder, each with what failed."""
+        """Draw the progress of the jobs that record into the folder, each with its failures."""
         now = time.time()
         wanted = (view.jobs, [job.is_silent(now) for job in view.jobs])
         if wanted == self._jobs_drawn:
@@ -414,7 +414,7 @@ class LibraryPanel(PagePart[object]):
                     tell_all(self._server, "This recording is damaged", body, "orange")
 
     def _why_unreadable(self, ids: tuple[str, ...], salvages: bool) -> str:
-        """Why none of these can be read; empty if one can.
+        """Reason why none of these can be read; empty if one can.
 
         Args:
             salvages: what is left of a damaged recording of the workbench is enough.

@@ -15,7 +15,7 @@ from workbench.ui.widgets.templates import counted, size
 
 Column = Literal["task", "date", "seed", "steps", "return", "success", "version", "tags", "note", "name"]
 COLUMNS: tuple[Column, ...] = ("task", "date", "seed", "steps", "return", "success")
-"""Of a row's first line."""
+"""Columns of a row's first line."""
 SECOND_LINE: tuple[Column, ...] = ("name", "version", "tags", "note")
 HINTS: dict[Column, str] = {
     "task": "Env id of the task",
@@ -33,7 +33,7 @@ HINTS: dict[Column, str] = {
 
 @dataclass(frozen=True)
 class OpenVersion:
-    """The version of the open task."""
+    """Version of the open task."""
 
     task: str
     source_hash: str
@@ -47,12 +47,12 @@ MEANS: dict[Outcome, str] = {
     "broken": "Something is wrong with the files",
 }
 HASH = 7
-"""Characters of a source hash that are shown."""
+"""Number of characters of a source hash that are shown."""
 _DESCENDING_FIRST: tuple[Column, ...] = ("date", "steps", "return", "success")
 
 
 def count_recordings(rows: Iterable[LibraryRow]) -> int:
-    """How many recordings these rows are: an export or a copy counts with the one that it was made of."""
+    """Number of recordings in these rows: an export or a copy counts with the recording that it was made from."""
     return len({row.copy_of or row.uid or row.id for row in rows})
 
 
@@ -67,8 +67,8 @@ def has_outcome(row: LibraryRow, outcome: Outcome) -> bool:
 
 
 def has_words(row: LibraryRow, words: Sequence[str]) -> bool:
-    """Whether each of these lower-case words is in its task, tags, note, name, source hash or action source;
-    ``seed:3`` means that seed."""
+    """Whether each of these lower-case words occurs in the task, tags, note, name, source hash or action source of
+    the row; ``seed:3`` means that seed."""
     said = "\n".join(
         (row.task, *row.tags, row.note, row.name, row.source_hash, row.acted_by, row.problem or "")
     ).lower()
@@ -206,7 +206,7 @@ def in_words(rows: Sequence[LibraryRow]) -> str:
 
 
 def job_text(job: JobStatus, now: float) -> str:
-    """How a job stands, as the end of a sentence."""
+    """State of a job, as the end of a sentence."""
     if job.is_silent(now):
         return ", ended without a word: the same command goes on, if it was given --job"
     if job.state == "stopped":

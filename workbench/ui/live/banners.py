@@ -21,8 +21,8 @@ from workbench.ui.widgets.tools import Tool, tool, tools_html
 from workbench.ui.widgets.visitors import Visitor
 
 WIDEST, BUSY_WIDEST = 520, 460
-"""Pixels. The style sheet makes them as narrow as the view: they must not cover the controls, with which the last good
-version is still used."""
+"""Maximum width in pixels. The style sheet makes a banner as narrow as the view, so that it does not cover the
+controls, with which the last good version is still used."""
 
 FILL = "Write the minimal task into it"
 RELOAD, INTERRUPT, RESTART, NEW_WORKER = "Reload the file", "Interrupt", "Restart", "Restart the worker"
@@ -32,9 +32,11 @@ REBUILD_HINT = (
     "the old scene. The moment is restored."
 )
 _MAY_BE_OLD = ("reset", "step", "evaluate", "reward", "observation", "returns")
-"""Stages that use what the scene's building made: a patch keeps it, and may lack what the new code expects of it."""
+"""Stages that use objects made while the scene was built: a patch keeps those objects, and may lack what the new
+code expects."""
 SHOWN_AFTER = 4.0
-"""Seconds. The status line shows it earlier; a banner is for code that one may want to end."""
+"""Seconds after which the banner of long-running code is shown. The status line shows it earlier; a banner is for
+code that a person may want to end."""
 
 DOING = {
     "syntax": "is not Python yet",
@@ -86,7 +88,7 @@ class Banner(PagePart[SessionView]):
     ) -> None:
         self._link, self._is_own = link, is_own
         self._blank: Path | None = None
-        """The file that is offered to be filled."""
+        """File that is offered to be filled."""
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
@@ -96,7 +98,7 @@ class Banner(PagePart[SessionView]):
         # At the right edge of the view: on the left are viser's own notifications.
         self._panel.float(x=-GAP, y=GAP, width=WIDEST)
         self._drawn: int | None = None
-        """Serial of the problem."""
+        """Serial of the problem that is drawn."""
 
     def draw(self, view: SessionView) -> None:
         problem = view.problem
@@ -151,7 +153,7 @@ def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) ->
 
 
 def kept_html(view: SessionView) -> str:
-    """What runs now, and what to do, under the problem."""
+    """HTML under the problem: which version runs now, and what to do."""
     return render("banner_kept", kept=_kept(view))
 
 

@@ -1,4 +1,4 @@
-"""Widths of the columns of the table of envs, and which are left out where its panel is narrow."""
+"""Widths of the columns of the table of envs, and the columns that are left out where its panel is narrow."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 CHARACTER, PADDING, NARROW_PADDING = 6.2, 14.6, 9.2
-"""Pixels of an average character, and between two columns."""
+"""Widths in pixels: of an average character, and of the padding between two columns."""
 DOT = 13.0
-"""Pixels of the dot before the name of a state."""
+"""Width in pixels of the dot before the name of a state."""
 MARGINS = 36.0
-"""Pixels beside the table in its panel, and of the arrow in the heading that it is sorted by."""
+"""Width in pixels of the margins next to the table in its panel, and of the arrow in the heading that it is sorted
+by."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +34,11 @@ class Column:
 
     @property
     def wide(self) -> float:
-        """Pixels with the heading in one line."""
+        """Width in pixels with the heading in one line."""
         return PADDING + max(CHARACTER * len(self.name), self._cell(self.text))
 
     def least(self, words: bool) -> float:
-        """Pixels without padding."""
+        """Minimum width in pixels, without padding."""
         part = max(map(len, self.name.replace("_", "_ ").split()))
         return max(CHARACTER * part, self._cell(self.text if words else self.text - self.word))
 
@@ -47,17 +48,18 @@ class Column:
 
 @dataclass(frozen=True)
 class Level:
-    """What is left out where the panel is not wider than `below` pixels: this, and what the levels before leave out."""
+    """Content that is left out where the panel is not wider than `below` pixels: that of this level and of the
+    levels before."""
 
     below: int
     columns: tuple[int, ...] = ()
     """Numbers of the columns, from 1, that are left out here."""
     names: tuple[str, ...] = ()
-    """Names of all that are left out."""
+    """Names of everything that is left out."""
 
 
 def wanted_width(columns: Sequence[Column]) -> float:
-    """Pixels of a panel that shows everything."""
+    """Width in pixels of a panel that shows everything."""
     return MARGINS + sum(column.wide for column in columns)
 
 

@@ -55,15 +55,16 @@ FILTERS: dict[Filter, tuple[str, str, str]] = {
 """Label of the button, hint, and text of an empty table. "last failed", not "failed": a running env may have failed
 before, and "failed 16" next to "running 16" confuses."""
 TABLE = "envs"
-"""The panel, as a page tells that it was unfolded."""
+"""Name of the panel in the page's report that the panel was unfolded."""
 MOST_ENTRIES = 6
-"""Columns of bool entries at first; with more a row is wider than the view. The others can be chosen."""
+"""Maximum number of columns of bool entries at first; with more a row is wider than the view. The others can be
+chosen."""
 POINTS = 40
-"""Points of a row's small curve."""
+"""Number of points of a row's small curve."""
 STEP_CHARACTERS = 3
-"""A number of a step is at least so long soon."""
+"""Minimum width of a step number in characters: step numbers are soon that long."""
 REWARD_CURVE = "reward curve"
-"""The column that nothing is sorted by."""
+"""Name of the column that cannot be sorted by."""
 CURVE_WIDTH, CURVE_HEIGHT = 60, 14
 _GRAVITY = np.array([2, 3, 0, 1])
 """Sort key of each `Outcome`: failed, then truncated, then running, then solved."""
@@ -75,7 +76,7 @@ def bool_entries(rows: EnvRows) -> tuple[str, ...]:
 
 
 def entry_names(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[str, ...]:
-    """The bool entries that get a column: those that were chosen, and of those that were not asked about the first."""
+    """Bool entries that get a column: the chosen ones, and the first of those that a person did not set."""
     chosen = chosen or {}
     every = bool_entries(rows)
     return tuple(name for place, name in enumerate(every) if chosen.get(name, place < MOST_ENTRIES))
@@ -215,7 +216,7 @@ def _curves(rewards: NDArray[np.float32], envs: NDArray[np.int64]) -> list[list[
     finite = np.isfinite(chosen)
     if not finite.any():
         return [[] for _ in envs]
-    # As wide as the longest shown episode.
+    # The longest shown episode sets the width.
     chosen = chosen[:, int(finite.any(axis=0).argmax()) :]
     every = np.arange(0, chosen.shape[1], -(-chosen.shape[1] // POINTS))
     # A single step without a number makes a gap, too.
@@ -238,7 +239,7 @@ def _step(step: int) -> str:
 
 
 MOST_ROWS = 64
-"""Rows of one page of the table."""
+"""Number of rows of one page of the table."""
 HINTS = {
     "env": "Click a column to sort by it, again to reverse the order",
     "state": "Of the current episode: running until it first ends",
@@ -275,14 +276,14 @@ class EnvPanel(MomentPart):
         self._filter: Filter = "all"
         self._pages = Paged(MOST_ROWS)
         self._chosen: dict[str, bool] = {}
-        """Bool entries that were switched on or off."""
+        """Whether a person switched each bool entry on or off."""
         self._choosing = False
         """Whether the list of entries is open."""
         self._pressed = 0
-        """Number of presses that change the table."""
+        """Number of presses that changed the table."""
         self._is_unfolded = False
         self._drawn_task = -1
-        """`SessionView.task_serial` when it was drawn last."""
+        """Value of `SessionView.task_serial` at the last drawing."""
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
@@ -310,11 +311,12 @@ class EnvPanel(MomentPart):
         self._pressed += 1
 
     def unfold(self) -> None:
-        """Draw it from now on: a page shows it. Until `fold`, as no page tells that it folds it by itself."""
+        """Draw the table from now on, because a page shows it. Lasts until `fold`, since no page reports that it
+        folds it by itself."""
         self._is_unfolded = True
 
     def fold(self) -> None:
-        """No page shows it."""
+        """Stop drawing the table, because no page shows it."""
         self._is_unfolded = False
 
     def key(self, view: SessionView) -> object:
@@ -332,7 +334,7 @@ class EnvPanel(MomentPart):
         self._handle.content = content
 
     def wanted_width(self) -> float:
-        """Pixels of a panel in which every column is seen."""
+        """Width in pixels of a panel in which every column is seen."""
         rows = self._session.env_rows()
         if rows is None:
             return 0.0

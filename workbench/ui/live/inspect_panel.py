@@ -27,7 +27,7 @@ from workbench.ui.widgets.visitors import Visitor
 
 TAB = "Inspect"
 NEAR_A_LIMIT = 0.02
-"""Part of a joint's range."""
+"""Share of a joint's range within which a joint counts as near its limit."""
 
 Row = dict[str, Any]
 """A row of the template ``inspect``."""
@@ -134,9 +134,9 @@ def _code(values: NDArray[np.float32]) -> str:
 
 
 READ_EVERY = 0.2
-"""Seconds."""
+"""Seconds between two readings."""
 PATIENCE = 2.0
-"""Seconds without an answer after which the question is sent again: the worker may be another by then."""
+"""Timeout in seconds of a reading, after which the question is sent again: the worker may have been replaced."""
 NOTHING, JOINTS, POSES = "nothing", "joints", "poses"
 CHOICES: dict[str, Section | None] = {
     NOTHING: None,
@@ -217,7 +217,7 @@ class InspectPanel(PagePart[SessionView]):
         return self._now if shown else None
 
     def unfold(self) -> None:
-        """A page has opened the tab."""
+        """Start reading, because a page has opened the tab."""
         self._opened = True
 
     def _no_step_yet(self, view: SessionView) -> bool:
@@ -323,7 +323,7 @@ LONGEST = 0.3
 SHAFT, HEAD, HEAD_LENGTH = 0.005, 0.012, 0.028
 """Metres; viser does not draw an arrow shorter than its head as an arrow."""
 WEAKEST = 1e-3
-"""Newtons; weaker forces are not drawn."""
+"""Minimum force in newtons that is drawn."""
 
 
 class ForceArrows:

@@ -29,15 +29,16 @@ LIGHT_PAGE: Rgb = (241, 243, 245)
 DARK_PAGE: Rgb = (66, 66, 66)
 """Backgrounds of the Log, a little nearer to the text than the real ones."""
 READABLE = 4.5
-"""Least contrast of text in WCAG 2.1."""
+"""Minimum contrast of text in WCAG 2.1."""
 MOST_SPANS = 1500
-"""In all lines; older lines are shown plain. A line may change its colour with each character."""
+"""Maximum number of spans in all lines; older lines are shown plain. A line may change its colour with each
+character."""
 SIXTEEN = TerminalTheme(
     (255, 255, 255), (0, 0, 0),
     [(0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229)],
     [(102, 102, 102), (241, 76, 76), (35, 209, 139), (245, 245, 67), (59, 142, 234), (214, 112, 214), (41, 184, 219), (255, 255, 255)],
 )  # fmt: skip
-"""Used where one of the sixteen is a background, or stands on one."""
+"""Theme that is used where one of the sixteen colours is a background, or stands on one."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ class LogPanel(PagePart[SessionView]):
         self._vitals = server.gui.add_html("")
         self._cleared = 0
         self._drawn: object = None
-        """Filter and number of clears when it was drawn; a change is drawn even while it is held."""
+        """Filter and number of clears at the last drawing; a change is drawn even while the log is held."""
 
     def key(self, view: SessionView) -> object:
         return view.printed.serial, self._held, self._wanted, self._cleared, view.vitals

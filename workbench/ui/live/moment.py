@@ -11,7 +11,7 @@ class MomentPart(PagePart[SessionView]):
 
     of_the_moment = True
     every = 0.2
-    """Faster, numbers of many rows cannot be read."""
+    """Seconds between two drawings; numbers of many rows cannot be read faster."""
 
     def urgent(self, view: SessionView) -> object:
         return view.task_serial, view.state, view.playing, view.selected_env, view.timeline.shown

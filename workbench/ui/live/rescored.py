@@ -1,4 +1,5 @@
-"""Rescoring of the past in the Reward tab: a summary above the curves, and below them the new curve and what differs."""
+"""Rescoring of the past in the Reward tab: a summary above the curves, and below them the new curve and the
+differences."""
 
 from __future__ import annotations
 
@@ -130,7 +131,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
 
 
 def _place(verdict: Verdict[PastRun]) -> tuple[int, int]:
-    """Env and serial of the moment to look at."""
+    """Env and serial of the moment to show."""
     assert verdict.look_at is not None
     return verdict.of.env, verdict.of.at(verdict.look_at)
 

@@ -30,7 +30,7 @@ COLOURS = (
 )  # fmt: skip
 MOST_LINES = len(COLOURS)
 MOST_CHARTS = 12
-"""Entries of ``evaluate`` with a chart."""
+"""Maximum number of entries of ``evaluate`` with a chart."""
 MOST_NAMED = 12
 CHOICE = "Choose curves"
 HOW_TO = (
@@ -38,9 +38,9 @@ HOW_TO = (
     "(num_envs,)) into the info that compute_dense_reward receives."
 )
 AT_FIRST = (Group.REWARD, Group.TERM)
-"""Drawn unless a person turns them off, as success is."""
+"""Groups that are drawn unless a person turns them off; success is drawn too."""
 Entry = tuple[Group, str]
-"""What is chosen: a column, or all parts of an entry of several."""
+"""Key of a choice: a column, or all parts of an entry of several."""
 
 
 class CurvesPanel(MomentPart):
@@ -63,11 +63,11 @@ class CurvesPanel(MomentPart):
         self._folder = gui.add_folder(None)
         self._charts: dict[Entry, LineChart] = {}
         self._toggled: dict[str, set[Entry]] = {}
-        """By task, what a person has turned on or off."""
+        """Entries that a person has turned on or off, by task."""
         self._turned = 0
         self._task = ""
         self._asked: int | None = None
-        """The step that was pressed last."""
+        """Step that was pressed last."""
         self._hint = gui.add_html("", visible=False)
         self._lost = gui.add_html("", visible=False)
         self._empty = gui.add_html(render("note", text="Curves appear after the second step."))
@@ -217,7 +217,7 @@ def entry_of(column: Column) -> Entry:
 
 
 def value_at(view: SessionView, column: Column) -> float:
-    """The shown moment's number of the selected env; NaN if it has none."""
+    """Value of the selected env at the shown moment; NaN if it has none."""
     assert view.step is not None
     joints = () if view.task is None else view.task.joints
     values = columns_of(view.step, joints).get(column)
@@ -277,7 +277,7 @@ class NumberRow:
     hint: str = ""
     """Further information about the value."""
     about: str = ""
-    """Beside the name: the mode of a reward."""
+    """Text next to the name: the mode of a reward."""
 
 
 def number_rows(

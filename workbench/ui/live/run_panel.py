@@ -44,12 +44,12 @@ from workbench.ui.widgets.visitors import Visitor
 HOLD = "Hold still"
 MOVED_HINT = "Whose robot a slider moves. The sliders show what the robot of the selected env is told."
 UNBOUNDED = 1.0
-"""A dimension without bounds gets a slider from -1 to 1."""
+"""Limit of the slider of a dimension without bounds: from -1 to 1."""
 
 
 class ActionSliders:
-    """A folder with one slider for each dimension, shown while the source is ``sliders``: what the selected env's robot is
-    told. A slider that is moved tells that dimension alone, in the env or envs that the folder names."""
+    """A folder with one slider for each action dimension of the selected env's robot, shown while the source is
+    ``sliders``. A slider that is moved sets that dimension alone, in the env or envs that the folder names."""
 
     DOES = (MoveSlider, ChooseMoved, HoldStill)
 
@@ -148,11 +148,12 @@ PREVIOUS, NEXT = "‹ previous", "next ›"
 CHOOSE = "choose one"
 KNOWN_HINT = "Functions of one parameter in the files where the command was started and beside the task, and policies used before."
 LOOK_EVERY = 5.0
-"""Seconds."""
+"""Seconds between two searches for policies."""
 
 
 class KnownPolicies:
-    """Policies to choose from: those that were used in this folder, and what the files there and beside the task hold."""
+    """Policies to choose from: policies that were used in this folder, and functions in its files and those of the
+    task's folder."""
 
     def __init__(self) -> None:
         self._here = Path.cwd()
@@ -162,7 +163,7 @@ class KnownPolicies:
         self._kept: str | None = None
 
     def look(self, task_folder: Path | None, acting: str | None) -> tuple[str, ...]:
-        """What is known; looked up again every `LOOK_EVERY` seconds on a thread, since it reads many files.
+        """Known policies; searched again every `LOOK_EVERY` seconds on a thread, since the search reads many files.
 
         Args:
             acting: the policy that is chosen; kept for the next run if there is such a file or module.

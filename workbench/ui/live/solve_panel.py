@@ -1,4 +1,5 @@
-"""The folder *Solve* of the Run tab: how actions are planned, what the rollouts earned, and their ways in the 3-D view."""
+"""The folder *Solve* of the Run tab: how actions are planned, the returns of the rollouts, and their paths in the
+3-D view."""
 
 from __future__ import annotations
 
@@ -52,7 +53,7 @@ BETTER_MODE = "pd_ee_delta_pose"
 USE_MODE = "Plan in end-effector control (resets the envs)"
 USE_MODE_HINT = "Makes the envs anew with this control mode, in which plans are found soonest"
 MOST_TOLD = 4
-"""Solved envs that are named."""
+"""Maximum number of newly solved envs that are named."""
 CHART_HEIGHT = 150
 PREDICTED, ACHIEVED = "#228be6", "#f08c00"
 
@@ -87,7 +88,7 @@ class SolvePanel(PagePart[SessionView]):
         self._told: tuple[tuple[int, int], ...] = ()
         self._shows_rollouts = True
         self._place = 0
-        """Of the rollout that is looked at, among those that are drawn."""
+        """Index of the rollout that is looked at, among those that are drawn."""
         self._folder = gui.add_folder("Solve", visible=False)
         with self._folder:
             self._status = gui.add_html("")
@@ -251,7 +252,7 @@ class SolvePanel(PagePart[SessionView]):
         self._tell(view)
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> None:
-        """Draw the ways of the last plan's rollouts.
+        """Draw the paths of the last plan's rollouts.
 
         Args:
             offset: (3,) of the selected env on the grid.
@@ -266,7 +267,7 @@ class SolvePanel(PagePart[SessionView]):
             self._traces.draw(plan.paths, offset, 0 if view.playing else self._place_in(plan))
 
     def _place_in(self, plan: PlannedEnv) -> int:
-        """The best one where this plan has fewer."""
+        """Index of the rollout that is looked at; 0, the best one, if this plan has fewer."""
         return self._place if self._place < len(plan.drawn) else 0
 
     def _draw_saving(self, view: SessionView) -> None:
@@ -300,7 +301,8 @@ class SolvePanel(PagePart[SessionView]):
         self._chart.draw("Reward a step, of the steps that a plan looks ahead", steps, lines)
 
     def _tell(self, view: SessionView) -> None:
-        """Whichever tab is open: a person may not look at this one while it plans."""
+        """Notify every page of newly solved envs, whichever tab is open: a person may not look at this tab while
+        it plans."""
         solved = view.solve.solved
         new = [one for one in solved if one not in self._told]
         self._told = solved
@@ -311,12 +313,12 @@ class SolvePanel(PagePart[SessionView]):
 
 
 def horizon_seconds(plan: PlanOptions, control_dt: float, has_success: bool = True) -> float:
-    """The horizon that a plan has, the usual one too."""
+    """Horizon of a plan in seconds, also for the usual horizon."""
     return plan.steps(control_dt, has_success) * control_dt
 
 
 def movable_bodies(view: SessionView) -> list[str]:
-    """Names of the bodies that can have a way."""
+    """Names of the bodies whose path can be drawn."""
     if view.task is None:
         return []
     geometry = view.task.geometry
@@ -333,7 +335,7 @@ def offers_better_mode(view: SessionView) -> bool:
 
 
 def in_words(plan: PlannedEnv, place: int) -> str:
-    """The rollout that is looked at: ``12th of 64: return 3.2, succeeds at step 7``.
+    """Text of the rollout that is looked at: ``12th of 64: return 3.2, succeeds at step 7``.
 
     Args:
         place: among those that are drawn.
@@ -360,7 +362,7 @@ def is_flat(plan: PlannedEnv) -> bool:
 
 
 def solve_html(solve: SolveView, rows: EnvRows | None, env: int, link: LinkTo = no_links) -> str:
-    """What the plan came to, or what to do for one.
+    """HTML of the result of the plan, or of what to do for one.
 
     Args:
         rows: the table of envs.

@@ -122,11 +122,12 @@ def robot_text(task: TaskDescription) -> str:
 
 
 SLOWS = 0.3
-"""Least part of the time that is named as what makes playing slow."""
+"""Minimum share of the time that is named as what slows down playing."""
 
 
 def slowed_by(view: SessionView) -> tuple[str, str] | None:
-    """What of recording and watching takes most of the time while playing, measured: short, and in full; None for neither."""
+    """The part of recording and watching that takes most of the measured time while playing, as a short and a full
+    text; None for neither."""
     task, recorded, watched = view.task, view.recorded_share, view.watched_share
     if task is None or max(recorded, watched) < SLOWS:
         return None

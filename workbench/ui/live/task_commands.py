@@ -17,7 +17,7 @@ from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.visitors import Visitor, Visitors
 
 MAX_ENVS = 256
-"""Envs that are entries; more would make every page wait for them."""
+"""Maximum number of envs with an entry; more entries would make every page wait for them."""
 STUDIO = "Studio"
 
 

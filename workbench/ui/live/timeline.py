@@ -39,24 +39,24 @@ from workbench.ui.widgets.tools import Tool, tool, tools_html
 from workbench.ui.widgets.visitors import Visitor
 
 GAP = 12
-"""Pixels between floating panels and the view's edges; the same in ``view_width.js``."""
+"""Distance in pixels between floating panels and the view's edges; the same in ``view_width.js``."""
 WIDEST = 760
 HEIGHT = 205
-"""Pixels of the view that it covers; framing a scene leaves them out."""
+"""Height in pixels of the view that it covers; framing a scene leaves these out."""
 RANGE_EVERY = 0.5
-"""Seconds. A slider whose ends move at every step cannot be held."""
+"""Seconds between two changes of the slider's range. A slider whose ends move at every step cannot be held."""
 STANDS_STILL = 0.35
-"""Seconds at one moment until its pictures are drawn; with less, every drag would draw some."""
+"""Seconds at one moment before its pictures are drawn; with less, every drag would draw some."""
 LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
 EPISODE, EVERYTHING = "this episode", "all episodes"
 GO_ON = "Continue from here"
 UNDO = "undo"
-"""Start of the undo button's label; what is undone follows."""
+"""Start of the undo button's label; the name of the undone change follows."""
 View = TypeVar("View", contravariant=True)
 
 
 class Seeks(Protocol):
-    """What the slider and the buttons move through time; it defines what a place is."""
+    """Target of the slider and the buttons, which defines what a place in time is."""
 
     def seek(self, place: Any, /) -> None: ...
     def seek_by(self, steps: int, /) -> None: ...
@@ -157,10 +157,10 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         self._range = (0, 0)
         """Ticks of the slider's ends."""
         self._newest = 0
-        """The tick that the slider shows as 0."""
+        """Tick that the slider shows as 0."""
         self._range_at = -math.inf
         self._strip_of: object = None
-        """What the strip was drawn for."""
+        """Key of the data that the strip was drawn for."""
         self._stood: tuple[object, float] = (None, 0.0)
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
@@ -188,7 +188,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         self._session.past.seek(None)
 
     def _to_first(self) -> None:
-        """Go to the left end of the slider, where a slider with the focus goes too."""
+        """Go to the left end of the slider; a slider with the focus goes there too."""
         if self._episode_only:
             self._session.past.seek_tick(self._range[0], in_episode=True)
         else:
@@ -294,7 +294,8 @@ def continue_tools(view: SessionView) -> list[Tool]:
 
 
 POINTS = 240
-"""Points of the reward's line, minimum and maximum of each interval in turn: a spike of one step stays visible."""
+"""Number of points of the reward's line, minimum and maximum of each interval in turn: a spike of one step stays
+visible."""
 LINE_HEIGHT = 30.0
 """Height of the line in the picture's units; the marks are above."""
 FLAGS = {
@@ -305,7 +306,7 @@ FLAGS = {
     WENT_BACK: "back",
     RESET: "reset",
 }
-"""Style of each event's mark; of several events at once the first of these is drawn."""
+"""Style of each event's mark. Where several events coincide, the first of these is drawn."""
 NAMES = {
     "odd": "reward is NaN or infinite",
     "fail": "fail",
@@ -315,9 +316,9 @@ NAMES = {
     "reset": "reset",
     "other": "other event",
 }
-"""Legend of the styles."""
+"""Legend text of each style."""
 MOST_MARKS = 250
-"""Places of the strip that have a mark each: what is nearer together cannot be told apart."""
+"""Maximum number of places of the strip with a mark each: closer places cannot be told apart."""
 
 
 def strip_values(
@@ -341,7 +342,7 @@ def strip_values(
 
 
 def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
-    """Tick, style and name of each mark. Of several events that fall on one place the first of `FLAGS` is drawn."""
+    """Tick, style and name of each mark. Where several events fall on one place, the first of `FLAGS` is drawn."""
     rank, names = list(FLAGS), dict(strip.branches)
     marks: dict[int, tuple[int, int, str]] = {}
     for tick, flags in strip.events:
@@ -384,7 +385,7 @@ def _number(value: float) -> str:
 
 
 def ago_in_words(past: TimelineView) -> str:
-    """``7 steps ago``, of the shown moment."""
+    """Age of the shown moment as text: ``7 steps ago``."""
     # An episode's last step is at the tick of the reset that follows it.
     return f"{counted(past.steps_ago, 'step')} ago" if past.steps_ago else "before the last reset"
 

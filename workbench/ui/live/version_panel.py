@@ -22,7 +22,7 @@ from workbench.ui.widgets.visitors import Visitor
 
 LAST_LOADS = "Last reloads"
 MOST_SHOWN = 8
-"""Items not carried over that are named; the rest is counted."""
+"""Maximum number of items not carried over that are named; the rest is counted."""
 
 
 class VersionPanel(PagePart[SessionView]):

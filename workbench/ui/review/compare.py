@@ -37,7 +37,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
         self._wish, self._metres = 1, USUAL_TOLERANCE
-        """The recording that was chosen last, kept while fewer are open, and the tolerance."""
+        """Recording that was chosen last, kept while fewer are open, and the tolerance."""
         self._other = choice(server, "A against", CompareWith, "index", {"B": 1}, 1)
         self._swap = server.gui.add_html("")
         self._tolerance = choice(
@@ -51,7 +51,7 @@ class ReviewComparePanel(PagePart[ReviewView]):
         )
         self._html = server.gui.add_html("")
         self._differing: list[FirstDifference] = []
-        """By row of the table."""
+        """First difference of each row of the table."""
 
     def key(self, view: ReviewView) -> object:
         return view.opened_serial, len(view.opened), view.anchors, self._wish, self._metres

@@ -27,7 +27,7 @@ from workbench.ui.widgets.templates import colour, letter, render
 from workbench.ui.widgets.visitors import Visitor
 
 CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
-"""Heights in pixels, from the top."""
+"""Height of each chart in pixels, from the top."""
 Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
 
@@ -82,9 +82,9 @@ class ReviewCurves(PagePart[ReviewView]):
         self._lines_drawn: object = None
         self._found: dict[str, dict[str, Lines]] = {}
         self._offered: dict[str, tuple[str, str]] = {}
-        """What can be chosen, to entry and line; the line is empty where the entry has one."""
+        """Entry and line of each choice; the line is empty where the entry has a single line."""
         self._wish = ""
-        """The entry that was chosen last, kept while recordings without it are open."""
+        """Entry that was chosen last, kept while recordings without it are open."""
 
     def key(self, view: ReviewView) -> object:
         which = view.opened_serial, len(view.opened), view.selected
@@ -116,7 +116,7 @@ class ReviewCurves(PagePart[ReviewView]):
                 self._wish = curve
 
     def _offer(self, view: ReviewView, shown: Sequence[int]) -> str:
-        """Which entry is chosen; empty if there is none."""
+        """Chosen entry; empty if there is none."""
         found = [self._found[view.opened[index].id] for index in shown]
         self._offered = {
             name if len(lines) == 1 else f"{name}: {line}": (name, "" if len(lines) == 1 else line)
@@ -135,7 +135,7 @@ class ReviewCurves(PagePart[ReviewView]):
         return chosen
 
     def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
-        """One entry of all compared recordings."""
+        """Draw one entry of all compared recordings."""
         group, line = self._offered.get(entry, (entry, ""))
         drawn: list[ChartLine] = []
         cursor = 0
@@ -153,7 +153,7 @@ class ReviewCurves(PagePart[ReviewView]):
         self._put(chart, entry, view, drawn, drawn[cursor] if drawn else None)
 
     def _draw_lines(self, chart: str, entry: str, view: ReviewView) -> None:
-        """An entry with several lines, of the selected recording."""
+        """Draw an entry with several lines, of the selected recording."""
         chosen, axis = view.chosen, axis_of(view)
         lines = {} if chosen is None else self._found[chosen.id].get(entry, {})
         drawn = [

@@ -36,7 +36,7 @@ from workbench.ui.widgets.tools import Tool, tool, tools_html
 from workbench.ui.widgets.visitors import Visitor
 
 MOST_OF_CODE = 200_000
-"""Characters of one file."""
+"""Maximum number of characters of one file's text."""
 SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 GHOSTS, GRID = "overlaid", "side by side"
 TRY_AGAIN = "Try again"
@@ -94,13 +94,13 @@ class ReviewPanel(PagePart[ReviewView]):
         self._facts = gui.add_html("")
         self._changes = ChangesOnDisk()
         self._listed: object = None
-        """What the list was drawn for."""
+        """Key of the data that the list was drawn for."""
         self._facts_of: tuple[Opened, str] | None = None
-        """What the facts were drawn for."""
+        """Key of the data that the facts were drawn for."""
 
     @property
     def ghosts(self) -> bool:
-        """Whether the recordings are drawn over each other: chosen, and few enough."""
+        """Whether the recordings are drawn over each other: a person chose so, and they are few enough."""
         return self._arranged == GHOSTS and len(self._review.view().opened) <= MOST_COMPARED
 
     def do(self, command: Command, visitor: Visitor) -> None:

@@ -37,13 +37,13 @@ MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Code:
-    """Code to run recordings with. A choice among files that the server knows; a page never sends a path."""
+    """Code to run recordings with, as one of the files that the server knows; a page never sends a path."""
 
     label: str = field(compare=False)
     told: str = field(compare=False)
-    """Which files it runs, for the page."""
+    """Text for the page: which files it runs."""
     file: Path | None = None
-    """Used before the files named by the recordings."""
+    """File that is used before the files named by the recordings."""
     recorded: bool = False
 
 
@@ -94,7 +94,7 @@ IDLE = (
 
 @dataclass
 class RescoreChoices:
-    """How it is rescored; outlives the page."""
+    """Options of rescoring, kept while pages are replaced."""
 
     code: Code = Code(TODAYS, "")
     use_env_states: bool = False
@@ -161,7 +161,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         self._selected: str | None = None
 
     def rescore_and_notify(self, ids: Sequence[str]) -> None:
-        """As `rescore`, for a press from where the tab is not seen."""
+        """Start `rescore` and notify every page, for a press from where the tab is not seen."""
         if not ids:
             tell_all(self._server, "Nothing to rescore", "No recording is selected or open.")
             return
@@ -170,7 +170,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         tell_all(self._server, title, "What differs now is listed under Rescore.", None, 4.0)
 
     def rescore(self, ids: Sequence[str]) -> None:
-        """Begin with these recordings of the library."""
+        """Start rescoring these recordings of the library."""
         files = episode_files(self._library, ids)
         self._selected = None
         self._pages.go_to(0)
@@ -197,7 +197,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
                 super().do(command, visitor)
 
     def _chosen(self) -> Code:
-        """What is not among the choices any more does not rescore, unseen."""
+        """Chosen code. A code that is no longer among the choices is not used unseen: the first choice replaces it."""
         return next((code for code in self._codes if code == self._choices.code), self._codes[0])
 
     # --- drawing -----------------------------------------------------------------------------------
@@ -271,5 +271,5 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
 
 
 def _end_of(name: str) -> str:
-    """Its end, which tells recordings of a task apart."""
+    """End of the name, which distinguishes recordings of a task."""
     return name if len(name) <= 24 else f"…{name[-23:]}"

@@ -30,12 +30,12 @@ from workbench.ui.scene.viewpoint import Stage, Viewpoint, frame_all, frame_one
 from workbench.ui.widgets.templates import colour, letter
 
 SEE_THROUGH = 0.45
-"""Alpha of a ghost. Less vanishes over a white table, more hides the bodies behind."""
+"""Alpha of a ghost. A lower one vanishes over a white table, a higher one hides the bodies behind."""
 MOST_NAMED = 16
 """Most recordings side by side with a label each. A browser lays out labels at every frame: with sixty its frame rate
 halves (measured)."""
 APART = 5e-4
-"""Least metres between a ghost and its body for the ghost to be drawn."""
+"""Minimum distance in metres between a ghost and its body for the ghost to be drawn."""
 _SAME_PLACE = 1e-5
 
 
@@ -187,10 +187,10 @@ class ReviewIn3D:
         self._frustums = CameraFrustums(server)
         self._scene: ReviewScene | None = None
         self._view = ReviewView()
-        """The one that the scene was drawn for: another recording may be open since."""
+        """View that the scene was drawn for: another recording may have been opened since."""
         self._scene_of: object = None
         self._looks: Looks | None = None
-        """What the bodies were built with."""
+        """Looks that the bodies were built with."""
         server.scene.on_click()(self._on_click)
 
     def draw(

@@ -37,18 +37,18 @@ from workbench.ui.widgets.visitors import Visitor
 log = logging.getLogger(__name__)
 
 LOOK_SECONDS = 1.0
-"""Between two looks at the file's time."""
+"""Seconds between two checks of the file's modification time."""
 ROWS = 12
-"""Of a page of the table."""
+"""Number of rows of a page of the table."""
 MOST_AXES = 9
 MOST_TICKS = 8
-"""Labels of an axis."""
+"""Maximum number of labels of an axis."""
 MOST_PRESSED = 64
-"""Lines that can be pressed."""
+"""Maximum number of lines that can be pressed."""
 MOST_SHOWN = 5
-"""Best episodes of a point, and worst ones."""
+"""Number of best and of worst episodes of a point that are shown."""
 WIDTH, TOP, BOTTOM, SIDE = 500, 34, 196, 34
-"""Pixels of the plot, and of its axes."""
+"""Sizes in pixels of the plot and of its axes."""
 _TERMS = "reward_terms/"
 _RATE = "success"
 
@@ -60,9 +60,9 @@ class Axis:
     name: str
     x: float
     heights: tuple[float | None, ...]
-    """Of each point, in pixels; None for one without a value."""
+    """Height of each point in pixels; None for a point without a value."""
     ticks: tuple[tuple[str, float, str], ...]
-    """Label, height, and for a set value its JSON."""
+    """Label and height of each tick, and the JSON of a set value."""
 
 
 def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Axis]:
@@ -91,13 +91,13 @@ def axes_of(results: SweepResults, summaries: Sequence[PointSummary]) -> list[Ax
 
 
 def terms_of(summaries: Sequence[PointSummary]) -> list[str]:
-    """Names of the means: the reward's terms, where the task tells them, else all."""
+    """Names of the means: the reward's terms, where the task reports them, else all."""
     names = list(dict.fromkeys(name for one in summaries for name in one.means))
     return [name for name in names if name.startswith(_TERMS)] or names
 
 
 def _in_order(text: str) -> tuple[int, float, str]:
-    """Numbers by size, then texts."""
+    """Sort key: numbers by size, then texts."""
     number = _number(text)
     return (1, 0.0, text) if number is None else (0, number, "")
 
@@ -160,14 +160,15 @@ def best_first(rows: Sequence[SweepEpisode]) -> list[SweepEpisode]:
 
 @dataclass
 class Shown:
-    """What a person chose; the same on all open pages."""
+    """Choices of a person; the same on all open pages."""
 
     column: str = "success"
     descending: bool = True
     chosen: int | None = None
-    """Index of a point; None while nobody has chosen: it is the one of the open episode then, else the best one."""
+    """Index of the chosen point. None until a person chooses: then the point of the open episode is shown, else
+    the best one."""
     only: dict[str, set[str]] = field(default_factory=dict)
-    """Of a set name, the values of the points that are shown; all if it has none."""
+    """Values of the shown points, by name of the setting; all values if a name is missing."""
 
 
 class SweepPanel(PagePart[ReviewView]):
@@ -197,12 +198,12 @@ class SweepPanel(PagePart[ReviewView]):
         self._results: SweepResults | None = None
         self._summaries: list[PointSummary] = []
         self._point_of: dict[str, int] = {}
-        """Of each recording's path."""
+        """Index of the point of each recording, by path of the recording."""
         self._problem = ""
         self._seen: object = None
         self._looked = -math.inf
         self._serial = 0
-        """Grows with everything that is shown."""
+        """Counter that grows with every change of what is shown."""
         self.shown = Shown()
         self._chosen: int | None = None
         """The point whose episodes are listed."""

@@ -39,11 +39,11 @@ LABELS = {
 }
 NONE = "none (null)"
 _FEWEST_DIGITS, _MOST_DIGITS = 4, 9
-"""Decimals of the step of a number."""
+"""Minimum and maximum number of decimals of the step of a number."""
 
 
 class EnvOptionsPanel(PagePart[SessionView]):
-    """A form that is applied as a whole: every change makes the envs anew.
+    """A form that is applied as a whole: every change rebuilds the envs.
 
     What is typed stays in the form until it is applied or discarded, also if the task fails with it; then the envs that
     run stay as they are. The form is written anew when the envs were made in another way.
@@ -54,13 +54,13 @@ class EnvOptionsPanel(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self._session = server, session
         self._made: tuple[HowMade, TaskOptions] | None = None
-        """What the form was last written for."""
+        """Env and options that the form was last written for."""
         self._num_envs = 1
         self._keywords: tuple[Keyword, ...] = ()
         self._values: dict[str, Plain] = {}
-        """What stands in the form, by the name of the keyword."""
+        """Values in the form, by the name of the keyword."""
         self._fields: list[Field] = []
-        """Of the keywords."""
+        """Input fields of the keywords."""
         gui = server.gui
         with gui.add_folder("How the envs are made", expand_by_default=False):
             self._envs = Field(server, "Envs", SetNumEnvs, "num_envs", self._num_envs)
@@ -124,7 +124,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
                 self._fields = [_field_for(self._server, keyword) for keyword in self._keywords]
 
     def _changed(self) -> dict[Keyword, Plain]:
-        """What stands in the form, of the keywords of which something else is in effect."""
+        """Values in the form that differ from those in effect, by keyword."""
         now = {keyword: self._values[keyword.name] for keyword in self._keywords}
         return {keyword: value for keyword, value in now.items() if value != _in_effect(keyword)}
 
@@ -191,12 +191,12 @@ def _of_the_machine(kwargs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _input_of(keyword: Keyword) -> object:
-    """What its input depends on, but for what is in it."""
+    """Key of the input of a keyword: everything that the input depends on, except its value."""
     return keyword.name, keyword.kind, keyword.choices, keyword.optional, keyword.fixed
 
 
 def _in_effect(keyword: Keyword) -> Plain:
-    """What the input of a keyword has in it when it shows what is in effect."""
+    """Value in the input of a keyword when it shows the value in effect."""
     if keyword.fixed:
         return keyword.value
     if keyword.kind == "str":
@@ -227,7 +227,7 @@ def _field_for(server: viser.ViserServer, keyword: Keyword) -> Field:
 
 
 def _options(keyword: Keyword) -> dict[str, Plain]:
-    """Values in JSON, by what is shown for them."""
+    """Values in JSON, by their label."""
     texts = keyword.choices or ("true", "false")
     names = [shown(text) for text in texts]
     # 1 and "1" look the same.
@@ -238,7 +238,7 @@ def _options(keyword: Keyword) -> dict[str, Plain]:
 
 
 def _step(value: float) -> float:
-    """What an arrow key adds to a number of this size."""
+    """Step by which an arrow key changes a number of this size."""
     if isinstance(value, int):
         return 1.0
     size = math.floor(math.log10(abs(value))) if value else 0
@@ -251,7 +251,7 @@ def _is_number(text: str) -> bool:
 
 
 def options_html(reference: object, view: SessionView) -> str:
-    """What the form does not show: options that were refused, further arguments, the driver, and the command."""
+    """HTML of what the form does not show: options that were refused, further arguments, the driver, and the command."""
     options = replace(view.options, seed=view.seed)
     refused = view.options_refused
     made = HowMade() if view.task is None else view.task.made

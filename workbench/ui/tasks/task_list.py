@@ -32,11 +32,11 @@ from workbench.ui.widgets.tools import tool, tools_html
 from workbench.ui.widgets.visitors import Visitor
 
 PICTURES = "/task_pictures/"
-"""Where the server gives the pictures of registered tasks."""
+"""Prefix of the route of the pictures of registered tasks."""
 LONGEST_WORDS = 4096
-"""Characters of the search; a path may be as long."""
+"""Maximum number of characters of the search; a path may be as long."""
 MOST_RECENT = 6
-"""Recent tasks that are shown while nothing is searched."""
+"""Maximum number of recent tasks that are shown while nothing is searched."""
 OPEN = "Open…"
 NEW_TASK, CREATE = "New task", "Create"
 
@@ -60,7 +60,7 @@ class Chooser(Protocol):
         ...
 
     def doing(self) -> str:
-        """What it is doing, for the page; empty if nothing."""
+        """Text for the page: what is being done; empty if nothing."""
         ...
 
     def is_open(self, entry: Entry) -> bool:
@@ -201,7 +201,7 @@ def shown_rows(view: CatalogueView, words: str, typed: Entry | None) -> dict[Sec
 
 
 def best_row(rows: Sequence[Entry], is_open: Callable[[Entry], bool]) -> Entry | None:
-    """What Enter opens: the first that is not open."""
+    """Row that Enter opens: the first that is not open."""
     return next((row for row in rows if not is_open(row)), rows[0] if rows else None)
 
 
@@ -258,7 +258,7 @@ def _picture_of(entry: Entry, pictures: frozenset[str]) -> str:
 
 
 def _note(section: Section, view: CatalogueView, some: bool, searched: bool) -> str:
-    """What to say below the heading of a section."""
+    """Text below the heading of a section."""
     if section is Section.FOLDER:
         if view.searching and not some:
             return f"Looking for task files in {view.folder} …"
