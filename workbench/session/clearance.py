@@ -19,7 +19,7 @@ from workbench.recording.episode.made_here import MadeHere, made_here
 
 SHORT_HASH = 12
 LONGEST = 400
-"""Characters of a shown name."""
+"""Longest name that is shown, in characters."""
 FOLLOWED = (
     "While it is open live, every save of this file and of the modules beside it runs without asking, whoever saves it. "
     "Rescore uses the file as it is then."
@@ -32,7 +32,7 @@ class Consent(Enum):
     NONE = "none"
     """No to this and to all other questions of the same call."""
     ONCE = "once"
-    """Until the program ends."""
+    """Yes, until the program ends."""
     ALWAYS = "always"
 
 
@@ -53,7 +53,7 @@ class CodeFile:
     hash: str
     """First digits of its SHA-256."""
     text: str
-    """Unescaped: escape it before showing it."""
+    """The text, not escaped: escape it before showing it."""
     since: Since = Since.SAME
 
 
@@ -62,27 +62,27 @@ class TrustQuestion:
     """A question to a person. Texts from recordings are made printable, not escaped."""
 
     task: str
-    """Of the recording that names the code; empty for a listed file."""
+    """Task of the recording that names the code; empty for a listed file."""
     recorded_text: bool
-    """The texts are those that the recording holds, not files on disk."""
+    """Whether the texts are those that the recording holds, not files on disk."""
     files: tuple[CodeFile, ...]
-    """What would run; the task's own file first."""
+    """Files that would run; the task's own file first."""
     unseen: tuple[str, ...] = ()
     """Code that may run and is not among `files`."""
     computed: bool = False
-    """The task computes what it imports, so its modules are all files of its folder."""
+    """Whether the task computes what it imports, so that its modules are all files of its folder."""
     trusted_before: bool = False
-    """Another version of the same files was trusted; see `CodeFile.since`, unless `nothing_known`."""
+    """Whether another version of the same files was trusted; see `CodeFile.since`, unless `nothing_known`."""
     gone: tuple[str, ...] = ()
-    """Modules of that version that no longer exist."""
+    """Modules of the version trusted before that no longer exist."""
     followed: bool = False
-    """Later saves of these files run too."""
+    """Whether later saves of these files run too."""
     agreed: bool = False
-    """These texts may run already; only `followed` is new."""
+    """Whether these texts may run already; only `followed` is new."""
     more: int = 0
     """Number of questions after this one."""
     listed: bool = False
-    """A person chose the file from a list; no recording names it."""
+    """Whether a person chose the file from a list; no recording names it."""
 
     @property
     def file(self) -> str:
@@ -91,7 +91,7 @@ class TrustQuestion:
 
     @property
     def hash(self) -> str:
-        """Of the task's own file."""
+        """Hash of the task's own file."""
         return self.files[0].hash
 
     @property
@@ -101,7 +101,7 @@ class TrustQuestion:
 
     @property
     def nothing_known(self) -> bool:
-        """The version trusted before is not known file by file."""
+        """Whether the version trusted before is not known file by file."""
         return self.trusted_before and not self.gone and all(one.since is Since.SAME for one in self.files)
 
 
@@ -135,13 +135,13 @@ class CodeToRun:
     """Code that a recording names or holds."""
 
     reference: TaskName
-    """The task to open; ignored if `recorded_text`."""
+    """The task to open; ignored if `recorded_text` is True."""
     info: EpisodeInfo
-    """Of the recording."""
+    """Info of the recording."""
     recorded_text: bool = False
-    """Run the text that the recording holds."""
+    """Whether to run the text that the recording holds."""
     followed: bool = False
-    """Later saves of the file run too."""
+    """Whether later saves of the file run too."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class _Undecided:
 
     content: TaskContent
     agreed: bool
-    """They may run, but not be followed."""
+    """Whether the texts may run, but not be followed."""
 
 
 class Clearances:
@@ -196,7 +196,7 @@ class Clearances:
     def clear_all(
         self, codes: Sequence[CodeToRun], stopped: Callable[[], bool] = lambda: False
     ) -> list[TaskName | NotCleared]:
-        """The same for several; each text is asked about once."""
+        """What to open for each of several, or the refusal; asks about each text once."""
         decisions = [self._without_asking(one) for one in codes]
         to_ask: dict[str, tuple[CodeToRun, _Undecided]] = {}
         for one, decision in zip(codes, decisions):
@@ -251,7 +251,7 @@ class Clearances:
         return RecordedTask(file.name, content.main, class_name, content.texts)
 
     def _answer(self, question: TrustQuestion, content: TaskContent, stopped: Callable[[], bool]) -> Consent:
-        """Ask, and keep a yes."""
+        """Ask the question, and store the answer if it is yes."""
         answer = Consent.NO if self._ask is None or stopped() else self._ask(question, stopped)
         if answer is Consent.ALWAYS:
             self._store.trust(content, question.followed)
@@ -260,7 +260,8 @@ class Clearances:
         return answer
 
     def refused_arguments(self, info: EpisodeInfo, made: MadeHere | None = None) -> str | None:
-        """Why an env may not get the arguments of this recording, or None: those from elsewhere may name no files."""
+        """Why an env must not get the arguments of this recording; None if it may. Recordings from elsewhere may name
+        no files."""
         if self._all_trusted or (made or made_here(info)) is not MadeHere.NO:
             return None
         named = [_printable(text) for text in paths_in_arguments(info)]
@@ -398,7 +399,7 @@ def _is_like_a_path(text: str) -> bool:
 
 
 def recorded_content(info: EpisodeInfo) -> TaskContent:
-    """The source text in a recording.
+    """The source text that a recording holds.
 
     Raises:
         NoRecordedSource: it has none.
@@ -416,7 +417,7 @@ def _approved(code: CodeToRun, content: TaskContent) -> TaskName:
 
 
 def _equals_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
-    """Whether a file has the recorded text: then the recording's seal covers it, in any folder."""
+    """Whether a file has the recorded text; then the recording's seal covers the file, in any folder."""
     try:
         return content.hash == recorded_content(info).hash
     except NoRecordedSource:

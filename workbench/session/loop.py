@@ -65,7 +65,7 @@ def post(change: Callable[[], object]) -> None:
 
 
 def on_loop(method: Callable[Args, Value]) -> Callable[Args, Value]:
-    """A method that does its work on the loop, whoever calls it."""
+    """Make a method run on the loop, from any calling thread."""
 
     @functools.wraps(method)
     def called(*args: Args.args, **kwargs: Args.kwargs) -> Value:
@@ -88,7 +88,7 @@ def later(seconds: float, change: Callable[[], object]) -> asyncio.TimerHandle:
 
 
 def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lambda: None) -> Value:
-    """For another thread: wait for work on the loop.
+    """Wait for work on the loop; called on another thread than the loop.
 
     Args:
         check: called often meanwhile; what it raises cancels the work, and is raised.
@@ -106,7 +106,7 @@ def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lamb
 
 
 def wait_for_disk(done: futures.Future[Any] | None) -> None:
-    """Wait for what an `Aside` does, at most for a second: a disk may hang. Called on another thread than the loop."""
+    """Wait for the result of an `Aside`, at most one second: a disk may hang. Called on another thread than the loop."""
     if done is not None and not is_here():
         futures.wait([done], timeout=1.0)
 
@@ -139,8 +139,8 @@ class Changes:
 
 
 class Aside:
-    """A thread for what blocks, one thing after the other. It begins with the first use, and nobody waits for it at the end
-    of the process: a call into a disk that hangs cannot be ended."""
+    """A thread that runs blocking calls one after the other. It begins with the first use, and the end of the process
+    does not wait for it: a call into a disk that hangs cannot be ended."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -151,7 +151,7 @@ class Aside:
         self._ended = False
 
     def begin(self, work: Callable[[], Value]) -> futures.Future[Value]:
-        """Do this after what was begun before; after the end it is cancelled. Called on the loop."""
+        """Queue `work` behind the work begun before; it is cancelled if the thread has ended. Called on the loop."""
         made: futures.Future[Value] = futures.Future()
         if self._ended:
             made.cancel()
@@ -163,16 +163,16 @@ class Aside:
         return made
 
     async def run(self, work: Callable[[], Value]) -> Value:
-        """Do this after what was begun before, and wait for it. Who is cancelled meanwhile does not stop it."""
+        """Queue `work` and wait for its result. Cancelling the caller does not stop `work`."""
         return await asyncio.wrap_future(self.begin(work))
 
     def end(self) -> None:
-        """End the thread when all that was begun is done."""
+        """End the thread when all queued work is done."""
         self._ended = True
         self._work.put(None)
 
     def close(self) -> None:
-        """The same, and return then; called on another thread than the loop."""
+        """End the thread when all queued work is done, and wait for that; called on another thread than the loop."""
         self.end()
         if self._thread is not None:
             self._thread.join()

@@ -36,13 +36,13 @@ SENTENCES: dict[Change, tuple[str, str, str]] = {
         "{old} was not removed.",
     ),
 }
-"""By change: what it would do, what it did, and the message when another plan replaces it."""
+"""Sentences by change: what it would do, what it did, and the message when another plan replaces it."""
 PLANNED, DONE, LEFT = range(3)
 """Index into an entry of `SENTENCES`."""
 
 
 def change_text(request: EditRequest, when: int, file: str = "") -> str:
-    """The sentence of `SENTENCES` about a change."""
+    """The sentence of `SENTENCES` for a change."""
     return SENTENCES[request.what][when].format(old=request.key[1], new=request.result[1], file=file)
 
 

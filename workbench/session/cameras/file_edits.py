@@ -63,7 +63,7 @@ class FileEdits:
     ) -> None:
         self._cameras, self._notify, self._open_copy = cameras, on_change, open_copy
         self.folder = Path.cwd()
-        """For a copy of a task: the folder where the program was started."""
+        """Folder for a copy of a task: the one in which the program was started."""
         self._asker, self._load, self._shown, self._patience = asker, load, shown, patience
         self._stopped = threading.Event()
         """Cancels the present question."""
@@ -77,9 +77,9 @@ class FileEdits:
         self._removed: dict[CameraKey, CameraSettings] = {}
         """Placements of cameras that were removed from the file."""
         self._turn = asyncio.Lock()
-        """Of one edit after the other."""
+        """Lock that makes edits run one after the other."""
         self._drawings = Jobs(on_change, self._not_drawn)
-        """Of new cameras."""
+        """Jobs that draw the previews of new cameras."""
         self._aside = Aside("edits")
         """Reads and writes the file, and finds edits in it."""
         self._closing = False
@@ -130,7 +130,7 @@ class FileEdits:
         self._cameras.problem = f"There is no picture of the new camera: {failure}."
 
     def _run(self, texts: Mapping[str, str]) -> HookCameras:
-        """Run the hooks of these texts; called beside the loop."""
+        """Run the hooks of these texts; called off the loop."""
         stopped = self._stopped = threading.Event()
         load, deadline = self._load(), time.monotonic() + self._patience
         if load is None or self._closing:
@@ -341,7 +341,7 @@ class FileEdits:
         self._drawings.close()
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        """Do this after the edits before."""
+        """Run `work` after the edits that were begun before it."""
         self._drawings.stop()
         begin(self._in_turn(work))
 

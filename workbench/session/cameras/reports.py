@@ -23,16 +23,16 @@ from workbench.session.protocol.messages import Load, Reset
 from workbench.session.protocol.questions import DrawCamera, MeasureCamera, SuggestCameras
 
 FIRST_SEED = 10_000
-"""The same seeds for every report, so that two can be compared; far from those that people start with."""
+"""First seed of every report, so that two reports can be compared; far from the seeds that people start with."""
 MOST_ENVS = 16
-"""In the background; for more seeds these are reset again."""
+"""Most envs of a job in the background process; for more seeds these envs are reset again."""
 _REPORT_EVERY = 8
 """Steps between two partial reports."""
 
 
 Triple = tuple[float, float, float]
 Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]
-"""What a camera is measured on: the env; (B, 7) its bodies, None for now; the moment of the history."""
+"""What a camera is measured on: the env; the poses (B, 7) of its bodies, None for now; the moment of the history."""
 
 
 class CameraReports:

@@ -54,7 +54,7 @@ class Placements:
         self._undone: list[PlacementChange] = []
 
     def copy(self) -> Placements:
-        """The same placements and steps, independent of these."""
+        """A copy of the placements and steps, independent of this object."""
         other = Placements()
         other.in_file, other.placed = dict(self.in_file), dict(self.placed)
         other._done, other._undone = list(self._done), list(self._undone)
@@ -253,11 +253,11 @@ class StudioCameras:
         """The step and the selected env that were shown last."""
 
     def kept(self) -> KeptPlacements:
-        """For a later session of this task."""
+        """Placements, steps of undo and the selected camera, for a later session of this task."""
         return KeptPlacements(self.placements.copy(), self.selected or self._select_when_loaded)
 
     def select_again(self) -> None:
-        """After a load: select the camera that was selected in the earlier session; none that is gone."""
+        """Select again, after a load, the camera that was selected in the earlier session; none if the camera is gone."""
         before, self._select_when_loaded = self._select_when_loaded, None
         self.selected = self.selected or before
         if self.selected is not None and self.info(self.selected) is None:

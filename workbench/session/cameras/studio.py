@@ -308,7 +308,7 @@ class CameraStudio:
 
     @on_loop
     def kept_placements(self) -> KeptPlacements:
-        """For a later session of this task."""
+        """Placements, steps of undo and the selected camera, for a later session of this task."""
         return self._cameras.kept()
 
     def placed(self, event: Placed, task: TaskDescription | None) -> None:

@@ -21,7 +21,7 @@ edit. ``mismatch``: it does not. ``undone``: taken out of the file."""
 
 
 Change = Literal["edit", "add", "duplicate", "rename", "remove"]
-"""Of a camera in the file."""
+"""Kind of change to a camera in the file."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class StudioCamera:
 
     key: CameraKey
     info: CameraInfo
-    """Of the live camera; its `settings` are those of the file."""
+    """Description of the live camera; its `settings` are those of the file."""
     now: CameraSettings | None
-    """As placed; equal to ``info.settings`` without a placement. None only if that is None."""
+    """Settings as placed; equal to ``info.settings`` without a placement. None only if ``info.settings`` is None."""
     moved: bool
-    """Its placement differs from the file."""
+    """Whether the placement differs from the file."""
     mount_pose: NDArray[np.float32] | None
     """(7,) p and wxyz of its mount in the selected env's frame, at the shown moment. None for a camera without a mount."""
     refused: str = ""
@@ -128,7 +128,7 @@ class StudioResults:
     report_seeds: int = 0
     """Number of fresh episodes; 0 for a report over the envs at the shown moment."""
     report_moments: tuple[MeasuredMoment, ...] = ()
-    """Of a report over steps: the moment of each of ``report.envs``; else empty."""
+    """Moment of each of ``report.envs`` in a report over steps; else empty."""
     outdated: bool = False
     """The report is of an earlier version."""
     measuring: bool = False
@@ -166,13 +166,13 @@ class StudioView:
     results: StudioResults = StudioResults()
     """Reports, suggestions, pictures."""
     report_stale: bool = False
-    """The camera was moved since it was measured, or another version runs."""
+    """Whether the camera was moved since it was measured, or another version runs."""
     preview_scale: float = 1.0
     """Size of the preview relative to the camera's own; 1 for no preview."""
     preview: Picture | None = None
     """The preview, while there is one."""
     progress: JobProgress | None = None
-    """None while no job runs."""
+    """Progress of the running job; None while no job runs."""
     problem: str = ""
     """The last failure, or a placement that was dropped, as a sentence."""
     serial: int = 0

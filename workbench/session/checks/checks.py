@@ -20,48 +20,49 @@ from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleP
 from workbench.session.rescore.background import StoppedBy
 
 AHEAD = 2.0
-"""Seconds of checking before the history is rescored, which a person waits for more than for the last rule."""
+"""Seconds of checking at low priority; then at the lowest, since a person waits more for the rescored history than
+for the last rule."""
 MOST_DEATHS = 5
-"""Processes that may die in one check, each of another rule."""
+"""Most processes that may die in one check; the rule that was running fails, and the next process checks the others."""
 ChecksState = Literal["none", "off", "loading", "checking", "done", "stopped", "failed"]
 RUNNING: tuple[ChecksState, ...] = ("loading", "checking")
 
 
 @dataclass(frozen=True)
 class ChecksView:
-    """What the rules came to so far."""
+    """Results of the rules so far."""
 
     state: ChecksState = "none"
-    """``loading`` the version in the background process; ``off``: every rule is off."""
+    """``loading``: the version is loaded in the background process; ``off``: every rule is off."""
     serial: int = 0
     """Grows with every change."""
     results: tuple[RuleResult, ...] = ()
-    """One a rule, in the order in which they came."""
+    """One result for each rule, in the order in which they came."""
     before: tuple[Finding, ...] = ()
-    """Findings of an earlier version, of rules that are not checked anew."""
+    """Findings of an earlier version, for rules that have not been checked again."""
     total: int = 0
-    """Rules that are checked in all; 0 while unknown."""
+    """Number of rules to check; 0 while unknown."""
     looks_at: str = ""
     """What the running group looks at."""
     waits: bool = False
-    """Another job has the background process."""
+    """Whether another job has the background process."""
     stopped_by: StoppedBy | None = None
     why: str = ""
-    """Why it stopped or failed, as text."""
+    """Why the check stopped or failed, as text."""
     problem: Problem | None = None
     """What the code raised when it was loaded."""
     seconds: float = 0.0
-    """Since the version was loaded in the background process."""
+    """Seconds since the version was loaded in the background process."""
     after_each_save: bool = True
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Of the running version."""
+        """Findings of the running version."""
         return tuple(finding for result in self.results for finding in result.findings)
 
 
 class Checks:
-    """Checks the version that runs, and keeps what the version before came to until each rule is checked anew.
+    """Checks the running version, and keeps the findings of the version before until each rule has been checked again.
 
     Nothing of it runs in the worker that plays. The process gives way to whatever a person waits for; a group that was cut
     short is asked again without the rules that are known. Methods return at once.
@@ -105,7 +106,7 @@ class Checks:
 
     @on_loop
     def check(self, load: Load) -> None:
-        """Check this version; a running check ends."""
+        """Check this version; a running check is cancelled."""
         if all(degree == "off" for degree in degree_of_each(choice=load.options.rules).values()):
             self._jobs.stop()
             self._begin(load, "off")
@@ -115,7 +116,7 @@ class Checks:
 
     @on_loop
     def check_after_each_save(self, wanted: bool) -> None:
-        """Whether `loaded` begins to check, from now on."""
+        """Set whether `loaded` begins a check."""
         self._set(after_each_save=wanted)
 
     @on_loop
@@ -193,7 +194,8 @@ class Checks:
         self._on_change()
 
     def _begin(self, load: Load, state: ChecksState) -> None:
-        """Nothing is known of this version yet."""
+        """Begin the view of a version whose results are not known; findings of earlier versions move to
+        `ChecksView.before`."""
         self._of, view = _version(load), self._view
         before = {
             finding.key: finding
@@ -217,7 +219,7 @@ async def load_version(process: Background, job: Job, load: Load) -> None:
         JobFailed: it cannot be loaded there.
     """
     try:
-        # Where the process stands, at some moment of a job before, the new code may raise: then it is built anew.
+        # The new code may raise at the moment where an earlier job has left the process: then the env is rebuilt.
         await process.ensure(job, load, or_else=replace(load, level="rebuilt"))
     except JobFailed as failure:
         if failure.problem is None:
@@ -234,5 +236,5 @@ def _still_there(finding: Finding, source: Mapping[str, str] | None) -> bool:
 
 
 def _version(load: Load) -> object:
-    """What results depend on."""
+    """The part of a load that results depend on."""
     return str(load.task), load.source, load.options.env_kwargs, load.options.rules

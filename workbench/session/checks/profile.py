@@ -26,11 +26,11 @@ class ProfileView:
     serial: int = 0
     """Grows with every change."""
     profile: StepProfile | None = None
-    """The last that was made; of an earlier version if `stale`."""
+    """The last profile; of an earlier version if `stale`."""
     stale: bool = False
-    """Another version runs since."""
+    """Whether another version runs since."""
     why: str = ""
-    """Why it failed, as text."""
+    """Why the profile failed, as text."""
     problem: Problem | None = None
     """What the code raised."""
 
@@ -69,7 +69,7 @@ class StepProfiler:
 
     @on_loop
     def close(self) -> None:
-        """Stop, and make no more."""
+        """Stop, and begin no more profiles."""
         self.stop()
         self._jobs.close()
 

@@ -1,4 +1,4 @@
-"""Solves the open task from many seeds in processes beside, as ``workbench solve`` does, and keeps every episode."""
+"""Solves the open task from many seeds in separate processes, as ``workbench solve`` does, and keeps every episode."""
 
 from __future__ import annotations
 
@@ -19,42 +19,42 @@ from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.protocol.messages import Load
 
 _NICENESS = 10
-"""The worker that plays comes first."""
+"""Niceness of the solving processes: the worker that plays comes first."""
 SeedsState = Literal["none", "starting", "solving", "done", "stopped", "failed"]
 RUNNING: tuple[SeedsState, ...] = ("starting", "solving")
 
 
 @dataclass(frozen=True)
 class SeedsView:
-    """What came of the seeds so far."""
+    """Results of the seeds so far."""
 
     state: SeedsState = "none"
     serial: int = 0
     """Grows with every change."""
     report: SolveReport | None = None
-    """Of the seeds that are done; of an earlier version if `stale`."""
+    """Report on the finished seeds; of an earlier version if `stale`."""
     total: int = 0
     """Seeds that were asked for."""
     done: float = 0.0
-    """Seeds that are done, those under way in part."""
+    """Finished seeds; a seed under way counts in part."""
     activity: str = ""
-    """What is done at the moment: before the first seed, or which seed is at which step."""
+    """What is being done: the preparation before the first seed, or which seed is at which step."""
     stale: bool = False
-    """Another version runs since."""
+    """Whether another version runs since."""
     why: str = ""
-    """Why it failed, as text."""
+    """Why solving failed, as text."""
     problem: Problem | None = None
     """What the author's code raised."""
 
 
 @dataclass(frozen=True)
 class _Update:
-    """One thing that the other process has to say."""
+    """An update from the other process."""
 
     activity: str = ""
-    """As of `SeedsView`."""
+    """New value of `SeedsView.activity`."""
     done: float | None = None
-    """As of `SeedsView`; None before the first seed."""
+    """New value of `SeedsView.done`; None before the first seed."""
     report: SolveReport | None = None
 
 
@@ -111,13 +111,13 @@ class SeedsSolver:
 
     @on_loop
     def loaded(self) -> None:
-        """Another version runs: what is known is of an earlier one."""
+        """Another version runs: mark the results as those of an earlier version."""
         if self.view.report is not None:
             self._set(stale=True)
 
     @on_loop
     def stop(self) -> None:
-        """End it; seeds that are done stay, with their recordings."""
+        """End the job; finished seeds stay, with their recordings."""
         self._jobs.stop()
         if self.view.state in RUNNING:
             self._set(state="stopped", activity="")
@@ -134,7 +134,7 @@ class SeedsSolver:
         self._set(state="done", activity="")
 
     def _run(self, job: Job, setup: _Setup) -> None:
-        """On a thread of its own."""
+        """Run the job on its own thread."""
         if job.stopped:
             return
         work = Work(_run, setup, SolveReport, _Update, "that solves")
@@ -171,7 +171,7 @@ class SeedsSolver:
 
 
 def _run(setup: _Setup, queue: ItemQueue) -> None:
-    """Runs in the other process, which starts the workers."""
+    """Entry point of the other process, which starts the workers."""
     from workbench.jobs.record.solve import SolveOptions, solve
 
     if queue.next() is None:

@@ -13,18 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 from workbench.core.env.step_result import StepResult
 
 PREFIX = "reward_terms/"
-"""Of the entries of a `StepResult` that are terms of a dense reward.
+"""Prefix of the entries of a `StepResult` that are terms of a dense reward.
 
 ``compute_dense_reward`` puts them into ``info["reward_terms"]``, a dict of tensors (N,). The key is the workbench's own,
 since ManiSkill has no place for them; it passes ``info`` on unchanged, nested dicts included, so such a file runs in stock
 ManiSkill too. A term that is not one number an env is shown among the numbers, without a curve.
 """
 MOST = 64
-"""Columns that are kept; what comes first in `columns_of` counts."""
+"""Most columns that are kept; the first ones of `columns_of`."""
 MOST_PARTS = 8
-"""Numbers of one entry; of a longer one none has a curve."""
+"""Most numbers of one entry; a longer entry has no curve."""
 _SPANS = 400
-"""Spans of a curve, two points each: more do not fit in the panel's 300 pixels."""
+"""Spans of a curve, two points each: more do not fit into the panel's 300 pixels."""
 _NUMBERS = 2**17
 """Limit of spans times envs: with `MOST` columns of 17 bytes the curves take 140 MB at most, 7 MB for 16 envs."""
 _FEWEST_SPANS = 64
@@ -175,7 +175,7 @@ class Spans:
     gap: NDArray[np.bool_]
     """(L, B) whether some number is NaN or infinite."""
     last: NDArray[np.floating]
-    """(L,) at the last step."""
+    """(L,) numbers at the last step."""
     first: int = 1
 
     def points(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -315,7 +315,7 @@ class StepCurves:
         self._last = values
 
     def curves(self, env: int) -> Curves:
-        """Of one env. Copies: spans change until they are full, and when they are joined."""
+        """Curves of one env, as copies: spans change until they are full, and when they are joined."""
         if self._found is None or self._found.env != env:
             rows, used = [min(env, self._num_envs - 1), self._num_envs], -(-self.count // self._width)
 
@@ -334,7 +334,7 @@ class StepCurves:
         if not new:
             return
         if len(self._columns) + len(new) > MOST:
-            # Those that a new version of the task has dropped make room.
+            # Columns that a new version of the task has dropped make room.
             places = [k for k, column in enumerate(self._columns) if column in found]
             self._columns = [self._columns[k] for k in places]
             low, high, low_at, high_at, gap = (part[:, places] for part in self._parts)
@@ -375,7 +375,7 @@ class StepCurves:
 
 
 def mean_of_numbers(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(...) mean over the envs with a finite value of (N, ...); NaN where there is none."""
+    """(...) mean of (N, ...) over the envs with a finite value; NaN where there is none."""
     there = np.isfinite(values)
     total, count = np.where(there, values, 0.0).sum(axis=0, dtype=np.float64), there.sum(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)

@@ -18,7 +18,7 @@ from workbench.jobs.task import Restored, Stepped
 KEPT_REWARDS = 100
 """The newest steps of an episode whose rewards a row holds."""
 Outliers = Mapping[int, tuple[Outlier, ...]]
-"""By env, oldest first; only envs with outliers."""
+"""Outliers by env, oldest first; only envs with outliers."""
 
 
 class Outcome(IntEnum):
@@ -38,13 +38,13 @@ class LastEpisode:
     outcome: NDArray[np.int8]
     """(N,) `Outcome`; RUNNING if it was cut short, or there was none (then `steps` is -1)."""
     steps: NDArray[np.int32]
-    """(N,) control steps until its end."""
+    """(N,) control steps until the end of the episode."""
     total: NDArray[np.float64]
-    """(N,) its return until its end."""
+    """(N,) return until the end of the episode."""
     outliers: Outliers
 
     def with_envs(self, envs: NDArray[np.bool_], other: LastEpisode) -> LastEpisode:
-        """The same, but with the values of `other` in these envs (N,)."""
+        """A copy with the values of `other` in these envs (N,)."""
         return LastEpisode(
             np.where(envs, other.outcome, self.outcome),
             np.where(envs, other.steps, self.steps),
@@ -69,16 +69,16 @@ class EnvRows:
     followed: NDArray[np.bool_]
     """(N,) whether `total` is known: the task has a reward, and the episode was followed from its start."""
     first: Mapping[Hashable, NDArray[np.int32]]
-    """(N,) the first step at which it was true (0: after the reset); -1: never. By bool entry of ``evaluate``, by
+    """(N,) first step at which an entry was true; 0 is the reset, -1 is never. By bool entry of ``evaluate``, and by
     `OutlierKind`, also of a rule that is off."""
     outliers: Outliers
     last: LastEpisode
     ended: NDArray[np.int64]
-    """(N,) episodes that ended since the task was loaded."""
+    """(N,) number of episodes that ended since the task was loaded."""
     succeeded: NDArray[np.int64]
-    """(N,) those of them that ended in success."""
+    """(N,) number of the ended episodes that ended in success."""
     rewards: NDArray[np.float32]
-    """(N, `KEPT_REWARDS`) oldest first; NaN before the episode's start. (N, 0) in a moment of the history."""
+    """(N, `KEPT_REWARDS`) rewards, oldest first; NaN before the episode's start. (N, 0) in a moment of the history."""
 
     @property
     def num_envs(self) -> int:
@@ -172,7 +172,7 @@ class EnvTable:
         return tuple(self._found.values())
 
     def begin_version(self, rules: Mapping[str, Finding]) -> None:
-        """The code changes: its findings begin anew, and the rows stay."""
+        """The code changes: drop the findings of the old code, and keep the rows."""
         self._rules, self._found = rules, {}
 
     def rows(self) -> EnvRows:

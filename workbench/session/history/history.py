@@ -29,10 +29,10 @@ RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 3
 _OVERHEAD = 2500
 """Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
 _PICTURES_SHARE = 0.5
-"""Of the memory, for pictures: they are by far the largest (a human camera's is 0.8 MB; a step of 16 PickCube envs without
-pictures 21 KB, of 64 envs 72 KB) and can be rendered again."""
+"""Share of the memory limit for pictures: they are by far the largest (a human camera's is 0.8 MB; a step of 16
+PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be rendered again."""
 _RECENT = 200
-"""Newest moments that are searched for the one of a picture: pictures come some steps late."""
+"""Newest moments among which a picture's moment is searched: pictures come some steps late."""
 
 
 @dataclass
@@ -41,7 +41,7 @@ class SnapshotPartSet:
 
     keys: tuple[int, ...]
     content: tuple[bytes, ...] | None
-    """None if some parts went to another history: then the moment has no snapshot."""
+    """Bytes of the parts; None if some parts went to another history: then the moment has no snapshot."""
     moments: int = 0
     """Number of moments with these parts."""
 
@@ -58,7 +58,7 @@ class SnapshotParts:
         self._references: dict[int, int] = {}
         self._last = SnapshotPartSet((), ())
         self.used = 0
-        """Bytes."""
+        """Bytes in use."""
 
     def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> SnapshotPartSet:
         """Parts of the next moment; `keys` is None if they are those of the moment before."""
@@ -93,30 +93,31 @@ class Moment:
     """The batch after one reset, control step or jump back."""
 
     serial: int
-    """Counts up over the session."""
+    """Number of the moment, counting up over the session."""
     step: StepResult
-    """Its reward is NaN in an env that was reset, and the recorded one in an env that was put back here."""
+    """Result of the step. Its reward is NaN in an env that was reset, and the recorded one in an env that was put
+    back here."""
     jumped: NDArray[np.bool_]
-    """(N,) as `Stepped.reset_mask`."""
+    """(N,) mask as in `Stepped.reset_mask`."""
     seeds: NDArray[np.int64] | None
     tick: int
     """`Curves.serial` of this moment."""
     event_flags: NDArray[np.uint8]
-    """(N,) event flags (`RESET` ...), added up."""
+    """(N,) event flags (`RESET` ...), combined."""
     restored: Restored | None
     number: int
     """`Stepped.number`."""
     snapshot: WholeSnapshot | None
-    """Of the whole batch, or None; shares its bytes with other moments."""
+    """Snapshot of the whole batch, or None; shares its bytes with other moments."""
     parts: SnapshotPartSet
     size: int
-    """Bytes, without parts and pictures."""
+    """Size in bytes, without parts and pictures."""
     rows: EnvRows
     """The table of envs at that moment."""
     acted_by: str
-    """As `Stepped.acted_by`."""
+    """What chose the action, as in `Stepped.acted_by`."""
     pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
-    """By env, kind and name of the camera."""
+    """Pictures by env, kind and name of the camera."""
     outdated: set[tuple[int, CameraKind, str]] = field(default_factory=set)
     """Keys of pictures whose camera was moved since."""
     original_step: StepResult | None = None
@@ -129,7 +130,8 @@ class Moment:
 
 
 EnvMoment = tuple[Moment, int]
-"""A moment of an episode and the env's number in it: another one where the env continued from another env's moment."""
+"""A moment of an episode, and the env's number in it, which is another one where the env continued from another env's
+moment."""
 
 
 @dataclass(frozen=True)
@@ -137,13 +139,13 @@ class ShownMoment:
     """The moment that the page shows."""
 
     env: int
-    """The selected one."""
+    """The selected env."""
     num_envs: int
     poses: NDArray[np.float32] | None
-    """(N, B, 7) of a past moment; None while live."""
+    """(N, B, 7) poses of a past moment; None while live."""
 
     def of(self, env: int) -> NDArray[np.float32] | None:
-        """(B, 7) of one env."""
+        """(B, 7) poses of one env; None while live."""
         return None if self.poses is None else self.poses[env]
 
 
@@ -151,7 +153,7 @@ class ShownPast(Protocol):
     """Gives the moments that the page shows."""
 
     def shown_moment(self) -> ShownMoment:
-        """The shown one."""
+        """The shown moment."""
         ...
 
     def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
@@ -295,7 +297,7 @@ class History:
 
     @property
     def used(self) -> int:
-        """Bytes."""
+        """Bytes in use."""
         return self._used + self._parts.used
 
     @property
@@ -360,7 +362,7 @@ class History:
         return [(low + int(k), int(event_flags[k])) for k in np.flatnonzero(event_flags)]
 
     def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
-        """(K,) of this env between two moments, both included; NaN where it was reset."""
+        """(K,) rewards of this env between two moments, both included; NaN where it was reset."""
         return self._columns.between("reward", max(low, self.first), min(high, self.last))[:, env]
 
     def jumps_back(self, env: int) -> list[tuple[int, int]]:
@@ -498,7 +500,7 @@ class History:
         terms: dict[str, NDArray[np.float32]] = {}
 
         def take(then: StepResult, to: Sequence[int] | NDArray, of: Sequence[int] | NDArray) -> None:
-            """The rows of these envs, from those of others."""
+            """Copy rewards and reward terms of the envs `of` in `then` into the envs `to`."""
             reward[to] = then.reward[of]
             for name, values in then.evaluate.items():
                 # evaluate() has no terms: only the hook of the reward adds them, and it is not called here.

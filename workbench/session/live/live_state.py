@@ -58,7 +58,7 @@ class LiveState:
     """
 
     reference: TaskName
-    """The requested task: a file, ``file.py:ClassName``, or a registered env id; or what a recording names."""
+    """The requested task: a file, ``file.py:ClassName`` or a registered env id, or a task that a recording names."""
     options: TaskOptions
     """Build options; the seed is that of `now`."""
     history_bytes: int
@@ -66,7 +66,7 @@ class LiveState:
     now: SessionView = SessionView(activity="a worker process")
     """The live view, without the fields that `view` adds."""
     timeline: Timeline | None = None
-    """None before a task is loaded."""
+    """The timeline; None before a task is loaded."""
     first_step_due: bool = False
     """The next step is the first of a new scene: it does not prove that the task runs."""
     clients: int = 0
@@ -75,7 +75,8 @@ class LiveState:
     """Options that a person applied and that no load has taken or refused yet."""
     wants_play: bool = False
     policy_failed: bool = False
-    """It ended the playing, and none has begun since. The problem itself may be gone: a save that a load follows clears it."""
+    """Whether a failure of the policy stopped playing, and playing has not begun since. `problem` may be gone: a save
+    that a load follows clears it."""
     versions: list[tuple[int, TaskDescription]] = field(default_factory=list)
     """The versions that made the moments of `timeline`, oldest first, each with the serial of its first one."""
 
@@ -84,7 +85,7 @@ class LiveState:
         self.own_file = named_file(self.reference)
         """The named file, even if it never loaded; None for an env id."""
         self.own_folder = followed_folder(self.reference)
-        """Modules in or below it are watched with the file; None if nothing is watched."""
+        """Folder whose modules, and those below it, are watched with the file; None if nothing is watched."""
         self.running_reference = self.reference
         """The running task."""
 
@@ -310,7 +311,7 @@ class LiveState:
     # --- options of the envs -----------------------------------------------------------------------
 
     def apply_options(self, options: TaskOptions) -> None:
-        """Make the envs with these at the next load."""
+        """Build the envs with these options at the next load."""
         self.tried_options = options if changed_options(self.options, options) else None
         self.set(options_refused=None)
 
@@ -429,7 +430,7 @@ class LiveState:
         return own_files_of(() if self.now.task is None else self.now.task.source_files, self.own_file)
 
     def newest_moment(self) -> bytes | None:
-        """Pickled for `Load.snapshot`; None before a task is loaded."""
+        """The newest moment, pickled for `Load.snapshot`; None before a task is loaded."""
         return (
             None if self.timeline is None else self.timeline.history.snapshot_at(self.timeline.history.last)
         )
@@ -491,7 +492,7 @@ class LiveState:
 def past_after(
     before: TaskDescription | None, event: Loaded, restored: bool
 ) -> Literal["same", "patched", "gone"]:
-    """What a load means for the history: it goes on and means the same, it goes on with other code, or another begins.
+    """What a load means for the history: it continues unchanged, it continues with other code, or another history begins.
 
     Args:
         before: the version that ran before.

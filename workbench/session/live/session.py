@@ -144,13 +144,13 @@ class Session:
             recordings, self._notify, lambda envs: self._send(SetCapture(envs, from_reset=True)), on_notice
         )
         self._background = Background()
-        """Asks the background process."""
+        """Asks questions of the background process."""
         self.past_saver = PastSaver(recordings, self._recorder.finisher, self._notify, self._background)
         self.rescorer = PastRescorer(self._notify, self._background)
         self.checks = Checks(self._notify, self._background, check)
-        """The rules of the running version."""
+        """Checks the rules of the running version."""
         self.profiler = StepProfiler(self._notify, self._background)
-        """Where a step of the running version goes."""
+        """Measures where the time of a step of the running version goes."""
         self.solver = Solver(self._notify, self._send, lambda: self._set_playing(False))
         """Plans the actions of the source *solve*."""
         self.seeds_solver = SeedsSolver(self._notify, recordings)
@@ -210,7 +210,7 @@ class Session:
 
     @on_loop
     def kept_work(self) -> KeptWork:
-        """For a later session of this task."""
+        """What a person did in this session, for a later session of the same task."""
         options, now = self._state.options, self._state.now
         return KeptWork(options, now.settings, now.seed, self.studio.kept_placements())
 
@@ -252,7 +252,7 @@ class Session:
         self._set_playing(False, SingleStep())
 
     def _set_playing(self, playing: bool, request: Play | SingleStep | None = None) -> None:
-        """Note it and send `request`, or a plain `Play`."""
+        """Note whether the session plays, and send `request`, or a plain `Play`."""
         self._state.set(playing=playing)
         self._state.wants_play = playing
         self._notify()
@@ -297,7 +297,7 @@ class Session:
             self._send(Tell(envs, tuple(dimensions), tuple(values)))
 
     def _on_policy_saved(self) -> None:
-        """On the watcher's thread."""
+        """Read the policy again. Called on the watcher's thread."""
         # A policy in the task's folder is also watched as a module of the task, for which a save reports "nothing changed".
         self._log("the policy's file was saved: it is read again")
         do(lambda: self._send(self._state.policy_saved()))
@@ -441,7 +441,7 @@ class Session:
     # --- events of the worker ------------------------------------------------------------------------
 
     def _take(self, event: Event) -> None:
-        """On the supervisor's thread, which goes on when the event was taken."""
+        """Take an event of the worker. Called on the supervisor's thread, which continues when the event was taken."""
         # Files are read here: a disk that hangs must not keep the loop.
         if isinstance(event, LoadFailed):
             self.versions.follow_failure(event)
@@ -450,7 +450,7 @@ class Session:
             self._on_event(event)
 
     def _on_death(self, death: Death) -> None:
-        """On the supervisor's thread."""
+        """Take the death of a worker. Called on the supervisor's thread."""
         problem, kept = do(lambda: self._died(death))
         if problem is not None:
             self._on_event(LoadFailed(problem, kept))
@@ -531,7 +531,7 @@ class Session:
             self.rescorer.rescore(load, rescored)
         elif what_to_do == "forget":
             self.rescorer.forget()
-        # After the rescoring was begun: of two jobs for which nobody waits, the later comes first.
+        # After the rescoring was begun: the later of two jobs of one priority comes first.
         self.checks.loaded(load, before is not None and before.env_id == event.task.env_id)
         self.profiler.loaded()
         self.seeds_solver.loaded()

@@ -1,4 +1,4 @@
-"""Plans the actions of the live envs in a process beside, for the source of actions *solve*."""
+"""Plans the actions of the live envs in a separate process, for the source of actions *solve*."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from workbench.session.protocol.messages import FollowPlan, Load, PlanWanted, Re
 from workbench.session.protocol.questions import PlanActions, Planned, PlannedEnv
 
 _NICENESS = 5
-"""Between the worker that plays and what nobody waits for."""
+"""Niceness of the planning process: between the worker that plays and work that nobody waits for."""
 _NOTHING = np.zeros(0, np.float32)
 SolveState = Literal["none", "starting", "planning", "failed"]
 
@@ -43,11 +43,11 @@ class SolveView:
     plan: PlannedEnv | None = None
     """The last plan of the env."""
     plan_step: int = 0
-    """The control step of the episode that it was made for, from 0 on."""
+    """Control step of the episode that the plan was made for, from 0 on."""
     predicted: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
-    """(T,) reward a step of the best rollout from each step of the episode on; NaN where nothing was planned."""
+    """(T,) predicted reward a step of the best rollout from each step of the episode on; NaN where nothing was planned."""
     achieved: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
-    """(T,) reward a step that came, over the horizon from there on as far as it is over."""
+    """(T,) achieved reward a step, over the horizon from each step on, as far as the horizon is over."""
     begins: int = 0
     """The control step of the episode that `predicted` and `achieved` begin with."""
     solved_at: int = 0
@@ -63,10 +63,10 @@ class _Episode:
     """What is known of the running episode of an env."""
 
     begins: int = 0
-    """Control steps before its first one here."""
+    """Control steps of the env's episode before the first one that is kept here."""
     rewards: list[float] = field(default_factory=list)
     predicted: dict[int, float] = field(default_factory=dict)
-    """By place in `rewards`."""
+    """Predicted reward a step, by index into `rewards`."""
     horizon: int = 1
     plan: PlannedEnv | None = None
     plan_step: int = 0
@@ -93,12 +93,12 @@ class Solver:
         self._on_change, self._send, self._pause = on_change, send, pause
         self._process = Background(_NICENESS)
         self._state: SolveView = SolveView()
-        """Without what belongs to one env."""
+        """The view without the fields of a single env."""
         self._episodes: dict[int, _Episode] = {}
         self._jobs = Jobs(on_change, self._refuse)
 
     def view(self, env: int) -> SolveView:
-        """What is known of this env."""
+        """The view of this env."""
         progress, state, episode = self._jobs.progress, self._state, self._episodes.get(env, _Episode())
         solved = tuple((e, one.solved_at) for e, one in sorted(self._episodes.items()) if one.solved_at)
         predicted, achieved = _curves(episode)
@@ -148,7 +148,7 @@ class Solver:
 
     @on_loop
     def stop(self) -> None:
-        """End the planning; the last plan stays, to be looked at."""
+        """End the planning; the last plan stays visible."""
         self._jobs.stop()
         if self._state.state in ("starting", "planning"):
             self._set(state="none")

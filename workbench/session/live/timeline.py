@@ -27,21 +27,22 @@ MOST_STEPS = 400
 
 @dataclass(frozen=True)
 class TimelineView:
-    """State of the time slider. Moments are named by serials, which count up and are never reused; resets are moments too.
-    What a person is told of are control steps: a tick is their number since the envs were built, as on the curves."""
+    """State of the time slider. Moments are named by serials, which count up and are never reused; resets are moments
+    too. A person sees control steps: a tick is the number of control steps since the envs were built, as on the
+    curves."""
 
     first: int = 0
     last: int = -1
-    """The kept moments; `last` is the live one."""
+    """Serials of the oldest and the newest kept moment; the newest is the live one."""
     shown: int | None = None
     """The shown moment; None while live."""
     first_tick: int = 0
     tick: int = 0
     last_tick: int = 0
-    """Of the first, the shown and the live moment."""
+    """Ticks of the first, the shown and the live moment."""
     used: int = 0
     limit: int = 0
-    """Bytes."""
+    """Memory in use and its limit, in bytes."""
     moments: int = 0
     can_continue: bool = False
     """Whether envs can go back to the shown moment."""
@@ -50,7 +51,7 @@ class TimelineView:
     not_carried: tuple[str, ...] = ()
     """State that the last jump could not restore, each with its reason."""
     arrived: str = ""
-    """How the last jump entered a recording; empty if it did not."""
+    """How the last jump entered a recording; empty if the jump entered none."""
     entered: int = 0
     """Number of the last finished `Session.enter_recording`; 0 for none."""
     wants_pictures: bool = False
@@ -73,13 +74,13 @@ class Strip:
 
     low: int
     high: int
-    """Both included."""
+    """Lowest and highest tick, both included."""
     events: tuple[tuple[int, int], ...]
     """Tick and event flags (`history.RESET` ... added up); what happened at one tick is one event."""
     reward: NDArray[np.float32]
-    """(high - low + 1,) after each control step; NaN where there is none."""
+    """(high - low + 1,) reward after each control step; NaN where there is none."""
     branches: tuple[tuple[int, int], ...]
-    """Where the env went back, each with where it went back to."""
+    """Ticks at which the env went back, each with the tick that it went back to."""
     segments: tuple[tuple[int, int, bool], ...]
     """First and last tick of each segment (see `History`), and whether it begins with going back."""
 
@@ -187,7 +188,7 @@ class Timeline:
         at = moment if moment is not None else history.at(history.last)
         jump = history.last_jump(env)
         begin = history.at(history.segment_at(env, self.at)[0]) if at is not None else None
-        # Of the env and the moment that are shown: another env, or a reset since, lacks nothing.
+        # For the shown env and moment: another env, or a reset since, lacks nothing.
         came = begin.restored if begin is not None and begin.jumped[env] else None
         missed, how = ({}, "") if came is None else (came.not_carried, came.how)
         return TimelineView(
@@ -218,7 +219,7 @@ class Timeline:
         if jump.restored is None and before is not None:
             ended = before.step.terminated | before.step.truncated
             if ended[jump.jumped].all():
-                return "reset at the end"  # nobody asked for it but the task
+                return "reset at the end"  # only the task asked for it
         what = "reset" if jump.restored is None else "jump"
         if jump.restored is not None and jump.restored.recording:
             what = "going live"
@@ -229,7 +230,7 @@ class Timeline:
         return f"{what} of env {envs[0]}" if len(envs) == 1 else f"{what} of {len(envs)} envs"
 
     def tick_of(self, serial: int) -> int:
-        """Of a kept moment."""
+        """Tick of a kept moment; 0 if the moment is not kept."""
         moment = self.history.at(serial)
         return 0 if moment is None else moment.tick
 
@@ -239,7 +240,7 @@ class Timeline:
         ticks = history.ticks(history.first, history.last)
         low = min(max(low, int(ticks[0])), int(ticks[-1]))
         high = min(max(high, low), int(ticks[-1]))
-        # Of the moments at one tick the first is the control step that led there; the others are resets and jumps after it.
+        # The first moment at a tick is the control step that led there; the others are resets and jumps after it.
         first, end = int(np.searchsorted(ticks, low)), int(np.searchsorted(ticks, high, side="right"))
         here = slice(first, end)
         serials, base = (history.first + first, history.first + end - 1), history.first

@@ -32,7 +32,7 @@ from workbench.session.protocol.messages import (
 Attempt = Literal["file", "moment", "version", "nothing"]
 _GOOD_VERSIONS = 2
 _PROVEN_SECONDS = 30.0
-"""A version that crashes its process later than this after it was loaded had worked."""
+"""Seconds after a load: a version whose process crashes later than this counts as one that worked."""
 
 
 class LoadInputs(NamedTuple):
@@ -64,11 +64,11 @@ class _GoodVersion:
     file: str | None
     source: dict[str, str]
     since: float
-    """When it was loaded last."""
+    """When the version was last loaded."""
     crashes: int = 0
-    """Of its process, one after the other, each soon after it was loaded."""
+    """Crashes of its process in a row, each soon after the version was loaded."""
     idle_crashes: int = 0
-    """Of these, those since its last step while nothing was asked of it."""
+    """How many of `crashes` came since its last step, while nothing was asked of the worker."""
 
 
 class Recovery:
@@ -107,7 +107,7 @@ class Recovery:
 
     @property
     def good_source(self) -> dict[str, str] | None:
-        """Of the version that is brought back; None if there is none."""
+        """Source of the version that is brought back; None if there is none."""
         return self._good[-1].source if self._good else None
 
     @property
@@ -152,7 +152,8 @@ class Recovery:
             self._good[-1].idle_crashes = 0
 
     def failed(self, kept: bool) -> bool:
-        """A load failed in a worker that goes on. True if it has no version now, and `next_load` has one to try."""
+        """A load failed in a worker that continues. True if the worker has no version now, and `next_load` has one to
+        try."""
         was_loading, self.loading = self.loading, self.file_waits
         if kept or not was_loading or self.file_waits:
             return False
@@ -235,7 +236,7 @@ class Versions:
         self._recovery = Recovery(state.newest_moment)
         self._watcher = SourceWatcher(self._on_files_changed)
         self._aside = Aside("follow")
-        """Begins to watch, for which files are read."""
+        """Thread on which watching begins, since that reads files."""
         self._needed = NewProcessNeeded("", False)
         """Why the next worker is a new process, where the last one said so."""
 
@@ -341,7 +342,7 @@ class Versions:
 
     @on_loop
     def running_load(self) -> Load | None:
-        """Loads the running version into another worker; None if no task runs."""
+        """The load of the running version, for another worker; None if no task runs."""
         task = self._state.now.task
         return None if task is None else self._state.load_request(dict(task.source))
 

@@ -40,7 +40,7 @@ class ShownCameras:
 
     cameras: tuple[CameraInfo, ...]
     cameras_serial: int
-    """Differs for each set of cameras."""
+    """Number that differs for each set of cameras."""
     pictures: dict[CameraKey, Picture]
     pictures_serial: int
     segmentation: dict[int, str]
@@ -52,7 +52,7 @@ class ShownCameras:
     placed: CameraKey | None = None
     """The camera that is placed by hand."""
     preview: bool = False
-    """That camera is shown in another size than its own."""
+    """Whether the placed camera is shown in another size than its own."""
     failed: Mapping[CameraKey, str] = field(default_factory=dict)
     """Why cameras cannot be drawn, as sentences."""
     hidden: tuple[str, ...] = ()
@@ -66,11 +66,11 @@ class PastLoad:
     at: float
     """Seconds since the epoch."""
     level: ReloadLevel | None
-    """None for the first version, and for one that was refused."""
+    """Level of the reload; None for the first version, and for one that was refused."""
     reason: str
     milliseconds: float = 0.0
     problem: Problem | None = None
-    """Why it was refused."""
+    """Why the version was refused."""
 
 
 @dataclass(frozen=True)
@@ -110,16 +110,16 @@ class SessionView:
     problem: Problem | None = None
     problem_serial: int = 0
     problem_at_run: bool = False
-    """`problem` came while the task ran, not while a version was loaded."""
+    """Whether `problem` came while the task ran, not while a version was loaded."""
     spoiled: str = ""
     """Why another process brought the version back that ran when `problem` came, as `LoadFailed` has it."""
     refused: Problem | None = None
-    """Why the file's present version does not run."""
+    """Why the present version of the file does not run."""
     curves: Curves | None = None
     settings: Settings = Settings()
-    """Chosen on the page."""
+    """Settings chosen on the page."""
     told: NDArray[np.float32] | None = None
-    """(N, A) what sliders tell the robots next, of the shown moment what led there; None if unknown."""
+    """(N, A) action that sliders send next; of a past moment, the action that led there. None if unknown."""
     options: TaskOptions = TaskOptions()
     """How the envs are made; the seed is `seed`."""
     options_refused: TaskOptions | None = None
@@ -130,7 +130,7 @@ class SessionView:
     real_time_factor: float = 0.0
     recorded_share: float = 0.0
     watched_share: float = 0.0
-    """As `Status` has them."""
+    """Speeds and shares of time, as in `Status`."""
     timeline: TimelineView = TimelineView()
     """The history. While one of its moments is shown, `step` and `pictures` are of that moment."""
     busy: Busy | None = None
@@ -152,7 +152,7 @@ class SessionView:
     checks: ChecksView = ChecksView()
     """The rules of the running version, checked in the background."""
     profile: ProfileView = ProfileView()
-    """Where a control step goes."""
+    """Where the time of a control step goes."""
     seeds: SeedsView = SeedsView()
     """The task solved from many seeds."""
     studio: StudioView = StudioView()
@@ -162,7 +162,7 @@ class SessionView:
 
     @property
     def shown_cameras(self) -> ShownCameras | None:
-        """None while there is no task."""
+        """Cameras and pictures of the shown env; None while there is no task."""
         task, studio = self.task, self.studio
         return task and ShownCameras(
             task.cameras,
@@ -181,7 +181,7 @@ class SessionView:
 
     @property
     def played(self) -> tuple[Finding, ...]:
-        """What was found while playing."""
+        """Findings while playing: broken rules of GPU simulation, and outliers."""
         return (*(() if self.rules is None else self.rules.rows), *self.odd)
 
     @property

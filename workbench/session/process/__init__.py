@@ -1,1 +1,1 @@
-"""The worker as a process: started, supervised, asked, and what it printed; jobs in the background and what is shown of them."""
+"""The worker as a process: started, supervised, asked and logged; and jobs in the background with their progress."""

@@ -20,20 +20,20 @@ from workbench.session.process.worker_process import WorkerProcess
 from workbench.session.protocol.messages import Answer, Cancel, Load, PlaceCamera, Progress, Request
 
 _LOOK = 1.0
-"""Seconds between two looks whether a process still lives that says nothing."""
+"""Seconds between two checks whether a silent process still lives."""
 _NICENESS = 10
-"""The worker that plays comes first where there are fewer cores than work."""
+"""Niceness of the background process: the worker that plays comes first where there are fewer cores than work."""
 WAITING = "waiting for other work in the background"
 IDLE_SECONDS = 300.0
-"""How long an idle process is kept."""
+"""Seconds for which an idle process is kept."""
 _KEPT_OF_WORDS = 4096
-"""Bytes of what a process writes to ``stderr``: the last line is quoted if it ends with an error."""
+"""Bytes that are kept of a process's ``stderr``: its last line is quoted if the process ends with an error."""
 _PATIENCE = 3.0
 _LOAD_PATIENCE = 10.0
-"""Seconds in which a process must answer a cancelled question, or is ended."""
+"""Seconds in which a process must answer a cancelled load; then it is ended. For other questions see `_PATIENCE`."""
 Value = TypeVar("Value")
 OnProgress = Callable[[int, int, Any], None]
-"""Gets done, total, and the new part of the answer."""
+"""Callback for progress: gets done, total, and the new part of the answer."""
 
 
 def _ignore(done: int, total: int, part: Any) -> None:
@@ -56,10 +56,10 @@ class Asker:
         self._send = send
         self._numbers = count(1)
         self._asked: dict[int, _Asked] = {}
-        """By number."""
+        """Questions under way, by number."""
 
     async def ask(self, question: Question[Value], on_progress: OnProgress = _ignore) -> Value:
-        """The answer. Whoever is cancelled meanwhile does not get it.
+        """Ask a question and return the answer, unless the caller is cancelled meanwhile.
 
         Raises:
             JobFailed: there is no answer.
@@ -88,7 +88,7 @@ class Asker:
             asked.answer.set_exception(error)
 
     def _fail(self, error: Exception) -> None:
-        """There are no answers to what is under way."""
+        """Fail all questions under way with `error`."""
         for asked in self._asked.values():
             if not asked.answer.done():
                 asked.answer.set_exception(error)
@@ -102,7 +102,7 @@ Priority = Literal["person", "low", "lowest"]
 """Whether a person waits for the job; else whether its results are wanted soon."""
 _ORDER: dict[Priority, int] = {"person": 2, "low": 1, "lowest": 0}
 _Rank = tuple[int, int]
-"""The place of its priority, and the job's number: the highest comes first."""
+"""Rank of a job: its priority and its number; the highest rank comes first."""
 
 
 class Background(Asker):
@@ -125,24 +125,24 @@ class Background(Asker):
         super().__init__(self._send_call)
         self._niceness = niceness
         self._turn: _Rank | None = None
-        """Of the job that has it; also until its last answer has come."""
+        """Rank of the job that has the process, until its last answer has come."""
         self._waiting: dict[_Rank, asyncio.Future[None]] = {}
         self._idle: asyncio.TimerHandle | None = None
-        """Ends the process if it stays idle."""
+        """Timer that ends an idle process."""
         self._process: _Process | None = None
         self._ending: set[_Process] = set()
         self._unanswered: Call | None = None
         self._overdue: asyncio.TimerHandle | None = None
-        """Ends the process if the answer to a question that nobody waits for does not come."""
+        """Timer that ends the process if the answer to a cancelled question does not come."""
         self._loaded: Load | None = None
         """The last load; None after a failure."""
         self._placed: dict[CameraKey, PlaceCamera] = {}
         self.num_envs = 0
-        """Of the version that is open in the process; 0 for none."""
+        """Number of envs of the version that is open in the process; 0 for none."""
 
     @property
     def pid(self) -> int | None:
-        """None while there is no process; that of one that was ended until it has."""
+        """Process id; None without a process. A process that is being ended counts until it has ended."""
         process = self._process or next(iter(self._ending), None)
         return None if process is None else process.pid
 
@@ -197,7 +197,7 @@ class Background(Asker):
         self._grant()
 
     def _is_waited_for(self) -> bool:
-        """Whether a job of higher priority waits than the one that has the process."""
+        """Whether a job waits that has a higher priority than the job that has the process."""
         return self._turn is not None and max(self._waiting, default=self._turn) > self._turn
 
     @property
@@ -254,7 +254,7 @@ class Background(Asker):
         return self.num_envs
 
     async def ask(self, question: Question[Value], on_progress: OnProgress = _ignore) -> Value:
-        """As `Asker.ask`; starts the process if there is none.
+        """Ask a question as `Asker.ask` does; starts the process if there is none.
 
         Raises:
             JobFailed: there is no answer.
@@ -299,13 +299,13 @@ class Background(Asker):
         self._forget(ProcessDied("the process in the background was ended"))
 
     def close(self) -> None:
-        """End the process; returns when it has ended. Called on another thread."""
+        """End the process; returns when it has ended. Called on another thread than the loop."""
         self.end()
         for process in loop.do(lambda: tuple(self._ending)):
             process.join()
 
     def _ended(self, process: _Process, why: str) -> None:
-        """This process has ended."""
+        """Handle the end of this process."""
         self._ending.discard(process)
         if process is self._process:
             self._process = None
@@ -318,7 +318,7 @@ class Background(Asker):
 
 
 class _Process:
-    """A worker process, started and heard on a thread of its own, with which the kernel ends it."""
+    """A worker process, started and read on its own thread; the kernel ends the process with that thread."""
 
     def __init__(self, background: Background, niceness: int) -> None:
         self._background, self._niceness = background, niceness
@@ -326,9 +326,9 @@ class _Process:
         self._unsent: list[Request] = []
         self._killed = False
         self._said = b""
-        """The end of what it wrote to ``stderr``."""
+        """The last bytes that the process wrote to ``stderr``."""
         self._lock = threading.Lock()
-        """Of the start: what is sent before it is sent then."""
+        """Lock for the start: requests sent before it are queued and sent then."""
         self._thread = threading.Thread(target=self._run, name="background", daemon=True)
         self._thread.start()
 
@@ -365,7 +365,7 @@ class _Process:
             loop.do(partial(self._background._ended, self, why))
 
     def _serve(self) -> str:
-        """Returns why it ended."""
+        """Start the process and read its events until it ends; returns why it ended."""
         # The worker that plays shows the author's output; here it would appear twice. Its last words tell why it died.
         worker = WorkerProcess(self._hear, self._niceness)
         code: int | None = None

@@ -21,9 +21,9 @@ SWITCHES = ("bold", "dim", "italic", "underline", "reverse", "strike")
 _LONGEST_LINE = 2000
 _LINES_KEPT = 1000
 _LINES_PER_SECOND = 400
-"""More are counted and dropped. Costs 1 % of a core."""
+"""Most lines a second; further ones are counted and dropped. Costs 1 % of a core."""
 _BAR_PERIOD = 0.1
-"""Seconds."""
+"""Least seconds between two reports of an unfinished line that is overwritten."""
 _KEPT_OF_PIECE = 16_384
 """Bytes at the end of a piece that are split into lines during a flood."""
 
@@ -40,9 +40,9 @@ class PrintedLine:
     stream: str
     """``stdout`` or ``stderr``."""
     text: str
-    """Without colours, control characters escaped."""
+    """The text without colours, control characters escaped."""
     runs: tuple[Run, ...] = ()
-    """The same text in coloured runs; empty if it has no colour."""
+    """The text as coloured runs; empty if it has no colour."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class PrintedLog:
             earned = (now - self._refilled) * _LINES_PER_SECOND
             self._budget, self._refilled = min(self._budget + earned, float(_LINES_PER_SECOND)), now
             found, dropped = self._split(stream, piece)
-            # Of a flood the last lines are kept.
+            # The last lines of a flood are kept.
             over = len(found) - max(1, int(self._budget))
             if over > 0:
                 found, dropped = found[over:], dropped + over
@@ -146,7 +146,7 @@ class PrintedLog:
             if cut:
                 piece, self._rest[stream] = piece[cut:], b""
         *whole, rest = (self._rest.get(stream, b"") + piece).split(b"\n")
-        # Of a progress bar only the last version and the one being written are needed.
+        # Only the last version of a progress bar and the one being written are needed.
         if rest.count(b"\r") > 1:
             rest = b"\r".join(rest.rsplit(b"\r", 2)[1:])
         # Cut a line without an end, or a gigabyte of it would fill this process.

@@ -33,22 +33,22 @@ class Busy:
 
     seconds: float
     doing: str
-    """For the page: ``in evaluate``, ``loading``."""
+    """Text for the page: ``in evaluate``, ``loading``."""
     file: str | None = None
     """The author's file, if one of its lines is being executed."""
     line: int | None = None
     code: str | None = None
     traceback: str = ""
     drawing: bool = False
-    """The renderer works, which may take long the first time."""
+    """Whether the renderer works, which may take long the first time."""
     getting_ready: bool = False
-    """A new worker imports and compiles; none of the author's lines runs."""
+    """Whether a new worker imports and compiles; none of the author's lines runs then."""
     ignores_interrupt: bool = False
-    """It was interrupted and continued all the same."""
+    """Whether the worker was interrupted and continued nevertheless."""
     held: bool = False
-    """A debugger has suspended it, or is waited for: it does not hang."""
+    """Whether a debugger has suspended the worker, or is waited for; the worker does not hang then."""
     awaited: bool = False
-    """It waits until a debugger attaches."""
+    """Whether the worker waits until a debugger attaches."""
 
 
 def parse_stack(dump: str) -> list[FrameSummary]:
@@ -97,7 +97,7 @@ def hook_of(frames: Sequence[FrameSummary]) -> str | None:
 
 
 def as_traceback(frames: Sequence[FrameSummary], texts: Mapping[str, str] | None = None) -> str:
-    """As Python prints a traceback, without the workbench's own frames at its start.
+    """A traceback in Python's format, without the workbench's own frames at its start.
 
     Args:
         texts: source by path, for files that run in another version than on disk.
@@ -210,11 +210,11 @@ Doing = Literal[
 ]
 _DOINGS: tuple[Doing, ...] = get_args(Doing)
 _LAYOUT = struct.Struct("=QdB")
-"""Number of the piece of work, its beginning in seconds, index into `_DOINGS`."""
+"""Layout: number of the piece of work, its beginning in seconds, index into `_DOINGS`."""
 _PID, _PID_AT = struct.Struct("=I"), 64
-"""Of the worker; 0 until it has started."""
+"""Layout and offset of the worker's process id; 0 until the worker has started."""
 _HELD_AT = 128
-"""A byte: 1 while a debugger holds the worker."""
+"""Offset of a byte that is 1 while a debugger holds the worker."""
 
 
 @dataclass(frozen=True)
@@ -222,12 +222,12 @@ class Beat:
     """What a worker was doing at one moment."""
 
     number: int
-    """Counts pieces of work; 0 until the first."""
+    """Number of the piece of work, counting up; 0 before the first."""
     doing: Doing
     since: float
-    """``time.monotonic()`` of its beginning."""
+    """``time.monotonic()`` at the beginning of the work."""
     held: bool = False
-    """A debugger has suspended it, or is waited for."""
+    """Whether a debugger has suspended the worker, or is waited for."""
 
     @property
     def seconds(self) -> float:
@@ -244,7 +244,7 @@ def make_heartbeat() -> int:
 
 
 class HeartbeatWriter:
-    """The worker's side."""
+    """The worker's side of the heartbeat."""
 
     def __init__(self, fd: int) -> None:
         self._memory = mmap.mmap(fd, mmap.PAGESIZE)
@@ -261,7 +261,7 @@ class HeartbeatWriter:
 
 
 class HeartbeatReader:
-    """The server's side."""
+    """The server's side of the heartbeat."""
 
     def __init__(self, fd: int) -> None:
         self._memory = mmap.mmap(fd, mmap.PAGESIZE, prot=mmap.PROT_READ)
@@ -284,9 +284,9 @@ class HeartbeatReader:
 # --- interrupting the author's code ------------------------------------------------------------------
 
 INTERRUPT_SIGNAL = signal.SIGUSR1
-"""Not SIGINT, for which libraries and authors install handlers of their own."""
+"""Signal that interrupts the author's code. Not SIGINT, for which libraries and authors install handlers of their own."""
 STACK_SIGNAL = signal.SIGUSR2
-"""Makes faulthandler write the worker's stack into its file."""
+"""Signal that makes faulthandler write the worker's stack into its file."""
 
 
 class Interrupts:

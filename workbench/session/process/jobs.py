@@ -1,4 +1,4 @@
-"""Work that goes on beside a session, as tasks of the loop."""
+"""Background work of a session, as tasks of the loop."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class JobFailed(Exception):
 
 
 class ProcessDied(JobFailed):
-    """The process that worked on it is gone; the next question starts another."""
+    """The process that worked on the job is gone; the next question starts another one."""
 
 
 class Job:
@@ -41,10 +41,10 @@ class Job:
     def __init__(self, what: str, on_change: Callable[[], None] = lambda: None) -> None:
         self._what, self._on_change = what, on_change
         self.number = next(self._numbers)
-        """Higher for a job that begins later, whatever it is about."""
+        """Number of the job; a job that begins later has a higher one, whatever it is about."""
         self.progress = JobProgress(what, 0, 0)
         self.stopped = False
-        """For work on another thread, which asks."""
+        """Whether the job was stopped; work on another thread checks this."""
 
     def report(self, done: int, total: int, what: str = "") -> None:
         """Report progress."""
@@ -68,7 +68,7 @@ class Jobs:
 
     @property
     def progress(self) -> JobProgress | None:
-        """Of the job that runs; None without one."""
+        """Progress of the running job; None without one."""
         return None if self._job is None else self._job.progress
 
     def start(self, what: str, work: Callable[[Job], Awaitable[None]]) -> None:
@@ -88,7 +88,7 @@ class Jobs:
             self._job = self._task = None
 
     def close(self) -> None:
-        """Stop, and begin nothing more."""
+        """Stop the job, and begin no more."""
         self._closed = True
         self.stop()
 

@@ -14,9 +14,9 @@ from workbench.machine.processes.family import family, proportional_memory, resi
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 _SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kmgt]?)i?b?", re.IGNORECASE)
 _SHARE = 0.8
-"""Of the memory of the machine or the container."""
+"""Share of the memory of the machine or the container that ``auto`` allows."""
 _LEAST = 2**30
-"""Bytes; a worker that has only imported uses about half of this."""
+"""Lowest limit in bytes; a worker that has only imported uses about half of it."""
 _CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 _COUNT_EVERY = 2.0
 

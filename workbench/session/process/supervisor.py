@@ -36,24 +36,25 @@ _LOOK = 0.1
 """Seconds between two checks of the worker."""
 _BUSY = 2.0
 _LONG: dict[Doing, float] = {"starting": 20.0, "warming up": 20.0, "drawing": 20.0}
-"""Seconds of one piece of work after which it is reported: importing and compiling shaders takes long anyway."""
+"""Seconds after which a piece of work is reported, for work that takes long anyway: imports, shaders. For other work
+see `_BUSY`."""
 _STACK_EVERY = 1.0
-"""Seconds between two reads of the stack."""
+"""Seconds between two reads of the worker's stack."""
 _IGNORED_AFTER = 1.5
 """Seconds after an interrupt in which the author's code must have ended."""
 _LOAD_WAITS = 2.0
-"""Seconds that a load may wait behind something else, which is then interrupted ..."""
+"""Seconds that a load may wait behind other work; then that work is interrupted."""
 _LONGEST_SILENCE = 4.0
-"""... and this long after the interrupt the worker is ended."""
+"""Seconds after the interrupt at which the worker is ended if the load still waits."""
 _AFTER_A_FAILURE = 0.5
 _HEADLESS = 1.0
-"""Seconds without a main thread; a process that is ending has none for a moment."""
+"""Seconds without a main thread after which a worker is ended; a process that exits has none for a moment."""
 _MOST_DEATHS = 3
-"""Workers that may die in a row without a load in between."""
+"""Most workers that may die in a row without a load in between."""
 _SPARE_DELAY = 5.0
 """Seconds between a load and the start of a spare."""
 _MOST_SPARE_FAILURES = 2
-"""Spares that may die while they warm up; then no more are started."""
+"""Most spares that may die while they warm up; then no more are started."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +76,11 @@ class End(Enum):
 
     DIED = auto()
     ASKED = auto()
-    """By `Supervisor.replace`."""
+    """Ended by `Supervisor.replace`."""
     FILE_WAITS = auto()
-    """It was killed because it did not begin a load."""
+    """Killed because it did not begin a load."""
     HANDED_OVER = auto()
-    """It said that another process has to go on, see `messages.hands_over`."""
+    """Ended because another process has to continue, see `messages.hands_over`."""
 
 
 @dataclass(frozen=True)
@@ -87,14 +88,14 @@ class Death:
     """The end of a worker."""
 
     why: str
-    """For example ``was killed by SIGSEGV``."""
+    """Why it ended, for example ``was killed by SIGSEGV``."""
     end: End
     doing: str | None
-    """What it was doing; None for an idle worker."""
+    """What the worker was doing; None for an idle worker."""
     stack: str
-    """Its last stack, as faulthandler writes it; may be empty."""
+    """The worker's last stack, as faulthandler writes it; may be empty."""
     gives_up: bool
-    """Too many died: the next is started only when `Supervisor.replace` is called."""
+    """Whether too many workers died: the next is started only when `Supervisor.replace` is called."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,7 @@ class SpareWorker:
             self._due = time.monotonic() + _SPARE_DELAY
 
     def poll(self) -> None:
-        """Start one if it is due, and read its events. Does not block."""
+        """Start a spare if it is due, and read its events. Does not block."""
         if self._process is None:
             if self._due is not None and time.monotonic() >= self._due:
                 self._due = None
@@ -158,17 +159,17 @@ class SpareWorker:
 
     @property
     def memory(self) -> int:
-        """Bytes of memory; 0 without a spare."""
+        """Bytes of memory of the spare; 0 without one."""
         process = self._process
         return 0 if process is None else process.memory()
 
     def kill(self) -> None:
-        """End it without waiting; `stop` waits."""
+        """End the spare without waiting; `stop` waits."""
         if self._process is not None:
             self._process.kill()
 
     def stop(self) -> None:
-        """End it and wait."""
+        """End the spare and wait for its end."""
         process, self._process, self._ready, self._due = self._process, None, False, None
         if process is not None:
             process.stop(grace=0.0)
@@ -223,11 +224,11 @@ class Supervisor:
         self._closing = False
         self._hands_over = False
         self._pressed: list[Request] = []
-        """Waits for the next worker."""
+        """Requests from a person that wait for the next worker."""
         self._begun = False
-        """The worker has its first requests."""
+        """Whether the worker has got its first requests."""
         self._late: Load | None = None
-        """Asked for before that, perhaps too late to be among them."""
+        """Load that was sent before the worker had its first requests, perhaps too late to be among them."""
         self._deaths = 0
         self._interrupted: tuple[int, float] | None = None
         self._lives = 0
@@ -239,14 +240,14 @@ class Supervisor:
 
     @property
     def pid(self) -> int | None:
-        """Of the current worker; None between two."""
+        """Process id of the current worker; None between two workers."""
         with self._condition:
             worker = self._worker
         return None if worker is None else worker.pid
 
     @property
     def vitals(self) -> Vitals:
-        """As of the last check."""
+        """Memory of the processes, as measured at the last check."""
         return self._vitals
 
     @property
@@ -309,7 +310,7 @@ class Supervisor:
                 self._spare.stop()
 
     def _run_worker_safely(self) -> bool:
-        """As `_run_worker`, but an exception in it costs the worker and not the thread."""
+        """Run `_run_worker`; an exception in it ends the worker, not the thread."""
         try:
             return self._run_worker()
         except Exception as error:
@@ -427,7 +428,7 @@ class Supervisor:
                     self._spare.poll()
 
     def _drain_events(self, worker: WorkerProcess) -> None:
-        """Handle what it sent before it died: a recording loses only the step under way."""
+        """Handle the events that the worker sent before it died: a recording loses only the step under way."""
         try:
             while (event := worker.receive(timeout=_LOOK)) is not None:
                 self._on_event(event)
@@ -515,11 +516,11 @@ class _WorkerState:
     end: End = End.DIED
     stack: str = ""
     stack_of: int = 0
-    """Number of the piece of work of `stack`."""
+    """Number of the piece of work that `stack` was read in."""
     headless_since: float | None = None
-    """When it was first seen without its main thread."""
+    """When the worker was first seen without its main thread."""
     reported: float | None = None
-    """When it was last reported busy."""
+    """When the worker was last reported as busy."""
     held: bool = False
     """Whether a debugger held it at the last check."""
     held_changed: float = 0.0

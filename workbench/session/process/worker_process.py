@@ -42,18 +42,18 @@ from workbench.session.protocol.messages import (
 )
 
 _ONLY_LAST = (Load, Settings)
-"""Of two such requests in a row in the queue only the second matters."""
+"""Types of requests of which only the last counts, if several are queued in a row."""
 _MOST_REQUESTS = 1000
 """Longest queue while the worker reads nothing; then steps and resets are dropped (a key is held down)."""
 _PIECE = 1 << 20
 _FLOOD_PAUSE = 0.005
-"""Seconds between two reads of a flood: with pieces of a megabyte that drains 200 MB a second."""
+"""Seconds between two reads during a flood: with pieces of a megabyte that drains 200 MB a second."""
 _F_SETPIPE_SZ = 1031
 _BEGINS = 60.0
-"""Seconds in which a worker starts, also on a busy machine and where it is the first."""
+"""Start-up timeout of a worker in seconds; generous for a first start on a busy machine."""
 
 Output = Callable[[str, bytes], bool]
-"""Gets ``stdout`` or ``stderr`` and new bytes (none at its end); True asks for a pause."""
+"""Callback for output: gets ``stdout`` or ``stderr`` and new bytes (none at its end); True asks for a pause."""
 
 
 class WorkerProcess:
@@ -111,7 +111,8 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """Of the process that runs the task. Waits until it has started: some 50 ms, of the first worker seconds.
+        """Process id of the process that runs the task. Blocks until it has started: about 50 ms, some seconds for
+        the first worker.
 
         Raises:
             ProcessLookupError: it did not.
@@ -154,13 +155,13 @@ class WorkerProcess:
         return message
 
     def redirect_output(self, output: Output) -> None:
-        """Redirect its output from now on."""
+        """Redirect the output from now on."""
         self._output = output
 
     # --- looking at it -------------------------------------------------------------------------------
 
     def beat(self) -> Beat:
-        """What it is doing, and since when."""
+        """What the worker is doing, and since when."""
         return self._heartbeat.read()
 
     def memory(self, limit: int | None = None) -> int:
@@ -173,7 +174,8 @@ class WorkerProcess:
         return pid != 0 and main_thread_ended(pid) and self._process.poll() is None
 
     def stack(self, patience: float = 0.3) -> str:
-        """Its current stack, as faulthandler writes it; empty if it does not come within `patience` seconds."""
+        """The worker's current stack, as faulthandler writes it; empty if the stack does not come within `patience`
+        seconds."""
         if self.beat().number == 0 or self._process.poll() is not None:
             return ""  # before its handlers are installed the signal would end it
         with self._look_lock:
@@ -195,7 +197,7 @@ class WorkerProcess:
         return dump
 
     def crash_report(self) -> str:
-        """The stack of a crash or of ``os._exit``. Empty after a plain kill."""
+        """The stack of a crash or of ``os._exit``; empty after a plain kill."""
         return os.pread(self._stacks, 100_000, 0).decode(errors="replace")
 
     def interrupt(self) -> None:
@@ -208,18 +210,19 @@ class WorkerProcess:
     # --- its end -----------------------------------------------------------------------------------
 
     def exit_code(self) -> int | None:
-        """As of ``subprocess``: negative is the signal that ended it. Waits up to 2 s; None if it still runs."""
+        """Exit code as in ``subprocess``: negative for the signal that ended the worker. Blocks up to 2 s; None if
+        the worker still runs."""
         try:
             return self._process.wait(timeout=2.0)
         except subprocess.TimeoutExpired:
             return None
 
     def kill(self) -> None:
-        """End it now with all processes that it started; `receive` then raises EOFError."""
+        """End the worker now with all processes that it started; `receive` then raises EOFError."""
         self._process.terminate()
 
     def stop(self, grace: float = 1.0) -> None:
-        """Ask it to quit, and after `grace` seconds end it with all processes that it started."""
+        """Ask the worker to quit, and after `grace` seconds end it with all processes that it started."""
         if grace > 0 and self._process.poll() is None:
             self.send(Quit())
             try:

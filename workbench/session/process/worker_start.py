@@ -26,14 +26,14 @@ _UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
 
 @dataclass(frozen=True)
 class NewWorker:
-    """What the fork server is asked for."""
+    """Request to the fork server for a new worker."""
 
     niceness: int
 
 
 @dataclass(frozen=True)
 class Forked:
-    """It is there: process id of its keeper."""
+    """A worker was forked: process id of its keeper."""
 
     pid: int
 
@@ -41,7 +41,7 @@ class Forked:
 @dataclass(frozen=True)
 class ForkEnded:
     code: int
-    """As of ``subprocess``."""
+    """Exit code as in ``subprocess``: negative for the signal that ended the process."""
 
 
 class ForkedKeeper:
@@ -62,12 +62,12 @@ class ForkedKeeper:
 
     @property
     def pid(self) -> int:
-        """0 until it has been forked."""
+        """Process id of the keeper; 0 until it has been forked."""
         self.poll()
         return self._pid
 
     def poll(self) -> int | None:
-        """Its exit code; None while it runs. A killed fork server has killed it too."""
+        """Exit code; None while the process runs. A fork server that is killed has killed its workers too."""
         with self._lock:
             while self._code is None and has_come(self._told):
                 try:
@@ -87,7 +87,7 @@ class ForkedKeeper:
             return self._code
 
     def wait(self, timeout: float | None = None) -> int:
-        """As of ``subprocess.Popen``."""
+        """Wait for the end; returns the exit code, and raises as ``subprocess.Popen.wait`` does."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while (code := self.poll()) is None:
             left = None if deadline is None else deadline - time.monotonic()
@@ -122,10 +122,10 @@ class WorkerForks:
         self._process: subprocess.Popen[bytes] | None = None
         self._control: socket.socket | None = None
         self._from: tuple[dict[str, str], str] | None = None
-        """The environment and the current folder that it was started with."""
+        """Environment and current folder with which the fork server was started."""
 
     def start(self, fds: Sequence[int], niceness: int) -> Keeper:
-        """Start a worker; not waited for.
+        """Start a worker without waiting for it.
 
         Args:
             fds: socket, heartbeat and stacks, see `workbench.session.worker.start.run`.
@@ -143,12 +143,12 @@ class WorkerForks:
         return start_anew(fds, niceness)
 
     def end(self) -> None:
-        """End it, and all workers that it forked."""
+        """End the fork server and all workers that it forked."""
         with self._lock:
             self._end()
 
     def _fork_server(self) -> socket.socket | None:
-        """The socket that it listens to; None if it would not give what a worker started here and now is."""
+        """Socket of the fork server; None if the environment or the current folder has changed since it was started."""
         come_from = (child_environment(**_UNBUFFERED), _current_folder())
         if self._control is None:
             self._process, self._control = start_with_socket(
@@ -191,7 +191,7 @@ def _forked(control: socket.socket, fds: Sequence[int], niceness: int) -> Forked
 
 
 def start_anew(fds: Sequence[int], niceness: int) -> Keeper:
-    """A worker that does the imports itself; see `WorkerForks.start`."""
+    """Start a worker that does the imports itself; see `WorkerForks.start`."""
     return subprocess.Popen(
         python_command("-m", "workbench.session.worker.start", *map(str, [*fds, os.getpid(), niceness])),
         stdin=subprocess.DEVNULL,

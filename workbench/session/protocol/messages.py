@@ -43,7 +43,7 @@ class Load(Question["Loaded"]):
     """Import and build the task; it replaces the running one only if all of it succeeds."""
 
     task: TaskName
-    """A path, ``path:ClassName``, or a registered env id, as a person named it; or what a recording names."""
+    """A path, ``path:ClassName`` or a registered env id, as a person named it, or a task that a recording names."""
     options: TaskOptions
     source: dict[str, str] | None = None
     """Text to use in place of the files on disk, to bring back the last good version."""
@@ -54,11 +54,11 @@ class Load(Question["Loaded"]):
     any_task: bool = False
     """If no class is named and the first one fails, open another task of the file."""
     number: int = 0
-    """Counts the loads of the file on disk; 0 for a version that is brought back."""
+    """Number of the load of the file on disk, counting up; 0 for a version that is brought back."""
     because: str = ""
     """Why a new process loads it, for the `ReloadReport`."""
     same_scene: bool = False
-    """A new process loads it, and the scene is built by the same code as before."""
+    """Whether a new process loads the version, and the same code as before builds the scene."""
 
 
 @dataclass(frozen=True)
@@ -78,13 +78,13 @@ class Reset(Question[StepResult]):
     """Reset envs."""
 
     env_idx: tuple[int, ...] | None = None
-    """None resets all."""
+    """The envs to reset; None for all."""
     seed: int | None = None
-    """None continues the task's own random numbers."""
+    """Seed of the reset; None continues the task's own random numbers."""
 
 
 class CameraRequest(NamedTuple):
-    """As `core.cameras.render.Request`."""
+    """A picture to draw, in the form of `core.cameras.render.Request`."""
 
     name: str
     kind: CameraKind
@@ -106,29 +106,30 @@ class Settings:
     policy: str | None = None
     """``module:function`` or ``file.py:function`` when `action_source` is ``policy``; None if not named yet."""
     policy_folder: str | None = None
-    """Searched for the policy's file after the current folder."""
+    """Folder in which the policy's file is searched, after the current folder."""
     plan: PlanOptions = PlanOptions()
     """How actions are planned while `action_source` is ``solve``."""
     solve_all: bool = False
-    """Plan for every env in turn; else for the selected one, and the others hold still."""
+    """Plan for every env in turn; else for the selected one only, and the other envs hold still."""
     traced: str = ""
-    """The body whose way in the rollouts is shown; empty for the robot's tool."""
+    """Name of the body whose path in the rollouts is shown; empty for the robot's tool."""
     selected_env: int = 0
     cameras: tuple[CameraRequest, ...] = ()
     """Cameras to draw in the selected env; none while no page is open."""
     pictures: ShownPictures = "auto"
-    """What is drawn of them."""
+    """Degree of the pictures of these cameras."""
 
 
 @dataclass(frozen=True)
 class Tell:
-    """Tell envs values of their action, while `Settings.action_source` is ``sliders``; what is not named stays."""
+    """Set values of the action of envs, while `Settings.action_source` is ``sliders``; other dimensions keep their
+    value."""
 
     env_idx: tuple[int, ...]
     dimensions: tuple[int, ...]
-    """Without any they hold still where they are."""
+    """Dimensions to set; without any, the envs hold still."""
     values: tuple[float, ...]
-    """One for each dimension, the same for each env."""
+    """One value for each dimension, the same for each env."""
 
 
 @dataclass(frozen=True)
@@ -144,10 +145,10 @@ class FollowPlan:
     """The answer to a `PlanWanted`: actions to take from that moment on. Dropped if anything else moved the envs since."""
 
     number: int
-    """Of the `PlanWanted`."""
+    """Number of the `PlanWanted` that this answers."""
     env_idx: tuple[int, ...]
     actions: NDArray[np.float32]
-    """(S, n, A) for S control steps and these envs; the others hold still."""
+    """(S, n, A) actions for S control steps of these n envs; the other envs hold still."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ class PlaceCamera(Question["Placed"]):
 
     key: CameraKey
     settings: CameraSettings | None
-    """None restores the task's own."""
+    """The new settings; None restores the task's own."""
 
 
 @dataclass(frozen=True)
@@ -167,21 +168,21 @@ class SetCapture:
     """Send every step with the batch's state columns and the pictures of all cameras of these envs, for a recording."""
 
     env_idx: tuple[int, ...]
-    """Empty turns it off."""
+    """Envs to capture; empty turns capturing off."""
     from_reset: bool = False
-    """Begin in each env at its next reset, so that no picture is made in vain."""
+    """Begin in each env at its next reset, so that no unused picture is drawn."""
 
 
 @dataclass(frozen=True)
 class ReplayPath:
-    """How an env came to a moment: from the state at an exact point, by actions."""
+    """How an env came to a moment: actions from the state at an exact point."""
 
     start: int
-    """The server's number of the exact point's moment; its snapshot is in `Restore.starts`."""
+    """The server's number of the exact point's moment; the snapshot of it is in `Restore.starts`."""
     source: int
-    """The env's number then."""
+    """The env's number at the exact point."""
     actions: NDArray[np.float32]
-    """(T, A)"""
+    """(T, A) actions from there."""
 
 
 @dataclass(frozen=True)
@@ -191,15 +192,15 @@ class Restore:
     snapshot: bytes
     """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch."""
     env_idx: tuple[int, ...]
-    """The envs to set."""
+    """The envs to put back."""
     source: tuple[int, ...]
-    """For each, the env of the snapshot whose state it gets."""
+    """Env of the snapshot whose state each env of `env_idx` gets."""
     origin: int
     """The server's number of that moment; returned unchanged."""
     undoes: int | None = None
     """The server's number of the jump that this undoes, if any; returned unchanged."""
     ways: Mapping[int, ReplayPath] = field(default_factory=dict)
-    """For those of `env_idx` that can be replayed up to the moment."""
+    """Replay paths of those of `env_idx` that can be replayed up to the moment."""
     starts: Mapping[int, bytes] = field(default_factory=dict)
     """Pickled snapshots of the whole batch at the beginnings of `ways`, by number of the moment."""
 
@@ -209,7 +210,7 @@ class EnterRecording:
     """Put envs into a state of a recorded episode; followed by a `Stepped` that has `Stepped.restored`."""
 
     run: RecordedRun
-    """Up to the state."""
+    """The recorded run, up to the state."""
     env_idx: tuple[int, ...]
     """The envs to set, all to the same state."""
     source_file: str | None = None
@@ -224,7 +225,7 @@ class DrawPast:
     """Draw one env at a past moment without touching its simulation; followed by `PastPictures`."""
 
     poses: NDArray[np.float32]
-    """(B, 7) of that env's bodies, as in `StepResult.poses`."""
+    """(B, 7) poses of that env's bodies, as in `StepResult.poses`."""
     env: int
     cameras: tuple[CameraRequest, ...]
     origin: int
@@ -257,7 +258,8 @@ class Inspect:
 
 @dataclass(frozen=True)
 class Cancel:
-    """Nobody waits for the previous question's answer any more. Wakes the worker: long work stops as soon as a request comes."""
+    """Cancel the previous question: its answer is not needed. Wakes the worker: long work stops as soon as a request
+    comes."""
 
 
 @dataclass(frozen=True)
@@ -300,7 +302,7 @@ def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
 
 
 def hands_over(event: object) -> bool:
-    """Whether the worker ends with this event, and another one is to go on."""
+    """Whether the worker ends with this event, so that another worker continues."""
     return isinstance(event, NewProcessNeeded) or (isinstance(event, LoadFailed) and event.spoiled != "")
 
 
@@ -310,7 +312,7 @@ class Loading:
 
     activity: str
     number: int = 0
-    """Of the `Load`."""
+    """Number of the `Load`."""
 
 
 @dataclass(frozen=True)
@@ -320,7 +322,7 @@ class NewProcessNeeded:
 
     reason: str
     same_scene: bool
-    """Only code that runs at resets and steps differs, if any does."""
+    """Whether only code that runs at resets and steps differs, if any does."""
 
 
 @dataclass(frozen=True)
@@ -329,13 +331,13 @@ class ReloadReport:
 
     level: ReloadLevel
     reason: str
-    """For example ``only compute_dense_reward changed``."""
+    """Reason of the level, for example ``only compute_dense_reward changed``."""
     carried: tuple[str, ...] = ()
     """After a build: names of actors, articulations and attributes that kept their state."""
     not_carried: dict[str, str] = field(default_factory=dict)
-    """Names of those that did not, each with the reason."""
+    """Names of what did not keep its state, each with the reason."""
     same_scene: bool = False
-    """As `Load.same_scene`."""
+    """Whether the same code as before built the scene, see `Load.same_scene`."""
 
 
 @dataclass(frozen=True)
@@ -347,10 +349,11 @@ class Loaded:
     milliseconds: dict[str, float]
     """Time of each part of the load: import, build, rehearse, reset, geometry."""
     reload: ReloadReport | None = None
-    """None for the first version of a task. With ``same``, ``patched`` and ``cameras`` the scene, its episodes and
-    `first`'s poses are unchanged, and the geometry's visuals, which are large, are left out."""
+    """How the version replaced the previous one; None for the first version of a task. With ``same``, ``patched`` and
+    ``cameras`` the scene, its episodes and `first`'s poses are unchanged, and the geometry's visuals, which are
+    large, are left out."""
     options: TaskOptions | None = None
-    """Those of the `Load`."""
+    """Options of the `Load`."""
 
 
 @dataclass(frozen=True)
@@ -359,13 +362,13 @@ class LoadFailed:
 
     problem: Problem
     kept: bool
-    """The previous version still runs."""
+    """Whether the previous version still runs."""
     classes: tuple[str, ...] = ()
-    """The tasks of the file, the one that was tried first; empty where the file has only one or none was tried."""
+    """Tasks of the file, the one that was tried first; empty where the file has only one or none was tried."""
     options: TaskOptions | None = None
-    """Those of the `Load` that failed; None if the problem came later."""
+    """Options of the `Load` that failed; None if the problem came later."""
     at_run: bool = False
-    """The version that runs failed, or its policy; no load did."""
+    """Whether the running version or its policy failed; no load did."""
     spoiled: str = ""
     """What the failed code left in this process, or may have: the worker ends, and the next one brings the version that ran
     back. Empty if the worker goes on."""
@@ -382,14 +385,14 @@ class PlanWanted:
     snapshot: bytes = b""
     """A pickled `core.snapshots.snapshot.Snapshot` of these envs at that moment."""
     bodies: tuple[dict[str, bytes], ...] = ()
-    """What each of them is built of, from `planning.rollouts.bodies_of`."""
+    """What each of these envs is built of, from `planning.rollouts.bodies_of`."""
     why_not: str = ""
     """Why there is no snapshot; empty if there is one."""
 
 
 @dataclass(frozen=True)
 class PlanDropped:
-    """The worker waits for no plan any more: it was paused, or something else moved the envs."""
+    """The worker no longer waits for a plan: it was paused, or something else moved the envs."""
 
 
 @dataclass(frozen=True)
@@ -398,9 +401,9 @@ class Pictures:
 
     pictures: tuple[Picture, ...]
     milliseconds: float | None
-    """None where steps were made meanwhile, which took part of the time."""
+    """Render time; None where steps were made meanwhile, which took part of the time."""
     number: int
-    """`Stepped.number` of the moment that they show."""
+    """`Stepped.number` of the moment that the pictures show."""
 
 
 @dataclass(frozen=True)
@@ -417,13 +420,13 @@ class Placed:
 
     key: CameraKey
     settings: CameraSettings | None
-    """As in the request."""
+    """Settings of the request."""
     info: CameraInfo | None
     """The camera as it is now; `CameraInfo.settings` stays what the task's config has."""
     reshaped: bool = False
-    """Its pictures have another size or other modalities now."""
+    """Whether the camera's pictures have another size or other modalities now."""
     why_not: str = ""
-    """Why it was not placed; nothing changed then."""
+    """Why the camera was not placed; nothing has changed then."""
 
 
 @dataclass(frozen=True)
@@ -436,13 +439,13 @@ class PastPictures:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a `wire.Call` is."""
+    """Progress of a `wire.Call`."""
 
     number: int
     done: int
     total: int
     part: bytes = b""
-    """The new part of the answer since the last one, packed; see `wire.Question.part`."""
+    """New part of the answer since the last progress message, packed; see `wire.Question.part`."""
 
 
 @dataclass(frozen=True)
@@ -451,7 +454,7 @@ class Answer:
 
     number: int
     value: bytes = b""
-    """Packed: only the caller knows its type."""
+    """The answer, packed: only the caller knows its type."""
     why: str = ""
     """Why there is no value, for the page; empty if there is one."""
     problem: Problem | None = None
@@ -475,15 +478,16 @@ class Status:
     """Long work that delays requests, if any."""
     recorded_share: float = 0.0
     watched_share: float = 0.0
-    """0..1 of the time while playing that went into what is recorded with every step, and into pictures for the page."""
+    """Share (0 to 1) of the time while playing that went into what is recorded with every step, and into pictures for
+    the page."""
 
 
 @dataclass(frozen=True)
 class Told:
-    """What sliders tell the robots next, while they are the source of actions; sent whenever it may have changed."""
+    """The action that sliders send next, while they are the source of actions; sent whenever it may have changed."""
 
     action: NDArray[np.float32]
-    """(N, A)."""
+    """(N, A) the action."""
 
 
 @dataclass(frozen=True)

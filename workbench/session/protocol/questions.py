@@ -38,9 +38,9 @@ class DrawCamera(Question[Picture]):
     stands still and is drawn as with a `scale`."""
     env: int
     modalities: tuple[str, ...] = ("rgb",)
-    """Those that its shader does not give are left out."""
+    """Requested modalities; those that the camera's shader does not give are left out."""
     poses: NDArray[np.float32] | None = None
-    """(B, 7) of the env's bodies at a past moment; None for now."""
+    """(B, 7) poses of the env's bodies at a past moment; None for now."""
     scale: float = 1.0
     """Factor on the picture's size. Other than 1 it needs `settings`, and a temporary camera with the minimal shader draws:
     colours, depth and segmentation."""
@@ -52,10 +52,10 @@ class MeasureCamera(Question[CameraReport]):
 
     key: CameraKey
     settings: CameraSettings | None
-    """None for the env's own."""
+    """Settings to measure with; None for the env's own."""
     env: int
     poses: NDArray[np.float32] | None = None
-    """As in `DrawCamera`."""
+    """(B, 7) poses of the env's bodies at a past moment, as in `DrawCamera`; None for now."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class RunCameras(Question[HookCameras]):
     """Run the camera hooks with other texts of the author's files."""
 
     task: TaskName
-    """As it was opened."""
+    """The task, by the reference with which it was opened."""
     texts: Mapping[str, str]
-    """By path."""
+    """Text of each file, by path."""
 
 
 CameraQuestion = DrawCamera | MeasureCamera | SuggestCameras | RunCameras
@@ -85,42 +85,42 @@ CameraQuestion = DrawCamera | MeasureCamera | SuggestCameras | RunCameras
 
 @dataclass(frozen=True)
 class CheckedGroup:
-    """A group was checked; its results came before."""
+    """A group was checked; its results were sent before."""
 
     groups: int
-    """How many groups there are."""
+    """Number of groups."""
     rules: int
-    """How many rules of all groups are not off."""
+    """Number of rules in all groups that are not off."""
     next: str
-    """What the group after this one looks at; empty for the last."""
+    """What the next group looks at; empty after the last group."""
 
 
 @dataclass(frozen=True)
 class RuleProgress:
-    """How far the rules of a group are."""
+    """Progress of the rules of a group."""
 
     rule: str
-    """The one that is looked at; empty for those of GPU simulation, which are looked at together."""
+    """The rule that is being checked; empty for the rules of GPU simulation, which are checked together."""
     result: RuleResult | None = None
-    """What a rule came to; None where it is begun."""
+    """Result of the rule; None when its check begins."""
 
 
 @dataclass(frozen=True)
 class CheckGroup(Question[CheckedGroup]):
-    """Check the rules of one group on the loaded version. Any request behind it ends it."""
+    """Check the rules of one group on the loaded version. A later request ends the check."""
 
     part: ClassVar[Any] = RuleProgress
     group: int
-    """From 0, in the order of what people meet most."""
+    """Index of the group, from 0 on, in the order of what people meet most."""
     degrees: Mapping[str, Degree]
-    """Of each rule."""
+    """Degree of each rule."""
     known: tuple[str, ...] = ()
     """Rules of the group that were checked before a job of higher priority came."""
 
 
 @dataclass(frozen=True)
 class ProfileStep(Question[StepProfile]):
-    """Time the hooks and lines of a control step on envs of its own. Any request behind it ends it."""
+    """Time the hooks and lines of a control step, on separate envs. A later request ends it."""
 
 
 # --- plans -------------------------------------------------------------------------------------------
@@ -133,23 +133,23 @@ class PlannedEnv:
 
     env: int
     actions: NDArray[np.float32]
-    """(S, A) for the control steps before the next plan."""
+    """(S, A) actions for the control steps before the next plan."""
     horizon: int
     """H, control steps of a rollout."""
     returns: NDArray[np.float32]
-    """(K,) best first, NaN last; what each rollout earned."""
+    """(K,) return of each rollout, best first, NaN last."""
     plan: int
-    """Which of them was the plan itself as it was before."""
+    """Index of the rollout that is the earlier plan, unchanged."""
     hold: int
-    """Which of them held still."""
+    """Index of the rollout that holds still."""
     success_at: NDArray[np.int32]
     """(K,) the step of the horizon at which each succeeded, from 1 on; 0 if it did not."""
     paths: NDArray[np.float32]
-    """(P, H + 1, 3) the way of the traced body in some of them, best first; metres in the env's frame."""
+    """(P, H + 1, 3) path of the traced body in some of the rollouts, best first; metres in the env's frame."""
     drawn: tuple[int, ...]
-    """(P,) which of the rollouts `paths` are."""
+    """(P,) indices of the rollouts in `paths`."""
     traced: str
-    """The body; empty if the task has none to trace."""
+    """Name of the traced body; empty if the task has none to trace."""
     seconds: float
 
 
@@ -162,15 +162,15 @@ class Planned:
 
 @dataclass(frozen=True)
 class PlanActions(Question[Planned]):
-    """Plan the next actions of some envs, going on from their last plans. Any request behind it ends it."""
+    """Plan the next actions of some envs, continuing their last plans. A later request ends the planning."""
 
     snapshot: bytes
     """A pickled `core.snapshots.snapshot.Snapshot` of these envs."""
     bodies: tuple[dict[str, bytes], ...]
-    """What each of them is built of, from `planning.rollouts.bodies_of`."""
+    """What each of these envs is built of, from `planning.rollouts.bodies_of`."""
     options: PlanArguments
     traced: str = ""
-    """As `Settings.traced`."""
+    """Name of the body to trace, as in `Settings.traced`."""
 
 
 # --- moments of the past -----------------------------------------------------------------------------
@@ -182,11 +182,11 @@ class MomentToRescore:
     """A past moment to replay: a control step, or a jump if it has a snapshot."""
 
     action: NDArray[np.float32] | None
-    """(N, A); None for a jump, or a task without robots."""
+    """(N, A) action; None for a jump, or a task without robots."""
     snapshot: bytes | None = None
     """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch."""
     env_idx: tuple[int, ...] = ()
-    """The envs that are put back to it."""
+    """The envs that are put back to the snapshot."""
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class Captured:
     """What a recording stores of a moment."""
 
     columns: dict[str, NDArray]
-    """As `Stepped.columns`."""
+    """State columns, as in `Stepped.columns`."""
     pictures: tuple[Picture, ...]
 
 
@@ -226,7 +226,7 @@ class CaptureMoment(Question[Captured]):
     env_idx: tuple[int, ...]
     """The envs to draw."""
     pictures: bool
-    """Whether to draw."""
+    """Whether to draw pictures."""
 
 
 # --- the scene of a recording ------------------------------------------------------------------------
@@ -236,7 +236,7 @@ class CaptureMoment(Question[Captured]):
 class SceneMade:
     geometry: SceneGeometry
     poses: NDArray[np.float32]
-    """(T + 1, B, 7)"""
+    """(T + 1, B, 7) poses."""
     missed: tuple[str, ...]
     """States that could not be written into the env, each with its reason."""
 
@@ -247,16 +247,16 @@ class MakeScene(Question[SceneMade]):
 
     part: ClassVar[Any] = str
     task: str
-    """Registered id."""
+    """Registered id of the task."""
     files: tuple[str, ...]
     """Task files to search before ManiSkill's registry."""
     env_kwargs: dict[str, Any]
     seed: int
     reset_options: dict[str, Any]
     env_states: dict[str, NDArray]
-    """(T + 1, D) by name."""
+    """(T + 1, D) states by name."""
     imports: tuple[str, ...] = ()
-    """As `TaskOptions.imports`."""
+    """Modules to import, as in `TaskOptions.imports`."""
 
 
 # --- the list of tasks --------------------------------------------------------------------------------
@@ -272,15 +272,15 @@ class TaskPicture:
     """A picture of a task, or why there is none."""
 
     pixels: NDArray[np.uint8] | None = None
-    """(H, W, 3)"""
+    """(H, W, 3) pixels."""
     why_not: str = ""
     needs_download: bool = False
-    """The task or its robot lacks files that ManiSkill can download."""
+    """Whether the task or its robot lacks files that ManiSkill can download."""
 
 
 @dataclass(frozen=True)
 class DrawTask(Question[TaskPicture]):
-    """A picture of a registered task after a reset, as its human camera sees it, or else its first sensor."""
+    """Draw a picture of a registered task after a reset, by its human camera, or else by its first sensor."""
 
     env_id: str
 

@@ -17,7 +17,7 @@ from workbench.session.loop import Aside, on_loop, post
 from workbench.session.record.save_past import SaveStatus
 
 _MOST_WAITING = 256 * 1024**2
-"""Bytes of steps that wait for the disk."""
+"""Most bytes of steps that may wait for the disk."""
 
 
 @dataclass(frozen=True)
@@ -27,18 +27,18 @@ class RecordingStatus:
     active: bool = False
     env_idx: tuple[int, ...] = ()
     since: float = 0.0
-    """Seconds since the epoch: when it was begun, also where a new version came meanwhile."""
+    """Seconds since the epoch at which the recording began; a new version of the task does not change it."""
     episodes: int = 0
-    """That have ended since."""
+    """Number of episodes that have ended since the recording began."""
     waiting: int = 0
-    """Envs of these whose episode begins with their next reset."""
+    """Number of recorded envs whose episode begins with their next reset."""
     steps: int = 0
-    """Steps captured of the running episodes."""
+    """Captured steps of the running episodes."""
     bytes_written: int = 0
-    """Of this session's episodes, the running ones included."""
+    """Bytes written for this session's episodes, including the running ones."""
     episodes_written: int = 0
     being_written: int = 0
-    """Ended episodes whose files are being made."""
+    """Number of ended episodes whose files are being made."""
     recovered: tuple[str, ...] = ()
     """.rrd files of episodes that an earlier server left unfinished, recovered at the start."""
     folder: str = ""
@@ -76,13 +76,13 @@ class LiveRecorder:
         self.one_each = False
         """Whether the recording ends after one episode of each env."""
         self._gatherer: EpisodeGatherer | None = None
-        """Takes the steps, on `_aside`."""
+        """Takes the steps, on the thread of `_aside`."""
         self._recovered: tuple[str, ...] = ()
         self._problem: str | None = None
         self._waiting_bytes = 0
         self._since, self._episodes = 0.0, 0
         self.finisher = EpisodeFinisher(on_change, self._recover)
-        """Makes the files, also those of `PastSaver`."""
+        """Makes the files, including those of `PastSaver`."""
         self._aside = Aside("recorder")
 
     @on_loop
@@ -115,7 +115,7 @@ class LiveRecorder:
 
     @on_loop
     def take(self, stepped: Stepped) -> None:
-        """A step was made."""
+        """Take a step."""
         gatherer = self._gatherer
         if gatherer is None:
             return

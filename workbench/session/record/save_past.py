@@ -31,11 +31,11 @@ class SaveStatus:
     message: str = ""
     """Result of the last job that ended."""
     failed: bool = False
-    """`message` is an error."""
+    """Whether `message` is an error."""
     refused_at: object = None
-    """What was shown when nothing could be recorded of it: the message holds for that alone. None for any other message."""
+    """What was shown when nothing could be recorded of it; the message holds only there. None for any other message."""
     progress: JobProgress | None = None
-    """In moments; None while no job runs."""
+    """Progress in moments; None while no job runs."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class PastEpisode:
     env: int
     moments: tuple[EnvMoment, ...]
     seed: int
-    """Negative if unknown."""
+    """Seed of the episode; negative if unknown."""
     played_by: TaskDescription | None = None
-    """The version that made its last moment; None for the running one."""
+    """The version that made the last moment; None for the running one."""
 
     @property
     def steps(self) -> int:
@@ -58,7 +58,7 @@ class PastEpisode:
 
     @property
     def ended(self) -> bool:
-        """Whether the task ended it; false if it still runs or was reset early."""
+        """Whether the task ended the episode; False if it still runs or was reset early."""
         moment, env = self.moments[-1]
         step = moment.as_recorded
         return bool(step.terminated[env] or step.truncated[env])
@@ -70,7 +70,7 @@ class SaveRequest:
 
     task: TaskDescription
     load: Load
-    """Loads the running version into another worker."""
+    """The load of the running version, for another worker."""
     placed: tuple[PlaceCamera, ...]
     """Cameras that were placed by hand."""
     episodes: tuple[PastEpisode, ...]
@@ -132,7 +132,7 @@ def moments_of(episodes: Sequence[PastEpisode]) -> list[tuple[Moment, dict[int, 
 
 
 _SAME_START = 1e-6
-"""Metres and quaternion components."""
+"""Tolerance of the start state: metres, and quaternion components."""
 
 
 class PastSaver:
@@ -152,7 +152,7 @@ class PastSaver:
         self._process = process
         self._jobs = Jobs(on_change, self._failed)
         self._aside = Aside("keep-past")
-        """Writes, since the disk may be slow."""
+        """Thread that writes, since the disk may be slow."""
 
     @on_loop
     def save(self, what: SaveRequest) -> None:
@@ -178,14 +178,14 @@ class PastSaver:
             self._report("")
 
     def status(self, at: object) -> SaveStatus:
-        """Of what is shown `at` now."""
+        """The status for what is shown `at` now."""
         status = self._status
         if status.refused_at not in (None, at):
             status = SaveStatus()
         return replace(status, progress=self._jobs.progress)
 
     def close(self) -> None:
-        """Cancel the running job; returns when nothing is written any more. Called on another thread than the loop."""
+        """Cancel the running job; returns when no more is written. Called on another thread than the loop."""
         do(self._jobs.close)
         self._aside.close()
 
@@ -267,7 +267,7 @@ class PastSaver:
         return writer
 
     async def _verified_seed(self, episode: PastEpisode) -> int:
-        """Its seed, if a reset of its env alone with it gives the first state; else -1.
+        """Seed of the episode, if a reset of its env alone with this seed gives the first state; else -1.
 
         What envs that were reset together drew from torch's generator depends on all of them.
         """
@@ -299,7 +299,7 @@ def _as_played(task: TaskDescription, episode: PastEpisode) -> TaskDescription:
 
 
 def _cameras_in_source(task: TaskDescription, episode: PastEpisode) -> dict[CameraKey, CameraSettings]:
-    """Of the cameras that the running version has elsewhere than the one that played: what the latter said."""
+    """Settings in the version that played, for the cameras that the running version has elsewhere."""
     now = {camera.key: camera.settings for camera in task.cameras}
     played = () if episode.played_by is None else episode.played_by.cameras
     return {

@@ -32,11 +32,11 @@ class RescoreView:
     """State and results of the last rescoring job."""
 
     state: RescoreState = "none"
-    """``asking`` whether the code may run; ``loading`` it in the background process."""
+    """``asking``: whether the code may run; ``loading``: the code is loaded in the background process."""
     serial: int = 0
     """Grows with every change."""
     verdicts: tuple[Verdict[Any], ...] = ()
-    """Results so far, also of runs that are rescored in part."""
+    """Verdicts so far, including runs that are rescored in part."""
     done: int = 0
     total: int = 0
     unit: str = "steps"
@@ -44,24 +44,24 @@ class RescoreView:
     steps: int = 0
     """Control steps made so far."""
     seconds: float = 0.0
-    """Time for them, without loading."""
+    """Seconds that these steps took, without loading."""
     task: str = ""
     """The code that rescores."""
     stopped_by: StoppedBy | None = None
     why: str = ""
-    """Why it stopped or failed, as text."""
+    """Why the job stopped or failed, as text."""
     problem: Problem | None = None
     """What the code raised."""
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    """A sentence each: state that could not be restored, modules that a library's name hides."""
+    """Warnings, a sentence each: state that could not be restored, modules that a library's name hides."""
     names: tuple[str, ...] = ()
-    """Names for `RescoredPast.curve`: ``reward`` first, then what differs, then the rest."""
+    """Names for `RescoredPast.curve`: ``reward`` first, then the numbers that differ, then the others."""
     differing_names: frozenset[str] = frozenset()
 
     @property
     def rate(self) -> float:
-        """Control steps a second; 0 while unknown."""
+        """Control steps per second; 0 while unknown."""
         return self.steps / self.seconds if self.seconds > 0.5 else 0.0
 
 
@@ -107,7 +107,7 @@ class Rescoring:
 
     @on_loop
     def close(self) -> None:
-        """Stop, and begin nothing more."""
+        """Stop the job, and begin no more."""
         self.stop(StoppedBy.CLOSING)
         self._jobs.close()
 

@@ -24,7 +24,7 @@ from workbench.session.protocol.questions import MomentToRescore, RescoredMoment
 from workbench.session.rescore.background import RescoreView, Rescoring, StoppedBy
 
 MOST_ENTRIES = 24
-"""Compared entries of ``evaluate``; each takes 8 bytes for every moment and env."""
+"""Most entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class PastRun:
     serials: NDArray[np.int64]
     """(T + 1,) serials of its moments."""
     tick: int = 0
-    """Control steps until its first moment, as of `Curves` and the timeline."""
+    """Control steps before its first moment, counted as in `Curves` and the timeline."""
 
     @property
     def name(self) -> str:
@@ -53,13 +53,13 @@ class RescoredCurve:
     """One number of one env at the recorded control steps, oldest first."""
 
     tick: NDArray[np.int64]
-    """(T,) as `Curves.serial`."""
+    """(T,) ticks, counted as in `Curves.serial`."""
     serial: NDArray[np.int64]
     """(T,) serials of the moments."""
     old: NDArray[np.float32]
-    """(T,) NaN where the old code did not have it."""
+    """(T,) recorded numbers; NaN where the old code did not have the number."""
     new: NDArray[np.float32]
-    """(T,) NaN where it is not rescored (yet)."""
+    """(T,) rescored numbers; NaN where a moment is not rescored (yet)."""
 
 
 class RescoredPast:
@@ -157,7 +157,7 @@ class RescoredPast:
         self._changed.update(self._run[row].tolist())
 
     def release(self) -> None:
-        """Free the moments and their snapshots; no more rows may come."""
+        """Free the moments and their snapshots; `add` must not be called afterwards."""
         self._moments = []
 
     def curve(self, name: str, env: int) -> RescoredCurve | None:
@@ -176,7 +176,7 @@ class RescoredPast:
     # --- results -----------------------------------------------------------------------------------
 
     def verdicts(self) -> list[Verdict[PastRun]]:
-        """One for each run with a rescored step, over its rescored part."""
+        """One verdict for each run with a rescored step, over the rescored part of the run."""
         for number in self._changed:
             if (verdict := self._compared(number)) is not None:
                 self._verdicts[number] = verdict
@@ -226,7 +226,7 @@ class RescoredPast:
 
 
 _CHUNK_SECONDS = 0.1
-"""Aim for the duration of one question: how soon progress is shown and a stop takes effect."""
+"""Desired seconds of one question: it decides how soon progress is shown and a stop takes effect."""
 _MOST_AT_ONCE = 64
 _SUMMARY_EVERY = 0.5
 """Seconds between two summaries."""
@@ -263,11 +263,11 @@ class PastRescorer:
         self.rescoring = Rescoring(on_change)
         self._process = process
         self._rescored: RescoredPast | None = None
-        """Of the running or the last job."""
+        """Scores of the running or the last job."""
 
     @on_loop
     def curve(self, name: str, env: int) -> RescoredCurve | None:
-        """As `RescoredPast.curve`; None also before the first job."""
+        """The curve of `RescoredPast.curve`; None before the first job."""
         return None if self._rescored is None else self._rescored.curve(name, env)
 
     @on_loop
@@ -287,7 +287,7 @@ class PastRescorer:
 
     @on_loop
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
-        """As `Rescoring.stop`."""
+        """Cancel the running job, as `Rescoring.stop` does, and free its moments; results so far stay."""
         self.rescoring.stop(why)
         if self._rescored is not None:
             self._rescored.release()

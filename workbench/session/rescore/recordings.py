@@ -46,7 +46,7 @@ class RescoreGroup:
     """The task to open, unless `recorded_source`."""
     options: TaskOptions
     info: EpisodeInfo
-    """Of the first of them."""
+    """Info of the first episode of the group."""
     files: tuple[Source, ...]
     note: str = ""
     """Options that differ from the recorded ones on purpose."""
@@ -55,7 +55,7 @@ class RescoreGroup:
 
     @property
     def code(self) -> CodeToRun:
-        """What has to be cleared before it runs."""
+        """The code that has to be cleared before it runs."""
         return CodeToRun(self.reference, self.info, self.recorded_source)
 
 
@@ -115,7 +115,8 @@ def hidden_modules_text(reference: TaskName) -> list[str]:
 
 
 def rescore_options(options: TaskOptions) -> tuple[TaskOptions, str]:
-    """The same env without pictures, which take most of the time and which no reward reads; and a note on the change."""
+    """Options of the same env without pictures, which take most of the time and which no reward reads; and a note on
+    the change."""
     kwargs, note = dict(options.env_kwargs), ""
     mode = kwargs.get("obs_mode")
     if mode is not None and mode not in ("state", "state_dict", "none"):
@@ -126,12 +127,14 @@ def rescore_options(options: TaskOptions) -> tuple[TaskOptions, str]:
 
 
 def with_renderer(options: TaskOptions) -> TaskOptions:
-    """The same with a renderer, which some tasks need to be built: PushT-v1 makes render materials for its shapes."""
+    """Options of the same env with a renderer, which some tasks need to be built: PushT-v1 makes render materials for
+    its shapes."""
     return replace(options, env_kwargs={k: v for k, v in options.env_kwargs.items() if k != "render_backend"})
 
 
 def _info_of(source: Source) -> EpisodeInfo:
-    """Read from the small .json if it is there, else by `read_recording`, which reads pictures and meshes too. Raises as that."""
+    """Info of a recording, from its small .json if there is one, else from `read_recording`, which reads pictures and
+    meshes too. Raises as `read_recording`."""
     try:
         return read_document(source.path.with_suffix(".json")).description().info(source.path.parent)
     except (OSError, WrongDocument):
@@ -139,9 +142,9 @@ def _info_of(source: Source) -> EpisodeInfo:
 
 
 MOST_AT_ONCE = 16
-"""Envs."""
+"""Most envs that rescore at once."""
 MOST_NAMED = 3
-"""Versions that a note lists."""
+"""Most versions that a note lists."""
 
 
 class Rescorer:
@@ -159,7 +162,7 @@ class Rescorer:
         self.rescoring = Rescoring()
         self._process = Background()
         self._aside = Aside("rescore")
-        """Reads recordings, and waits for answers of people."""
+        """Thread that reads recordings, and waits for answers of people."""
         self._clearances = clearances or Clearances()
         self._base = base or TaskOptions()
 

@@ -39,13 +39,13 @@ def change_text(verdict: Verdict[Any]) -> str:
 
 
 def _flag_text(name: str, was: int | None, now: int | None) -> str:
-    """The steps at which a flag turned true, in the record and now; None is never."""
+    """The steps at which a flag turned true, in the record and now; None for never."""
     before = "never" if was is None else f"at step {was}"
     return f"{name} never now, was {before}" if now is None else f"{name} now at step {now}, was {before}"
 
 
 def _reward_change(verdict: Verdict[Any]) -> str:
-    """By how much the rewards changed, or which of the two returns is not finite."""
+    """Text of how much the rewards changed, or which of the two returns is not finite."""
     if math.isfinite(verdict.largest):
         return f"reward by up to {number_text(verdict.largest)}"
     was, now = verdict.returns

@@ -16,7 +16,7 @@ from workbench.machine.text import length, number_text
 from workbench.recording.episode.episode import Episode
 
 ARM = 0.1
-"""Metres: a rotation counts as the way of a point at this distance from the body's origin."""
+"""Metres: a rotation counts as the distance that a point this far from the body's origin moves."""
 TOLERANCES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Metres. A replay on other threads or another machine differs by 1e-6 to 1e-5."""
 USUAL_TOLERANCE = 1e-4
@@ -31,13 +31,13 @@ class FirstDifference:
 
     name: str
     position: int | None
-    """Relative to the alignment; None if nothing differs."""
+    """Position relative to the alignment; None if nothing differs."""
     values: str
-    """Both values there."""
+    """Both values at that position."""
     largest: str
     """The largest difference."""
     totals: str = ""
-    """Both sums over the episode, where that makes sense."""
+    """Both sums over the episode, where a sum makes sense."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Difference:
     """
 
     bodies: FirstDifference | None
-    """None if one of them has no scene."""
+    """First difference of bodies; None if one of the recordings has no scene."""
     body: str
     """The body that differs first."""
     apart: NDArray[np.float64]
@@ -59,12 +59,12 @@ class Difference:
     compared: int
     """Number of compared states."""
     not_in_both: tuple[str, ...]
-    """Bodies that only one has."""
+    """Bodies that only one of the recordings has."""
     numbers: tuple[FirstDifference, ...]
     """Action, reward, and the entries of ``evaluate``; those that differ come first, by position."""
     same_seed: bool
     same_source: bool | None
-    """None if one of them has no source."""
+    """Whether both have the same source; None if one of them has none."""
     source: tuple[tuple[str, tuple[tuple[str, str], ...]], ...]
     """File, and its changed lines as (``add``, ``del``, ``at`` or ``same``, text)."""
 

@@ -18,7 +18,7 @@ _NOT_PASSED_ON = HOW_IT_IS_RUN | {
     "obs_mode", "reward_mode", "backend", "parallel_in_single_scene", "sensor_configs",
     "human_render_camera_configs", "viewer_camera_configs", "enable_shadow", "max_episode_steps",
 }  # fmt: skip
-"""Keywords of ``gym.make`` that change nothing about where bodies are."""
+"""Keywords of ``gym.make`` that do not change where bodies are."""
 
 
 class SceneError(RuntimeError):

@@ -29,7 +29,7 @@ from workbench.session.review.view import START, Opened, ReviewView, find_events
 log = logging.getLogger(__name__)
 
 MOST_COMPARED = 4
-"""Recordings drawn over each other; more cannot be told apart."""
+"""Most recordings that are drawn over each other; more cannot be told apart."""
 MOST_OPEN = 64
 MEMORY_SHARE = 0.25
 """Share of the machine's memory for open recordings: without a limit the system may kill the server."""
@@ -44,25 +44,25 @@ _CHECK_EVERY = 2.0
 
 @dataclass(frozen=True)
 class _Stamp:
-    """Of a file that was read."""
+    """Name, size and time of a file when it was read."""
 
     recording: str
-    """Its name."""
+    """Name of the recording."""
     size_and_time: tuple[int, int] | None
     """Bytes and mtime in ns; None if the file did not exist."""
 
 
 @dataclass
 class _Playback:
-    """Where playing began."""
+    """Position and time at which playing began."""
 
     position: int
     at: float
-    """Seconds of the clock."""
+    """Clock time in seconds."""
 
 
 class _Stopped(Exception):
-    """The scenes are not needed any more."""
+    """The scenes are no longer needed."""
 
 
 class Review:
@@ -103,14 +103,14 @@ class Review:
         self._playback: _Playback | None = None
         self._opening = Jobs(lambda: None, self._failed)
         self._partly_shown = False
-        """The newest opening has put something on the page."""
+        """Whether the newest opening has put something on the page."""
         self._closed: set[str] = set()
         """Ids closed by the user while the opening still runs."""
         self._files: dict[Path, _Stamp] = {}
         """Files of the open recordings."""
         self._open_problems: tuple[str, ...] = ()
         self._files_checked = -math.inf
-        """Seconds of the clock."""
+        """Clock time in seconds of the last check."""
 
     # --- what the page reads -------------------------------------------------------------------------
 
@@ -183,7 +183,7 @@ class Review:
             aside.end()
 
     def open_again(self) -> None:
-        """Try once more what could not be read, beside what is open: a busy machine may have been too slow."""
+        """Read what could not be read once more, and keep what is open: a busy machine may have been too slow."""
         view = self.view()
         self.open((*(one.id for one in view.opened), *view.not_opened))
 
@@ -259,7 +259,7 @@ class Review:
         await aside.run(lambda: self._give_scenes(job, without, shapes))
 
     def _read_row(self, row: LibraryRow, shapes: SharedShapes, job: Job) -> tuple[Opened, dict[Path, _Stamp]]:
-        """Beside the loop."""
+        """Read the recording of a row. Called off the loop."""
         stamps = _stamps_of(row)
         episode = _shared(self._read(row, shapes, lambda: job.stopped), shapes)
         return Opened(row.id, row.name, episode, find_events(episode)), stamps
@@ -285,7 +285,7 @@ class Review:
                 self._seek(state)
 
     def _give_scenes(self, job: Job, without: Sequence[Opened], shapes: SharedShapes) -> None:
-        """Beside the loop."""
+        """Make the scenes of recordings without one. Called off the loop."""
 
         def update(one: Opened, **values: Any) -> None:
             post(lambda: job.stopped or self._replace_opened(one.id, **values))
@@ -506,7 +506,7 @@ class Review:
             self._playback = _Playback(self._view.position, self._clock())
 
     def _rate(self) -> float:
-        """Positions a second."""
+        """Positions per second."""
         chosen = self._view.chosen
         return self._view.speed / max(chosen.episode.info.control_dt, 1e-4) if chosen is not None else 0.0
 
@@ -535,12 +535,12 @@ class Review:
 
 
 def _shared(episode: Episode, shapes: SharedShapes) -> Episode:
-    """The same recording, with equal shapes of other recordings reused."""
+    """The recording, sharing equal shapes with other recordings."""
     return episode if episode.geometry is None else replace(episode, geometry=shapes.share(episode.geometry))
 
 
 def _stamps_of(row: LibraryRow) -> dict[Path, _Stamp]:
-    """Stamps of its files as they are now."""
+    """Stamps of the row's files as they are now."""
     return {path: _Stamp(row.name, _size_and_time(path)) for path in row.paths}
 
 

@@ -24,9 +24,9 @@ REWARD = "reward"
 TERMS = "terms of the reward"
 ACTION = "action"
 MOST_LINES = 12
-"""Columns of one entry; more cannot be told apart."""
+"""Most columns of one entry; more cannot be told apart."""
 _MOST_RUNS = 40
-"""Events of one entry. One that flickers at every step is no event."""
+"""Most events of one entry; an entry that flickers at every step is no event."""
 
 
 @dataclass(frozen=True)
@@ -43,19 +43,19 @@ class Opened:
     """One open recording. Two are equal only if they are the same one, opened once."""
 
     id: str
-    """Of the library's row."""
+    """Id of the library's row."""
     name: str
-    """Its file, as shown."""
+    """Name of the file, as shown."""
     episode: Episode
     events: tuple[EpisodeEvent, ...]
     scene: str = ""
     """Message about a missing 3-D scene: it is being made, or why it cannot be."""
     making: bool = False
-    """Its scene is being made in the background."""
+    """Whether the scene is being made in the background."""
 
     @property
     def length(self) -> int:
-        """Control steps; there is one state more."""
+        """Number of control steps; there is one state more."""
         return len(self.episode.reward)
 
     @property
@@ -82,16 +82,16 @@ class ReviewView:
     opened_serial: int = 0
     """Grows when other recordings are open, or one of them has got its scene."""
     selected: int = 0
-    """Whose cameras and numbers are shown: index into `opened`."""
+    """Index into `opened` of the recording whose cameras and numbers are shown."""
     align: str = START
     alignments: tuple[str, ...] = (START,)
     """What the open recordings can be aligned at."""
     anchors: tuple[int, ...] = ()
-    """The state of each that is at position 0."""
+    """State of each recording that is at position 0."""
     position: int = 0
     first: int = 0
     last: int = 0
-    """Range of `position`, both included."""
+    """First and last position, both included."""
     playing: bool = False
     speed: float = 1.0
     loop: bool = False
@@ -104,7 +104,7 @@ class ReviewView:
 
     @property
     def states(self) -> tuple[int, ...]:
-        """The state of each that is shown at the position."""
+        """State of each recording that is shown at the position."""
         return tuple(
             state_at(self.position, a, o.length) for o, a in zip(self.opened, self.anchors, strict=True)
         )
@@ -115,7 +115,7 @@ class ReviewView:
 
 
 def state_at(position: int, anchor: int, length: int) -> int:
-    """Of an episode of `length` steps: the state at that position, its first or last one beyond its ends."""
+    """State at a position of an episode with `length` steps; its first or last state beyond its ends."""
     return min(max(position + anchor, 0), length)
 
 
@@ -188,7 +188,7 @@ def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDA
 
 
 def outcome_text(episode: Episode) -> tuple[str, str]:
-    """How it ended, and the colour for it: ``good``, ``bad``, ``warn`` or none."""
+    """How the episode ended, and the colour for it: ``good``, ``bad``, ``warn`` or none."""
     success, fail = (_flag(episode.evaluate.get(name)) for name in ("success", "fail"))
     if fail is not None and len(fail) and fail[-1]:
         return "failed", "bad"
@@ -215,7 +215,7 @@ def _numbers(values: NDArray) -> NDArray[np.float64]:
 
 
 def _flag(values: NDArray | None) -> NDArray[np.bool_] | None:
-    """(T + 1,) of a bool entry; None of any other."""
+    """(T + 1,) values of a bool entry; None for any other entry."""
     if values is None or not len(values) or values.size != len(values):
         return None
     flat = values.reshape(len(values))
@@ -248,10 +248,10 @@ class PictureReader:
         self._episode: Episode | None = None
         self._cache: dict[CameraKey, tuple[int, tuple[str, ...], Picture]] = {}
         self.problem = ""
-        """Why a picture cannot be shown, a sentence; else empty."""
+        """Why a picture cannot be shown, as a sentence; else empty."""
 
     def cameras(self, episode: Episode) -> tuple[CameraInfo, ...]:
-        """Its cameras, each with the modalities that were recorded."""
+        """Cameras of the episode, each with the modalities that were recorded."""
         return tuple(
             replace(track.info, modalities=tuple(track.pictures))
             for track in episode.cameras
@@ -261,7 +261,7 @@ class PictureReader:
     def pictures(
         self, episode: Episode, state: int, requests: Iterable[CameraRequest], env: int
     ) -> dict[CameraKey, Picture]:
-        """By camera, the newest picture at or before `state`, labelled as of `env`.
+        """The newest picture of each camera at or before `state`, labelled as a picture of `env`.
 
         A camera whose picture cannot be decoded has none; `problem` says why.
         """

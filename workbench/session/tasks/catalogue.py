@@ -46,22 +46,22 @@ class Entry:
     """A row of the list. Its texts are printable, not escaped."""
 
     number: int
-    """What a page sends to choose it; never given to another row while the program runs."""
+    """Number that a page sends to choose the row; never given to another row while the program runs."""
     section: Section
     name: str
     about: str
     reference: str
-    """What is opened; empty for the recordings."""
+    """Reference of the task to open; empty for the recordings."""
     file: Path | None = None
-    """Of the task; None for a registered id and for the recordings."""
+    """File of the task; None for a registered id and for the recordings."""
     gone: bool = False
-    """The file is not there any more."""
+    """Whether the file no longer exists."""
     options: TaskOptions | None = None
-    """How it was opened last; None for the options of this run."""
+    """Options with which the task was last opened; None for the options of this run."""
     env_id: str = ""
-    """The id whose picture it has; empty for none."""
+    """The id whose picture the row shows; empty for none."""
     blank: str = ""
-    """Stands where the picture would."""
+    """Text in place of the picture."""
 
     def matches(self, words: list[str]) -> bool:
         """Whether its name has all of these words, in lower case, or a word of its other texts begins with them."""
@@ -74,10 +74,10 @@ class CatalogueView:
     """The list at a moment."""
 
     entries: tuple[Entry, ...] = ()
-    """In the order of the sections."""
+    """Rows in the order of the sections."""
     folder: str = ""
     searching: bool = False
-    """The folder is searched for the first time."""
+    """Whether the folder is being searched for the first time."""
     left_out: str = ""
     """Why the search may have missed files."""
     registered: RegisteredView = RegisteredView()
@@ -114,7 +114,7 @@ class Catalogue:
         self._once_more = False
         self._numbers: dict[tuple[Section, str], int] = {}
         self._found: FoundTasks | None = None
-        """None before the first search has ended."""
+        """Result of the last search; None before the first search has ended."""
         self._files = TaskFileReader()
         self._search_again = 0.0
         self._typed: dict[int, Entry] = {}
@@ -238,7 +238,7 @@ class Catalogue:
             else "No recordings here yet. workbench review FOLDER opens another folder.",
         )
         why_not = registered.why_not
-        # Those that cannot be opened before something is downloaded come last.
+        # Tasks that cannot be opened before a download come last.
         for env_id in sorted(registered.ids, key=why_not.__contains__):
             why = why_not.get(env_id)
             entry = self._entry(

@@ -21,9 +21,9 @@ log = logging.getLogger(__name__)
 RECENT_FILE = "recent_tasks.json"
 MOST_KEPT = 20
 LONGEST = 4096
-"""Characters of a reference."""
+"""Longest reference, in characters."""
 LARGEST_KWARGS = 20_000
-"""Bytes of the keyword arguments of one task."""
+"""Most bytes of the keyword arguments of one task."""
 
 
 class RecentTask(msgspec.Struct, frozen=True):
@@ -38,7 +38,7 @@ class RecentTask(msgspec.Struct, frozen=True):
 
     @property
     def file(self) -> Path | None:
-        """None for a registered id."""
+        """The task's file; None for a registered id."""
         return named_file(self.reference)
 
 
@@ -64,7 +64,7 @@ class RecentTasks:
         self._warned: set[str] = set()
 
     def list(self) -> list[RecentTask]:
-        """The newest first, each reference once."""
+        """The tasks, newest first, each reference once."""
         with self._lock:
             return _newest([*self._this_run, *self._read()])
 

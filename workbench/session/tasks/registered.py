@@ -31,21 +31,22 @@ log = logging.getLogger(__name__)
 LIST_FILE = "tasks.json"
 MOST_TASKS = 2000
 MOST_TRIES = 2
-"""Attempts to draw a task ..."""
+"""Attempts to draw a task before `AGAIN_AFTER` has to pass."""
 AGAIN_AFTER = 7 * 24 * 3600.0
-"""... until this many seconds later: what it lacks may have been downloaded."""
+"""Seconds after which a task that failed so often is tried again: what it lacks may have been downloaded."""
 LONGEST_LIST, LONGEST_DRAWING = 120.0, 120.0
-"""Seconds; on two cores with a software renderer most are drawn in 5."""
+"""Timeouts in seconds; on two cores with a software renderer most tasks are drawn in 5 s."""
 PICTURES_A_PROCESS = 20
-"""Then another is started: SAPIEN keeps the meshes of scenes that are gone."""
+"""Pictures that one process draws before another is started: SAPIEN keeps the meshes of closed scenes."""
 LONGEST_WHY = 300
 WIDTH, HEIGHT = 160, 120
 LARGEST_PICTURE = 64 * 1024
-"""Bytes of a cached picture; 160 x 120 take 6 kB."""
+"""Most bytes of a cached picture; 160 x 120 pixels take 6 kB."""
 _LOOK = 0.5
-"""Seconds between two checks whether it may go on."""
+"""Seconds between two checks whether drawing may continue."""
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
-"""An id. Without a dot, a slash and a colon it cannot be a file or a module, whoever wrote it into the cache."""
+"""Pattern of an id. Without a dot, a slash and a colon an id cannot be a file or a module, whoever wrote it into the
+cache."""
 
 
 class NotDrawn(msgspec.Struct, frozen=True):
@@ -54,9 +55,9 @@ class NotDrawn(msgspec.Struct, frozen=True):
     text: str
     needs_download: bool = False
     tries: int = 1
-    """Attempts that failed."""
+    """Number of failed attempts."""
     last: float = 0.0
-    """Unix time of the last."""
+    """Unix time of the last attempt."""
 
 
 class _Cached(msgspec.Struct):
@@ -66,13 +67,13 @@ class _Cached(msgspec.Struct):
 
 @dataclass(frozen=True)
 class RegisteredView:
-    """What is known at a moment."""
+    """List and pictures at one moment."""
 
     ids: tuple[str, ...] = ()
     pictures: frozenset[str] = frozenset()
     """Ids that have a picture."""
     why_not: Mapping[str, NotDrawn] = field(default_factory=dict)
-    """By id."""
+    """Why a task has no picture, by id."""
     doing: str = ""
     """``listing the tasks``, ``drawing PickCube-v1``; empty if nothing is being done."""
     problem: str = ""
@@ -189,7 +190,7 @@ class RegisteredTasks:
                 process.close()
 
     def _wait_until_allowed(self, process: Background) -> bool:
-        """False if it is to end."""
+        """Wait until drawing may continue; False if the process has to end."""
         while not self._may_work():
             process.close()
             self._say(doing="")
@@ -235,7 +236,7 @@ class RegisteredTasks:
 
 
 class _Ended(Exception):
-    """It is no longer wanted, or takes too long."""
+    """The work is no longer wanted, or takes too long."""
 
 
 def _version_folder() -> Path:

@@ -1,4 +1,4 @@
-"""What a person typed or pasted into the search of the list of tasks, read as the path of a task."""
+"""Reads what a person typed or pasted into the task search as the path of a task."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class NotAPath(ValueError):
 
 
 def typed_path(text: str, folder: Path) -> tuple[Path, str | None] | None:
-    """File and class that a text names; None for a text that has not the form of a path, such as words of a search.
+    """File and class that a text names; None for a text that does not have the form of a path, such as search words.
 
     Takes what terminals, editors and file managers give: quotes and spaces around, ``file://``, ``~``, a line behind.
 

@@ -76,9 +76,9 @@ from workbench.session.worker.pacing import throttled
 
 _PERIOD = 1 / 15
 _PAUSE_SHARE = 0.3
-"""Of the time a round took."""
+"""Length of the pause after a round, as a share of the round's time."""
 SIMPLIFYING = "simplified meshes"
-"""Name of the thread that makes them."""
+"""Name of the thread that makes simplified meshes."""
 _STILL = 0.3
 """Seconds after the last fast picture until an exact one is drawn, if nothing moves."""
 
@@ -90,10 +90,10 @@ class _Begun:
     pictures: PendingPictures
     requested: tuple[CameraRequest, ...]
     number: int
-    """Of the moment that they show."""
+    """Number of the moment that the pictures show."""
     at: float
     ready_at: float
-    """Expected end; seconds of `time.monotonic`, as `at`."""
+    """Expected end, like `at` in seconds of `time.monotonic`."""
 
 
 class WorkerCameras:
@@ -118,24 +118,25 @@ class WorkerCameras:
         self._watched: tuple[int, tuple[CameraRequest, ...]] = 0, ()
         """The env and the cameras that the page shows."""
         self._there: tuple[CameraRequest, ...] = ()
-        """Those of them that the version has."""
+        """The watched cameras that the version has."""
         self._wanted = False
-        """Their pictures are out of date."""
+        """Whether the pictures of the watched cameras are out of date."""
         self._hurried: set[CameraKey] = set()
         self._left: list[tuple[CameraRequest, ...]] = []
-        """Groups of the round that are not begun, one for each kind."""
+        """Groups of this round that are not begun, one for each kind."""
         self._begun: _Begun | None = None
         self._expected: dict[tuple[CameraRequest, ...], float] = {}
-        """Seconds that pictures take."""
+        """Expected render time of pictures, in seconds."""
         self._round_began = self._next_round = 0.0
         self._round_degree: PictureDegree = "exact"
         self._may_block = False
-        """No step is due, so the loop may block until a picture is ready."""
+        """Whether the loop may block until a picture is ready, because no step is due."""
         self._degree: ShownPictures = "exact"
         self._exact_at: float | None = None
-        """When the shown pictures, which are fast, are to be drawn exactly; None if they are."""
+        """Time at which the shown pictures, which are fast, are drawn exactly; None if the shown pictures are exact."""
         self._fast_scene: Any = None
-        """For which `_simplifying` makes, or made, the meshes that this machine lacked: exact pictures are drawn meanwhile."""
+        """Scene for which `_simplifying` makes, or made, the missing simplified meshes; exact pictures are drawn
+        meanwhile."""
         self._may_be_fast = False
         self._simplifying = threading.Thread()
         self._placed = PlacedCameras()
@@ -148,7 +149,7 @@ class WorkerCameras:
         # Every `Settings` has it, changed or not.
         before, of_degree = self._watched, self._degree
         self._watched, self._degree = (env, cameras), degree
-        # From exact to auto those that are there, or under way, stay right: drawn anew they would be fast for a moment.
+        # From exact to auto, pictures made or under way stay valid: redrawn, they would be fast for a moment.
         stay = degree == of_degree or (of_degree == "exact" and degree == "auto")
         if before != (env, cameras) or not stay:
             self.update_watched()
@@ -250,7 +251,7 @@ class WorkerCameras:
                 self.failed(error)
 
     def failed(self, error: CannotDraw) -> None:
-        """Leave out a camera that cannot be drawn, and say so."""
+        """Leave out a camera that cannot be drawn, and report it."""
         self._begun, self._left = None, []
         self._there = tuple(camera for camera in self._there if camera.key != error.key)
         self._hurried.discard(error.key)
@@ -411,14 +412,14 @@ class WorkerCameras:
 
 
 def _simplify(meshes: Sequence[Mesh]) -> None:
-    """On a thread of its own, which leaves the cores to the simulation."""
+    """Simplify meshes on a separate thread, which leaves the cores to the simulation."""
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 15)
     for mesh in meshes:
         levels_of(mesh)
 
 
 def _observe_again(opened: OpenedTask) -> None:
-    """Renew the observation, or a policy would get pictures of the old size."""
+    """Renew the observation; without this, a policy would get pictures of the old size."""
     with blamed("step", opened.loaded, opened.env):
         opened.env.rescore()
     keep_observation_space(opened.env.env, opened.env.obs)
@@ -428,7 +429,7 @@ def _observe_again(opened: OpenedTask) -> None:
 
 
 REPORT_SIDE = 128
-"""At most so many pixels on the shorter side of a measured picture: an object too small for these is hardly visible."""
+"""Most pixels on the shorter side of a measured picture: an object too small for these is hardly visible."""
 LARGEST_SCALE = 4.0
 _PROGRESS_PERIOD = 0.2
 

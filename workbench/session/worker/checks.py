@@ -1,4 +1,4 @@
-"""Checks rules and times a step in the worker, on envs of their own."""
+"""Checks rules and times a step in the worker, on separate envs."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     from workbench.checks.results import RuleResult
 
 OnProgress = Callable[[int, int, RuleProgress], None]
-"""Gets the number of results so far in this group, the number of rules in all, and what is begun or done."""
+"""Callback for progress: gets the number of results so far in this group, the number of rules in all, and what is
+begun or done."""
 NUM_ENVS, SEEDS = 8, 32
-"""Envs of a check; one where the page has one."""
+"""Envs of a check (one where the page has one), and number of seeds."""
 
 
 class WorkerChecks:
-    """Keeps what was seen of the loaded version from one group of rules to the next."""
+    """Checks groups of rules, and keeps what it saw of the loaded version from one group to the next."""
 
     def __init__(self, waits: Callable[[], bool]) -> None:
         """
@@ -63,7 +64,7 @@ class WorkerChecks:
             raise CannotAnswer("another request came") from None
 
     def close(self) -> None:
-        """Close its envs, and forget what was seen."""
+        """Close the envs, and forget what was seen."""
         if self._checkup is not None:
             self._checkup.close()
         self._checkup = self._of = None

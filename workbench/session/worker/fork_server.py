@@ -19,11 +19,12 @@ from workbench.session.worker import start
 
 _LONGEST = 1 << 12
 _STANDARD = (1, 2)
-"""stdout and stderr."""
+"""File descriptors of stdout and stderr."""
 _MOST_PRINTED = 1 << 15
-"""Bytes of what the imports printed: as many as fit into a pipe that nobody has read yet."""
+"""Most bytes that are kept of what the imports printed: what fits into a pipe that is not read yet."""
 _FDS = 6
-"""Of a request: the socket that tells of its end, those of `start.run`, its stdout and its stderr."""
+"""File descriptors of a request: the socket that reports the worker's end, the three of `start.run`, and its stdout
+and stderr."""
 
 
 def main() -> None:
@@ -51,7 +52,7 @@ def main() -> None:
 
 
 def _versions() -> dict[str, int]:
-    """When the file of each imported module was written, in nanoseconds; -1 if it is gone."""
+    """Modification time of the file of each imported module, in nanoseconds; -1 if the file is gone."""
     files = {getattr(module, "__file__", None) for module in list(sys.modules.values())}
     return {file: _written(file) for file in files if isinstance(file, str)}
 
@@ -67,7 +68,7 @@ class _ForkServer:
     def __init__(self, control: socket.socket, versions: dict[str, int] | None, printed: list[bytes]) -> None:
         self._control, self._versions, self._printed = control, versions, printed
         self._workers: dict[int, socket.socket] = {}
-        """By process id of their keeper."""
+        """Sockets by process id of the worker's keeper."""
         self._woken, self._wakes = socket.socketpair()
         for end in (self._woken, self._wakes):
             end.setblocking(False)
@@ -93,7 +94,7 @@ class _ForkServer:
                 self._fork(Unpacker().unpack(message, NewWorker), fds)
 
     def _signal(self, pid: int, end: socket.socket) -> None:
-        """Who started a worker sends the number of a signal, or has left."""
+        """Handle a message on a worker's socket: a signal number to send, or the end of the connection."""
         try:
             asked = end.recv(_LONGEST)
         except ConnectionResetError:  # it left without having read what we told

@@ -28,7 +28,7 @@ from workbench.session.protocol.messages import EnterRecording, Restore
 from workbench.session.protocol.questions import RescoredMoments, RescoreMoments
 
 MOST_SECONDS = 8.0
-"""A replay that takes longer is given up, and the moment's state restored instead."""
+"""Longest replay in seconds; a longer one is given up, and the state of the moment is restored instead."""
 
 
 def go_back(
@@ -139,7 +139,7 @@ def _how(request: Restore, replayed: int, put: int, steps: int) -> str:
 
 
 def going_back_text(done: int, total: int) -> str:
-    """The status line's text."""
+    """Text of the status line while going back."""
     return f"going back: step {done} of {total}"
 
 
@@ -194,5 +194,5 @@ def enter_recording(
 
 
 def entering_text(request: EnterRecording, done: int) -> str:
-    """The status line's text."""
+    """Text of the status line while entering a recording."""
     return f"going to {request.run.name}: step {done} of {request.run.length}"

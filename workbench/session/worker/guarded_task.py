@@ -38,16 +38,16 @@ class ServerConnection:
         self._line = MessageSocket(socket.socket(fileno=connection), get_args(Request), QUESTIONS)
         self._interrupts = interrupts
         self._queue: deque[Request] = deque()
-        """Requests that were received and not handled."""
+        """Received requests that are not handled yet."""
         self.closed = False
-        """The server closed the connection."""
+        """Whether the server closed the connection."""
 
     def listen(self, timeout: float) -> None:
         """Wait at most `timeout` seconds for requests, and queue them."""
         self._queue.extend(self._requests(timeout))
 
     def next(self) -> Request | None:
-        """The next queued request."""
+        """The next queued request; None if there is none."""
         return self._queue.popleft() if self._queue else None
 
     def waits(self) -> bool:
@@ -106,11 +106,11 @@ class GuardedTask:
         self.requested_file: Path | None = None
         """The file that was requested last, loaded or not."""
         self.failed = False
-        """`opened` has failed while it ran: what it was doing may be half done."""
+        """Whether `opened` has failed while it ran; what it was doing may be half done."""
         self.when_loaded: ProcessState | None = None
-        """Settings of the process when the load of `opened` had ended."""
+        """Settings of the process when the load of `opened` ended."""
         self.spoiled = False
-        """What the author's code left in this process cannot be taken back: it has to end."""
+        """Whether the author's code left something in this process that cannot be taken back: the process has to end."""
 
     def run(self, doing: Doing | None, work: Callable[[], object], loads: bool = False) -> Problem | None:
         """Run `work`; if `doing` is not None it may run the author's code, and can be interrupted. Returns the failure,
@@ -150,7 +150,7 @@ class GuardedTask:
         return None
 
     def _own_files(self, error: BaseException) -> list[Path]:
-        """The author's files, with those of the traceback in the task's folder, whose import may not have finished."""
+        """The author's files, and the files of the traceback in the task's folder, whose import may not have finished."""
         known = [] if self.opened is None else list(self.opened.loaded.source_files)
         if self.requested_file is not None:
             folder, frames = self.requested_file.parent, traceback.extract_tb(error.__traceback__)
@@ -189,7 +189,7 @@ class GuardedTask:
         return f"{some_of(changed)} changed since the version was loaded" if changed else ""
 
     def refuse(self, failed: LoadFailed) -> None:
-        """Send that a version was refused."""
+        """Report that a version was refused."""
         self._send_failure(failed)
 
     def _send_failure(self, failed: LoadFailed) -> None:

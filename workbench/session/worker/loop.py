@@ -99,7 +99,7 @@ from workbench.session.worker.step_events import StepEvents
 
 _STATUS_PERIOD = 0.25
 _IDLE = 0.5
-"""Seconds to sleep when nothing is due; a request ends the sleep at once."""
+"""Longest sleep in seconds when nothing is due; a request ends the sleep at once."""
 
 
 class Worker:
@@ -138,7 +138,7 @@ class Worker:
         self._rules_serial: tuple[object, int] = None, 0
         self._quit = False
         self._state_at_start: ProcessState = {}
-        """Before any version was loaded."""
+        """Settings of the process before any version was loaded."""
         self._handlers: dict[type, Callable[[Any], None]] = {
             Load: self._load,
             Play: self._play,
@@ -193,7 +193,7 @@ class Worker:
     # --- questions ---------------------------------------------------------------------------------
 
     def _call(self, call: Call) -> None:
-        """Always answer, or the server's thread would wait for ever."""
+        """Answer a call. There is always an answer, or the server's thread would wait for ever."""
         answers: list[Answer] = []
         doing = _DOING.get(type(call.request))
         problem = self._task.run(doing, lambda: answers.append(self._answer(call)))
@@ -459,7 +459,7 @@ class Worker:
         self._take_planned_step()
 
     def _take_planned_step(self) -> None:
-        """Make the pressed step, if its plan is there."""
+        """Make the requested step, if its plan has come."""
         if self._one_planned_step and self._plan_ready():
             self._one_planned_step = False
             self._task.run("stepping", partial(self._task.guarded, self._step_once))
@@ -469,7 +469,7 @@ class Worker:
         return self._settings.action_source == "solve" and self._task.opened is not None
 
     def _plan_ready(self) -> bool:
-        """Whether there is an action to take now; it is asked for if there is none."""
+        """Whether there is an action to take now; if there is none, request a plan."""
         opened, last = self._task.opened, self._last
         if opened is None or last is None:
             return False
@@ -645,7 +645,7 @@ def _led_there(request: Restore | EnterRecording) -> Mapping[int, NDArray[np.flo
 
 
 def _mask(opened: OpenedTask, env_idx: tuple[int, ...] | None) -> np.ndarray:
-    """(N,) True for these envs; all if None."""
+    """(N,) mask of these envs; all if `env_idx` is None."""
     mask = np.zeros(opened.env.num_envs, bool)
     mask[slice(None) if env_idx is None else list(env_idx)] = True
     return mask

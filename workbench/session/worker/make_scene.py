@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from workbench.core.env.task_env import TaskEnv
 
 _PROGRESS_PERIOD = 0.2
-"""Seconds."""
+"""Seconds between two progress messages."""
 
 
 class SceneEnv:

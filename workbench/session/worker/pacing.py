@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 _LONGEST_DEBT = 0.1
-"""Wall seconds of simulation that are caught up with."""
+"""Most wall seconds of simulation that are caught up with."""
 
 
 @dataclass
@@ -59,7 +59,7 @@ class Pacer:
 
 @dataclass
 class Rate:
-    """Events per second over the last second or so, of slower ones over the last two."""
+    """Events per second over the last second or so; over the last two seconds for slower events."""
 
     window: float = 1.0
     _times: deque[float] = field(default_factory=deque)
@@ -84,20 +84,20 @@ class Rate:
 
 @dataclass
 class Shares:
-    """Which part of the last seconds each kind of work took."""
+    """Share of the last seconds that each kind of work took."""
 
     window: float = 2.0
     _spent: deque[tuple[float, str, float]] = field(default_factory=deque)
     _since: float = -math.inf
 
     def add(self, what: str, seconds: float, now: float) -> None:
-        """`what` took so long until now."""
+        """Add work of kind `what` that took `seconds` and ended at `now`."""
         self._spent.append((now, what, seconds))
         while now - self._spent[0][0] > self.window:
             self._spent.popleft()
 
     def of(self, what: str, now: float) -> float:
-        """0..1 of the window, or of the time since `clear` while that is shorter."""
+        """Share (0 to 1) of the window, or of the time since `clear` while that is shorter."""
         begin = max(now - self.window, self._since)
         spent = sum(
             min(seconds, at - begin) for at, name, seconds in self._spent if name == what and at > begin

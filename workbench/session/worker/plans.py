@@ -1,4 +1,4 @@
-"""Plans in the worker: asks for them where it plays, and makes them in the background process."""
+"""Plans in the worker: requests them in the worker that plays, and makes them in the background process."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from workbench.session.protocol.messages import (
 from workbench.session.protocol.questions import PlanActions, Planned, PlannedEnv
 
 MOST_PATHS = 24
-"""Rollouts of which a page gets the way."""
+"""Most rollouts whose path is sent to the page."""
 
 
 class FollowedPlan:
-    """The actions of the worker that plays while they are planned. The worker goes on with its loop until a plan comes."""
+    """Planned actions in the worker that plays. The worker continues its loop until a plan comes."""
 
     def __init__(self, send: Callable[[PlanWanted | PlanDropped], None]) -> None:
         """
@@ -54,15 +54,15 @@ class FollowedPlan:
         self._send = send
         self._asked: int | None = None
         self._told = False
-        """Whether the server was told of a wish, and not that it is dropped."""
+        """Whether the server knows of a request for a plan, and not that it is dropped."""
         self._at = -1
-        """The moment that the next of `_actions` is for."""
+        """Number of the moment that the next of `_actions` is for."""
         self._actions: deque[NDArray[np.float32]] = deque()
         self._env_idx: tuple[int, ...] = ()
 
     @property
     def awaited(self) -> bool:
-        """Whether a plan was asked for and has not come."""
+        """Whether a plan was requested and has not come."""
         return self._asked is not None and not self._actions
 
     def ready(self, opened: OpenedTask, moment: int, envs: Sequence[int]) -> bool:
@@ -86,7 +86,7 @@ class FollowedPlan:
             self._at, self._env_idx, self._actions = plan.number, plan.env_idx, deque(plan.actions)
 
     def next_action(self, task: TaskEnv, moment: int) -> NDArray[np.float32]:
-        """(N, A) for this moment, which is `ready`."""
+        """(N, A) action for this moment, for which `ready` was True."""
         action = actions.hold_action(task.parts, task.num_envs)
         planned = self._actions.popleft()
         self._at, self._asked = moment + 1, None
@@ -96,17 +96,17 @@ class FollowedPlan:
         return action
 
     def forget(self) -> None:
-        """What moves the envs has changed: a plan that is under way is not followed."""
+        """Drop plans, also one that is under way: something else moves the envs now."""
         self._asked = None
         self._actions.clear()
         if self._told:
-            # From here: the server might hear of a wish after it has sent the pause, and plan for nobody.
+            # Dropped by the worker: the server may get a request after it has sent the pause, and plan in vain.
             self._told = False
             self._send(PlanDropped())
 
 
 def envs_to_plan(settings: Settings, task: TaskEnv, last: StepResult) -> list[int]:
-    """The envs that are planned for: those that have not succeeded, or all where every one has."""
+    """Envs to plan for: those that have not succeeded, or all if every one has."""
     if not settings.solve_all:
         return [min(settings.selected_env, task.num_envs - 1)]
     done = succeeded(last)
@@ -115,7 +115,7 @@ def envs_to_plan(settings: Settings, task: TaskEnv, last: StepResult) -> list[in
 
 
 def succeeded(step: StepResult) -> NDArray[np.bool_]:
-    """(N,) False throughout for a task without success."""
+    """(N,) whether each env has succeeded; False throughout for a task without success."""
     success = step.evaluate.get("success", np.zeros(len(step.reward)))
     return np.array([bool(np.all(one)) for one in success])
 
@@ -133,10 +133,10 @@ def _wanted(opened: OpenedTask, moment: int, envs: tuple[int, ...]) -> PlanWante
 
 
 class WorkerPlans:
-    """Makes plans with envs of its own, which are the rollouts; they are made when they are first wanted.
+    """Makes plans with its own rollout envs, which are built when they are first needed.
 
-    An env's plan goes on from its last one as long as its episode does: a snapshot that does not follow from the last
-    plan begins anew.
+    An env's plan continues its last one as long as its episode continues; for a snapshot that does not follow from
+    the last plan, a new plan begins.
     """
 
     def __init__(self, waits: Callable[[], bool]) -> None:
@@ -149,7 +149,7 @@ class WorkerPlans:
         self._planner: RolloutPlanner | None = None
         self._options = PlanOptions()
         self._next: dict[int, tuple[int, int]] = {}
-        """The episode's seed, and its control steps at the next plan, of each env that has a plan."""
+        """Seed of the episode, and its control steps at the next plan, by env that has a plan."""
 
     def answer(
         self,
@@ -248,7 +248,7 @@ def _for_page(env: int, plan: Plan, steps: int, traced: str) -> PlannedEnv:
 
 
 def _body_to_trace(rolled: TaskEnv, name: str) -> int | None:
-    """The place of this body, or of the robot's tool if it has one, else of its last link; None if there is neither."""
+    """Index of this body, or of the robot's tool if it has one, else of its last link; None if there is neither."""
     env = rolled.env
     names = scene_index(env).names
     if name in names:

@@ -20,7 +20,7 @@ _MODULES = (
     *("torch", "torch.nn.functional", "numpy", "numpy.random", "random", "time", "math", "os", "builtins"),
     *("mani_skill.envs.sapien_env", "mani_skill.utils.common", "mani_skill.utils.sapien_utils", "sapien"),
 )
-"""Their functions are compared: a task may have put its own in place of one."""
+"""Modules whose functions are compared: a task may have replaced one by its own."""
 _FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType)
 
 _TRACED = "sys.settrace()"

@@ -61,10 +61,10 @@ class Running:
     """The running version."""
 
     request: Load
-    """The load that made it."""
+    """The load that made the version."""
     opened: OpenedTask
     last: StepResult
-    """The last step's result."""
+    """Result of the last step."""
 
 
 class _MustRebuild(Exception):
@@ -193,7 +193,7 @@ def why_new_process(
 
 
 def _is_python(text: str | None) -> bool:
-    """Whether a file's text can be executed; None if the file cannot be read."""
+    """Whether a file's text can be executed; `text` is None for a file that cannot be read."""
     if text is None:
         return False
     try:

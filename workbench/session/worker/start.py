@@ -79,7 +79,7 @@ def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: 
 
 
 def _let_kernel_end_us_first() -> None:
-    """When memory runs out the kernel ends the process with the highest score: this one, and not the server."""
+    """Give this process the highest score, so that the kernel ends it first when memory runs out, and not the server."""
     try:
         Path("/proc/self/oom_score_adj").write_text("1000")
     except OSError:

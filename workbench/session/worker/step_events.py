@@ -32,12 +32,12 @@ class StepEvents:
         self._from_reset: set[int] = set()
         self._columns_fail = False
         self._undrawable: set[CameraKey] = set()
-        """Cameras of the scene that failed."""
+        """Cameras of the scene that cannot be drawn."""
         self.moment: Snapshot | None = None
         """The batch at the newest event, to restore after a step that was cut short; None if it cannot be copied."""
         self.number = 0
         self.recording_took = 0.0
-        """Seconds that the newest event took for what is recorded: pictures, states, observations."""
+        """Seconds that the newest event took for the recording: pictures, states, observations."""
         self._packer: SnapshotPacker | None = SnapshotPacker()
 
     def new_scene(self) -> None:
@@ -48,7 +48,8 @@ class StepEvents:
         self._undrawable.clear()
 
     def capture(self, env_idx: tuple[int, ...], from_reset: bool) -> None:
-        """As `SetCapture`; an env that is captured already continues, also with `from_reset`."""
+        """Start or stop capturing, as `SetCapture` asks; an env that is captured already continues, also with
+        `from_reset`."""
         begun = self._recording & set(env_idx) if from_reset else set(env_idx)
         self._recording, self._from_reset = begun, set(env_idx) - begun
 
@@ -116,7 +117,7 @@ class StepEvents:
                 on_failed(failed)
 
     def _state_columns(self, opened: OpenedTask) -> dict[str, NDArray]:
-        """Of this moment; empty for a task whose ``get_state_dict`` raises, which is printed once."""
+        """State columns of this moment; empty for a task whose ``get_state_dict`` raises, which is printed once."""
         try:
             return {} if self._columns_fail else read_state_columns(opened.env)
         except Exception as error:
