@@ -73,7 +73,7 @@ _ctrl_c: tuple[type[BaseException], ...] = (KeyboardInterrupt,)
 
 
 def treat_ctrl_c_as_error() -> None:
-    """In a process without a terminal: a KeyboardInterrupt is raised by the task, and is an error like others."""
+    """Treat a KeyboardInterrupt as an error of the task: in a process without a terminal no person raises it."""
     global _ctrl_c
     _ctrl_c = ()
 
@@ -91,30 +91,30 @@ class Problem:
     stage: str
     """What failed: ``syntax import build reset step evaluate reward observation returns policy pictures worker``."""
     message: str
-    """One line: exception type and text."""
+    """Exception type and text, on one line."""
     file: str | None
-    """The author's file; None if the traceback has none of their lines."""
+    """The author's file; None if no line of the author is on the traceback."""
     line: int | None
     """1-based line in `file`."""
     code: str | None
     """The text of that line, stripped."""
     traceback: str
-    """As Python prints it, shortened; may be empty."""
+    """The traceback in Python's format, shortened; may be empty."""
     interrupted: bool = False
-    """A person stopped it."""
+    """Whether a person stopped the code."""
     column: int | None = None
-    """1-based, in `code`: where Python cannot read on."""
+    """1-based column in `code` at which Python stops reading."""
 
     @property
     def what_failed(self) -> str:
-        """Begins a message in the terminal."""
+        """What failed, as the beginning of a message in the terminal."""
         if self.stage == "syntax":
             return "not Python yet"
         return "not loaded" if self.has_no_place else f"{self.stage} failed"
 
     @property
     def has_no_place(self) -> bool:
-        """No line of the file failed: it is empty, has no task, or is not there."""
+        """Whether no line of the file failed: the file is empty, has no task, or does not exist."""
         return self.stage == "import" and self.line is None
 
 
@@ -134,12 +134,12 @@ class TaskError(Exception):
 
 
 def place_text(file: str | None, line: int | None) -> str:
-    """``push.py:88: ``, as it begins a message; without a line where none is known, and empty without a file."""
+    """Place at the beginning of a message, ``push.py:88: ``; without the line if it is unknown, empty without a file."""
     return "" if file is None else f"{file}: " if line is None else f"{file}:{line}: "
 
 
 def task_error(message: str, file: Path | None = None) -> TaskError:
-    """A task that cannot be loaded, for a reason that no line of the author raised."""
+    """The error for a task that cannot be loaded for a reason that no line of the author raised."""
     return TaskError(Problem("import", shorten(message), None if file is None else str(file), None, None, ""))
 
 
@@ -351,7 +351,7 @@ def _suggestion(exc: BaseException) -> str:
 
 
 _Line = tuple[str, int]
-"""File and line."""
+"""File, and 1-based line."""
 
 
 def _place_in(exc: BaseException, own: Collection[str]) -> _Line | None:
@@ -428,7 +428,7 @@ def _is_authors(file: str, own: Collection[str]) -> bool:
 
 
 def _is_authors_syntax(exc: BaseException, own: Collection[str]) -> TypeGuard[SyntaxError]:
-    """Whether a file of the author's is not Python. Not a text that is parsed."""
+    """Whether `exc` is a SyntaxError of one of the author's files, and not of a text that is parsed."""
     known = isinstance(exc, SyntaxError) and exc.filename and exc.lineno is not None
     return bool(known) and _is_authors(exc.filename, own)  # type: ignore[union-attr]
 

@@ -60,7 +60,7 @@ class CameraToExport:
 
     @property
     def pose_in_env(self) -> Floats:
-        """(7,) in the env's frame.
+        """(7,) pose in the env's frame.
 
         Raises:
             ValueError: it is mounted, and `mount_pose` is not given.
@@ -79,11 +79,11 @@ class FoundPose:
     """
 
     label: str
-    """Its path in the text, for a person to choose."""
+    """Path of the matrix in the text, for a person to choose."""
     matrix: Floats
-    """(4, 4)"""
+    """(4, 4) matrix."""
     stated: tuple[Convention, Direction] | None = None
-    """Its convention, if the text names it; None: a person must choose."""
+    """Convention and direction, if the text names them; None if a person must choose."""
 
 
 # --- out ---------------------------------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ def camera_pose(
     direction: Direction | None = None,
     metres_per_unit: float = 1.0,
 ) -> Floats:
-    """(7,) the camera's pose in the env's frame (or in its mount's, if that is what was calibrated).
+    """(7,) pose of the camera in the env's frame (or in its mount's frame, if that is what was calibrated).
 
     Args:
         convention: camera axes of the calibration. Needed unless the text names it.
@@ -331,7 +331,7 @@ def _workbench_poses(tree: Mapping[Any, Any]) -> Iterator[FoundPose]:
 _ROTATIONS = ("rvec", "rotation_vector", "r", "rotation", "rotation_matrix", "rot", "rot_mat", "rmat")
 _TRANSLATIONS = ("tvec", "translation_vector", "t", "translation", "trans", "position", "tvecs")
 _NO_POSE = ("projection_matrix", "p", "p1", "p2", "q")
-"""3 x 4 and 4 x 4 matrices of calibration files that are not poses (ROS, OpenCV's stereo calibration)."""
+"""Names of 3 x 4 and 4 x 4 matrices of calibration files that are not poses (ROS, OpenCV's stereo calibration)."""
 
 
 def _search(tree: Any, path: str) -> Iterator[FoundPose]:
@@ -369,7 +369,7 @@ def _first(values: Mapping[str, Any], names: Sequence[str], read: Any) -> Floats
 
 
 def _array(value: Any) -> Floats | None:
-    """An array of a list of numbers, a list of rows, or a map of rows, cols and data; None for other values."""
+    """An array from a list of numbers, a list of rows, or a map of rows, cols and data; None for other values."""
     if isinstance(value, Mapping) and {"rows", "cols", "data"} <= set(value):
         data = _array(value["data"])
         rows, columns = value["rows"], value["cols"]

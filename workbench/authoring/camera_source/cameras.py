@@ -28,14 +28,14 @@ class HookCamera:
     """One camera that a hook made."""
 
     made: CameraSettings | None
-    """As its ``CameraConfig`` call made it; None if the call was not recorded or has other settings."""
+    """Settings of its ``CameraConfig`` call; None if the call was not recorded or has other settings."""
     settings: CameraSettings | None
-    """As the hook returned it."""
+    """Settings of the config that the hook returned."""
     mount: str
-    """Text that identifies the body it is mounted on."""
+    """Text that identifies the body that the camera is mounted on."""
     site: CallSite | None
     trace: Trace | None
-    """Of the call; None if that is in none of the author's files."""
+    """Trace of the call; None if the call is in none of the author's files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +68,12 @@ class CameraCall:
 
     @property
     def hook(self) -> str | None:
-        """Name of ManiSkill's hook that contains it."""
+        """Name of ManiSkill's hook that contains the call."""
         return next((name for name in reversed(self.trace.function.split(".")) if name in HOOKS), None)
 
     @property
     def key(self) -> ast.expr | ast.keyword | None:
-        """Its key, if it is a value of a dict."""
+        """Key of the call, if the call is a value of a dict."""
         outer = self.file.parents[self.node]
         if isinstance(outer, ast.Dict):
             return outer.keys[outer.values.index(self.node)]
@@ -83,20 +83,20 @@ class CameraCall:
 
     @property
     def container(self) -> ast.AST:
-        """The expression or statement that directly contains it."""
+        """The expression or statement that directly contains the call."""
         outer = self.file.parents[self.node]
         return self.file.parents[outer] if isinstance(outer, ast.keyword) else outer
 
     @property
     def loop(self) -> ast.AST | None:
-        """The loop within its function that contains it."""
+        """The loop within its function that contains the call."""
         scope = self.file.scopes(self.node)[0]
         outers = self.file.ancestors(self.node)
         return next((o for o in outers if isinstance(o, LOOPS) and scope in self.file.ancestors(o)), None)
 
 
 def changed_fields(a: CameraSettings, b: CameraSettings) -> list[str]:
-    """Those of `FIELDS` that differ."""
+    """The names in `FIELDS` of settings that differ."""
     apart = differences(a, b, _SAME)
     return [
         name

@@ -26,7 +26,7 @@ class NewNames:
     """Names that a copy has in place of the original's."""
 
     ids: dict[str, str] = field(default_factory=dict)
-    """By the original's id; one that is not in it is renamed as in any copy."""
+    """New ids by the original's id; an id that is missing here is renamed as in any copy."""
     classes: dict[str, str] = field(default_factory=dict)
 
 
@@ -141,7 +141,7 @@ def _renamed(file: SourceFile, names: NewNames) -> Iterator[Replacement]:
 
 
 def _bound(node: ast.AST) -> str:
-    """The name that a node uses or defines; empty for none."""
+    """The name that a node uses or defines; empty if there is none."""
     if isinstance(node, ast.alias):
         return node.asname or node.name
     return getattr(node, "id", None) or (node.name if isinstance(node, ast.ClassDef) else "")

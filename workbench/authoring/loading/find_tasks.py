@@ -16,16 +16,16 @@ from workbench.machine.files import read_regular_file
 from workbench.machine.parse_python import parse_python
 
 DEEPEST = 6
-"""Folders below the first that are searched."""
+"""Levels of folders below the first that are searched."""
 MOST_LOOKED_AT = 5_000
-"""Python files that are opened."""
+"""Most Python files that are opened."""
 MOST_FOUND = 200
 LARGEST = 512 * 1024
-"""Bytes of a file that is read; the largest task of ManiSkill has 60 kB."""
+"""Largest file that is read, in bytes; the largest task of ManiSkill has 60 kB."""
 LONGEST = 5.0
-"""Seconds of one search."""
+"""Time limit of one search, in seconds."""
 LONGEST_NAME = 120
-"""Characters of an id or a class that are kept."""
+"""Characters of an id or a class name that are kept."""
 _NO_TASKS_IN = LIBRARY_FOLDERS | {"node_modules", "__pycache__", "build", "dist"}
 _ENVIRONMENT_HAS = ("pyvenv.cfg", "conda-meta")
 """Files and folders that only the root of a Python environment has."""
@@ -33,18 +33,18 @@ _ENVIRONMENT_HAS = ("pyvenv.cfg", "conda-meta")
 
 @dataclass(frozen=True)
 class TaskFile:
-    """A Python file that has a task, as its text says."""
+    """A Python file with a task, as its text describes it."""
 
     path: Path
-    """Absolute, without links."""
+    """Absolute path, without links."""
     ids: tuple[str, ...]
-    """Ids that it registers, as far as they are written as plain text."""
+    """Ids that the file registers, as far as they are written as plain text."""
     classes: tuple[str, ...]
-    """Its task classes, in the order of the file."""
+    """Task classes of the file, in the order of the text."""
     not_python: bool = False
-    """Its text does not parse."""
+    """Whether the text does not parse."""
     line: int | None = None
-    """Where it does not parse, if that is known."""
+    """Line at which the text does not parse, if known."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class FoundTasks:
     """The result of a search."""
 
     files: tuple[TaskFile, ...] = ()
-    """Sorted: those of the folder itself first, then by path."""
+    """Files in order: those of the folder itself first, then by path."""
     left_out: str = ""
-    """Why it may have missed files, as a sentence; empty if it has seen all."""
+    """Why the search may have missed files, as a sentence; empty if it has seen all."""
 
 
 class TaskFileReader:
@@ -64,7 +64,7 @@ class TaskFileReader:
         self._known: dict[Path, tuple[tuple[int, ...], TaskFile | None]] = {}
 
     def read(self, path: Path) -> TaskFile | None:
-        """As `read_task_file`."""
+        """The result of `read_task_file`, read again only when the file's ``stat`` has changed."""
         try:
             found = os.stat(path)
         except OSError:
@@ -112,7 +112,7 @@ def find_task_files(
 
 
 _BEGUN = re.compile(rb"^[ \t]*(class[ \t][^(\n]*\([^)\n]*\bBaseEnv\b|@[\w.]*\bregister_env\b)", re.MULTILINE)
-"""In a text that does not parse: most likely a task that somebody is writing."""
+"""Pattern in a text that does not parse: most likely a task that somebody is writing."""
 
 
 def read_task_file(path: Path) -> TaskFile | None:
@@ -137,7 +137,7 @@ def read_task_file(path: Path) -> TaskFile | None:
 
 
 def _python_files(root: Path) -> Iterator[Path]:
-    """Breadth first, so that a deep folder cannot hide the files next to where one looks."""
+    """The Python files below `root`, breadth first, so that a deep folder cannot hide the files at the top."""
     waiting = [(root, 0)]
     while waiting:
         folder, depth = waiting.pop(0)
@@ -171,7 +171,7 @@ def is_below(path: Path, folder: Path) -> bool:
 
 
 def _tasks_of(tree: ast.Module) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Ids and class names."""
+    """Ids and class names of the tasks in a module."""
     ids: list[str] = []
     tasks: list[str] = []
     for node in _top_level(tree):

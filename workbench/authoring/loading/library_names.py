@@ -33,7 +33,7 @@ _INSTALLED_BY_MISTAKE = {"docs", "example", "examples", "scripts", "test", "test
 _author_folders: set[str] = set()
 """Every folder that was put on ``sys.path`` for an author."""
 _permanent_folder = False
-"""An author's folder stays on ``sys.path``."""
+"""Whether an author's folder stays on ``sys.path``."""
 
 
 def is_own_file(path: str, folder: Path) -> bool:

@@ -81,11 +81,11 @@ class LoadedTask:
     others: tuple[str, ...] = ()
     """Further task classes of the file (robots if it has no task), which ``file.py:Name`` opens."""
     alternatives: tuple[str, ...] = ()
-    """Those of `others` to try if this one fails, in order; none if a class was named."""
+    """Names in `others` to try if this class fails, in order; empty if a class was named."""
     in_place_of: RefusedClass | None = None
     """The class that was tried first and failed."""
     robot: Robot | None = None
-    """Shown in a scene of ManiSkill, for a file without a task."""
+    """The robot, shown in a scene of ManiSkill, for a file without a task."""
     replaced: tuple[registry.Registration, ...] = ()
     """Names that another task or robot had (``PickCube-v1``): plain ManiSkill would skip this file's class."""
     named_like_libraries: tuple[Path, ...] = ()
@@ -127,9 +127,9 @@ class _Load:
     before: _Load | None
     """The load of the same file that this one replaced."""
     unloaded: UnloadedModules | None
-    """The modules before it; None once a later load depends on this one."""
+    """The modules before this load; None once a later load depends on this one."""
     cls: type[BaseEnv] | None = None
-    """The class that it gave."""
+    """The class that the load gave."""
 
 
 _loads: dict[Path, _Load] = {}
@@ -519,7 +519,7 @@ def _named_like(name: str | None, finder: AuthorFinder) -> Path | None:
 
 
 def _installed(name: str | None) -> str | None:
-    """The package that the module `name` is of, or Python, with its version; None for a module of the author's."""
+    """The package, or Python, that the module `name` belongs to, with its version; None for a module of the author's."""
     top = (name or "").partition(".")[0]
     if top in sys.stdlib_module_names:
         return f"Python {platform.python_version()}"

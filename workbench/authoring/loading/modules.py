@@ -37,7 +37,7 @@ class ModuleName:
     name: str
     search_folder: Path
     own_folder: Path
-    """Files in or below it are the author's."""
+    """Folder of the author: the files in and below it are the author's."""
 
 
 def module_name(file: Path) -> ModuleName:
@@ -83,13 +83,14 @@ class AuthorFinder(MetaPathFinder):
         place = named or module_name(file)
         self.main, self.search_folder, self.own_folder = place.name, place.search_folder, place.own_folder
         self.goes_by_stem = named is None
-        """Helpers may import the task by its file's name."""
+        """Whether helpers may import the task by its file's name."""
         self.given = given
-        """Path to text that replaces the file on disk."""
+        """Text by path that replaces the file on disk."""
         self.only_given = only_given
-        """Execute no other file of the folder: a recording named the task, and a person approved these texts."""
+        """Whether to execute no other file of the folder: a recording named the task, and a person approved these
+        texts."""
         self.texts: dict[str, str] = {}
-        """Path to text of the files read so far, in order."""
+        """Text by path of the files read so far, in order."""
         self.names: list[str] = []
         """Names in ``sys.modules`` of the executed modules."""
 
@@ -128,7 +129,8 @@ class AuthorFinder(MetaPathFinder):
     def _given_folder(
         self, fullname: str, last: str, path: Sequence[str] | None
     ) -> importlib.machinery.ModuleSpec | None:
-        """For a name without a given text: an installed module, else a folder of given texts without an ``__init__.py``.
+        """The spec for a name without a given text: an installed module, else a folder of given texts without
+        ``__init__.py``.
 
         Raises ModuleNotFoundError for other files of the folder: if an earlier task, or the code itself, has put the folder
         on ``sys.path``, Python would continue with `PathFinder` and find them.
@@ -197,7 +199,7 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
     """Executes one text. Reads and writes no bytecode files."""
 
     executed = 0
-    """By all loaders of this process."""
+    """Number of modules with at least one statement that all loaders of this process have begun to execute."""
 
     def __init__(self, finder: AuthorFinder, name: str, path: str) -> None:
         super().__init__(name, path)
@@ -234,7 +236,7 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
 
 
 def executed_modules() -> int:
-    """How many modules of authors that hold a statement this process has begun to execute, over all loads."""
+    """Number of authors' modules with at least one statement that this process has begun to execute, over all loads."""
     return _AuthorLoader.executed
 
 

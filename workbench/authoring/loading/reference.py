@@ -29,7 +29,7 @@ class RecordedTask:
     """
 
     env_id: str
-    """Opened if it is registered; never read as a path."""
+    """Id that is opened if it is registered; never read as a path."""
     file: str | None = None
     """The task's own file, absolute, if the recording has one."""
     class_name: str | None = None
@@ -75,7 +75,7 @@ def looks_like_file(env_id: str) -> bool:
 
 
 def is_path(reference: str) -> bool:
-    """Whether `reference` has the form of a path, or is one of something other than a folder beside.
+    """Whether `reference` has the form of a path, contains a slash and exists, or names a file in the current folder.
 
     A folder may have the name of an env id.
     """
@@ -164,12 +164,12 @@ class NamedModule:
     search_folder: Path | None
     """The folder that must be on ``sys.path``; None if the file's path does not match its name (an import hook maps it)."""
     own_folder: Path | None
-    """Its top package, or the folder of a module without a package: everything in it is the author's. None for a
+    """Top package of the module, or the folder of a module without a package: all in it is the author's. None for a
     library's module, which is imported as it is and not watched."""
 
 
 def split_reference(reference: str) -> tuple[str, str] | None:
-    """Module and class of ``package.module:ClassName``; None for another form, ``file.py:ClassName`` too."""
+    """Module and class of ``package.module:ClassName``; None for any other form, including ``file.py:ClassName``."""
     match = _REFERENCE.fullmatch(reference)
     if match is None or match["module"].endswith(".py"):
         return None

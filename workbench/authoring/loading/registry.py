@@ -43,7 +43,7 @@ class Registration:
     file: str
     line: int
     override: bool
-    """It was asked to take the place of another."""
+    """Whether the registration asked to replace another one."""
 
     @property
     def is_robot(self) -> bool:
@@ -55,11 +55,11 @@ class Registrations:
     """The table entries of one load."""
 
     made: list[Registration] = field(default_factory=list)
-    """In order; environments and agents."""
+    """Registrations of environments and agents, in order."""
     displaced: dict[str, Slot] = field(default_factory=dict)
-    """Name to the entries before the load."""
+    """Entries before the load, by name."""
     placed: dict[str, Slot] = field(default_factory=dict)
-    """Name to the entries of this load."""
+    """Entries of this load, by name."""
     _removed: list[str] = field(default_factory=list)
     """Names of `placed` whose entries the last `undo` removed."""
 
@@ -78,8 +78,8 @@ class Registrations:
             _put(name, self.placed[name])
 
     def replaced(self) -> tuple[Registration, ...]:
-        """Those that plain ManiSkill skips: the name was registered before, as those of built-in tasks, and they do not
-        override it."""
+        """Registrations that plain ManiSkill skips: their name was registered before, such as that of a built-in
+        task, and they do not override it."""
         first = {made.name: made for made in reversed(self.made)}
         taken = [
             name for name, slot in self.displaced.items() if any(one is not _NOTHING for one in slot[:3])
@@ -93,7 +93,7 @@ def environment(env_id: str) -> EnvSpec | None:
 
 
 def id_of(cls: type) -> str | None:
-    """The id that a class is registered under; None if it is under none."""
+    """The id that a class is registered under; None if the class is not registered."""
     return next((name for name in environment_ids() if REGISTERED_ENVS[name].cls is cls), None)
 
 

@@ -32,13 +32,13 @@ class Robot:
 class ChosenTask:
     cls: type[BaseEnv]
     env_id: str | None
-    """None for a class that is not registered."""
+    """Registered id; None for a class that is not registered."""
     others: tuple[str, ...]
     """Other classes of the file that can be named."""
     alternatives: tuple[str, ...] = ()
-    """Those of `others` to try if no class was named and this one fails, in order."""
+    """Names in `others` to try if no class was named and this one fails, in order."""
     kwargs: dict[str, Any] = field(default_factory=dict)
-    """For the constructor, in addition to the registered ones."""
+    """Constructor arguments in addition to the registered ones."""
     robot: Robot | None = None
 
 
@@ -93,7 +93,7 @@ def choose_task(
 
 
 def _alternatives(cls: type, candidates: list[type], registered: Collection[type]) -> tuple[str, ...]:
-    """Classes to try if `cls` fails. Base classes of it are left out: one may open and show nothing."""
+    """Classes to try if `cls` fails, without its base classes: one may open and show nothing."""
     return tuple(
         other.__name__
         for other in reversed(candidates)

@@ -37,13 +37,13 @@ class TaskContent:
     main: str
     """Path of the task's own file, or its name in a recording."""
     texts: dict[str, str]
-    """Path to text; the task's own file first."""
+    """Text by path; the task's own file first."""
     unseen: tuple[str, ...] = ()
     """Sentences about code that may run and is not in `texts`."""
     computed: bool = False
-    """A text imports by computed names, so `texts` has every module of the folder."""
+    """Whether a text imports by computed names, so that `texts` has every module of the folder."""
     sums: Mapping[str, str] = field(default_factory=dict)
-    """Path to the sha256 of the file's bytes, which its text does not determine (line ends, encoding)."""
+    """sha256 of each file's bytes, by path; the text does not determine it (line ends, encoding)."""
 
     @property
     def modules(self) -> tuple[str, ...]:

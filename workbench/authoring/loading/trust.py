@@ -16,18 +16,18 @@ log = logging.getLogger(__name__)
 
 STORE_FILE = "trusted_tasks.json"
 MOST_KEPT = 5000
-"""Entries; the oldest are dropped."""
+"""Most entries that are kept; the oldest are dropped."""
 MOST_WITH_FILES = 200
-"""The newest entries, which keep the hashes of their files: those of 300 modules take 30 kB."""
+"""Newest entries that keep the hashes of their files: those of 300 modules take 30 kB."""
 
 
 class _Entry(msgspec.Struct, frozen=True):
     hash: str
     file: str
-    """Its path when it was asked about, to report that a text has changed."""
+    """Path of the file when a person was asked, to report that a text has changed."""
     when: str
     followed: bool = False
-    """Later texts saved to `file` may run too."""
+    """Whether later texts saved to `file` may run too."""
     files: dict[str, str] = {}
     """`TaskContent.file_sums`, to report which file has changed; empty in entries of an earlier version."""
 
@@ -50,7 +50,7 @@ class TrustStore:
         self._warned: set[str] = set()
 
     def trusts(self, content: TaskContent) -> bool:
-        """Whether this very text may run."""
+        """Whether exactly this text may run."""
         with self._lock:
             return any(e.hash == content.hash for e in self._all())
 

@@ -14,27 +14,27 @@ from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file, real_p
 from workbench.machine.processes.watched_thread import report_failure, watched_thread
 
 POLL_S = 0.04
-"""Time between two polls."""
+"""Seconds between two polls."""
 QUIET_S = 0.03
-"""A burst is over when nothing changes for this long."""
+"""Seconds without a change after which a burst of saves is over."""
 BURST_S = 0.2
-"""Longest wait for the end of a burst."""
+"""Longest wait in seconds for the end of a burst."""
 READ_S = 0.25
 """How often the files are read even if their ``stat`` is the same: a network mount may be late with it, and two saves
 within one tick of a file system's clock have the same one."""
 GONE_S = 0.3
-"""How long a file must be missing or empty before that is its new content, and not half of a save."""
+"""Seconds for which a file must be missing or empty before that counts as its new content, and not as half of a save."""
 STOP_S = 1.0
-"""Longest wait for the end of the thread: reading a file on a disk that hangs cannot be ended."""
+"""Longest wait in seconds for the end of the thread: reading a file on a disk that hangs cannot be ended."""
 POLL_SHARE, READ_SHARE = 0.003, 0.001
 """Shares of one core for ``stat`` and for reading; with hundreds of files both are done less often."""
 NEWEST, TURN = 8, 32
-"""Files checked at every poll, those saved last, and how many of the others."""
+"""Files checked at every poll, which are those saved last; and how many of the others are checked in turn."""
 
 Content = str | bytes | None
-"""Text; bytes that are not text; None for a missing or unreadable file (a device, a pipe, too large)."""
+"""Text; bytes if they are not text; None for a missing or unreadable file (a device, a pipe, too large)."""
 Statuses = dict[Path, tuple[int, ...]]
-"""Per file the fields of ``stat`` that change with its content, modification time first; empty for no file."""
+"""Fields of ``stat`` that change with a file's content, by file, modification time first; empty if there is no file."""
 
 
 class SourceWatcher:

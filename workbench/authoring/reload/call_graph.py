@@ -16,7 +16,7 @@ Key = tuple[str, str]
 """File and name within it: ``("/x/push.py", "PushEnv.evaluate")``."""
 
 STATEMENTS = "(statements)"
-"""Name of the symbol of all statements that are no definition, and run in order when the file is imported."""
+"""Name of the symbol of all statements that are no definition; they run in order when the file is imported."""
 
 _INTROSPECTION = frozenset(
     (
@@ -49,11 +49,11 @@ class Symbol:
     parts: Sequence[ast.AST]
     """The nodes that make its text; for a class without its members."""
     nodes: Sequence[ast.AST]
-    """Its nodes: a property with its setter is one symbol."""
+    """Nodes of the symbol: a property with its setter is one symbol."""
     short_names: frozenset[str]
-    """Names by which other code may mention it."""
+    """Names by which other code may mention the symbol."""
     owner: str | None = None
-    """The class of a member."""
+    """Class that a member belongs to."""
 
     @cached_property
     def text(self) -> str:
@@ -66,12 +66,12 @@ class Symbol:
 
     @property
     def mentions(self) -> frozenset[str]:
-        """Names of variables and attributes in it, and strings that are identifiers."""
+        """Names of variables and attributes in the symbol, and strings that are identifiers."""
         return self._mentions[0]
 
     @property
     def dynamic(self) -> str | None:
-        """A name in it by which it may reach code that it does not mention; None if there is none."""
+        """A name in the symbol by which it may reach code that it does not mention; None if there is none."""
         return self._mentions[1]
 
     @property
@@ -280,7 +280,7 @@ class TwoVersions:
         self.old = _read_all(old, keep_docstrings)
         self.new = _read_all(new, keep_docstrings)
         self.by_key: dict[Key, list[Symbol]] = {}
-        """The symbol in the versions that have it, the old one first."""
+        """The symbol in each version that has it, the old version first."""
         self._named: dict[str, set[Key]] = {}
         for symbol in (*self.old.values(), *self.new.values()):
             self.by_key.setdefault(symbol.key, []).append(symbol)

@@ -19,7 +19,7 @@ _NEW_VALUES = set("dict list set tuple zip range sorted float int bool len sum m
 _MAKES_NEW = {"clone", "copy", "deepcopy", "tolist", "sum", "mean", "norm"}
 _PLAIN_DECORATORS = {"property", "staticmethod", "classmethod", "override"}
 _HOOK_ARGUMENTS = {"info", "obs", "action"}
-"""ManiSkill creates them for every step."""
+"""Arguments of hooks that ManiSkill creates for every step."""
 
 
 def memoizing_statement(function: ast.AST, imported: Collection[str]) -> str | None:
@@ -121,7 +121,7 @@ def _call_keeps(call: ast.Call, conditional: bool, fresh: set[str], imported: Co
 
 
 def changes_in_place(method: ast.Attribute) -> bool:
-    """``append``, ``update``, torch's ``add_``."""
+    """Whether a method changes its object in place: ``append``, ``update``, torch's ``add_``."""
     return method.attr in MUTATES or (method.attr.endswith("_") and not method.attr.endswith("__"))
 
 

@@ -27,7 +27,7 @@ RESET_HOOKS = frozenset(hooks_of("reset"))
 STEP_HOOKS = frozenset(hooks_of("step"))
 REWARD_HOOKS = frozenset(hooks_of("reward"))
 SCORING_HOOKS = REWARD_HOOKS.union(hooks_of("evaluate"), hooks_of("observation"))
-"""They run at every step and change nothing; `BaseEnv.__init__` calls some of them in its first reset."""
+"""Hooks that run at every step and change nothing; `BaseEnv.__init__` calls some of them in its first reset."""
 CAMERA_HOOKS = frozenset(
     {
         *("_default_sensor_configs", "_default_human_render_camera_configs"),
@@ -68,13 +68,13 @@ class Change:
 
     level: Level
     reason: str
-    """For the page: ``only compute_dense_reward changed``."""
+    """Reason for the page: ``only compute_dense_reward changed``."""
     hooks: frozenset[str] = frozenset()
     """Hooks of the task that may behave differently."""
 
     @property
     def tried_hooks(self) -> frozenset[str]:
-        """Those of `hooks` that computing the current moment's reward, evaluation and observation does not run."""
+        """Hooks that computing the current moment's reward, evaluation and observation does not run."""
         return self.hooks & (RESET_HOOKS | STEP_HOOKS)
 
 
@@ -215,7 +215,7 @@ class _Comparison:
     # --- code that cannot be analysed ----------------------------------------------------------------
 
     def _refuse_another_order(self, family: set[Key]) -> None:
-        """The order of members matters: it numbers an enum's members and a dataclass's arguments."""
+        """Refuse another order of members: it numbers an enum's members and a dataclass's arguments."""
         for key, versions in self._versions.by_key.items():
             if versions[0].kind != "class" or key in family or key in self._versions.changed:
                 continue

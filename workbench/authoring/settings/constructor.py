@@ -14,7 +14,7 @@ from workbench.authoring.source.text import RefusedEdit, SourceFile
 from workbench.core.env.keywords import parameters_of
 
 _DEEPEST = 20
-"""Classes that a constructor is followed through."""
+"""Most classes through which a constructor is followed."""
 
 
 def class_arguments(cls: type) -> tuple[str, ...]:

@@ -24,11 +24,11 @@ class Constant:
     """A literal that is assigned once, in the module or a class of the file."""
 
     name: str
-    """With what it belongs to: ``push.REACH_WEIGHT`` of a module, ``PushEnv.reach_weight`` of a class."""
+    """Name with its owner: ``push.REACH_WEIGHT`` of a module, ``PushEnv.reach_weight`` of a class."""
     line: int
     value: Any
     at: Replacement
-    """Its value's place, with the text that is there."""
+    """Place of the value, with the text that is there."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class TaskText:
     # --- inside ----------------------------------------------------------------------------------------
 
     def _scopes(self) -> Iterator[tuple[str, Mapping[str, list[Binding]]]]:
-        """The module and the classes of the file, each by its name, with what it binds."""
+        """The module and the classes of the file, each by its name, with the names that it binds."""
         yield self._path.stem, self._project.bindings(self._file, self._file.module)
         for node in self._file.nodes:
             if isinstance(node, ast.ClassDef) and "<locals>" not in self._file.qualname(node):
@@ -128,7 +128,7 @@ class TaskText:
         if self._class is not None:
             return classes.get(self._class)
         registered = [node for node in classes.values() if any(map(_registers, node.decorator_list))]
-        # As `choose_task`: the last one that is registered, else the last one.
+        # Same choice as in `choose_task`: the last class that is registered, else the last class.
         derived = [node for node in classes.values() if node.bases]
         return next(reversed([*derived, *registered]), None)
 
@@ -165,7 +165,7 @@ def _registers(decorator: ast.expr) -> bool:
 
 
 def _python_text(constant: Constant, value: Any, before: Any) -> str:
-    """The value, as it came of JSON, as Python's text, of the type that is there."""
+    """The Python text of a JSON value, in the type of the present value."""
     if value is None or before is None:
         return repr(value)
     kinds = ((bool, "true or false"), (int | float, "a number"), (str, "a text"), (list | tuple, "a list"))

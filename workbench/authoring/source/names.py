@@ -19,11 +19,11 @@ class Binding:
     value: ast.expr | None
     """The expression of its value; None if the text does not determine it."""
     why: str = ""
-    """Reason if `value` is None."""
+    """Reason why `value` is None."""
     imported: tuple[str, str] | None = None
-    """For an import: the module, with its leading dots, and the name in it (empty for the module itself)."""
+    """Module of an import, with its leading dots, and the name in it (empty for the module itself); else None."""
     attribute: bool = False
-    """An attribute of an object, not a variable."""
+    """Whether the binding is an attribute of an object, not a variable."""
 
     @property
     def dotted(self) -> str:

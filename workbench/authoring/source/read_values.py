@@ -40,7 +40,7 @@ from workbench.authoring.source.text import (
 from workbench.core import maniskill_private
 
 _DEPTH = 40
-"""Longest chain of names; a longer one is a circle."""
+"""Longest chain of names that is followed; a longer one is a circle."""
 _CONDITION_NODES = (
     ast.Name,
     ast.Attribute,
@@ -103,7 +103,7 @@ def trace_call(
 
 
 def _same(a: Plain, b: Plain) -> bool:
-    """Equal within single precision."""
+    """Whether two values are equal within single precision."""
     if isinstance(a, tuple) and isinstance(b, tuple):
         return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
     if isinstance(a, float) and isinstance(b, float):
@@ -531,7 +531,7 @@ class KnownFunction:
     parameters: tuple[str, ...] = ()
     """Parameters in order, of a function whose arguments may be edited."""
     converts: bool = False
-    """It only converts the type of its first argument, which is edited instead."""
+    """Whether the function only converts the type of its first argument, which is edited instead."""
 
 
 @cache

@@ -22,7 +22,7 @@ Span = tuple[int, int]
 LOOPS = (ast.For, ast.AsyncFor, ast.While, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 
 _LINE_END = re.compile(r"\r\n?|\n")
-"""Line ends of Python; str.splitlines splits at more."""
+"""Pattern of Python's line ends; str.splitlines splits at more characters."""
 _BLANK = {
     tokenize.COMMENT,
     tokenize.NL,
@@ -384,7 +384,7 @@ class Read:
 
     at: Place
     others: str | None
-    """Text: the place of another reader of that value; None if there is no other."""
+    """Place of another reader of that value, as text; None if there is no other."""
 
 
 if TYPE_CHECKING:
@@ -400,9 +400,9 @@ class TracedValue:
 
     at: Place
     reads: tuple[Read, ...]
-    """The names that lead to it, the call's own first."""
+    """Names that lead to the expression, the name in the call first."""
     value: Plain
-    """A pose is seven numbers: p, then q as wxyz."""
+    """Value in the run; a pose is seven numbers: p, then q as wxyz."""
     function: str = ""
     """Name (`KnownFunction.name`) of the called function; empty for other expressions."""
     parts: Mapping[str, TracedValue] = field(default_factory=dict)
@@ -412,7 +412,7 @@ class TracedValue:
     offset: float = 0.0
     """value = slope * `parts["of"].value` + offset"""
     literal: bool = False
-    """Written as a plain number, perhaps with a sign, or as a list of its items."""
+    """Whether it is written as a plain number, perhaps with a sign, or as a list of its items."""
 
     @property
     def numbers(self) -> tuple[float, ...]:

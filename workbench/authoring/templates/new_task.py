@@ -23,7 +23,7 @@ from workbench.machine.parse_python import parse_python
 
 LONGEST_NAME = 60
 _MOST_BLANK = 64 * 1024
-"""Bytes of a file that may be filled; one with more holds something."""
+"""Most bytes of a file that may be filled; a larger file holds something."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _WORD = re.compile(r"[A-Za-z0-9]+")
 
@@ -33,9 +33,9 @@ class Template:
     """An example that a new task may begin from."""
 
     name: TemplateName
-    """What ``workbench new --from`` calls it."""
+    """Name for ``workbench new --from``."""
     example: str
-    """Its file among the examples."""
+    """File of the template among the examples."""
     about: str
 
 
@@ -60,7 +60,7 @@ class NewTask:
 
     @property
     def reference(self) -> str:
-        """What ``workbench open`` takes in the folder of the file."""
+        """Argument of ``workbench open`` in the folder of the file."""
         return self.file.name if self.is_default else f"{self.file.name}:{self.class_name}"
 
 
@@ -222,7 +222,7 @@ def _example(template: Template) -> Path:
 
 @cache
 def maniskill_ids() -> Mapping[str, Path]:
-    """Each id of the installed ManiSkill with its file, as their texts say; nothing is imported. Empty without ManiSkill."""
+    """File of each id of the installed ManiSkill, as the texts say; nothing is imported. Empty without ManiSkill."""
     spec = importlib.util.find_spec("mani_skill")
     folders = [] if spec is None else spec.submodule_search_locations or ()
     return {
