@@ -1,4 +1,4 @@
-"""Debian packages: installed where that is allowed, and the sources they come from."""
+"""Debian packages: installs them where that is allowed, and reads the sources that they come from."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class AptFailed(RuntimeError):
 class PackageVersion:
     version: str
     suite: str
-    """As in apt's ``-t``: ``bookworm-backports``."""
+    """Release as for apt's ``-t``: ``bookworm-backports``."""
 
 
 def has_apt() -> bool:
-    """True on Debian, Ubuntu and their derivatives."""
+    """Whether this is Debian, Ubuntu or a derivative."""
     return shutil.which("apt-get") is not None
 
 
 def can_install_packages() -> bool:
-    """True for root on a machine with apt."""
+    """Whether this is root on a machine with apt."""
     return has_apt() and os.geteuid() == 0
 
 
@@ -114,7 +114,7 @@ class AptSource:
     suites: tuple[str, ...]
     components: tuple[str, ...]
     options: dict[str, str] = field(default_factory=dict)
-    """Its options among `CARRIED_OPTIONS`, with names and values as in deb822."""
+    """Options of the source among `CARRIED_OPTIONS`, with names and values as in deb822."""
 
 
 def parse_one_line_format(text: str) -> list[AptSource]:

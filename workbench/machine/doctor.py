@@ -32,7 +32,8 @@ from workbench.machine.software_vulkan import ensure_render_device
 
 DEFAULT_PORT = 8080
 LEAST_MEMORY_GIB = 6.0
-"""One worker with 16 envs and cameras on a software driver, its warm spare, the server and a browser."""
+"""Least available memory, in GiB: one worker with 16 envs and cameras on a software driver, its warm spare, the
+server and a browser."""
 CHILD_TIMEOUT_S = 120
 
 GPU_QUESTIONS = """
@@ -58,7 +59,7 @@ class DoctorFinding:
 
     topic: str
     ok: bool | None
-    """True: works. None: the workbench runs, with less. False: it cannot run."""
+    """True: works. None: the workbench runs with limitations. False: the workbench cannot run."""
     what: str
     advice: str | None = None
     """What to do; None if all is well."""
@@ -104,7 +105,7 @@ def diagnose() -> list[DoctorFinding]:
 
 
 def exit_code(findings: Sequence[DoctorFinding]) -> int:
-    """0 if the workbench can run here, perhaps with less; 1 if not."""
+    """Exit code of the command: 0 if the workbench can run here, perhaps with limitations; 1 if not."""
     return int(any(finding.ok is False for finding in findings))
 
 
@@ -145,7 +146,7 @@ def _python() -> list[DoctorFinding]:
 
 
 def _packages() -> list[DoctorFinding]:
-    """Installed versions against the distribution's requirements."""
+    """Compare installed versions with the distribution's requirements."""
     if versions.installed(DISTRIBUTION) is None:
         return [DoctorFinding("packages", False, f"{DISTRIBUTION} is not installed", "Type: make open")]
     shown = [name for name in (*versions.TESTED, "torch", "numpy") if versions.installed(name) is not None]
@@ -157,8 +158,8 @@ def _packages() -> list[DoctorFinding]:
 
 
 def _maniskill() -> list[DoctorFinding]:
-    """Its release, a nightly build, or both, of which one has overwritten the other; and whether it and the packages beside
-    it have the private names that are used."""
+    """Check ManiSkill: its release, a nightly build, or both, of which one has overwritten the other; and whether it
+    and the packages beside it have the private names that are used."""
     topic = "ManiSkill"
     if (lacking := lines_if_lacking("A task")) is not None:
         return [DoctorFinding(topic, False, *lacking)]
@@ -212,7 +213,7 @@ def _render_device() -> list[DoctorFinding]:
 
 
 def _gpu() -> list[DoctorFinding]:
-    """CUDA through torch, then PhysX on it, without a download by SAPIEN."""
+    """Check CUDA through torch, then PhysX on it, without a download by SAPIEN."""
     answer = _ask_child(GPU_QUESTIONS)
     if isinstance(answer, str):
         return [
@@ -251,7 +252,7 @@ def _gpu() -> list[DoctorFinding]:
 
 
 def _ask_child(code: str) -> Any:
-    """What `code` prints last, as JSON; if it fails, the last line of its error."""
+    """What `code` prints last, read as JSON; if `code` fails, the last line of its error."""
     try:
         child = subprocess.run(
             python_command("-c", code),
@@ -283,7 +284,7 @@ def _cores_and_memory() -> list[DoctorFinding]:
 
 
 def _reading() -> list[DoctorFinding]:
-    """Confinement of the processes that read recordings."""
+    """Check the confinement of the processes that read recordings."""
     version = landlock_version()
     if version:
         what = f"recordings are read in processes that may read their folder and write nothing (Landlock {version})"
@@ -304,7 +305,7 @@ def _page_address() -> list[DoctorFinding]:
         f"http://127.0.0.1:{DEFAULT_PORT}/ and a token that `workbench open` prints; from elsewhere: {tunnel}"
     )
     with socket.socket() as trial:
-        # As a server does: a port with lingering connections counts as free.
+        # A server does the same: a port with lingering connections counts as free.
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             trial.bind(("127.0.0.1", DEFAULT_PORT))

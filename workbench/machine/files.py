@@ -145,7 +145,7 @@ def _taken(path: Path) -> FileExistsError:
 
 
 MOST_SOURCE_BYTES = 16 << 20
-"""Of one Python file; 50 times the largest of the standard library."""
+"""Most bytes of one Python file; 50 times the largest file of the standard library."""
 _PIECE = 1 << 20
 _KINDS = (
     (stat.S_ISDIR, "folder"),

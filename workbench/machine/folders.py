@@ -97,7 +97,8 @@ def write_private(name: str, content: bytes, folder: Path | None = None) -> None
 
 
 def create_private(name: str, content: bytes) -> bool:
-    """As `write_private` for a new file; returns False, and changes nothing, if it exists.
+    """Write a new file of the folder, readable by this user alone; returns False, and changes nothing, if the file
+    exists.
 
     Raises:
         OSError: it cannot be written.
@@ -198,7 +199,7 @@ class CurrentFolder:
 
     @contextmanager
     def again(self, *, stay: bool = False) -> Iterator[None]:
-        """Within this it is the current folder; afterwards the previous one is.
+        """Make it the current folder within this; afterwards the previous folder is current again.
 
         Args:
             stay: keep the folder in which the block ends, unless it raises.

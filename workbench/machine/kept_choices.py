@@ -1,4 +1,4 @@
-"""What a person chose on the page and finds again in the next run, in the user's own folder."""
+"""Choices that a person made on the page, kept for the next run in the user's own folder."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class KeptChoices(msgspec.Struct, frozen=True):
     """The file's content. A field that a later version adds has a default."""
 
     hints_closed: bool = False
-    """The hints of the first page were closed."""
+    """Whether the hints of the first page were closed."""
     check_after_save: bool = True
-    """Rules are checked after each load."""
+    """Whether rules are checked after each load."""
     policies: dict[str, list[str]] = {}
-    """Policies that were used, by the folder where the command was started; the newest first."""
+    """Policies that were used, newest first, by the folder in which the command was started."""
 
 
 def kept_choices() -> KeptChoices:
-    """The choices so far; those of a file that cannot be read are none, with a warning."""
+    """The choices so far; the defaults, with a warning, if the file cannot be read."""
     try:
         content = read_private(FILE)
         return KeptChoices() if content is None else msgspec.json.decode(content, type=KeptChoices)
@@ -37,12 +37,12 @@ def kept_choices() -> KeptChoices:
 
 
 def close_hints() -> None:
-    """The hints are not shown again."""
+    """Store that the hints are not shown again."""
     _change(lambda kept: msgspec.structs.replace(kept, hints_closed=True))
 
 
 def keep_check_after_save(wanted: bool) -> None:
-    """Whether rules are checked after each load."""
+    """Store whether rules are checked after each load."""
     _change(lambda kept: msgspec.structs.replace(kept, check_after_save=wanted))
 
 

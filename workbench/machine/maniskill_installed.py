@@ -16,7 +16,7 @@ from packaging.utils import canonicalize_name
 from workbench.machine import DISTRIBUTION
 
 EXTRAS: Mapping[str, str] = {"mani_skill": "maniskill", "mani_skill-nightly": "nightly"}
-"""ManiSkill's distributions, which write the same files, and the extra of ours that asks for each."""
+"""ManiSkill's distributions, which write the same files, each with the extra of the workbench that asks for it."""
 
 
 def lacks_maniskill() -> bool:
@@ -37,7 +37,7 @@ def installed_maniskills() -> dict[str, str]:
 
 
 def lines_if_lacking(what: str, arguments: Sequence[str] | None = None) -> tuple[str, str] | None:
-    """Two lines where ManiSkill is not installed: that `what` needs it, and the command to type. None where it is there.
+    """Two lines if ManiSkill is not installed: that `what` needs it, and the command to type. None if it is installed.
 
     Args:
         arguments: of ``workbench``, as they were typed; None if it was not started by its command.
@@ -72,7 +72,7 @@ def lines_if_mixed() -> tuple[str, str, str] | None:
 def command_to_install(name: str, arguments: Sequence[str] | None = None) -> str:
     """What installs this distribution of ManiSkill's into the environment of this process: by uv where uv has made it, else pip.
 
-    uv's environments of tools are not added to but made anew.
+    An environment of a uv tool is not added to, but rebuilt.
     """
     kind = _uv_environment()
     ours = shlex.quote(f"{DISTRIBUTION}[{EXTRAS[name]}]{_came_from()}")
@@ -86,7 +86,8 @@ def command_to_install(name: str, arguments: Sequence[str] | None = None) -> str
 
 
 def pip_command(verb: str, *requirements: str) -> str:
-    """What installs or uninstalls these in the environment of this process: with uv where uv has made it, else with pip."""
+    """The command that installs or uninstalls these in the environment of this process: uv where uv has made it, else
+    pip."""
     python = shlex.quote(sys.executable)
     if _uv_environment() is not None:
         command = f"uv pip {verb} --python {python}"
@@ -96,7 +97,8 @@ def pip_command(verb: str, *requirements: str) -> str:
 
 
 def _requirement(name: str) -> str:
-    """What our own metadata asks for with this distribution's extra; its bare name where we are not installed."""
+    """The requirement in the workbench's own metadata for this distribution's extra; the bare name where the
+    workbench is not installed."""
     try:
         lines = importlib.metadata.requires(DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:
@@ -127,7 +129,7 @@ def _is_in_uv_cache(prefix: Path) -> bool:
 
 
 def _came_from() -> str:
-    """`` @ URL`` of the wheel or folder that we were installed from; nothing where an index gave us."""
+    """`` @ URL`` of the wheel or folder that the workbench was installed from; empty if it came from an index."""
     try:
         text = importlib.metadata.distribution(DISTRIBUTION).read_text("direct_url.json")
     except importlib.metadata.PackageNotFoundError:

@@ -9,7 +9,7 @@ _lock = threading.Lock()
 
 
 def parse_python(text: str | bytes, file: str = "<unknown>") -> ast.Module:
-    """As ``ast.parse``, safe in several threads.
+    """Parse Python text as ``ast.parse`` does, safely in several threads.
 
     Before Python 3.12, and in some releases of 3.11 (seen in 3.11.7), all threads count the depth of the tree that they
     build in one place. Where a finalizer lets another thread go on meanwhile, ``ast.parse`` raises SystemError over text

@@ -43,7 +43,7 @@ class RenderProbe:
     device: str | None = None
     """Argument of ``sapien.Device``: ``cuda``, or ``cpu`` for any other Vulkan device."""
     missing_libraries: tuple[str, ...] = ()
-    """Those of `SYSTEM_LIBRARIES` that cannot be loaded; with any, `ok` is False."""
+    """Names in `SYSTEM_LIBRARIES` that cannot be loaded; with any, `ok` is False."""
     why_no_ray_tracing: str | None = None
     """Why this device cannot draw ray traced pictures, as a clause; None if it can."""
 
@@ -105,7 +105,7 @@ def driver_files() -> list[Path]:
 
 
 def _look() -> RenderProbe:
-    """In the child: build a render system and describe the device it took."""
+    """Build a render system and describe the device that it took; runs in the child."""
     missing = tuple(name for name in SYSTEM_LIBRARIES if not _loads(name))
     if missing:
         return RenderProbe(ok=False, error=f"missing: {', '.join(missing)}", missing_libraries=missing)
@@ -139,8 +139,9 @@ def _look() -> RenderProbe:
 
 
 def _why_no_ray_tracing(name: str, has_extension: bool, driver: _Driver | None) -> str | None:
-    """As `RenderProbe.why_no_ray_tracing`. Lavapipe has the extension too, and takes 10 s a picture with 2 samples a pixel
-    (``rt-fast``, 512 x 512), 20 s to compile for each camera, and more than 9 minutes with 32 samples (``rt``)."""
+    """Why this device cannot draw ray traced pictures, as a clause; None if it can. Lavapipe has the extension too,
+    and takes 10 s a picture with 2 samples a pixel (``rt-fast``, 512 x 512), 20 s to compile for each camera, and
+    more than 9 minutes with 32 samples (``rt``)."""
     if not has_extension:
         return f"the driver of {name} has none"
     return f"{name} is a software driver" if driver is not None and driver.in_software else None
@@ -167,12 +168,12 @@ def _loads(library: str) -> bool:
 @dataclass(frozen=True)
 class _Driver:
     text: str
-    """Name and version."""
+    """Name and version of the driver."""
     in_software: bool
 
 
 def _vulkan_drivers() -> dict[str, _Driver]:
-    """By device name, the driver of every device that Vulkan lists; SAPIEN has the device's name only.
+    """Driver of every device that Vulkan lists, by device name; SAPIEN has the device's name only.
 
     From ``VkPhysicalDeviceDriverProperties`` (core since 1.2). Written against the C layout of Vulkan 1.2 on 64 bits: VkApplicationInfo is 48 bytes with apiVersion
     at 44; VkInstanceCreateInfo is 64 bytes with the application info's address at 24;

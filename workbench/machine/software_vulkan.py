@@ -177,7 +177,7 @@ class MesaPlan:
     """Source of a Mesa that is new enough."""
 
     package: PackageVersion | None
-    """None if it is known only after `source_to_add` has been read."""
+    """Version to install; None if it is known only after `source_to_add` has been read."""
     source_to_add: str | None = None
     """A deb822 source, or None if apt already offers a good version."""
 
@@ -233,7 +233,7 @@ def use_private_driver() -> None:
 
 
 def known_render_device(install: bool) -> RenderProbe:
-    """As `ensure_render_device`, from what it found last if nothing that decides it has changed since.
+    """The result of `ensure_render_device`; the last one if nothing that decides it has changed since.
 
     A probe imports SAPIEN and makes a Vulkan device, and `make open` asks twice before the worker starts. A device that
     fails although nothing changed is reported by the worker, which is a process of its own too.
@@ -252,7 +252,8 @@ def known_render_device(install: bool) -> RenderProbe:
 
 
 def _what_decides() -> list[str]:
-    """Versions, the environment's variables, driver files with their age, the devices of this machine, and what is asked."""
+    """All that decides the result: versions, environment variables, driver files with their age, the machine's
+    devices, and the request."""
     named = (*DRIVER_VARIABLES, "LD_LIBRARY_PATH", "SAPIEN_VULKAN_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES")
     files = [*driver_files(), *_manifests(private_mesa_folder())]
     devices = [*Path("/dev").glob("nvidia*"), *Path("/dev/dri").glob("*")]

@@ -17,7 +17,7 @@ _UNITS = (("m", 1.0, 1.0), ("cm", 1e-2, 1e-2), ("mm", 1e-3, 1e-4), ("µm", 1e-6,
 
 
 def number_text(value: float, form: str = ".4g") -> str:
-    """``0.25``, ``NaN``, ``infinite``, ``-infinite``."""
+    """A number as text: ``0.25``, ``NaN``, ``infinite``, ``-infinite``."""
     if math.isnan(value):
         return "NaN"
     if math.isinf(value):
@@ -70,9 +70,9 @@ _ESCAPED = re.compile(
     "\ud800-\udfff]"  # bytes of a file's name that are not UTF-8: they cannot be printed
 )
 COLOURS = re.compile("\x1b\\[([0-9;:]{0,64})m")
-"""A colour sequence, and its numbers."""
+"""Pattern of a colour sequence with its numbers."""
 HARMLESS = frozenset((0, 1, 2, 3, 4, 7, 9, 22, 23, 24, 27, 29, *range(30, 50), *range(90, 108)))
-"""Codes of colours and styles that hide nothing and do not blink."""
+"""Codes of colours and styles that neither hide text nor blink."""
 
 
 def plain_text(text: str, keep: str = "") -> str:
@@ -164,7 +164,7 @@ def guard_terminal() -> None:
 
 
 MOST_LINES = 80
-"""Of a traceback."""
+"""Most lines of a traceback."""
 LONGEST_LINE = 500
 
 
@@ -183,10 +183,10 @@ class _OneLine(logging.Formatter):
 
 
 def of(count: int, total: int, what: str) -> str:
-    """``3 of 32 seeds``."""
+    """A count as text: ``3 of 32 seeds``."""
     return f"{count} of {total} {what}{'' if total == 1 else 's'}"
 
 
 def listed(values: Sequence[object], most: int = 5) -> str:
-    """``1, 2, 3 ...``."""
+    """Values as text: ``1, 2, 3 ...``."""
     return ", ".join(map(str, values[:most])) + (" ..." if len(values) > most else "")

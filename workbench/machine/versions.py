@@ -17,7 +17,7 @@ from workbench.machine import DISTRIBUTION
 from workbench.machine.maniskill_installed import EXTRAS, installed_maniskills, pip_command
 
 MANISKILL = tuple(EXTRAS)
-"""Two distributions with the same files: the release, and the build of a night."""
+"""Two distributions with the same files: the release, and the nightly build."""
 _OF_AN_EPISODE = (DISTRIBUTION, *MANISKILL, "sapien", "torch", "rerun-sdk")
 TESTED = {
     "mani_skill": ("3.0.1",),
@@ -34,18 +34,18 @@ class PrivateName:
     """A name of another package that the workbench uses and that package does not promise."""
 
     owner: str
-    """Module, or module and class: ``package.module:Class``."""
+    """Owner of the name: a module, or module and class: ``package.module:Class``."""
     name: str
-    """An attribute of it; for a class, also a field that is annotated or that its methods assign."""
+    """Attribute of the owner; for a class, also a field that is annotated or that its methods assign."""
     disables: str = ""
-    """What does not work without it; empty: nothing does."""
+    """What does not work without the name; empty if the workbench works without it."""
 
     @property
     def dotted(self) -> str:
         return f"{self.owner.rpartition(':')[2].rpartition('.')[2]}.{self.name}"
 
     def exists(self) -> bool:
-        """Imports its module."""
+        """Whether the name exists. Imports its module."""
         module, _, path = self.owner.partition(":")
         try:
             owner: Any = importlib.import_module(module)
@@ -95,7 +95,7 @@ def stored_names(code: CodeType, of: str | None = None) -> set[str]:
 
 
 _CACHE = dis.opmap.get("CACHE", 0)
-"""Fills up what follows an instruction."""
+"""Opcode that fills the space after an instruction."""
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
@@ -106,7 +106,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def installed(distribution: str) -> str | None:
-    """Its version; None if it is not installed."""
+    """Installed version of a distribution; None if it is not installed."""
     try:
         return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
@@ -126,7 +126,7 @@ def maniskill() -> tuple[str, str] | None:
 
 
 def untested(distributions: Iterable[str] = TESTED) -> dict[str, str]:
-    """Installed versions of these that no test was run with."""
+    """Installed versions of these distributions with which no test was run."""
     found = {name: installed(name) for name in distributions}
     return {name: v for name, v in found.items() if v is not None and v not in TESTED[name]}
 
@@ -138,7 +138,7 @@ def command_for_tested_versions() -> str:
 
 
 def unmet_requirements() -> list[tuple[Requirement, str | None]]:
-    """What this distribution asks for and is lacking or of another version, which comes with it.
+    """Requirements of the workbench that are missing or of another version, each with the installed version.
 
     Raises:
         importlib.metadata.PackageNotFoundError: The distribution itself is not installed.
@@ -154,7 +154,8 @@ def unmet_requirements() -> list[tuple[Requirement, str | None]]:
 
 
 def unmet_lines() -> tuple[str, str] | None:
-    """Two lines where requirements are unmet: which, and the command to type. None where all are met, or we are not installed."""
+    """Two lines if requirements are unmet: which, and the command to type. None if all are met, or the workbench is
+    not installed."""
     try:
         unmet = unmet_requirements()
     except importlib.metadata.PackageNotFoundError:
@@ -166,7 +167,7 @@ def unmet_lines() -> tuple[str, str] | None:
 
 
 def untested_text() -> str:
-    """What is installed that no test was run with, and the command for the tested versions; empty if all is tested."""
+    """The installed versions that no test was run with, and the command for the tested ones; empty if all are tested."""
     names = ", ".join(f"{name} {version}" for name, version in untested().items())
     return (
         f"Not tested with the workbench: {names}. The tested versions: {command_for_tested_versions()}"

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 LOWEST = 19
-"""Niceness of a process that gets only what all others leave over."""
+"""Niceness of a process that gets only the CPU time that all others leave over."""
 
 
 def python_command(*arguments: str) -> list[str]:

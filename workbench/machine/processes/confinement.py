@@ -17,21 +17,21 @@ _EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1 << 0, 1 << 1, 1 << 2, 1 << 3
 _FILE_RIGHTS = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
 """File rights that each version of Landlock adds; all but reading are given up."""
 _OF_FILES = _EXECUTE | _WRITE_FILE | _READ_FILE
-"""Rights that apply to what is no folder."""
+"""Rights that apply to files that are not folders."""
 _TCP_RIGHTS = 0b11
-"""Bind and connect, from version 4 on."""
+"""Rights to bind and to connect, from version 4 on."""
 _SCOPES = 0b11
-"""Abstract sockets of others, and signals to others, from version 6 on."""
+"""Scopes that keep out the abstract sockets of other processes and signals to them, from version 6 on."""
 _PR_SET_NO_NEW_PRIVS = 38
 _SYSTEM = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
            "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
 MOST_WRITTEN = 1 << 20
-"""Bytes of a written file, a limit that also holds without Landlock."""
+"""Most bytes of a written file; this limit also holds without Landlock."""
 MOST_OPEN_FILES = 512
 
 
 def landlock_version() -> int:
-    """Of this kernel; 0 where it has none, or it is turned off.
+    """Version of Landlock in this kernel; 0 if the kernel has none, or Landlock is turned off.
 
     Asked by system calls, since libc has no names for Landlock (``include/uapi/linux/landlock.h``).
     """

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 USUAL_PORT = 5678
-"""The default of editors."""
+"""Default port of editors."""
 HOST = "127.0.0.1"
-"""This machine only: a client that attaches can run any code."""
+"""Address of this machine only: a client that attaches can run any code."""
 
 
 class CannotDebug(ValueError):
@@ -142,7 +142,7 @@ def port_for_debugger(wanted: int | None) -> int:
 
 
 def listening_text(port: int, waits: bool) -> str:
-    """The log's line."""
+    """Log line with the address at which a debugger can attach."""
     at = f"{HOST}:{port}"
     if waits:
         return f"the worker waits for a debugger at {at}; the task is loaded when one has attached"

@@ -42,7 +42,7 @@ def family(pid: int) -> list[int]:
 
 
 def resident_memory(pid: int) -> int:
-    """Resident bytes of the process, including shared ones; 0 if it is gone."""
+    """Resident bytes of the process, including shared ones; 0 if the process is gone."""
     try:
         return int(_read(f"/proc/{pid}/statm").split()[1]) * _PAGE
     except (OSError, IndexError):
@@ -68,7 +68,7 @@ def proportional_memory(pids: Iterable[int]) -> int:
 
 
 def main_thread_ended(pid: int) -> bool:
-    """Whether its main thread has ended and others have not; also true for a moment of any exit."""
+    """Whether the main thread of the process has ended and others have not; also true for a moment of any exit."""
     try:
         return _state_and_parent(pid)[0] == "Z" and len(os.listdir(f"/proc/{pid}/task")) > 1
     except OSError:
@@ -81,7 +81,7 @@ def _proportional(pid: int) -> int:
             if line.startswith(b"Pss:"):
                 return int(line.split()[1]) * 1024
     except (OSError, ValueError):
-        # Of another user, or ending.
+        # The process belongs to another user, or is ending.
         return resident_memory(pid)
     return 0
 
@@ -111,7 +111,7 @@ def _read(path: str) -> bytes:
 
 _PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_CHILD_SUBREAPER = 1, 4, 36
 _LONGEST_END = 5.0
-"""Seconds for killed processes to end; one that waits for a disk may take longer."""
+"""Longest wait in seconds for killed processes to end; a process that waits for a disk may take longer."""
 _SIGNALS = {signal.SIGCHLD, signal.SIGTERM}
 
 
@@ -167,7 +167,8 @@ def end_with_parent(parent: int) -> None:
 
 
 class Keeper(Protocol):
-    """A process that called `begin_family`, as the server has it: a ``subprocess.Popen``, or what does as much of it."""
+    """A process that called `begin_family`, as the server sees it: a ``subprocess.Popen``, or an object with these
+    methods."""
 
     stdout: IO[bytes] | None
     stderr: IO[bytes] | None
@@ -196,11 +197,11 @@ def end_family(keeper: Keeper) -> None:
 
 
 def describe_exit(code: int | None) -> str:
-    """As text: ``was killed by SIGSEGV``, ``ended with exit code 3``."""
+    """An exit code as text: ``was killed by SIGSEGV``, ``ended with exit code 3``."""
     if code is None:
         return "stopped answering"
     if code < 0:
-        # Of the real-time signals only the first and the last have names.
+        # Only the first and the last real-time signal have names.
         named = -code in set(signal.Signals)
         return f"was killed by {signal.Signals(-code).name if named else f'signal {-code}'}"
     return f"ended with exit code {code}"
@@ -226,7 +227,7 @@ def _keep(worker: int) -> NoReturn:
 
 
 def _end_all() -> dict[int, int]:
-    """Kill all children, and those that become ours by that; returns exit statuses."""
+    """Kill all children, and the processes that become children by that; returns exit statuses."""
     ended: dict[int, int] = {}
     deadline = time.monotonic() + _LONGEST_END
     while (ours := children(os.getpid())) and time.monotonic() < deadline:

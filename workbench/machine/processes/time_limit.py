@@ -13,9 +13,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 PICTURE_SECONDS = 180.0
-"""Limit of one picture. The first of a process takes seconds, in which shaders are compiled."""
+"""Time limit of one picture, in seconds. The first picture of a process takes seconds, in which shaders are compiled."""
 _MOST_BYTES = 2000
-"""Of a message: a pipe takes it in one piece."""
+"""Most bytes of a message: a pipe takes these in one piece."""
 
 
 @dataclass
@@ -23,7 +23,7 @@ class _Watcher:
     """The process that watches this one."""
 
     pid: int
-    """Of the process that is watched. A fork of it is not."""
+    """Process id of the process that is watched. A fork of it is not watched."""
     seconds: float
     process: subprocess.Popen[bytes] | None = None
     pipe: int = -1
@@ -34,14 +34,15 @@ _watcher: _Watcher | None = None
 
 
 def end_after(seconds: float = PICTURE_SECONDS) -> None:
-    """End this process where what is done within `limited` takes longer. Without this call `limited` does nothing."""
+    """End this process when work within `limited` takes longer than `seconds`. Without this call `limited` does
+    nothing."""
     global _watcher
     end_limit()
     _watcher = _Watcher(os.getpid(), seconds)
 
 
 def end_limit() -> None:
-    """Take back `end_after`."""
+    """Cancel `end_after`."""
     global _watcher
     watcher, _watcher = _watcher, None
     if watcher is not None and watcher.process is not None and watcher.pid == os.getpid():

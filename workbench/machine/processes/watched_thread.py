@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 FIRST_PAUSE, LONGEST_PAUSE = 0.05, 5.0
 """Seconds before a thread starts again; doubled at each failure."""
 _LOOK = 0.05
-"""Seconds between two looks whether somebody waits."""
+"""Seconds between two checks whether somebody waits."""
 
 _listeners: list[Callable[[str], None]] = []
 _lock = threading.Lock()

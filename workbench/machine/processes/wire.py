@@ -20,16 +20,16 @@ import msgspec
 import numpy as np
 
 MOST_BYTES = 1 << 30
-"""Of one message. The largest of a working task, its meshes and the pictures of all envs, are some 100 MB."""
+"""Most bytes of one message. The largest of a working task, its meshes and the pictures of all envs, are some 100 MB."""
 _PIECE, _SMALL = 1 << 18, 1 << 14
-"""Bytes; the first is more than a socket's buffer."""
+"""Bytes of one read, more than a socket's buffer; and bytes below which a message is copied and sent at once."""
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
 """msgpack extensions: the next array, or a repeated one."""
 _NUMBERS = "biufcSU"
 """Kinds of arrays that may be sent; arrays of objects may not."""
 _LONGEST = 500
-"""Bytes of the description of one array."""
+"""Most bytes of the description of one array."""
 _Head = tuple[str, int | None, msgspec.Raw]
 Value = TypeVar("Value", covariant=True)
 
@@ -75,7 +75,7 @@ def _poll(end: socket.socket) -> select.poll:
 
 
 def has_come(end: socket.socket, seconds: float | None = 0.0) -> bool:
-    """Whether something can be read within `seconds` (None waits for ever), be it that the other end is closed; any thread may ask.
+    """Wait up to `seconds` (None waits for ever) for data or the other end's closing. Any thread may call it.
 
     False where another thread has closed `end`.
     """
@@ -267,7 +267,7 @@ class _Written:
         self.parts: list[Any] = []
         self._numbers: dict[int, int] = {}
         self._alive: list[np.ndarray] = []
-        """Kept alive, since `_numbers` goes by id."""
+        """Arrays that are kept alive, since `_numbers` goes by their id."""
 
     def hook(self, value: object) -> object:
         if isinstance(value, np.ndarray):
