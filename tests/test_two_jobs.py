@@ -84,7 +84,7 @@ class Rescoring:
         assert (verdict.why_not, verdict.differs, verdict.length) == ("", False, 8)
 
     def close(self) -> None:
-        self._rescorer.rescoring.close()
+        self._rescorer.close()
 
 
 class Filming:

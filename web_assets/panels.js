@@ -31,9 +31,10 @@
     wanted = null;
     if (tabsOf(marker()).includes(tab)) sessionStorage.setItem(KEEPS + which, nameOf(tab));
   }
-  for (const kind of ["click", "keydown"]) {
+  // At pointer down, for viser opens a tab before the click.
+  for (const kind of ["pointerdown", "keydown"]) {
     addEventListener(kind, (event) => {
-      const tab = event.isTrusted && (kind === "click" || event.key === "Enter") && event.target.closest?.("[role=tab]");
+      const tab = event.isTrusted && (kind === "pointerdown" || event.key === "Enter") && event.target.closest?.("[role=tab]");
       if (tab) keep(tab);
     }, true);
   }

@@ -402,4 +402,4 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
         rescorer.rescoring.stop()
         rescored(rescorer, "stopped")
     finally:
-        rescorer.rescoring.close()
+        rescorer.close()

@@ -244,7 +244,7 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
         )
         assert ran(foreign) and [[one.name for one in q.modules] for q in asked] == [["marks.py"]] * 2
     finally:
-        rescorer.rescoring.close()
+        rescorer.close()
 
 
 def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
@@ -263,5 +263,5 @@ def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
         rescorer.rescoring.stop()
         rescored(rescorer, "stopped")
     finally:
-        rescorer.rescoring.close()
+        rescorer.close()
     assert len(asking) == 1 and not ran(foreign)

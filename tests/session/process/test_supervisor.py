@@ -363,7 +363,8 @@ def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatc
         first = one.worker.pid
         os.kill(first or 0, signal.SIGKILL)
         one.until_greeted(2)
-        assert one.worker.pid not in (None, first) and not one.worker.vitals.spare_ready
+        assert one.worker.pid not in (None, first)
+        one.until(lambda: not one.worker.vitals.spare_ready, "that it is no spare any more")
 
 
 @pytest.mark.slow
