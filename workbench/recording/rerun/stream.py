@@ -22,10 +22,14 @@ _COPIED_BYTES = 1 << 16
 """Bytes that are copied at once: what a pipe holds."""
 
 
+_one_at_a_time = threading.Lock()
+"""Rerun 0.41 waits for ever where one thread makes a stream while another one ends the threads of streams."""
+
+
 def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> bytes:
     """`blueprint` as the content of an ``.rbl``."""
     content = BytesIO()
-    with _copied_to(content) as copy:
+    with _one_at_a_time, _copied_to(content) as copy:
         with _rerun_enabled():
             blueprint.save(application_id, copy.path)
         _end_threads(application_id)
@@ -41,7 +45,7 @@ def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: I
         OSError: it cannot be written.
         Exception: an error of `chunks`.
     """
-    with path.open("wb", buffering=0) as file, _copied_to(file) as copy:
+    with _one_at_a_time, path.open("wb", buffering=0) as file, _copied_to(file) as copy:
         with _rerun_enabled():
             # Rerun's default id is that of the process: two episodes of one process would become one.
             stream = rr.RecordingStream(application_id, recording_id=uuid.uuid4().hex, send_properties=False)
