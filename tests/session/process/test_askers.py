@@ -289,3 +289,16 @@ def test_a_process_that_nobody_wants_is_ended_and_one_that_is_wanted_is_not(
     in_turns(background, job, look).result(PATIENCE)
     until(lambda: background.pid is None, "its end")
     assert not psutil.pid_exists(first)
+
+
+def test_a_long_question_outside_a_turn_is_no_idleness(
+    background: Background, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(askers, "IDLE_SECONDS", 0.01)
+    load, job = load_of(tmp_path), Job("rescoring")
+
+    async def work() -> int:
+        await background.ensure(job, load)
+        return await background.ensure(job, replace(load, level="rebuilt"))
+
+    assert begun(work()).result(PATIENCE) == 1

@@ -264,6 +264,8 @@ class Background(Asker):
         # Before the question: the waiting job would wait for it too.
         if self._is_waited_for() and not _is_load(question):
             raise GaveWay
+        if self._idle is not None:
+            self._idle.cancel()  # also outside a turn, where a question may take hours
         if self._process is None:
             self._process = _Process(self, self._niceness)
         return await super().ask(question, on_progress)
