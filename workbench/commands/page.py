@@ -81,13 +81,6 @@ class CloseDialog(Command, frozen=True):
     context = "dialog"
 
 
-class TurnRows(Command, frozen=True):
-    """Show the next (1) or the previous (-1) rows of a list."""
-
-    of: str
-    by: int
-
-
 class TypeAnswer(Command, frozen=True):
     """Type into the question that is open over the page."""
 

@@ -20,11 +20,6 @@ _INSTALL = {
 }
 
 
-def is_address(out: str) -> bool:
-    """Whether it names a place of fsspec, such as ``s3://bucket/folder``, and no folder."""
-    return "://" in out
-
-
 def require_place(address: str) -> None:
     """Try to write to the address, before minutes are spent.
 
