@@ -20,10 +20,9 @@ from workbench.recording.rerun.layout import CAMERAS
 
 _COPIED_BYTES = 1 << 16
 """Bytes that are copied at once: what a pipe holds."""
-
-
 _one_at_a_time = threading.Lock()
-"""Rerun 0.41 waits for ever where one thread makes a stream while another one ends the threads of streams."""
+"""Rerun 0.41 waits for ever where one thread makes a stream while another one ends the threads of streams. And two that
+change and restore a variable of the environment may restore the other's change."""
 
 
 def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> bytes:
@@ -66,23 +65,18 @@ def write_recording(path: Path, application_id: str, blueprint: bytes, chunks: I
             _end_threads(application_id)
 
 
-_environment = threading.Lock()
-"""Two threads that change and restore one variable may restore the other's change."""
-
-
 @contextmanager
 def _rerun_enabled() -> Iterator[None]:
     """Override ``RERUN=off`` of the user, which is for logging in their code: with it rerun writes nothing, silently."""
-    with _environment:
-        entries = os.environ.get("RERUN")
-        if entries is None:
-            yield
-            return
-        os.environ["RERUN"] = "on"
-        try:
-            yield
-        finally:
-            os.environ["RERUN"] = entries
+    entries = os.environ.get("RERUN")
+    if entries is None:
+        yield
+        return
+    os.environ["RERUN"] = "on"
+    try:
+        yield
+    finally:
+        os.environ["RERUN"] = entries
 
 
 def _end_threads(application_id: str) -> None:
