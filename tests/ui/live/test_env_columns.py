@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from workbench.ui.live.env_columns import Column, levels, wanted_width
+from workbench.ui.live.env_columns import EnvColumn, levels, wanted_width
 
 COLUMNS = [
-    Column("env", 3),
-    Column("state", 9, 9),
-    Column("is_obj_placed", 3, rank=1),
-    Column("flags", 3, rank=0),
+    EnvColumn("env", 3),
+    EnvColumn("state", 9, 9),
+    EnvColumn("is_obj_placed", 3, rank=1),
+    EnvColumn("flags", 3, rank=0),
 ]
 
 
@@ -25,4 +25,4 @@ def test_the_narrower_the_panel_the_more_is_left_out_and_a_wide_one_shows_all() 
 
 
 def test_a_name_with_underscores_takes_less_room_than_its_letters() -> None:
-    assert Column("is_obj_placed", 3).least(words=True) < Column("isxobjxplaced", 3).least(words=True)
+    assert EnvColumn("is_obj_placed", 3).least(words=True) < EnvColumn("isxobjxplaced", 3).least(words=True)

@@ -15,7 +15,7 @@ by."""
 
 
 @dataclass(frozen=True)
-class Column:
+class EnvColumn:
     """A column of the table.
 
     Args:
@@ -47,7 +47,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Level:
+class LeftOut:
     """Content that is left out where the panel is not wider than `below` pixels: that of this level and of the
     levels before."""
 
@@ -58,23 +58,23 @@ class Level:
     """Names of everything that is left out."""
 
 
-def wanted_width(columns: Sequence[Column]) -> float:
+def wanted_width(columns: Sequence[EnvColumn]) -> float:
     """Width in pixels of a panel that shows everything."""
     return MARGINS + sum(column.wide for column in columns)
 
 
-def levels(columns: Sequence[Column]) -> list[Level]:
+def levels(columns: Sequence[EnvColumn]) -> list[LeftOut]:
     """The words go first, then half of the padding, then the columns by rank."""
     with_words = MARGINS + sum(column.least(words=True) + PADDING for column in columns)
     without = MARGINS + sum(column.least(words=False) + PADDING for column in columns)
     room = without - (PADDING - NARROW_PADDING) * len(columns)
-    found = [Level(round(with_words)), Level(round(without))]
+    found = [LeftOut(round(with_words)), LeftOut(round(without))]
     names: tuple[str, ...] = ()
     for number, column in sorted(
         ((number, column) for number, column in enumerate(columns, 1) if column.rank is not None),
         key=lambda one: one[1].rank or 0,
     ):
         names = (*names, column.name)
-        found.append(Level(round(room), (number,), names))
+        found.append(LeftOut(round(room), (number,), names))
         room -= column.least(words=False) + NARROW_PADDING
     return found

@@ -26,7 +26,7 @@ from workbench.machine.text import number_text
 from workbench.session.history.env_table import EnvRows, Outcome
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.ui.live.env_columns import DOT, Column, levels, wanted_width
+from workbench.ui.live.env_columns import DOT, EnvColumn, levels, wanted_width
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.live.timeline import polylines
 from workbench.ui.widgets.paged import Paged
@@ -408,7 +408,7 @@ class EnvPanel(MomentPart):
         end = [sortable(name, name, HINTS[name]) for name in ("last", "flags")]
         return [*start, plain, *entries, *end]
 
-    def _measure(self, rows: EnvRows, shown: list[dict[str, Any]]) -> list[Column]:
+    def _measure(self, rows: EnvRows, shown: list[dict[str, Any]]) -> list[EnvColumn]:
         """The columns in the order of `_head`."""
         names = entry_names(rows, self._chosen)
         ranks = gives_way(names, self._chosen, self._column)
@@ -419,7 +419,7 @@ class EnvPanel(MomentPart):
         states = longest(row["state"] for row in shown)
         last = longest(row["last"] for row in shown)
         firsts = [
-            Column(
+            EnvColumn(
                 name,
                 longest(row["first_true"][place] for row in shown),
                 rank=ranks.get(f"first {name}"),
@@ -427,14 +427,14 @@ class EnvPanel(MomentPart):
             for place, name in enumerate(names)
         ]
         return [
-            Column("env", longest(str(row["env"]) for row in shown)),
-            Column("state", states, states, DOT),
-            Column("steps", longest(row["steps"] for row in shown), rank=ranks.get("steps")),
-            Column("return", longest(row["total"] for row in shown), rank=ranks.get("return")),
-            Column("reward", 0, fixed=CURVE_WIDTH, rank=ranks.get(REWARD_CURVE)),
+            EnvColumn("env", longest(str(row["env"]) for row in shown)),
+            EnvColumn("state", states, states, DOT),
+            EnvColumn("steps", longest(row["steps"] for row in shown), rank=ranks.get("steps")),
+            EnvColumn("return", longest(row["total"] for row in shown), rank=ranks.get("return")),
+            EnvColumn("reward", 0, fixed=CURVE_WIDTH, rank=ranks.get(REWARD_CURVE)),
             *firsts,
-            Column("last", last + STEP_CHARACTERS, last, DOT if last else 0.0, ranks.get("last")),
-            Column("flags", 3, rank=ranks.get("flags")),
+            EnvColumn("last", last + STEP_CHARACTERS, last, DOT if last else 0.0, ranks.get("last")),
+            EnvColumn("flags", 3, rank=ranks.get("flags")),
         ]
 
     def _entries(self, rows: EnvRows) -> list[dict[str, object]]:
