@@ -24,16 +24,24 @@ Value = TypeVar("Value")
 Args = ParamSpec("Args")
 
 
+_here = threading.local()
+
+
 @functools.cache
 def _loop() -> asyncio.AbstractEventLoop:
     loop = asyncio.new_event_loop()
-    threading.Thread(target=loop.run_forever, name="loop", daemon=True).start()
+
+    def run() -> None:
+        _here.is_loop = True
+        loop.run_forever()
+
+    threading.Thread(target=run, name="loop", daemon=True).start()
     return loop
 
 
 def is_here() -> bool:
     """Whether this is the loop's thread."""
-    return asyncio._get_running_loop() is _loop()
+    return getattr(_here, "is_loop", False)
 
 
 def do(change: Callable[[], Value]) -> Value:
@@ -111,7 +119,7 @@ def wait_for_disk(done: futures.Future[Any] | None) -> None:
         futures.wait([done], timeout=1.0)
 
 
-class Changes:
+class ChangeCounter:
     """Counts the changes of something, for pages that wait for the next. Thread-safe."""
 
     def __init__(self) -> None:

@@ -119,8 +119,6 @@ class FileEdits:
         picture = None
         try:
             picture = await self._asker.ask(question)
-        except JobFailed as failure:
-            self._cameras.problem = f"There is no picture of the new camera: {failure}."
         finally:
             if self.view.request is request:
                 self.view = replace(self.view, picture=picture, drawing=False)

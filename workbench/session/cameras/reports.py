@@ -281,6 +281,7 @@ class CameraReports:
         self._background_jobs.stop()
         self.results = replace(self.results, outdated=True, compared=None, picked=None, sheet=())
 
+    @on_loop
     def close(self) -> None:
         """Cancel all jobs, and begin no more."""
         self._live_jobs.close()

@@ -328,7 +328,7 @@ class CameraStudio:
 
     def close(self) -> None:
         """Cancel all jobs, and wait for a running edit. Called on another thread than the loop."""
-        do(self.reports.close)
+        self.reports.close()
         do(self._previews.close)
         self.file.close()
 

@@ -29,7 +29,7 @@ from workbench.session.live.solver import Solver
 from workbench.session.live.timeline import TimeTravel
 from workbench.session.live.versions import Versions, is_on_disk
 from workbench.session.live.view import SessionView
-from workbench.session.loop import Aside, Changes, do, on_loop, wait_for_disk
+from workbench.session.loop import Aside, ChangeCounter, do, on_loop, wait_for_disk
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.captured_output import PrintedLine, PrintedLog
 from workbench.session.process.heartbeat import Busy
@@ -120,14 +120,21 @@ class Session:
         self._state = LiveState(task, options, history_bytes)
         if kept is not None:
             self._state.set(settings=replace(kept.settings, cameras=()))
-        self._changes = Changes()
+        self._changes = ChangeCounter()
         self._notify = self._changes.notify
         self._to_enter: tuple[Callable[[tuple[int, ...]], EnterRecording], bool] | None = None
         """Request to send as soon as a task is loaded, and whether for all envs."""
         self._enter_numbers = itertools.count(1)
         self._printed = PrintedLog(self._on_lines)
+        self._aside = Aside("follow")
+        """Begins to watch files, for which they are read."""
         self.versions = Versions(
-            self._state, self._notify, self._send, lambda: self._worker.replace(), on_save=self._on_save
+            self._state,
+            self._notify,
+            self._send,
+            lambda: self._worker.replace(),
+            self._on_save,
+            self._aside,
         )
         """Loads versions of the file."""
         self._worker = make_worker(
@@ -156,7 +163,6 @@ class Session:
         self.seeds_solver = SeedsSolver(self._notify, recordings)
         """Solves the task from many seeds."""
         self._policy_file = PolicyFile(self._on_policy_saved)
-        self._aside = Aside("follow-policy")
         self.past = TimeTravel(self._state, self._notify, self._send, self.pause)
         """The timeline."""
         self._asker = Asker(self._send)

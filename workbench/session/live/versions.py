@@ -224,19 +224,20 @@ class Versions:
         send: Callable[[Request], None],
         replace_worker: Callable[[], None],
         on_save: Callable[[], None],
+        aside: Aside,
     ) -> None:
         """
         Args:
             state: the session's.
             on_change: called when a watched file was saved.
             on_save: called then too, before it is loaded.
+            aside: begins to watch files, for which they are read.
         """
         self._state, self._on_change, self._send = state, on_change, send
         self._replace_worker, self._on_save = replace_worker, on_save
         self._recovery = Recovery(state.newest_moment)
         self._watcher = SourceWatcher(self._on_files_changed)
-        self._aside = Aside("follow")
-        """Thread on which watching begins, since that reads files."""
+        self._aside = aside
         self._needed = NewProcessNeeded("", False)
         """Why the next worker is a new process, where the last one said so."""
 
@@ -419,7 +420,6 @@ class Versions:
 
     def close(self) -> None:
         """Stop watching. Called on another thread than the loop."""
-        self._aside.end()
         self._watcher.stop()
 
     def _follow(

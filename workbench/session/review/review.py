@@ -20,7 +20,7 @@ from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import LibraryRow, UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import read_recording
-from workbench.session.loop import Aside, Changes, do, on_loop, post
+from workbench.session.loop import Aside, ChangeCounter, do, on_loop, post
 from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.process.memory_limit import format_size, total_memory
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
@@ -98,7 +98,7 @@ class Review:
             lambda row, shapes, stopped: read_recording(row.source, shapes, library.folder, stopped)
         )
         self._memory = memory
-        self._changes = Changes()
+        self._changes = ChangeCounter()
         self._view = ReviewView()
         self._playback: _Playback | None = None
         self._opening = Jobs(lambda: None, self._failed)
