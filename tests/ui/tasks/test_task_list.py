@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ from workbench.ui.tasks.task_list import (
     OPEN,
     OpenDialog,
     TaskList,
+    best_row,
     picture_route,
     tasks_html,
 )
@@ -117,6 +119,14 @@ def test_enter_opens_the_first_that_is_not_open_or_says_that_there_is_none(
     panels.type("Search", "nothing like it")
     panels.do(OpenFoundTask())
     assert len(chosen.numbers) == 2 and len(panels.client.notices) == 1
+
+
+def test_the_best_match_is_a_file_that_is_there() -> None:
+    gone, there, other = replace(PUSH, gone=True), PUSH, PICK
+    assert best_row([gone, there, other], lambda row: False) == there
+    assert best_row([gone, there, other], lambda row: row is there) == other
+    assert best_row([gone, there], lambda row: row is there) == there
+    assert best_row([gone], lambda row: False) == gone and best_row([], lambda row: False) is None
 
 
 def test_a_new_task_is_asked_for_by_its_name_and_its_template(panels: Panels, chosen: Chosen) -> None:

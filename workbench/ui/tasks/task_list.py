@@ -201,8 +201,8 @@ def shown_rows(view: CatalogueView, words: str, typed: Entry | None) -> dict[Sec
 
 
 def best_row(rows: Sequence[Entry], is_open: Callable[[Entry], bool]) -> Entry | None:
-    """Row that Enter opens: the first that is not open."""
-    return next((row for row in rows if not is_open(row)), rows[0] if rows else None)
+    """Row that Enter opens: the first that can be opened and is not open; else one that is open; else the first."""
+    return min(rows, key=lambda row: (row.gone, is_open(row)), default=None)
 
 
 def tasks_html(
