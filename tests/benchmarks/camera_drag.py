@@ -30,6 +30,7 @@ from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.run.run import PagesCounted
 
 BASE: CameraKey = ("sensor", "base_camera")
 BAR = 0.2
@@ -70,7 +71,7 @@ def main(options: Options) -> None:
                 seen = session.wait(seen, 1.0)
             start = camera.info.settings
             assert start is not None
-            session.set_clients(1)
+            session.happen(PagesCounted(1))
             session.change(cameras=(CameraRequest("base_camera", "sensor"),))
             wait(session, start)
             single = []

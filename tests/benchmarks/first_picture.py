@@ -26,6 +26,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.page import TASK
+from workbench.commands.run import RestartWorker
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.family import proportional_memory
 from workbench.session.live.session import Session
@@ -34,6 +35,7 @@ from workbench.session.process import worker_process
 from workbench.session.process.supervisor import WorkerOptions
 from workbench.session.process.worker_start import start_anew, worker_forks
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.run.run import PagesCounted
 
 CAMERAS = (CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human"))
 
@@ -87,7 +89,7 @@ def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
         )
         try:
             session.change(cameras=CAMERAS)
-            session.set_clients(1)
+            session.happen(PagesCounted(1))
             yield "the task's first moment, s", after(lambda view: view.timeline.moments == 1)
             yield "its first picture, s", after(lambda view: bool(view.pictures))
             yield "its first exact picture, s", after(is_exact)
@@ -97,7 +99,7 @@ def opened_and_restarted(num_envs: int) -> Iterator[tuple[str, float]]:
             for restarted in ("a restarted worker's, with the spare warm, s", "without a spare, s"):
                 before = session.view()
                 began = time.monotonic()
-                session.versions.restart_worker()
+                session.do(RestartWorker())
 
                 def drawn(view: SessionView, before: SessionView = before) -> bool:
                     again = view.task_serial > before.task_serial

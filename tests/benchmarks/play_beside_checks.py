@@ -19,6 +19,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.session import TASKS, live_session, wait_until
+from workbench.commands.run import PlayRun
 from workbench.session.checks.checks import RUNNING
 from workbench.session.live.session import Session
 
@@ -66,7 +67,7 @@ def main(options: Options) -> None:
         session.change(speed=options.speed)
         whole_check(session)  # shaders are compiled
         alone = whole_check(session)
-        session.play()
+        session.do(PlayRun())
         without, beside = [], []
         for _ in range(options.windows):
             session.checks.stop()

@@ -14,6 +14,7 @@ import viser
 
 from tests.drive.panels import Clock, Panels, forget_what_was_drawn
 from tests.ui.scenes import EMPTY
+from workbench.commands.command import Command
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.view import SessionView
 from workbench.ui.app.live_page import Page
@@ -37,17 +38,18 @@ class _Asked:
 
 
 class HandedSession:
-    """Shows the view that it was handed, and notes what it is asked: ``("versions.reload", "rebuilt")``."""
+    """Shows the view that it was handed, and notes what it is asked: ``Step()``, ``("studio.select", key)``."""
 
     def __init__(self) -> None:
         self.shown = EMPTY
         self.rows: EnvRows | None = None
-        self.asked: list[tuple[Any, ...]] = []
+        self.asked: list[Any] = []
         self.reference = self.present_reference = FILE
         self.answers: dict[str, Any] = {
-            "versions.knows_file": lambda file: True,
-            "past.strip": lambda low, high: None,
-            "past.episode": lambda: None,
+            "knows_file": lambda file: True,
+            "strip": lambda low, high: None,
+            "episode_ticks": lambda: None,
+            "segment": lambda: None,
             "rescorer.curve": lambda name, env: None,
             "checks.after_each_save": True,
         }
@@ -70,8 +72,17 @@ class HandedSession:
     def env_rows(self) -> EnvRows | None:
         return self.rows
 
+    def look(self, read: Callable[[Any], Any]) -> Any:
+        return read(self)
+
+    def do(self, command: Command, page: str = "") -> None:
+        self.asked.append(command)
+
+    def happen(self, event: object) -> None:
+        self.asked.append(event)
+
     def __getattr__(self, name: str) -> Any:
-        return _Asked(name, self)
+        return self.answers.get(name) or _Asked(name, self)
 
 
 class Live(Panels):
@@ -86,13 +97,13 @@ class Live(Panels):
         super().__init__(server)
         self.clock, self.session = clock or Clock(), HandedSession()
         self._envs = self._scenes = 0
-        self.asked_by_drawing: list[tuple[Any, ...]] = []
+        self.asked_by_drawing: list[Any] = []
         """Of the session, by the last drawing."""
         self.page = Page(server, self.visitors, self.session, on_look=on_look, clock=self.clock)  # type: ignore[arg-type]
         self.visitors.do = self.page.do
 
     @property
-    def asked(self) -> list[tuple[Any, ...]]:
+    def asked(self) -> list[Any]:
         """Of the session, by what was pressed."""
         return self.session.asked
 

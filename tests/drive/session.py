@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from tests.drive.waiting import until
 from tests.ui.scenes import camera as scene_camera
 from tests.ui.scenes import description, step_of, table_scene
+from workbench.commands.run import PauseRun, SetSeed, Step
+from workbench.commands.timeline import StepBack, StepForward
 from workbench.core.camera_data import CameraKey
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Restored, Stepped, TaskDescription, TaskOptions
@@ -30,6 +32,7 @@ from workbench.session.process.supervisor import Death, End, Supervisor, Vitals,
 from workbench.session.protocol.messages import Event, Loaded, ReloadReport, Request, Status
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.recordings import Rescorer
+from workbench.session.run.run import MomentShown
 
 TASKS = Path(__file__).parents[2] / "tasks"
 BASE: CameraKey = ("sensor", "base_camera")
@@ -262,16 +265,16 @@ def step(session: Session, count: int = 1) -> SessionView:
     for _ in range(count):
         # Not by what is shown: that changes too when a look at the past ends.
         last = session.view().timeline.last
-        session.step()
+        session.do(Step())
         view = wait_until(session, lambda view, n=last: view.timeline.last > n, "a step")
     return view
 
 
 def start_over(session: Session, seed: int) -> SessionView:
     """Paused at the first moment of new episodes of all envs, live; the session's seed is this from now on."""
-    session.pause()
+    session.do(PauseRun())
     before = session.view().timeline.last
-    session.set_seed(seed)
+    session.do(SetSeed(seed=seed))
 
     def came(view: SessionView) -> bool:
         if view.playing or view.timeline.last <= before:
@@ -311,6 +314,22 @@ def jump(session: Session, ask: Callable[[], object]) -> SessionView:
     return wait_until(session, lambda v: v.timeline.last > last, "the jump")
 
 
+def seek(session: Session, serial: int | None) -> None:
+    """Show the moment of this serial; live if None."""
+    session.happen(MomentShown(serial))
+
+
+def seek_by(session: Session, steps: int) -> None:
+    """Press the right arrow so often, or the left one."""
+    for _ in range(abs(steps)):
+        session.do(StepForward() if steps > 0 else StepBack())
+
+
+def stop_watching(session: Session) -> None:
+    """Saves are noticed no more."""
+    session._watcher.stop()
+
+
 # --- see -----------------------------------------------------------------------------------------------
 
 
@@ -330,13 +349,15 @@ def wait_until(session: Session, reached: Callable[[SessionView], object], what:
 
 def history_of(session: Session) -> History:
     """All that it keeps of the running scene."""
-    assert session._state.timeline is not None
-    return session._state.timeline.history
+    past = session.look(lambda run: run.past)
+    assert past is not None
+    return past.history
 
 
 def moment_at(session: Session, serial: int) -> Moment | None:
     """What the session keeps of a moment."""
-    return None if session._state.timeline is None else history_of(session).at(serial)
+    past = session.look(lambda run: run.past)
+    return None if past is None else past.history.at(serial)
 
 
 def moments_of(session: Session) -> list[Moment]:

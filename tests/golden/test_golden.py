@@ -18,11 +18,13 @@ from tests.drive.session import live_session, wait_until
 from tests.golden.make import GOLDEN, expected_of, read_folder
 from workbench.cli.main import main
 from workbench.cli.terminal.output import Exit
+from workbench.commands.run import Step
 from workbench.jobs.from_recording import run_of
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
+from workbench.session.run.run import ActionTold
 
 # Recordings are read, recovered and gone into in processes of their own; one is recorded in this one, which asks for a renderer.
 pytestmark = pytest.mark.usefixtures("child_process", "renderer")
@@ -218,8 +220,9 @@ def goes_on_as_recorded(session: Session, path: Path, state: int) -> None:
     assert_close(view.step.poses[1], episode.poses[state])
     for t in range(state, episode.length):
         last = view.timeline.last
-        session.tell(range(episode.action.shape[1]), [float(x) for x in episode.action[t]])
-        session.step()
+        told = tuple(float(x) for x in episode.action[t])
+        session.happen(ActionTold(tuple(range(len(told))), told))
+        session.do(Step())
         view = wait_until(session, lambda v, last=last: v.timeline.last > last, "a step")
         assert_close(view.step.poses[1], episode.poses[t + 1])
         assert view.step.reward[1] == pytest.approx(episode.reward[t], abs=METRES / 0.02)

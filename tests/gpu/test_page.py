@@ -12,9 +12,11 @@ import pytest
 
 from tests.drive.session import wait_until
 from tests.gpu.conftest import Simulation, Told
+from workbench.commands.run import PlayRun
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.run.run import PagesCounted
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 STEPS, PICTURES = 100, 5
@@ -32,10 +34,10 @@ def session(simulation: Simulation, renderer: str, tmp_path: Path) -> Iterator[S
 @pytest.mark.slow
 def test_it_plays_with_pictures(session: Session, simulation: Simulation, told: Told) -> None:
     assert ("gpu" in session.view().task.backend) == (simulation == "gpu")
-    session.set_clients(1)
+    session.happen(PagesCounted(1))
     session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),))
     session.change(speed=float("inf"))
-    session.play()
+    session.do(PlayRun())
     first = wait_until(
         session, lambda v: bool(v.pictures) and bool(v.step.elapsed_steps.any()), "a first picture"
     )

@@ -14,6 +14,7 @@ import pytest
 
 from tests.drive.session import TASKS, live_session, step, wait_until
 from tests.session.recorded_runs import opened, reaching, record
+from workbench.commands.timeline import UndoReset
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.from_recording import (
     CannotEnterRecording,
@@ -25,6 +26,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.run import ActionTold
 
 N, STEPS, ENV = 3, 40, 1
 
@@ -58,7 +60,7 @@ def into(session: Session, run: RecordedRun, everywhere: bool = False) -> Sessio
 
 
 def step_with(session: Session, action: np.ndarray) -> SessionView:
-    session.tell(range(len(action)), [float(x) for x in action])
+    session.happen(ActionTold(tuple(range(len(action))), tuple(float(x) for x in action)))
     return step(session)
 
 
@@ -85,7 +87,7 @@ def test_it_is_a_jump_that_undo_takes_back(live: Session, run: RecordedRun) -> N
     view = into(live, run.until(10))
     assert view.timeline.undo == "going live of env 1"
     last = view.timeline.last
-    live.past.undo()
+    live.do(UndoReset())
     view = wait_until(live, lambda v: v.timeline.last > last, "the way back")
     assert np.allclose(view.step.poses[ENV], stood, atol=1e-6, equal_nan=True)
     assert view.timeline.arrived == ""

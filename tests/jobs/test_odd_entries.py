@@ -16,6 +16,7 @@ from tests.recording.verify_rrd import verify_rrd
 from tests.session.odd_entries import write_task
 from tests.session.recorded_runs import opened
 from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
+from workbench.commands.run import PauseRun, PlayRun
 from workbench.core.env.step_result import OtherEntry, StepResult
 from workbench.jobs.from_recording import run_of
 from workbench.jobs.replay import replay_to
@@ -123,11 +124,11 @@ def test_the_page_plays_and_records_it(session: Session, file: Path) -> None:
         return step is not None and "best" in step.others and step.others["best"].numbers is not None
 
     session.start_recording((0, 1))
-    session.play()
+    session.do(PlayRun())
     view = wait_until(session, lambda view: shown(view.step), "a later step")
     assert view.problem is None and view.step.others["phase"].texts == ("push",)
     wait_until(session, lambda view: view.recording.episodes_written >= 2, "recordings")
-    session.pause()
+    session.do(PauseRun())
     rows = session.view()
     assert rows.problem is None
     read = [read_episode(path) for path in sorted((file.parent / "of_the_page").glob("*.json"))]

@@ -15,6 +15,7 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.session import wait_until
 from workbench.authoring.problem import Problem, TaskError
+from workbench.commands.run import PauseRun, PlayRun
 from workbench.core.env.actions import hold_action
 from workbench.core.rules import Finding
 from workbench.jobs.open_task import OpenedTask, Opening, open_task
@@ -323,9 +324,9 @@ def test_the_page_keeps_the_mark_until_the_file_is_mended(child_process: None, t
         assert row.rule == "not-applied" and Path(row.file or "").name == "task.py"
         assert reward.rule == "reward-rows"
         count = row.count
-        session.play()
+        session.do(PlayRun())
         wait_until(session, lambda view: bool(view.rules and view.rules.rows[0].count > count + 3), "a count")
-        session.pause()
+        session.do(PauseRun())
         told = [finding.rule for event in events for finding in event.new]
         assert told == ["not-applied", "reward-rows"], "told once"
         curves = session.view().curves

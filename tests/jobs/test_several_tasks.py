@@ -10,6 +10,7 @@ import pytest
 
 from tests.drive.session import TASKS, wait_until
 from workbench.authoring.problem import TaskError
+from workbench.commands.run import ChooseClass
 from workbench.jobs.open_task import open_task
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
@@ -78,19 +79,19 @@ def test_the_chooser_stays_while_the_one_that_was_tried_fails(
         view = wait_until(session, lambda v: v.problem is not None, "the failure")
         assert view.task is None and view.choices[0] == "TwoEnv" and "OneEnv" in view.choices
 
-        session.versions.choose_class("OneEnv")
+        session.do(ChooseClass(name="OneEnv"))
         view = wait_until(session, lambda v: v.task is not None, "the one that works")
         assert view.task.chosen == view.choices[0] == "OneEnv" and view.problem is None
 
-        session.versions.choose_class("TwoEnv")
+        session.do(ChooseClass(name="TwoEnv"))
         view = wait_until(session, lambda v: v.problem is not None, "the failure again")
         assert view.task.chosen == "OneEnv" and view.choices[0] == "TwoEnv"
 
-        session.versions.choose_class("OneEnv")
+        session.do(ChooseClass(name="OneEnv"))
         view = wait_until(session, lambda v: v.problem is None, "the one that works again")
         assert view.task.chosen == view.choices[0] == "OneEnv"
 
-        session.versions.choose_class("TwoEnv")
+        session.do(ChooseClass(name="TwoEnv"))
         wait_until(session, lambda v: v.problem is not None and v.choices[0] == "TwoEnv", "the failure")
         file.write_text(tasks("OneEnv", "TwoEnv", broken=()))
         view = wait_until(session, lambda v: v.task.chosen == "TwoEnv", "the mended one")

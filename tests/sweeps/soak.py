@@ -23,6 +23,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.session.hazards import calm, provoke, write_task
+from workbench.commands.run import Step
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -98,7 +99,7 @@ def die(session: Session, file: Path, number: int) -> float:
     """Have the worker die, and the seconds until its version is back."""
     before = session.view()
     provoke(file, "evaluate", DEATHS[number % len(DEATHS)])
-    session.step()
+    session.do(Step())
     reach(session, lambda v: v.problem_serial > before.problem_serial, "the death")
     began = time.monotonic()
     calm(file)

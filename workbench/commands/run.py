@@ -17,6 +17,18 @@ class TogglePlay(Command, frozen=True):
     key = "space"
 
 
+class PlayRun(Command, frozen=True):
+    """Play."""
+
+    context = "live"
+
+
+class PauseRun(Command, frozen=True):
+    """Pause."""
+
+    context = "live"
+
+
 class Step(Command, frozen=True):
     """One control step; pauses first."""
 

@@ -53,6 +53,8 @@ class Seek(Command, frozen=True):
     """Show the moment after this control step: of the run, or of the aligned recordings."""
 
     step: int
+    episode_only: bool = False
+    """Within the shown episode of the selected env: where it begins there is the last step of the one before, too."""
 
 
 class SeekBack(Command, frozen=True):

@@ -16,6 +16,7 @@ import pytest
 from tests.drive.session import wait_until
 from tests.session.debug_client import DebugClient
 from workbench.cli.main import main
+from workbench.commands.run import Interrupt, RestartWorker, Step
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.debugger import port_for_debugger
@@ -88,7 +89,7 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
     # A breakpoint, held for longer than a worker may hang, with a save that waits behind it.
     line = line_of(task_file, JUDGES)
     assert client.stop_at(task_file, line) == [True]
-    session.step()
+    session.do(Step())
     thread, *place = client.stopped_at()
     assert place == [str(task_file), line]
     view = wait_until(session, lambda v: bool(v.busy and v.busy.held), "the mark")
@@ -99,7 +100,7 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
     task_file.write_text(good.replace("def evaluate", "# a line more\n    def evaluate"))
     held_since = time.monotonic()
     view = wait_until(session, lambda v: bool(v.busy and v.busy.seconds > 6 * HANGS), "a long time")
-    session.interrupt()
+    session.do(Interrupt())
     assert view.stale and not is_busy_for_long(view) and view.problem is None
     assert session.worker_pid == worker and time.monotonic() - held_since > 4 * HANGS
     client.stop_at(task_file)
@@ -122,14 +123,14 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
     assert session.worker_pid == worker
 
     # Another worker listens at the same place, waits for nobody, and says so.
-    session.versions.restart_worker()
+    session.do(RestartWorker())
     view = wait_until(session, lambda v: said(v, "worker listens for a debugger") == 1, "the port again")
     view = wait_until(session, lambda v: v.task is not None and v.busy is None, "the task again")
     wait_until(session, lambda v: session.worker_pid not in (None, worker), "another worker")
     client = DebugClient(port)
     client.begin()
     serial = session.view().step_serial
-    session.step()
+    session.do(Step())
     thread, file, _ = client.stopped_at()
     assert file == str(task_file)
     client.ask("continue", threadId=thread)

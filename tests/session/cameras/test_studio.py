@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 
 from tests.drive.session import BASE, PEOPLE, camera, in_studio, moved, start_over, step, wait_until
+from workbench.commands.run import PauseRun
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
 from workbench.jobs.task import TaskOptions
 from workbench.session.cameras.view import EditRequest, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.run.run import EnvsReset, MomentShown, PagesCounted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -75,8 +77,8 @@ def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
     # Small pictures: what is tested is where they are taken from.
     task_file.write_text(text.replace("512", "64"))
     session.studio.back_to_file(BASE)
-    session.set_clients(1)
-    session.versions.open_file(task_file, "PushCubeEnv")
+    session.happen(PagesCounted(1))
+    session.open_file(task_file, "PushCubeEnv")
     wait_until(session, lambda view: view.task.file == str(task_file), "the example")
     session.change(cameras=(CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")))
     return session
@@ -85,8 +87,8 @@ def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
 @pytest.fixture
 def session(studio_session: Session) -> Session:
     """At rest, and every camera as the file has it; one of them is worked on."""
-    studio_session.pause()
-    studio_session.past.seek(None)
+    studio_session.do(PauseRun())
+    studio_session.happen(MomentShown(None))
     for one in studio_session.view().studio.cameras:
         studio_session.studio.back_to_file(one.key)
     wait_until(studio_session, lambda v: not v.playing and not moved(v), "rest")
@@ -229,7 +231,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     assert {moment.env for moment in studio.results.report_moments} == {0} == set(studio.results.report.envs)
     (cube,) = studio.results.report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
-    session.past.seek(studio.results.report_moments[2].serial)
+    session.happen(MomentShown(studio.results.report_moments[2].serial))
     assert session.view().step.elapsed_steps[0] == 2
     session.studio.reports.measure_steps(2)
     moments = settled(
@@ -238,9 +240,9 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     assert [moment.step for moment in moments] == [0, 4], (
         "of the whole episode, also where a moment in it is shown"
     )
-    session.reset()
+    session.happen(EnvsReset())
     wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
-    session.past.seek(None)
+    session.happen(MomentShown(None))
     session.studio.reports.measure_steps()
     settled(session, lambda s: len(s.results.report_moments) == 1, "the episode that has just begun")
 

@@ -14,6 +14,7 @@ import pytest
 from tests.drive.session import live_session, wait_until
 from tests.drive.waiting import until
 from workbench.checks.results import RuleResult
+from workbench.commands.run import PlayRun
 from workbench.core.rules import Finding
 from workbench.jobs.task import TaskOptions
 from workbench.session.checks.checks import RUNNING, Checks, ChecksView
@@ -253,7 +254,7 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
     line = text[: text.index(good)].count("\n") + 1
     with live_session(task_file, task_file.parent / "recordings") as session:
         session.checks.check_after_each_save(True)
-        session.play()
+        session.do(PlayRun())
         task_file.write_text(text.replace(good, bad))
 
         def found(rule: str) -> Callable[[Any], bool]:

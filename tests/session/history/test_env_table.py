@@ -19,6 +19,7 @@ from tests.drive.session import Told, told_session
 from workbench.core.capture.outliers import OutlierKind
 from workbench.session.history.env_table import KEPT_REWARDS, Outcome
 from workbench.session.history.history import FAIL, SUCCESS
+from workbench.session.run.run import MomentShown
 
 N = 3
 
@@ -127,10 +128,12 @@ def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(
     assert session.view().curves.serial == tick
     for env in range(N):
         session.change(selected_env=env)
-        found = {at: what & (SUCCESS | FAIL) for at, what in session.past.strip(0, 10**6).events}
+        found = {
+            at: what & (SUCCESS | FAIL) for at, what in session.look(lambda run: run.strip(0, 10**6)).events
+        }
         assert {at: what for at, what in found.items() if what} == flags[env]
     for place in (None, base + len(seen) // 2):  # now, and as it was
-        session.past.seek(place)
+        session.happen(MomentShown(place))
         at = session.view().step_serial - base
         now, before = seen[at]
         rows = session.env_rows()
@@ -149,7 +152,7 @@ def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(
         assert rows.last.total.tolist() == [0 if e is None else e.total for e in before]
         if place is None:
             assert (rows.ended.tolist(), rows.succeeded.tolist()) == (ended, succeeded)
-    session.past.seek(None)
+    session.happen(MomentShown(None))
 
 
 def test_an_env_that_was_put_back_nobody_knows_where_from_does_not_claim_to_know_its_return(

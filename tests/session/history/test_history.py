@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from tests.drive.session import Told, moment, moments_of, told_session
+from workbench.commands.timeline import Seek
 from workbench.core.camera_data import CameraKind, Picture
 from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.protocol.messages import CameraRequest, PastPictures, Pictures
+from workbench.session.run.run import MomentShown
 
 EYE = CameraRequest("eye", "sensor")
 
@@ -27,15 +29,15 @@ def pictured(told: Told) -> list[int]:
     session, found = told.session, []
     session.change(cameras=(EYE,))
     for serial in range(told.view.timeline.first, told.view.timeline.last):
-        session.past.seek(serial)
+        session.happen(MomentShown(serial))
         found += [serial] if told.view.pictures else []
-    session.past.seek(None)
+    session.happen(MomentShown(None))
     return found
 
 
 def events(told: Told, env: int) -> list[tuple[int, int]]:
     told.session.change(selected_env=env)
-    return list(told.session.past.strip(0, 10**6).events)
+    return list(told.session.look(lambda run: run.strip(0, 10**6)).events)
 
 
 def rewards(told: Told) -> list[list[float]]:
@@ -51,10 +53,10 @@ def test_memory_is_bounded_and_the_oldest_goes_first(tmp_path: Path) -> None:
         assert timeline.last == 499 and timeline.first == 500 - timeline.moments
         assert timeline.first_tick == timeline.first and timeline.steps == timeline.moments - 1
         assert [one.serial for one in moments_of(told.session)] == [*range(timeline.first, 500)]
-        strip = told.session.past.strip(0, 499)
+        strip = told.session.look(lambda run: run.strip(0, 499))
         assert strip.reward.tolist() == [*range(timeline.first, 500)] == [*range(strip.low, 500)]
         assert told.view.curves.serial == 499, "of the curves every step stays"
-        told.session.past.seek_tick(1)
+        told.session.do(Seek(step=1))
         assert told.view.timeline.shown == timeline.first, "the nearest that is kept"
 
 
@@ -66,11 +68,11 @@ def test_parts_of_a_snapshot_are_kept_and_counted_as_long_as_a_moment_needs_them
         told.step(part_keys=(2, 3), new_parts={3: bytes(100)})
         second = told.view.timeline.used - with_both - 100
         told.step(part_keys=(2, 99))
-        told.session.past.seek(2)
+        told.session.happen(MomentShown(2))
         assert not told.view.timeline.can_continue, "a part never came"
-        told.session.past.seek(1)
+        told.session.happen(MomentShown(1))
         assert told.view.timeline.can_continue
-        told.session.past.seek(None)
+        told.session.happen(MomentShown(None))
         told.step(part_keys=(2, 3))
         told.step(100)
         timeline = told.view.timeline
@@ -163,7 +165,7 @@ def test_the_rewards_of_an_episode_come_through_what_it_was_put_back_to(told: To
     told.reset((2,))
     assert rewards(told) == [[1, 2, 3], [1, 2, 3, 4, 5], []]
     told.step()
-    told.session.past.seek(6)
+    told.session.happen(MomentShown(6))
     assert rewards(told) == [[1, 2, 3], [1, 2, 3, 4, 5], [1, 2, 3, 4, 5]]
 
 

@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import live_session, wait_until
+from workbench.commands.run import Step
 from workbench.core.capture.outliers import OUTLIER_RULES, OutlierKind
 from workbench.session.history.env_table import Outcome
 from workbench.session.live.session import Session
+from workbench.session.run.run import EnvsReset
 
 BROKEN = '''
 import sapien
@@ -88,7 +90,7 @@ def one_of_each(child_process: None, tmp_path_factory: pytest.TempPathFactory) -
     with live_session(folder / "one_of_each.py", folder / "kept", num_envs=8) as session:
         session.change(action_source="hold")
         for count in range(1, 13):
-            session.step()
+            session.do(Step())
             view = wait_until(
                 session, lambda v, n=count: v.step.elapsed_steps[0] == n or v.problem is not None, "a step"
             )
@@ -119,7 +121,7 @@ def test_each_is_a_finding_of_its_rule_at_the_hook(one_of_each: Session) -> None
 
 def test_outliers_of_an_episode_are_those_of_the_last_one_after_a_reset(one_of_each: Session) -> None:
     before = one_of_each.env_rows()
-    one_of_each.reset((2,))
+    one_of_each.happen(EnvsReset((2,)))
     wait_until(one_of_each, lambda v: v.step.elapsed_steps[2] == 0, "the reset")
     rows = one_of_each.env_rows()
     assert 2 not in rows.outliers and rows.last.outliers[2] == before.outliers[2]

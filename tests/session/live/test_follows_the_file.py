@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import save, step, wait_until
+from workbench.commands.run import ReloadFile
 from workbench.session.live.session import Session
 
 
@@ -147,7 +148,7 @@ def test_a_worker_that_is_killed_comes_back_with_the_last_good_version(
     assert "SIGKILL" in view.problem.message
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the version again")
     assert view.task.source_hash == before.task.source_hash
-    session.versions.reload()
+    session.do(ReloadFile())
     wait_until(session, lambda v: v.problem is None, "the banner's end")
 
 

@@ -16,6 +16,8 @@ from tests.drive.session import DEATH, Told, ToldWorker, told_session
 from tests.drive.waiting import until
 from tests.ui.scenes import problem
 from workbench.authoring.loading.reference import RecordedTask
+from workbench.commands.command import Refused
+from workbench.commands.run import ChooseClass, PauseRun, PlayRun, ReloadFile, SetSeed
 from workbench.core.camera_data import Picture
 from workbench.core.capture.inspection import Inspection
 from workbench.core.rules import Finding
@@ -36,6 +38,7 @@ from workbench.session.protocol.messages import (
 )
 from workbench.session.protocol.messages import Told as ToldRobots
 from workbench.session.rescore.background import RescoreView
+from workbench.session.run.run import MomentShown, OptionsApplied, PagesCounted, Run
 
 EYE = CameraRequest("eye", "sensor")
 GONE_WRONG = Finding("r", "warn", "m", None, None, "", "", 1, 0)
@@ -49,7 +52,7 @@ def pictures(env: int, number: int = 0) -> Pictures:
 def asked_load(told: Told) -> Load:
     """What the next save asks for."""
     told.asked(object)
-    told.session.versions.reload()
+    told.session.do(ReloadFile())
     (load,) = told.asked(Load)
     return load
 
@@ -99,8 +102,8 @@ def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes(played
 def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_shown(played: Told) -> None:
     session = played.session
     session.change(selected_env=2, cameras=(EYE,))
-    session.past.seek(1)
-    session.past.seek(None)
+    session.happen(MomentShown(1))
+    session.happen(MomentShown(None))
     told = np.ones((3, 2), np.float32)
     played.tell(pictures(2), ToldRobots(told), Inspection(2, 3), RulesBroken((GONE_WRONG,)))
     played.tell(CameraFailed(EYE.key, "no shader"))
@@ -152,7 +155,7 @@ def test_what_was_odd_while_playing_goes_with_the_version_and_comes_back_if_that
 
 
 def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it(played: Told) -> None:
-    played.session.play()
+    played.session.do(PlayRun())
     played.die()
     view = played.view
     assert "SIGSEGV" in view.problem.message and view.problem_at_run
@@ -189,11 +192,11 @@ def test_a_mended_policy_plays_on_although_the_task_was_loaded_anew_before_its_f
     policy = tmp_path / "policy.py"
     policy.write_text("def act(obs): return None\n")
     played.session.change(action_source="policy", policy=f"{policy}:act")
-    played.session.play()
+    played.session.do(PlayRun())
     failed = replace(problem(), stage="policy", file=str(policy))
     played.tell(Status(True, 20.0, 1.0), LoadFailed(failed, kept=True, at_run=True), Status(False, 0.0, 0.0))
     if paused:
-        played.session.pause()
+        played.session.do(PauseRun())
     played.load("same")
     played.asked(object)
     policy.write_text("def act(obs): return obs\n")
@@ -216,7 +219,7 @@ def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before
 def test_a_worker_that_could_load_nothing_waits_with_the_problem_and_one_too_many_stops_it(
     told: Told,
 ) -> None:
-    told.session.play()
+    told.session.do(PlayRun())
     told.greet()
     told.die()
     (settings,) = told.greet()
@@ -240,7 +243,7 @@ def test_every_load_is_remembered_also_one_that_was_refused(played: Told) -> Non
 
 def test_a_camera_that_cannot_be_drawn_is_not_asked_for_until_it_is_ticked_again(played: Told) -> None:
     other = CameraRequest("hand", "sensor")
-    played.session.set_clients(1)
+    played.session.happen(PagesCounted(1))
     played.session.change(cameras=(EYE, other))
     played.tell(CameraFailed(EYE.key, "no shader"))
     assert played.view.failed_cameras == {EYE.key: "no shader"}
@@ -266,9 +269,9 @@ def test_pictures_are_those_of_the_env_that_is_looked_at_and_of_the_moment_that_
     played.tell(pictures(0, number=3))
     assert set(played.view.pictures) == {EYE.key}
     serial = played.view.pictures_serial
-    played.session.past.seek(1)
+    played.session.happen(MomentShown(1))
     assert played.view.pictures == {} and played.view.pictures_serial > serial
-    played.session.past.seek(3)
+    played.session.happen(MomentShown(3))
     assert set(played.view.pictures) == {EYE.key}
     played.session.change(selected_env=2)
     assert played.view.pictures == {}
@@ -277,9 +280,9 @@ def test_pictures_are_those_of_the_env_that_is_looked_at_and_of_the_moment_that_
     played.asked(object)
     played.session.change(selected_env=2)
     assert played.asked(Settings) == [], "nothing changed"
-    played.session.set_clients(1)
-    played.session.set_clients(2)
-    played.session.set_clients(0)
+    played.session.happen(PagesCounted(1))
+    played.session.happen(PagesCounted(2))
+    played.session.happen(PagesCounted(0))
     assert [settings.cameras for settings in played.asked(Settings)] == [(EYE,), ()], "for no page none"
 
 
@@ -294,13 +297,14 @@ def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_fo
     }
     with told_session(tmp_path, file) as told:
         told.load(**found)
-        told.session.versions.choose_class("Nobody")
+        with pytest.raises(Refused):
+            told.session.do(ChooseClass(name="Nobody"))
         assert told.asked(Load) == [] and told.view.choices == ("One", "Two")
-        told.session.set_seed(7)
-        told.session.versions.choose_class("Two")
+        told.session.do(SetSeed(seed=7))
+        told.session.do(ChooseClass(name="Two"))
         (load,) = told.asked(Load)
         assert load.task == f"{file}:Two" and load.options.seed == 7 and told.view.choices == ("Two", "One")
-        again = told.session.versions.running_load()
+        again = told.session.look(Run.running_load)
         assert again is not None and (again.task, again.source) == (f"{file}:One", {file: "text"})
         told.tell(Loading("", load.number))
         told.die()
@@ -347,7 +351,7 @@ def test_files_of_the_task_are_known_and_no_others(tmp_path: Path) -> None:
     for file in (task, beside, outside):
         file.write_text("")
     with told_session(tmp_path, str(task)) as told:
-        knows = told.session.versions.knows_file
+        knows = told.session.knows_file
         assert knows(str(task)) and knows(str(beside)) and not knows(str(outside))
         assert not knows(str(task.parent / ".." / "secret.py")) and not knows("/etc/passwd")
         assert not knows(str(task.parent / "gone.py"))
@@ -361,10 +365,10 @@ FIRST, MORE = TaskOptions(3), TaskOptions(4, env_kwargs={"size": 2})
 
 
 def test_options_are_in_effect_when_a_load_has_taken_them(played: Told) -> None:
-    played.session.versions.apply_options(MORE)
+    played.session.happen(OptionsApplied(MORE))
     (load,) = played.asked(Load)
     assert load.options == MORE and played.view.options == FIRST
-    again = played.session.versions.running_load()
+    again = played.session.look(Run.running_load)
     assert again is not None and again.options == FIRST, "the version that ran is brought back as it ran"
     played.load("same", options=FIRST)
     assert played.view.options == FIRST and asked_load(played).options == MORE, "it was under way before"
@@ -376,7 +380,7 @@ def test_options_are_in_effect_when_a_load_has_taken_them(played: Told) -> None:
 def test_options_with_which_the_task_fails_are_dropped_and_the_file_is_not_to_blame(
     played: Told, kills: bool
 ) -> None:
-    played.session.versions.apply_options(MORE)
+    played.session.happen(OptionsApplied(MORE))
     (load,) = played.asked(Load)
     if kills:
         played.tell(Loading("building", load.number))
@@ -388,11 +392,11 @@ def test_options_with_which_the_task_fails_are_dropped_and_the_file_is_not_to_bl
     assert played.view.problem is not None
     assert (played.view.options, played.view.options_refused) == (FIRST, MORE)
     assert asked_load(played).options == FIRST, "the next save does not fail for them"
-    played.session.versions.apply_options(FIRST)
+    played.session.happen(OptionsApplied(FIRST))
     assert played.view.options_refused is None
 
 
 def test_a_task_that_never_ran_keeps_the_options_that_a_person_chose_last(told: Told) -> None:
-    told.session.versions.apply_options(MORE)
+    told.session.happen(OptionsApplied(MORE))
     told.tell(LoadFailed(problem(), kept=False, options=MORE))
     assert told.view.options == MORE and asked_load(told).options == MORE

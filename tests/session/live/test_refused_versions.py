@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from tests.drive.session import live_session, save, start_over, step, wait_until
+from workbench.commands.run import PlayRun, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.run import EnvsReset
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -132,12 +134,12 @@ def test_after_a_failure_while_it_runs_a_reset_and_steps_are_those_of_a_clean_pr
     )
     line = bad[: bad.index("raise RuntimeError('late')")].count("\n") + 1
     save(mended, task_file, bad)
-    for go_on in (mended.play, mended.step):
+    for go_on in (PlayRun(), Step()):
         before, worker = played(mended), mended.worker_pid
         assert before.problem is None
         np.testing.assert_array_equal(before.step.poses, expected.step.poses)
         np.testing.assert_array_equal(before.step.reward, expected.step.reward)
-        go_on()
+        mended.do(go_on)
         view = wait_until(
             mended,
             lambda v, n=before.task_serial: (
@@ -171,14 +173,14 @@ def test_recording_and_playing_go_on_after_a_refused_version(
     with live_session(file, tmp_path / "recordings") as session:
         session.change(speed=8.0)
         session.start_recording((0,))
-        session.play()
+        session.do(PlayRun())
         wait_until(session, lambda v: v.recording.steps > 3, "some recorded steps")
         file.write_text(in_evaluate(good, "raise ValueError('enough')"))
         wait_until(session, lambda v: v.problem is not None, "the refusal")
         again = wait_until(session, lambda v: v.problem is not None and v.state == "running", "playing again")
         assert again.recording.active and again.recording.env_idx == (0,)
         wait_until(session, lambda v: v.recording.episodes_written >= 1, "the episode that was running")
-        session.reset((0,))
+        session.happen(EnvsReset((0,)))
         wait_until(session, lambda v: v.recording.steps > 3, "steps of the next episode")
         session.stop_recording()
         wait_until(session, lambda v: v.recording.episodes_written >= 2, "both episodes")

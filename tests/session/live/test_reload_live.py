@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from tests.drive.session import runs, save, wait_until
+from workbench.commands.run import ChooseClass, PauseRun, PlayRun, RebuildScene, ReloadFile, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.run import EnvsReset, InspectionWanted
 
 DRAWS = True
 
@@ -35,7 +37,7 @@ def good(task_file: Path, session: Session) -> str:
 @pytest.fixture(autouse=True)
 def good_again(session: Session, task_file: Path, good: str) -> Iterator[None]:
     yield
-    session.pause()
+    session.do(PauseRun())
     save(session, task_file, good)
 
 
@@ -47,14 +49,14 @@ def reward_plus(good: str, number: float) -> str:
 def played(session: Session, steps: int) -> SessionView:
     """The view after some steps of the player, paused."""
     session.change(speed=8.0)
-    session.play()
+    session.do(PlayRun())
     count = session.view().curves.serial
     wait_until(session, lambda v: v.curves.serial >= count + steps, "some steps")
-    session.pause()
+    session.do(PauseRun())
     wait_until(session, lambda v: not v.playing and v.state == "paused", "the pause")
     # What the worker sends after it has paused comes before its answer.
     before = session.view().inspection
-    session.inspect(("joints",))
+    session.happen(InspectionWanted(("joints",)))
     return wait_until(session, lambda v: v.inspection is not before, "rest")
 
 
@@ -72,13 +74,13 @@ def test_a_patch_keeps_moment_past_and_selection_and_shows_new_numbers_while_pau
         np.testing.assert_allclose(view.step.reward, before.step.reward + 1, rtol=1e-5)
     assert view.curves.serial == before.curves.serial
     assert view.selected_env == 1 and not view.playing
-    session.step()
+    session.do(Step())
     after = wait_until(session, lambda v: v.curves.serial > view.curves.serial, "the next step")
     assert after.curves.serial == view.curves.serial + 1
 
 
 def test_playing_goes_on_through_a_patch(session: Session, task_file: Path, good: str) -> None:
-    session.play()
+    session.do(PlayRun())
     wait_until(session, lambda v: v.state == "running", "play")
     view = save(session, task_file, reward_plus(good, 4))
     assert view.reload.level == "patched"
@@ -106,10 +108,10 @@ def test_edited_cameras_come_in_without_a_new_scene(session: Session, task_file:
 
 def test_a_level_can_be_asked_for_without_a_change(session: Session, good: str) -> None:
     before = session.view()
-    session.versions.reload("rebuilt")
+    session.do(RebuildScene())
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the load")
     assert view.reload.level == "rebuilt" and view.scene_serial == before.scene_serial + 1
-    session.versions.reload()
+    session.do(ReloadFile())
     view = wait_until(session, lambda v: v.task_serial > view.task_serial, "the load")
     assert (view.reload.level, view.reload.reason) == ("same", "nothing changed")
 
@@ -148,7 +150,7 @@ def test_a_save_while_a_reload_runs_wins(session: Session, task_file: Path, good
     last = reward_plus(good, 21)
     task_file.write_text(last)
     view = runs(session, last)
-    session.versions.reload()
+    session.do(ReloadFile())
     view = wait_until(session, lambda v: v.task_serial > view.task_serial, "another load")
     assert view.task.source[str(task_file)] == last, "the older one came after it"
 
@@ -182,8 +184,8 @@ def test_of_two_tasks_in_a_file_one_can_be_chosen_and_stays_chosen(
     view = save(session, task_file, good + SECOND_TASK)
     assert (view.task.class_name, view.task.others) == ("PushTheOtherEnv", ("PushCubeEnv",))
     assert view.reload.level == "rebuilt" and "a different task" in view.reload.reason
-    session.versions.choose_class("NobodysEnv")
-    session.versions.choose_class("PushCubeEnv")
+    session.do(ChooseClass(name="NobodysEnv"))
+    session.do(ChooseClass(name="PushCubeEnv"))
     view = wait_until(session, lambda v: v.task.class_name == "PushCubeEnv", "the other task")
     assert view.task.others == ("PushTheOtherEnv",) and view.task.max_episode_steps == 50
     edited = reward_plus(good, 31) + SECOND_TASK
@@ -205,7 +207,7 @@ def test_recording_goes_on_with_the_next_episode_and_the_moment_stays(
     np.testing.assert_array_equal(view.step.poses, before.step.poses)
     view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the episode of the old version")
     assert view.recording.active and view.recording.steps == 0
-    session.reset((0,))
+    session.happen(EnvsReset((0,)))
     played(session, 3)
     assert session.view().recording.steps >= 3
     session.stop_recording()

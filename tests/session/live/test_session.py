@@ -14,9 +14,11 @@ import numpy as np
 import pytest
 
 from tests.drive.session import Told, live_session, start_over, step, wait_until
+from workbench.commands.run import PauseRun, PlayRun, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest, EnterRecording
+from workbench.session.run.run import ActionTold, EnvsReset, InspectionWanted, PagesCounted
 
 pytestmark = pytest.mark.thorough
 
@@ -32,13 +34,13 @@ def settle(session: Session) -> None:
 def test_playing_goes_on_until_paused(session: Session) -> None:
     settle(session)
     session.change(speed=4.0)
-    session.play()
+    session.do(PlayRun())
     wait_until(session, lambda v: v.step.elapsed_steps.max() >= 10 and v.state == "running", "ten steps")
-    session.pause()
+    session.do(PauseRun())
     view = wait_until(session, lambda v: v.state == "paused", "the pause")
     session.change(speed=1.0)
     settled = view.step_serial
-    session.reset((1,))
+    session.happen(EnvsReset((1,)))
     after = wait_until(session, lambda v: v.step_serial > settled, "the reset")
     assert after.step.elapsed_steps[1] == 0
 
@@ -46,13 +48,13 @@ def test_playing_goes_on_until_paused(session: Session) -> None:
 def test_a_single_step_ends_playing(session: Session) -> None:
     settle(session)
     session.change(speed=4.0)
-    session.play()
+    session.do(PlayRun())
     wait_until(session, lambda v: v.step.elapsed_steps.max() >= 3 and v.state == "running", "playing")
-    session.step()
+    session.do(Step())
     serials = []
     for _ in range(20):  # a worker that played on would take some ten steps meanwhile
         before = session.view().inspection
-        session.inspect(("joints",))
+        session.happen(InspectionWanted(("joints",)))
         wait_until(session, lambda v, before=before: v.inspection is not before, "an answer")
         serials.append(session.view().step_serial)
     session.change(speed=1.0)
@@ -63,7 +65,7 @@ def test_resetting_one_env_leaves_the_other(session: Session) -> None:
     settle(session)
     step(session, 3)
     before = session.view().step
-    session.reset((1,))
+    session.happen(EnvsReset((1,)))
     after = wait_until(session, lambda v: v.step.elapsed_steps[1] == 0, "the reset of env 1").step
     assert after.elapsed_steps.tolist() == [3, 0]
     assert np.array_equal(after.poses[0], before.poses[0], equal_nan=True)
@@ -80,7 +82,7 @@ def test_a_slider_moves_one_joint_of_one_env_from_the_targets_that_the_robot_has
             "not the middle of the limits"
         )
         assert np.allclose(step(session, 3).step.action, start), "untouched, each joint keeps its target"
-        session.tell((0,), (5.0,), (1,))
+        session.happen(ActionTold((0,), (5.0,), (1,)))
         moved = wait_until(session, lambda v: v.told[1, 0] != start[1, 0], "the slider").told
         others = np.ones(moved.shape, bool)
         others[1, 0] = False
@@ -91,7 +93,7 @@ def test_a_slider_moves_one_joint_of_one_env_from_the_targets_that_the_robot_has
         acted = step(session).step.action
         session.change(action_source="sliders")
         assert np.allclose(told(session, lambda v: not np.array_equal(v.told, moved)), acted)
-        session.reset((0,))
+        session.happen(EnvsReset((0,)))
         after = told(session, lambda v: v.step.elapsed_steps[0] == 0 and not np.array_equal(v.told, acted))
         assert np.allclose(after[0, :7], session.view().step.qpos[0, :7], atol=1e-5)
         assert np.allclose(after[1], acted[1]), "env 1 was not reset"
@@ -111,7 +113,7 @@ def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, t
     policy.write_text(f"{counted}def act(obs):\n    return obs[:, :8] * 0 + 0.5\n")
     session.change(action_source="policy", policy=f"{policy}:act")
     session.change(speed=2.0)
-    session.step()
+    session.do(Step())
     view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
     assert np.allclose(view.step.action, 0.5)
     session.change(speed=1.0)
@@ -134,12 +136,12 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
     policy.write_text(text)
     session.change(action_source="policy", policy=f"{policy}:{reference}")
     if reference == "act":
-        session.step()
+        session.do(Step())
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
     assert view.problem.stage == "policy" and says in view.problem.message
     assert (view.problem.file, view.problem.line) == (None if line is None else str(policy), line)
     # No other action takes its place: whoever plays or steps hears the same.
-    for again in (session.play, session.step):
+    for again in (lambda: session.do(PlayRun()), session.step):
         said = session.view().problem_serial
         again()
         view = wait_until(
@@ -147,7 +149,7 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
         )
         assert says in view.problem.message and not view.step.elapsed_steps.any()
     session.change(action_source="random")
-    session.step()
+    session.do(Step())
     wait_until(session, lambda v: v.problem is None, "the problem's end")
 
 
@@ -174,7 +176,7 @@ def test_what_a_policy_returns_for_several_robots_and_is_no_action_is_named(
         for at, (name, (_, facts)) in enumerate(POLICIES.items()):
             serial = session.view().problem_serial
             session.change(action_source="policy", policy=f"{policy}:{name}")
-            session.step()
+            session.do(Step())
             view = wait_until(
                 session, lambda v, n=serial: v.problem_serial > n and v.problem is not None, name
             )
@@ -182,7 +184,7 @@ def test_what_a_policy_returns_for_several_robots_and_is_no_action_is_named(
             assert (problem.stage, problem.file, problem.line) == ("policy", str(policy), at + 2), problem
             assert all(fact in problem.message for fact in facts), problem.message
         session.change(action_source="policy", policy=f"{policy}:works")
-        session.step()
+        session.do(Step())
         view = wait_until(session, lambda v: v.step.elapsed_steps.all(), "a step")
         assert view.step.action.tolist() == [[0.0] * 8 + [1.0] * 8] * 2
 
@@ -194,7 +196,7 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
     policy, text = tmp_path / "policy.py", "def act(obs):\n    return obs[:, :8] * 0 + {}\n"
     policy.write_text(text.format("0.50"))
     session.change(action_source="policy", policy=f"{policy}:act")
-    session.play()
+    session.do(PlayRun())
     wait_until(session, lambda v: v.step.action is not None and np.allclose(v.step.action, 0.5), "its action")
     # Of the same length and in the same second as the one before.
     for action in ("0.25", "0.75"):
@@ -208,13 +210,13 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
     view = wait_until(session, lambda v: v.playing and np.allclose(v.step.action, 0.1), "the mended one")
     assert view.problem is None
     # Somebody who has paused is left alone.
-    session.pause()
+    session.do(PauseRun())
     wait_until(session, lambda v: not v.playing, "the pause")
     policy.write_text(text.format("0.30 +"))
     wait_until(session, lambda v: v.problem is not None, "the problem while paused")
     policy.write_text(text.format("0.30"))
     wait_until(session, lambda v: v.problem is None, "its end")
-    session.step()
+    session.do(Step())
     view = wait_until(session, lambda v: np.allclose(v.step.action, 0.3), "a step")
     assert not view.playing and view.problem is None
 
@@ -228,7 +230,7 @@ def test_a_policy_is_looked_for_beside_the_task_too_and_taken_when_it_is_mended(
     for folder in (Path.cwd(), task_file.parent):
         assert str(folder) in view.problem.message
     (task_file.parent / "pol.py").write_text("def act(obs):\n    return obs[:, :8] * 0 + 0.25\n")
-    session.step()
+    session.do(Step())
     view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
     assert np.allclose(view.step.action, 0.25) and view.problem is None
 
@@ -239,10 +241,10 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     sensor = next(c for c in session.view().task.cameras if c.kind == "sensor")
     wanted = CameraRequest(sensor.name, "sensor", ("rgb", "depth", "segmentation"))
     session.change(cameras=(wanted,))
-    session.step()
+    session.do(Step())
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 1, "a step")
     assert not session.view().pictures, "nobody looks yet"
-    session.set_clients(1)
+    session.happen(PagesCounted(1))
     session.change(selected_env=1)
     view = wait_until(session, lambda v: bool(v.pictures), "a picture")
     picture = view.pictures["sensor", sensor.name]
@@ -250,9 +252,9 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     assert picture.rgb.shape == (sensor.height, sensor.width, 3) and picture.rgb.std() > 5
     assert picture.depth.shape == (sensor.height, sensor.width) and picture.depth.max() > 0.1
     assert set(np.unique(picture.segmentation)) - {0} <= view.task.segmentation.keys()
-    session.set_clients(0)
+    session.happen(PagesCounted(0))
     session.change(selected_env=0)
-    session.step()
+    session.do(Step())
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 2, "another step")
     assert not session.view().pictures, "nobody looks any more"
     session.change(cameras=())

@@ -13,6 +13,7 @@ from tests.drive.session import Told, told_session
 from tests.drive.waiting import until
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem
+from workbench.commands.run import Step
 from workbench.session.protocol.messages import LoadFailed, SingleStep
 
 
@@ -27,7 +28,7 @@ def disk() -> Iterator[threading.Event]:
 def answers(told: Told) -> bool:
     """Whether a press on Step reaches the worker, and what comes of it the page."""
     told.asked(object)
-    told.session.step()
+    told.session.do(Step())
     told.step()
     return len(told.asked(SingleStep)) == 1 and told.view.timeline.last > 0
 

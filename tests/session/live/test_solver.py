@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from tests.drive.session import TASKS, Told, live_session, start_over, step, wait_until
+from workbench.commands.run import Interrupt, PauseRun, PlayRun, Step
 from workbench.planning.options import PlanOptions
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import PlanDropped, PlanWanted, Play
+from workbench.session.run.run import InspectionWanted
 
 FEW = PlanOptions(rollouts=16, horizon=0.3, noise=0.8)
 """Enough for a cube that is pushed."""
@@ -49,7 +51,7 @@ def test_what_an_episode_came_to_is_kept_until_it_is_over(played: Told) -> None:
     assert played.view.solve.solved == () and len(played.view.solve.achieved) == 0
     played.step(success=(0,))
     assert played.view.solve.solved == ((0, 1),), "and of the next episode the same"
-    played.session.play()
+    played.session.do(PlayRun())
     played.asked(object)
     played.tell(PlanWanted(5, (0,), why_not="it cannot be copied"))
     solve = played.view.solve
@@ -66,7 +68,7 @@ def test_what_an_episode_came_to_is_kept_until_it_is_over(played: Told) -> None:
 def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(session: Session) -> None:
     start_over(session, 3)
     before = session.view().step
-    session.play()
+    session.do(PlayRun())
     view = wait_until(session, lambda view: bool(view.solve.solved_at) and not view.playing, "a success")
     step = view.step
     assert step is not None and before is not None
@@ -94,12 +96,12 @@ def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(ses
     start_over(session, 4)
     view = step(session)
     assert view.step is not None and view.step.elapsed_steps.tolist() == [1, 1] and not view.playing
-    session.play()
+    session.do(PlayRun())
     wait_until(session, lambda view: view.step is not None and view.step.elapsed_steps[0] >= 2, "two steps")
-    session.pause()
+    session.do(PauseRun())
     view = wait_until(session, lambda view: not view.playing and view.solve.state == "none", "the pause")
     serial = session.view().step_serial
-    session.inspect(("joints",))
+    session.happen(InspectionWanted(("joints",)))
     view = wait_until(session, lambda v: v.inspection is not None, "an answer of the worker")
     assert view.step_serial - serial <= 1 and view.solve.state == "none"
 
@@ -108,9 +110,9 @@ def test_a_wish_that_comes_after_the_pause_was_sent_is_not_planned_for(session: 
     start_over(session, 4)
     # Some of these pauses meet the worker's wish on its way.
     for after in np.linspace(0, 0.03, 7):
-        session.play()
+        session.do(PlayRun())
         time.sleep(after)
-        session.pause()
+        session.do(PauseRun())
         time.sleep(0.1)
         wait_until(session, lambda view: not view.playing and view.solve.state == "none", "the end")
 
@@ -118,7 +120,7 @@ def test_a_wish_that_comes_after_the_pause_was_sent_is_not_planned_for(session: 
 def test_a_pressed_step_is_made_also_if_another_env_is_selected_while_it_is_planned(session: Session) -> None:
     start_over(session, 4)
     last = session.view().timeline.last
-    session.step()
+    session.do(Step())
     wait_until(session, lambda view: view.solve.state in ("starting", "planning"), "the planning")
     session.change(selected_env=1)
     wait_until(session, lambda view: view.timeline.last > last, "the step")
@@ -138,10 +140,10 @@ def test_a_pressed_step_that_waited_for_its_plan_is_found_hanging_and_can_be_int
     wait_until(session, lambda view: view.task_serial > serial, "the version that can hang")
     start_over(session, 4)
     hangs.touch()
-    session.step()
+    session.do(Step())
     view = wait_until(session, lambda view: view.busy is not None, "that it hangs")
     assert view.busy is not None and view.busy.file == str(file)
-    session.interrupt()
+    session.do(Interrupt())
     view = wait_until(session, lambda view: view.problem is not None and view.busy is None, "the interrupt")
     assert view.problem is not None and view.problem.interrupted
     hangs.unlink()
@@ -153,12 +155,12 @@ def test_a_pressed_step_that_waited_for_its_plan_is_found_hanging_and_can_be_int
 def test_another_body_is_traced_and_all_envs_are_planned_for_in_turn(session: Session) -> None:
     start_over(session, 5)
     session.change(solve_all=True, traced="cube", plan=replace(FEW, every=2))
-    session.play()
+    session.do(PlayRun())
     session.change(selected_env=1)
     view = wait_until(session, lambda view: view.solve.plan is not None, "a plan of the other env")
     plan = view.solve.plan
     assert plan is not None and plan.env == 1 and plan.traced == "cube" and plan.actions.shape == (2, 7)
-    session.pause()
+    session.do(PauseRun())
     session.change(solve_all=False, traced="", plan=FEW, selected_env=0)
 
 
@@ -173,7 +175,7 @@ def test_a_save_is_planned_with_and_one_that_fails_in_a_rollout_says_where(
     serial = session.view().task_serial
     file.write_text(text.replace("        return reward\n", broken))
     wait_until(session, lambda view: view.task_serial > serial, "the version")
-    session.play()
+    session.do(PlayRun())
     view = wait_until(session, lambda view: view.solve.state == "failed", "the failure")
     wait_until(session, lambda view: not view.playing, "the pause")
     assert view.solve.problem is not None and view.solve.problem.message == "ValueError: too far"

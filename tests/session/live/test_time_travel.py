@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 
 from tests.drive.session import jump, live_session, moment_at, start_over, step, wait_until
+from workbench.commands.run import PauseRun, RestartWorker
+from workbench.commands.timeline import ContinueFromHere, UndoReset
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.run.run import ActionTold, EnvsReset, MomentShown, PagesCounted, PastPicturesWanted
 
 N = 3
 
@@ -25,10 +28,10 @@ def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> It
 
 def fresh(session: Session) -> int:
     """Paused at the first moment of episodes of seed 0, live; its serial."""
-    session.pause()
+    session.do(PauseRun())
     session.change(episode_end="reset")
     session.change(action_source="sliders")
-    session.tell(range(8), (0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0))
+    session.happen(ActionTold(range(8), (0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0)))
     return start_over(session, 0).timeline.last
 
 
@@ -47,12 +50,12 @@ def test_scrubbing_shows_what_was(session: Session) -> None:
     start = fresh(session)
     step(session, 5)
     for serial in (*range(start, start + 6), *range(start + 5, start - 1, -1)):
-        session.past.seek(serial)
+        session.happen(MomentShown(serial))
         view = session.view()
         assert np.array_equal(view.step.poses, poses(session, serial), equal_nan=True)
         assert view.step.elapsed_steps[0] == serial - start
         assert view.timeline.shown == (serial if serial < start + 5 else None)
-    session.past.seek(None)
+    session.happen(MomentShown(None))
     assert session.view().timeline.shown is None and session.view().timeline.last == start + 5
 
 
@@ -61,8 +64,8 @@ def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session)
     step(session, 8)
     branches = []
     for _ in range(2):
-        session.past.seek(start + 3)
-        view = jump(session, lambda: session.past.continue_from_shown("all"))
+        session.happen(MomentShown(start + 3))
+        view = jump(session, lambda: session.do(ContinueFromHere(scope="all")))
         assert view.step.elapsed_steps.tolist() == [3] * N
         assert is_close(view.step.poses, poses(session, start + 3))
         step(session, 5)
@@ -78,11 +81,11 @@ def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
     start = fresh(session)
     step(session, 6)
     left = session.view().step
-    session.past.seek(start + 2)
-    jump(session, lambda: session.past.continue_from_shown("all"))
+    session.happen(MomentShown(start + 2))
+    jump(session, lambda: session.do(ContinueFromHere(scope="all")))
     step(session, 2)
     assert session.view().timeline.undo == "jump of all"
-    view = jump(session, session.past.undo)
+    view = jump(session, lambda: session.do(UndoReset()))
     assert is_close(view.step.poses, left.poses)
     assert view.step.elapsed_steps.tolist() == [6] * N
 
@@ -91,13 +94,13 @@ def test_a_reset_can_be_taken_back_and_the_one_before_it_too(session: Session) -
     fresh(session)
     step(session, 3)
     first = session.view().step
-    jump(session, lambda: session.reset((0, 1)))
+    jump(session, lambda: session.happen(EnvsReset((0, 1))))
     step(session, 2)
     second = session.view().step
-    jump(session, lambda: session.reset(None))
-    view = jump(session, session.past.undo)
+    jump(session, lambda: session.happen(EnvsReset(None)))
+    view = jump(session, lambda: session.do(UndoReset()))
     assert is_close(view.step.poses, second.poses)
-    view = jump(session, session.past.undo)
+    view = jump(session, lambda: session.do(UndoReset()))
     assert is_close(view.step.poses[:2], first.poses[:2])
     assert view.step.elapsed_steps.tolist() == [3, 3, 5]
 
@@ -107,17 +110,17 @@ def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session
     begin = session.view().timeline.last_tick
     assert np.isnan(session.view().step.reward).all()
     rewards = [step(session, 1).step.reward for _ in range(4)]
-    view = jump(session, lambda: session.reset((1,)))
+    view = jump(session, lambda: session.happen(EnvsReset((1,))))
     assert np.isnan(view.step.reward[1]) and np.array_equal(view.step.reward[[0, 2]], rewards[3][[0, 2]])
-    session.past.seek(start + 2)
-    view = jump(session, lambda: session.past.continue_from_shown("all"))
+    session.happen(MomentShown(start + 2))
+    view = jump(session, lambda: session.do(ContinueFromHere(scope="all")))
     assert np.array_equal(view.step.reward, rewards[1])
     assert not view.timeline.not_carried
-    strip = session.past.strip(begin, view.timeline.last_tick)
+    strip = session.look(lambda run: run.strip(begin, view.timeline.last_tick))
     # A strip is of control steps: the reset and the going back after them are none.
     assert np.array_equal(strip.reward[1:], [reward[0] for reward in rewards])
-    session.past.seek(start + 2)
-    assert not jump(session, lambda: session.past.continue_from_shown("into all")).timeline.not_carried
+    session.happen(MomentShown(start + 2))
+    assert not jump(session, lambda: session.do(ContinueFromHere(scope="into all"))).timeline.not_carried
 
 
 @pytest.mark.slow
@@ -129,8 +132,8 @@ def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     session.start_recording((0,))
     wait_until(session, lambda v: v.timeline.last > last, "the fresh episode")
     step(session, 3)
-    session.past.seek(start + 1)
-    jump(session, lambda: session.past.continue_from_shown("this"))
+    session.happen(MomentShown(start + 1))
+    jump(session, lambda: session.do(ContinueFromHere(scope="this")))
     view = wait_until(session, lambda v: v.recording.episodes_written == written + 1, "the file")
     assert view.recording.active and view.recording.problem is None
     step(session, 1)
@@ -146,12 +149,12 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     wanted = CameraRequest(human.name, "human", ("rgb",))
     # Else what comes first after a jump is a fast one.
     session.change(cameras=(wanted,), pictures="exact")
-    session.set_clients(1)
+    session.happen(PagesCounted(1))
     key = ("human", human.name)
     now = wait_until(session, lambda v: key in v.pictures, "the live picture").pictures[key]
-    session.past.seek(start)
+    session.happen(MomentShown(start))
     assert session.view().pictures == {} and session.view().timeline.wants_pictures
-    session.past.draw()
+    session.happen(PastPicturesWanted())
     then = wait_until(session, lambda v: key in v.pictures, "the picture of the past").pictures[key]
     assert not session.view().timeline.wants_pictures
     live = session.view().timeline.last
@@ -159,13 +162,13 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     assert np.abs(then.rgb.astype(int) - now.rgb).mean() > 0.5, "the arm stood elsewhere"
     # The same moment, gone back to, looks the same.
     last = session.view().timeline.last
-    session.past.continue_from_shown("all")
+    session.do(ContinueFromHere(scope="all"))
     wait_until(session, lambda v: v.timeline.last > last and v.timeline.shown is None, "the jump")
     serial = session.view().pictures_serial
     again = wait_until(session, lambda v: v.pictures_serial > serial and key in v.pictures, "its picture")
     assert np.abs(then.rgb.astype(int) - again.pictures[key].rgb).max() <= 2
     session.change(cameras=(), pictures="auto")
-    session.set_clients(0)
+    session.happen(PagesCounted(0))
 
 
 @pytest.mark.slow
@@ -173,7 +176,7 @@ def test_the_episodes_go_on_as_they_stand_with_a_worker_that_takes_over(session:
     fresh(session)
     step(session, 4)
     before, rows = session.view(), session.env_rows()
-    view = jump(session, session.versions.restart_worker)
+    view = jump(session, lambda: session.do(RestartWorker()))
     now = session.env_rows()
     assert view.reload.level == "restarted" and view.timeline.first == before.timeline.first
     assert np.array_equal(view.step.reward, before.step.reward)

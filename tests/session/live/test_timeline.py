@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.drive.session import Told, camera, told_session
+from tests.drive.session import Told, camera, seek, seek_by, told_session
+from workbench.commands.run import PlayRun, ResetAll, Step
+from workbench.commands.timeline import ContinueFromHere, NextEvent, PreviousEvent, Seek, UndoReset
 from workbench.core.camera_data import CameraKind, Picture
 from workbench.session.history.history import RESET, SUCCESS, WENT_BACK
 from workbench.session.protocol.messages import (
@@ -23,6 +25,8 @@ from workbench.session.protocol.messages import (
     Placed,
     Restore,
 )
+from workbench.session.run.past import Strip
+from workbench.session.run.run import EpisodeStepShown, MomentShown, PastPicturesWanted, Run
 
 EYE, HAND = CameraRequest("base_camera", "sensor", ("rgb",)), CameraRequest("hand", "sensor", ("rgb",))
 PEOPLE = CameraRequest("base_camera", "human", ("rgb",))
@@ -36,7 +40,7 @@ def drawn(told: Told, env: int, *cameras: CameraRequest, degree: str = "auto") -
     """What is asked for if the page that shows this env wants pictures of the shown moment."""
     told.session.change(selected_env=env, cameras=cameras, pictures=degree)
     told.asked(object)
-    told.session.past.draw()
+    told.session.happen(PastPicturesWanted())
     return told.asked(DrawPast)
 
 
@@ -46,21 +50,21 @@ def at(told: Told) -> int:
 
 
 def test_every_env_is_asked_for_its_own_pictures_of_a_past_moment_and_once(played: Told) -> None:
-    played.session.past.seek(2)
+    played.session.happen(MomentShown(2))
     for env in (0, 1, 2, 0):
         (asked,) = drawn(played, env, EYE)
         assert (asked.env, asked.origin) == (env, 2)
         np.testing.assert_array_equal(asked.poses, played.view.step.poses[env])
         assert drawn(played, env, EYE) == []
     assert [one.cameras for one in drawn(played, 0, EYE, HAND)] == [(EYE, HAND)]
-    played.session.past.seek(1)
+    played.session.happen(MomentShown(1))
     assert [one.origin for one in drawn(played, 0, EYE, HAND)] == [1]
-    played.session.past.seek(None)
+    played.session.happen(MomentShown(None))
     assert drawn(played, 0, EYE) == []
 
 
 def test_only_what_is_lacking_or_no_longer_so_is_asked_for(played: Told) -> None:
-    played.session.past.seek(1)
+    played.session.happen(MomentShown(1))
     played.tell(PastPictures(1, (picture(1), picture(0, "hand"))))
     assert drawn(played, 1, EYE) == [] and not played.view.timeline.wants_pictures
     assert list(played.view.pictures) == [EYE.key]
@@ -81,7 +85,7 @@ def test_only_what_is_lacking_or_no_longer_so_is_asked_for(played: Told) -> None
 
 def test_a_moment_that_was_drawn_fast_is_drawn_exactly_unless_fast_pictures_are_chosen(played: Told) -> None:
     played.tell(Pictures((picture(1, degree="fast"),), 5.0, 1))
-    played.session.past.seek(1)
+    played.session.happen(MomentShown(1))
     assert drawn(played, 1, EYE, degree="fast") == [] and not played.view.timeline.wants_pictures
     assert [one.cameras for one in drawn(played, 1, EYE)] == [(EYE,)] and played.view.timeline.wants_pictures
     assert list(played.view.pictures) == [EYE.key], "the fast one is seen meanwhile"
@@ -90,39 +94,39 @@ def test_a_moment_that_was_drawn_fast_is_drawn_exactly_unless_fast_pictures_are_
 
 
 def test_a_moment_is_pinned_and_left_for_live(played: Told) -> None:
-    past = played.session.past
+    session = played.session
     assert played.view.timeline.shown is None and at(played) == 3
-    past.seek_by(-2)
+    seek_by(session, -2)
     played.step()
     view = played.view
     assert (view.timeline.shown, at(played), view.timeline.last) == (1, 1, 4), "what comes does not move it"
     assert view.told is view.step.action and view.timeline.can_continue
     assert (view.timeline.tick, view.timeline.steps, view.timeline.steps_ago) == (1, 4, 3)
-    past.seek(-5)
+    seek(session, -5)
     assert at(played) == 0
-    past.seek_by(3)
+    seek_by(session, 3)
     assert played.view.timeline.shown == 3
-    past.seek_by(1)
+    seek_by(session, 1)
     assert played.view.timeline.shown is None and at(played) == 4
-    for ask in (played.session.play, played.session.step, played.session.reset):
-        past.seek(1)
-        ask()
+    for asked in (PlayRun(), Step(), ResetAll()):
+        seek(session, 1)
+        session.do(asked)
         assert played.view.timeline.shown is None
-    past.seek(4)
+    seek(session, 4)
     assert played.view.timeline.shown is None, "the newest is live"
 
 
 def test_a_pinned_moment_that_has_to_go_gives_way_to_the_oldest(tmp_path: Path) -> None:
     with told_session(tmp_path, history_bytes=60_000) as told:
         told.play(2)
-        told.session.past.seek(1)
+        told.session.happen(MomentShown(1))
         told.step(97)
         timeline = told.view.timeline
         assert timeline.first > 1 and timeline.shown == timeline.first == at(told)
 
 
 def test_events_steps_and_moments_of_an_env_are_gone_through(told: Told) -> None:
-    past = told.session.past
+    session = told.session
     told.play(1)
     told.step(success=(1,))
     told.step()
@@ -130,53 +134,55 @@ def test_events_steps_and_moments_of_an_env_are_gone_through(told: Told) -> None
     told.step()
     for env, expected in ((1, [4, 2, 0, 0]), (0, [0, 0])):
         told.session.change(selected_env=env)
-        past.seek(None)
+        seek(session, None)
         seen = []
         for _ in expected:
-            past.seek_event(-1)
+            session.do(PreviousEvent())
             seen.append(at(told))
         assert seen == expected
     told.session.change(selected_env=1)
-    past.seek_event(1)
+    session.do(NextEvent())
     assert at(told) == 2
-    past.seek_event(1)
-    past.seek_event(1)
+    session.do(NextEvent())
+    session.do(NextEvent())
     assert told.view.timeline.shown is None
     # Of the shown episode, through the resets of others.
-    past.seek_step(1, 0)
+    session.happen(EpisodeStepShown(1, 0))
     assert at(told) == 4
-    past.seek_step(0, 3)
+    session.happen(EpisodeStepShown(0, 3))
     assert at(told) == 3
     # A step back passes the resets of other envs by.
     ways = {}
     for env in (0, 1):
         told.session.change(selected_env=env)
-        past.seek(None)
+        seek(session, None)
         ways[env] = []
         for _ in range(3):
-            past.seek_by(-1)
+            seek_by(session, -1)
             ways[env].append(at(told))
     assert ways == {0: [3, 2, 1], 1: [4, 3, 2]}
 
 
 def test_steps_are_counted_in_one_way_and_a_reset_is_none(played: Told) -> None:
-    past = played.session.past
+    session = played.session
     played.reset()
     played.step(2)  # moments 4 to 6
     view = played.view
     assert view.timeline.steps == view.curves.serial == 5 and view.timeline.moments == 7
-    past.seek_tick(4)
+    session.do(Seek(step=4))
     view = played.view
     assert (view.timeline.tick, view.timeline.steps_ago, at(played)) == (4, 1, 5)
-    strip = past.strip(-9, 99)
+    strip = session.look(lambda run: run.strip(-9, 99))
     assert (strip.low, strip.high) == (0, 5)
     assert np.isnan(strip.reward[0]) and strip.reward[1:].tolist() == [1, 2, 3, 1, 2]
     # At tick 3 is the last step of the first episode and the reset after it; of the second episode it is the reset.
-    past.seek_tick(3)
-    assert at(played) == 3 and past.episode() == (0, 3)
-    past.seek(6)
-    past.seek_tick(3, in_episode=True)
-    assert at(played) == 4 and past.episode() == (3, 5) and past.segment() == (4, 6)
+    session.do(Seek(step=3))
+    assert at(played) == 3 and session.look(Run.episode_ticks) == (0, 3)
+    seek(session, 6)
+    session.do(Seek(step=3, episode_only=True))
+    assert (
+        at(played) == 4 and session.look(Run.episode_ticks) == (3, 5) and session.look(Run.segment) == (4, 6)
+    )
     assert [played.view.timeline.steps_ago, played.view.timeline.tick] == [2, 3]
 
 
@@ -184,7 +190,7 @@ def test_in_the_past_the_table_of_envs_is_of_the_past(played: Told) -> None:
     played.reset((1,))
     played.step()
     assert played.session.env_rows().steps.tolist() == [4, 1, 4]
-    played.session.past.seek(2)
+    played.session.happen(MomentShown(2))
     then = played.session.env_rows()
     assert then.steps.tolist() == [2, 2, 2] and then.total.tolist() == [3, 3, 3]
     assert [np.isfinite(row).sum() for row in then.rewards] == [2, 2, 2]
@@ -196,7 +202,12 @@ def test_a_strip_is_of_one_env_between_two_steps(told: Told) -> None:
     told.back((1,), (2,), 1)
     told.step()
     told.session.change(selected_env=1)
-    strip = told.session.past.strip
+
+    def strip(low: int, high: int) -> Strip:
+        found = told.session.look(lambda run: run.strip(low, high))
+        assert found is not None
+        return found
+
     whole = strip(-10, 99)
     assert (whole.low, whole.high) == (0, 4) and dict(whole.events) == {0: RESET, 3: SUCCESS | WENT_BACK}
     assert whole.branches == ((3, 1),) and whole.segments == ((0, 3, False), (3, 4, True))
@@ -218,16 +229,16 @@ def test_a_strip_is_of_one_env_between_two_steps(told: Told) -> None:
 def test_who_goes_back_to_whose_moment_and_by_which_steps(
     played: Told, scope: Any, envs: tuple[int, ...], source: tuple[int, ...]
 ) -> None:
-    past = played.session.past
+    session = played.session
     played.session.change(selected_env=2)
-    past.continue_from_shown(scope)
+    session.do(ContinueFromHere(scope=scope))
     assert played.asked(Restore) == [], "there is nothing to go back to while live"
-    past.seek(2)
+    seek(session, 2)
     actions = []
     for serial in (1, 2):
-        past.seek(serial)
+        seek(session, serial)
         actions.append(played.view.step.action)
-    past.continue_from_shown(scope)
+    session.do(ContinueFromHere(scope=scope))
     (asked,) = played.asked(Restore)
     assert (asked.env_idx, asked.source, asked.origin, asked.undoes) == (envs, source, 2, None)
     assert b"body 2" in asked.snapshot and played.view.timeline.shown is None
@@ -242,8 +253,8 @@ def test_the_way_to_a_moment_begins_at_the_last_exact_point(played: Told) -> Non
     def way(env: int, serial: int) -> tuple[int, int, int] | None:
         played.asked(object)
         played.session.change(selected_env=env)
-        played.session.past.seek(serial)
-        played.session.past.continue_from_shown("this")
+        played.session.happen(MomentShown(serial))
+        played.session.do(ContinueFromHere(scope="this"))
         (asked,) = played.asked(Restore)
         found = asked.ways.get(env)
         return found and (found.start, found.source, len(found.actions))
@@ -274,9 +285,9 @@ def test_a_jump_is_taken_back_in_the_envs_that_it_brought_where_they_are(played:
 
     def undone(env: int) -> tuple[tuple[int, ...], int, int | None]:
         session.change(selected_env=env)
-        session.past.seek(1)
+        session.happen(MomentShown(1))
         played.asked(object)
-        session.past.undo()
+        session.do(UndoReset())
         (asked,) = played.asked(Restore)
         assert asked.source == asked.env_idx and played.view.timeline.shown is None
         return asked.env_idx, asked.origin, asked.undoes
@@ -306,9 +317,9 @@ def test_what_a_going_back_could_not_put_back_is_told_of_its_env_and_episode_alo
     played.step()
     lacks = ("actor ball: the snapshot has none",), "put there"
     assert told_of(1) == lacks and told_of(0) == ((), "")
-    played.session.past.seek(1)
+    played.session.happen(MomentShown(1))
     assert told_of(1) == ((), ""), "before it went back"
-    played.session.past.seek(None)
+    played.session.happen(MomentShown(None))
     played.reset((0,))
     assert told_of(1) == lacks, "another env was reset"
     played.reset((1,))

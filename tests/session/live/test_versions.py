@@ -13,13 +13,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.drive.session import DEATH, Told, told_session
+from tests.drive.session import DEATH, Told, stop_watching, told_session
 from tests.drive.waiting import until
 from tests.ui.scenes import description, problem, table_scene
-from workbench.session.live import versions
-from workbench.session.live.versions import Recovery
+from workbench.commands.run import PlayRun, RebuildScene, ReloadFile, RestartWorker
 from workbench.session.process.supervisor import End
 from workbench.session.protocol.messages import Load, LoadFailed, Loading, NewProcessNeeded, Play, Settings
+from workbench.session.run import recovery
+from workbench.session.run.recovery import Recovery
 
 GOOD, NEW = "x = 1\n", "x = 2\n"
 FILE_WAITS = replace(DEATH, end=End.FILE_WAITS)
@@ -44,7 +45,7 @@ def one(file: Path, tmp_path: Path) -> Iterator[Told]:
 def runs(one: Told, file: Path, text: str = GOOD, level: str | None = None, *beside: Path) -> None:
     """The worker says that this text was loaded, and the first moment comes."""
     if file.read_text() != text:
-        one.session.versions.close()  # what is on the disk would be taken for a save, some moments later
+        stop_watching(one.session)  # what is on the disk would be taken for a save, some moments later
     files = (str(file), *map(str, beside))
     one.load(level, file=files[0], source_files=files, source={files[0]: text}, source_hash=text)
     one.reset()
@@ -95,8 +96,8 @@ def test_a_module_that_broke_before_the_task_was_whole_is_followed(one: Told, fi
 def test_each_worker_is_greeted_with_what_the_last_one_knew(one: Told, file: Path) -> None:
     runs(one, file)
     one.session.change(speed=2.0)
-    one.session.play()
-    one.session.versions.reload()
+    one.session.do(PlayRun())
+    one.session.do(ReloadFile())
     one.die(FILE_WAITS)
     settings, load, play = one.greet()
     assert isinstance(settings, Settings) and settings.speed == 2.0 and play == Play(True)
@@ -125,7 +126,7 @@ def test_a_file_that_kills_before_anything_ran_is_waited_for(one: Told) -> None:
     one.tell(Loading("", 1))
     one.die()
     assert next_load(one) is None and not one.view.problem_at_run
-    one.session.versions.restart_worker()
+    one.session.do(RestartWorker())
     one.die(replace(DEATH, end=End.ASKED))
     assert one.replaced == 1 and next_load(one) == ("disk", False)
 
@@ -135,7 +136,7 @@ def test_a_new_version_that_kills_or_is_refused_gives_way_to_the_last_good_one(
     one: Told, file: Path, death: object
 ) -> None:
     runs(one, file)
-    one.session.play()
+    one.session.do(PlayRun())
     file.write_text(NEW)
     one.tell(Loading("", saved(one).number))
     if death is HANDED_OVER:
@@ -152,7 +153,7 @@ def test_a_new_version_that_kills_or_is_refused_gives_way_to_the_last_good_one(
 
 def test_what_fails_in_a_fresh_worker_gives_way_to_the_version_that_ran(one: Told, file: Path) -> None:
     runs(one, file)
-    one.session.versions.reload()
+    one.session.do(ReloadFile())
     one.tell(NewProcessNeeded("a class", True))
     one.die(HANDED_OVER)
     (load,) = [request for request in one.greet() if isinstance(request, Load)]
@@ -170,7 +171,7 @@ def test_a_save_is_not_lost_with_the_worker_that_dies_before_it_takes_it(one: To
     runs(one, file)
     one.die()
     assert next_load(one) == (GOOD, True)
-    one.session.versions.reload()
+    one.session.do(ReloadFile())
     one.die()
     assert next_load(one) == ("disk", True), "it died at the version that was brought back"
     runs(one, file)
@@ -182,12 +183,12 @@ def test_a_version_that_crashes_soon_and_again_gives_way_to_the_one_before(
     one: Told, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs(one, file)
-    one.session.versions.reload()
+    one.session.do(ReloadFile())
     one.tell(Loading("", 2))
     runs(one, file, NEW, "patched")
     one.die()
     assert next_load(one) == (NEW, True)
-    monkeypatch.setattr(versions, "_PROVEN_SECONDS", -1.0)  # from now on it had worked for long enough
+    monkeypatch.setattr(recovery, "_PROVEN_SECONDS", -1.0)  # from now on it had worked for long enough
     for _ in range(3):
         runs(one, file, NEW)
         one.die()
@@ -214,11 +215,11 @@ def test_a_version_that_crashes_soon_and_again_gives_way_to_the_one_before(
 
 def test_after_too_many_deaths_a_reload_starts_another_worker(one: Told, file: Path) -> None:
     runs(one, file)
-    one.session.versions.reload("rebuilt")
+    one.session.do(RebuildScene())
     (load,) = one.asked(Load)
     assert load.level == "rebuilt" and one.replaced == 0
     one.die(replace(DEATH, gives_up=True))
-    one.session.versions.reload()
+    one.session.do(ReloadFile())
     assert one.asked(Load) == [] and one.replaced == 1 and next_load(one) == ("disk", True)
 
 
@@ -227,28 +228,29 @@ def test_workers_do_not_die_for_ever(events: list[str]) -> None:
     """Between two saves only so many processes are started, whatever happens to them."""
     task = description(table_scene(1)[0])
     good, new = ({"push.py": text} for text in (GOOD, NEW))
-    recovery = Recovery(lambda: b"newest")
-    recovery.next_load()
+    newest = lambda: b"newest"  # noqa: E731
+    now = Recovery().next_load(newest)[0]
     for source in (good, new):
-        recovery.began(recovery.file_requested().number)
-        recovery.loaded(replace(task, source=source))
+        now, load = now.file_requested(newest)
+        now = now.began(load.number).loaded(replace(task, source=source), 0.0)
     loads = 0
     for event in events:
         if event == "saved":
-            recovery.file_requested()
+            now, _ = now.file_requested(newest)
             loads = 0
         elif event == "began":
-            recovery.began(10**6)
-        elif event == "loaded" and recovery.loading:
-            recovery.loaded(replace(task, source=recovery.good_source or good))
+            now = now.began(10**6)
+        elif event == "loaded" and now.loading:
+            now = now.loaded(replace(task, source=now.good_source or good), 0.0)
         elif event == "failed":
-            recovery.failed(kept=False)
+            now, _ = now.failed(False, newest)
         elif event in ("died", "handed over"):
-            recovery.died(crashed=event == "died", idle=True)
-            loads += event == "died" and recovery.next_load() is not None
+            now = now.died(event == "died", True, 0.0, newest)
+            if event == "died":
+                now, next_one = now.next_load(newest)
+                loads += next_one is not None
         assert loads <= 8
-    recovery.began(10**6)
+    now, last = now.began(10**6), None
     for _ in range(8):
-        recovery.died(crashed=True)
-        last = recovery.next_load()
+        now, last = now.died(True, False, 0.0, newest).next_load(newest)
     assert last is None

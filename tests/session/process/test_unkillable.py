@@ -20,6 +20,8 @@ import pytest
 from tests.drive.session import live_session, runs, save, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import calm, edit, line_of, provocation, provoke, write_task
+from workbench.commands.run import Interrupt, PauseRun, PlayRun, ReloadFile, RestartWorker, Step
+from workbench.commands.timeline import ContinueFromHere
 from workbench.jobs.task import TaskOptions
 from workbench.recording.rerun.read import read_properties
 from workbench.session.live.session import Session
@@ -28,6 +30,7 @@ from workbench.session.process import supervisor
 from workbench.session.process.heartbeat import INTERRUPT_SIGNAL
 from workbench.session.process.supervisor import WorkerOptions
 from workbench.session.process.worker_process import signal_main_thread
+from workbench.session.run.run import EnvsReset, MomentShown
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -61,9 +64,9 @@ def risky_session(soon: None, file: Path, tmp_path_factory: pytest.TempPathFacto
 def session(risky_session: Session, file: Path) -> Iterator[Session]:
     """The session at rest at step 3 of an episode, with the file as it is on disk."""
     session = risky_session
-    session.pause()
+    session.do(PauseRun())
     steps = session.view().step_serial
-    session.reset()
+    session.happen(EnvsReset())
     wait_until(session, lambda v: v.step_serial > steps and not v.step.elapsed_steps.any(), "the reset")
     step(session, 3)
     wait_until(session, lambda v: v.problem is None and v.busy is None, "calm")
@@ -89,20 +92,20 @@ def test_a_loop_in_a_step_is_told_and_can_be_left_with_its_traceback(
 ) -> None:
     before, worker = session.view(), session.worker_pid
     provoke(file, place, "loop")
-    session.step()
+    session.do(Step())
     busy = wait_until(session, lambda v: v.busy is not None, "busy").busy
     assert place in busy.doing and busy.seconds >= supervisor._BUSY and not busy.ignores_interrupt
     assert busy.file == str(file) and busy.code in ("while True:", "pass")
-    session.step()
-    session.step()
-    session.play()
-    session.interrupt()
+    session.do(Step())
+    session.do(Step())
+    session.do(PlayRun())
+    session.do(Interrupt())
     view = wait_until(session, lambda v: v.problem is not None and v.busy is None, "the interrupt")
     assert view.problem.stage == place and view.problem.interrupted
     assert view.problem.file == str(file) and f'hazard("{place}")' in view.problem.traceback
     calm(file)
     # Nothing of the step that was left remains: the next one is the one that it would have been.
-    session.step()
+    session.do(Step())
     view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the fourth step")
     assert view.problem is None and session.worker_pid == worker and view.task_serial == before.task_serial
 
@@ -111,24 +114,24 @@ def test_a_loop_in_the_middle_of_a_replay_is_left_and_the_batch_is_where_it_was(
     session: Session, file: Path
 ) -> None:
     before, worker = step(session, 3), session.worker_pid
-    session.past.seek(before.timeline.last - 2)
+    session.happen(MomentShown(before.timeline.last - 2))
     provoke(file, "evaluate", "loop")
-    session.past.continue_from_shown("all")
+    session.do(ContinueFromHere(scope="all"))
     wait_until(session, lambda v: v.busy is not None, "busy")
-    session.interrupt()
+    session.do(Interrupt())
     view = wait_until(session, lambda v: v.problem is not None and v.busy is None, "the interrupt")
     assert view.problem.interrupted and view.problem.file == str(file) and view.problem_at_run
     assert view.timeline.last == before.timeline.last, "it went nowhere"
     calm(file)
-    session.step()
+    session.do(Step())
     view = wait_until(session, lambda v: v.timeline.last > before.timeline.last, "the next step")
     assert (
         view.step.elapsed_steps.tolist() == [7, 7] and view.problem is None and session.worker_pid == worker
     )
     # What was asked for then can be asked for again, and comes to the moment.
-    session.past.seek(before.timeline.last - 2)
+    session.happen(MomentShown(before.timeline.last - 2))
     shown, last = session.view().step.poses, view.timeline.last
-    session.past.continue_from_shown("all")
+    session.do(ContinueFromHere(scope="all"))
     view = wait_until(session, lambda v: v.timeline.last > last, "the going back")
     assert view.step.elapsed_steps.tolist() == [4, 4]
     np.testing.assert_allclose(view.step.poses, shown, atol=1e-5)
@@ -144,14 +147,14 @@ def test_a_loop_in_a_load_can_be_left_and_the_last_good_version_stays(
     provoke(file, place, "loop")
     edit(file)
     wait_until(session, lambda v: v.busy is not None and v.busy.file == str(file), "busy")
-    session.interrupt()
+    session.do(Interrupt())
     view = wait_until(session, lambda v: v.problem is not None, "the interrupt")
     assert view.problem.stage == place and view.problem.file == str(file)
     assert view.stale and view.task_serial == before.task_serial
     calm(file)
-    session.step()
+    session.do(Step())
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
-    session.versions.reload()
+    session.do(ReloadFile())
     wait_until(session, lambda v: v.problem is None and not v.stale, "the new version")
 
 
@@ -161,7 +164,7 @@ def test_a_hang_that_a_save_waits_for_is_left_and_the_new_version_loaded_where_i
 ) -> None:
     before, worker = session.view(), session.worker_pid
     provoke(file, "evaluate", "loop")
-    session.step()
+    session.do(Step())
     wait_until(session, lambda v: v.busy is not None, "busy")
     calm(file)
     edit(file)
@@ -178,14 +181,14 @@ def test_what_cannot_be_interrupted_is_said_and_a_restart_brings_the_moment_back
 ) -> None:
     before = session.view()
     provoke(file, "evaluate", what)
-    session.step()
+    session.do(Step())
     wait_until(session, lambda v: v.busy is not None, "busy")
     if what != "half":  # a message that stops in the middle
-        session.interrupt()
+        session.do(Interrupt())
         busy = wait_until(session, lambda v: v.busy and v.busy.ignores_interrupt, "that it is deaf").busy
         assert busy.file == str(file) and 'hazard("evaluate")' in busy.traceback
     calm(file)
-    session.versions.restart_worker()
+    session.do(RestartWorker())
     assert back(session, before).problem is None, "the file as it is now is not the one that hung"
 
 
@@ -239,7 +242,7 @@ def test_a_death_is_told_with_its_line_and_the_moment_comes_back(
 ) -> None:
     before, worker = another_version(session, file), session.worker_pid
     provoke(file, "evaluate", what)
-    session.step()
+    session.do(Step())
     wait_until(session, lambda v: v.problem is not None and v.problem.stage == "worker", "the death")
     calm(file)
     if what == "thread":  # it ends a while after the step
@@ -263,7 +266,7 @@ def test_a_new_version_that_kills_whoever_imports_it_costs_one_worker(session: S
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the last good version")
     assert view.stale and "SIGSEGV" in view.problem.message
     assert view.problem.line == len(good.splitlines()) + 3
-    session.step()
+    session.do(Step())
     view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
     assert view.problem is not None, "the file is still broken"
     save(session, file, good)
@@ -273,11 +276,11 @@ def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, file
     written = another_version(session, file).recording.episodes_written
     session.start_recording((1,))
     for count in (1, 2, 3, 4, 5):
-        session.step()
+        session.do(Step())
         wait_until(session, lambda v, n=count: v.recording.steps == n, f"recorded step {count}")
     before, worker = session.view(), session.worker_pid
     provoke(file, "reward", "kill")
-    session.step()
+    session.do(Step())
     view = wait_until(session, lambda v: v.recording.episodes_written > written, "the file")
     calm(file)
     assert not view.recording.active and view.recording.problem is None
@@ -376,7 +379,7 @@ def test_a_task_file_that_is_no_file_any_more_is_told_and_the_mended_one_loaded(
         view = wait_until(session, lambda v: v.problem is not None, "the problem")
         named = "/dev/zero" if what == "device" else str(file)
         assert named in view.problem.message and view.task_serial == before.task_serial
-        session.step()
+        session.do(Step())
         wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
         assert psutil.Process().memory_info().rss - resident < 200 * 2**20
     finally:
@@ -388,7 +391,7 @@ def test_a_task_file_that_is_no_file_any_more_is_told_and_the_mended_one_loaded(
 def test_a_flood_of_prints_is_counted_and_its_end_kept(session: Session, file: Path) -> None:
     session.clear_printed()
     provoke(file, "evaluate", "flood")
-    session.step()
+    session.do(Step())
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the step behind the flood")
     # The slower it is drained the more lines are kept for a while; those are pushed out by newer ones, and not counted.
     view = wait_until(session, lambda v: v.printed.dropped > 150_000, "most of the flood")
@@ -417,7 +420,7 @@ def test_a_task_that_goes_to_another_folder_is_reloaded_and_recorded_as_before(
         )
         session.start_recording()
         wait_until(session, lambda v: v.recording.active, "the recording")
-        session.step()
+        session.do(Step())
         wait_until(session, lambda v: v.recording.steps == 1, "a recorded step")
         session.stop_recording()
         view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the file")

@@ -15,6 +15,7 @@ import pytest
 
 from tests.drive.session import BASE, TASKS, camera, live_session, moved, step, wait_until
 from workbench.authoring.loading.load import load_task
+from workbench.commands.run import Step
 from workbench.recording.episode.episode import Episode
 from workbench.recording.lerobot.export import ExportOptions, export_lerobot
 from workbench.recording.lerobot.format import WORKBENCH_FILE
@@ -22,6 +23,7 @@ from workbench.recording.maniskill.export import export_maniskill
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.run import EnvsReset
 
 STEPS = 4
 EYE = "eye=[0.45, 0, 0.6]"
@@ -104,10 +106,10 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
 def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> None:
     count = session.view().recording.episodes_written
     for steps in (3, 1):
-        session.reset()
+        session.happen(EnvsReset())
         for made in range(steps):
             session.change(action_source="random" if made == 0 else "hold")
-            session.step()
+            session.do(Step())
         wait_until(session, lambda view, n=steps: elapsed(view) == n, "the steps")
     session.save_past((0,), before=True)
     kept = written(session, count + 1)[-1]
@@ -129,7 +131,7 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
 @pytest.mark.slow
 def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it(session: Session) -> None:
     count = session.view().recording.episodes_written
-    session.reset()
+    session.happen(EnvsReset())
     wait_until(session, lambda view: elapsed(view) == 0, "a reset")
     step(session, 2)
     played = wait_until(session, lambda view: elapsed(view) == 2, "the steps")
@@ -191,12 +193,12 @@ def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session)
     step(session, 1)
     view = wait_until(session, lambda view: view.recording.waiting == 1, "the waiting")
     assert view.recording.active and view.recording.steps == 0
-    session.reset((1,))
+    session.happen(EnvsReset((1,)))
     wait_until(session, lambda view: view.recording.waiting == 0, "the reset")
     step(session, 1)
     session.change(action_source="zero")
     step(session, 1)
-    session.reset((1,))
+    session.happen(EnvsReset((1,)))
     wait_until(session, lambda view: not view.recording.active, "its end")
     session.change(action_source="random")
     step(session, 1)

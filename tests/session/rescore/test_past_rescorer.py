@@ -16,10 +16,12 @@ import pytest
 
 from tests.drive.session import TASKS, background_pid, live_session, moments_of, wait_until
 from tests.drive.waiting import until
+from workbench.commands.run import PauseRun, PlayRun, RebuildScene
 from workbench.session.history.history import Moment
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.rescore.background import RescoreView, StoppedBy
+from workbench.session.run.run import EnvsReset
 
 N = 3
 ORIGINAL = (
@@ -46,21 +48,21 @@ class Desk:
     def record(self, steps: int) -> list[Moment]:
         """Start anew with the original, play, and stop at the first moment of new episodes; the whole record."""
         session = self.session
-        session.pause()
+        session.do(PauseRun())
         self.file.write_text(ORIGINAL)
         wait_until(session, lambda v: v.task.source[str(self.file)] == ORIGINAL, "the original")
-        session.versions.reload("rebuilt")
+        session.do(RebuildScene())
         first = session.view().timeline.last
         wait_until(session, lambda v: v.timeline.first > first and v.timeline.moments == 1, "a new history")
         session.rescorer.stop()
         wait_until(session, lambda v: v.rescored.state not in ("loading", "rescoring"), "its end")
         session.change(speed=math.inf)
-        session.play()
+        session.do(PlayRun())
         wait_until(session, lambda v: v.timeline.moments >= steps, "the steps")
-        session.pause()
+        session.do(PauseRun())
         wait_until(session, lambda v: not v.playing, "the pause")
         last = session.view().timeline.last
-        session.reset()
+        session.happen(EnvsReset())
         wait_until(session, lambda v: v.timeline.last > last and v.step.elapsed_steps.max() == 0, "the reset")
         return moments_of(session)
 
@@ -174,11 +176,11 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
     desk.rescored("rescoring")
     session = desk.session
     session.change(speed=1.0)
-    session.play()
+    session.do(PlayRun())
     last = session.view().timeline.last
     view = wait_until(session, lambda v: v.timeline.last > last + 10, "the worker that plays")
     assert view.rescored.state == "rescoring"
-    session.pause()
+    session.do(PauseRun())
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 4")
     # That the first is told as stopped is seen for as long as the process takes to come back, which may be no time.

@@ -10,8 +10,11 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import live_session, wait_until
+from workbench.commands.run import Step
+from workbench.commands.timeline import ContinueFromHere
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.run.run import MomentShown, PagesCounted, PastPicturesWanted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -43,7 +46,7 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
         (cube,) = (number for number, name in view.task.segmentation.items() if name == "cube")
         column = view.task.geometry.body_names.index("cube")
         session.change(cameras=(CameraRequest(CAMERA[1], "sensor", ("rgb", "segmentation")),))
-        session.set_clients(1)
+        session.happen(PagesCounted(1))
 
         def shows_cube(view: SessionView) -> bool:
             segmentation = view.pictures[CAMERA].segmentation
@@ -56,7 +59,7 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
         for env, seen in ((0, True), (1, False), (0, True)):
             session.change(selected_env=env)
             step = session.view().step.elapsed_steps[0]
-            session.step()
+            session.do(Step())
             wait_until(session, lambda v, n=step: v.step.elapsed_steps[0] > n, "a step")
             view = wait_until(session, lambda v, env=env: drawn(v, env), "a picture")
             assert shows_cube(view) == seen
@@ -64,11 +67,11 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
         # A moment of the past, and on from there.
         session.change(selected_env=1)
         past = session.view().timeline.first
-        session.past.seek(past)
-        session.past.draw()
+        session.happen(MomentShown(past))
+        session.happen(PastPicturesWanted())
         view = wait_until(session, lambda v: v.timeline.shown == past and drawn(v, 1), "a picture of then")
         assert not shows_cube(view)
         last = view.timeline.last
-        session.past.continue_from_shown("all")
+        session.do(ContinueFromHere(scope="all"))
         view = wait_until(session, lambda v: v.timeline.last > last and drawn(v, 1), "a picture of now")
         assert view.timeline.shown is None and not shows_cube(view)

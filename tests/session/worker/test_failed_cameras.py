@@ -12,6 +12,7 @@ import pytest
 from tests.drive.session import TASKS, live_session, step, wait_until
 from workbench.core.camera_data import CameraKey
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.run.run import PagesCounted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -69,7 +70,7 @@ def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
         session.change(
             cameras=(CameraRequest(SENSOR[1], "sensor", ("depth",)), CameraRequest(HUMAN[1], "human"))
         )
-        session.set_clients(1)
+        session.happen(PagesCounted(1))
         view = wait_until(session, lambda v: SENSOR in v.failed_cameras and HUMAN in v.pictures, "both")
         assert f"{file}:{line}" in view.failed_cameras[SENSOR] and [*view.failed_cameras] == [SENSOR]
         # Of the recording it is left out.
@@ -93,7 +94,7 @@ def test_a_picture_that_never_comes(tmp_path: Path) -> None:
     file = task(tmp_path, HANGS)
     with live_session(file, tmp_path / "recordings", draw=True, render_backend="cpu") as session:
         session.change(cameras=(CameraRequest(HUMAN[1], "human"),))
-        session.set_clients(1)
+        session.happen(PagesCounted(1))
         view = wait_until(session, lambda v: HUMAN in v.failed_cameras, "the end of the picture")
         assert any(HUMAN[1] in line and str(file) in line for line in view.printed.texts)
         wait_until(session, lambda v: v.state == "paused", "the next worker")

@@ -17,11 +17,14 @@ from hypothesis import strategies as st
 
 from tests.drive.live import Live
 from tests.drive.panels import Clock
-from tests.drive.session import BASE, Told, told_session
+from tests.drive.session import BASE, Told, seek_by, told_session
 from workbench.authoring.problem import Problem
 from workbench.commands.page import TellUnfolded
+from workbench.commands.run import PauseRun, PlayRun, ReloadFile, SetSeed, Step
+from workbench.commands.timeline import ContinueFromHere, UndoReset
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest, LoadFailed, Loading, Status
+from workbench.session.run.run import MomentShown
 from workbench.ui.live.env_panel import TABLE
 
 PROBLEM = Problem("step", "KeyError: 'goal'", "push.py", 7, None, "Traceback")
@@ -60,13 +63,13 @@ EVENTS = st.one_of(
     act("dies", lambda told: told.die()),
 )
 COMMANDS = st.one_of(
-    act("play", lambda told: told.session.play()),
-    act("pause", lambda told: told.session.pause()),
-    act("step", lambda told: told.session.step()),
-    act("undo", lambda told: told.session.past.undo()),
-    act("go on from here", lambda told: told.session.past.continue_from_shown("all")),
-    st.integers(-20, 20).map(lambda by: (f"{by} along", lambda told: told.session.past.seek_by(by))),
-    st.integers(-2, 40).map(lambda at: (f"seek {at}", lambda told: told.session.past.seek(at))),
+    act("play", lambda told: told.session.do(PlayRun())),
+    act("pause", lambda told: told.session.do(PauseRun())),
+    act("step", lambda told: told.session.do(Step())),
+    act("undo", lambda told: told.session.do(UndoReset())),
+    act("go on from here", lambda told: told.session.do(ContinueFromHere(scope="all"))),
+    st.integers(-20, 20).map(lambda by: (f"{by} along", lambda told: seek_by(told.session, by))),
+    st.integers(-2, 40).map(lambda at: (f"seek {at}", lambda told: told.session.happen(MomentShown(at)))),
     st.integers(-1, 5).map(lambda env: (f"select {env}", lambda told: told.session.change(selected_env=env))),
     act(
         "watch a camera",
@@ -74,8 +77,8 @@ COMMANDS = st.one_of(
     ),
     act("place a camera", places),
     act("undo a placement", lambda told: told.session.studio.undo()),
-    st.integers(0, 9).map(lambda seed: (f"seed {seed}", lambda told: told.session.set_seed(seed))),
-    act("reload", lambda told: told.session.versions.reload()),
+    st.integers(0, 9).map(lambda seed: (f"seed {seed}", lambda told: told.session.do(SetSeed(seed=seed)))),
+    act("reload", lambda told: told.session.do(ReloadFile())),
 )
 SEQUENCES = st.lists(st.one_of(EVENTS, COMMANDS), min_size=1, max_size=25)
 
@@ -102,8 +105,7 @@ def page() -> Iterator[Live]:
 
 
 def draw(live: Live, told: Told) -> None:
-    past = told.session.past
-    live.session.answers |= {"past.strip": past.strip, "past.episode": past.episode}
+    live.session.answers["look"] = told.session.look
     live.show(told.view, told.session.env_rows())
 
 

@@ -16,6 +16,7 @@ from tests.drive.waiting import until
 from tests.ui.scenes import problem
 from workbench.authoring.loading.reference import TaskName
 from workbench.commands.review import ReturnToFirstTask
+from workbench.commands.run import PlayRun
 from workbench.jobs.task import TaskOptions
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
@@ -121,7 +122,7 @@ def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason
 
 
 def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_yes(desk: Desk) -> None:
-    desk.live.play()
+    desk.live.do(PlayRun())
     until(lambda: desk.live.view().playing, "the play")
     desk.go(1)
     until(lambda: desk.person.asked, "the question")

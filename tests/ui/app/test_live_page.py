@@ -14,7 +14,7 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.session import TASKS, wait_until
 from tests.ui.tabs import handshake, messages_in
 from workbench.commands.envs import ToggleOnlySelected
-from workbench.commands.run import ResetAll
+from workbench.commands.run import PauseRun, PlayRun, ResetAll, Step
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -103,7 +103,7 @@ def test_a_step_moves_the_robots_and_fills_the_numbers(opened: Opened) -> None:
     before = hand.batched_positions.copy()
     opened.session.change(action_source="random")
     serial = opened.session.view().step_serial
-    opened.session.step()
+    opened.session.do(Step())
     wait_until(opened.session, lambda view: view.step_serial > serial, "a step")
     opened.draw()
     assert (hand.batched_positions != before).any(axis=1).all()
@@ -118,7 +118,7 @@ def test_while_steps_go_on_a_press_is_shown_at_once_and_the_robots_move_with_eve
     opened.load()
     hand, session = opened.panels.bodies("panda_hand")[0], opened.session
     session.change(action_source="random")
-    session.play()
+    session.do(PlayRun())
     wait_until(session, lambda view: view.state == "running" and view.steps_per_second > 0, "the play")
     for _ in range(2):
         opened.page.redraw()
@@ -130,7 +130,7 @@ def test_while_steps_go_on_a_press_is_shown_at_once_and_the_robots_move_with_eve
     session.change(selected_env=1)
     opened.page.redraw()
     assert opened.panels.field("Selected").value == 1
-    session.pause()
+    session.do(PauseRun())
     opened.page.redraw()
     assert opened.panels.part("Run").shows("Play")
     wait_until(session, lambda view: view.state == "paused", "the pause")

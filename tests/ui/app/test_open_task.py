@@ -14,6 +14,7 @@ from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.scenes import camera as camera_info
 from workbench.authoring.loading.reference import TaskName
+from workbench.commands.run import PauseRun, PlayRun
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import KeptWork, Session
@@ -198,9 +199,9 @@ def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
     desk.choose("push.py")
     session = desk.session_of("push.py")
     until(desk.place.is_idle, "a paused task")
-    session.play()
+    session.do(PlayRun())
     until(lambda: not desk.place.is_idle(), "a task that plays")
-    session.pause()
+    session.do(PauseRun())
     until(desk.place.is_idle, "a paused task")
     monkeypatch.setattr(workplace, "ENOUGH_MEMORY", 1 << 60)
     assert not desk.place.is_idle()

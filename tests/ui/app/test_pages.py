@@ -17,6 +17,7 @@ from tests.drive.panels import Panels, held_by
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import tabs_of
+from workbench.commands.run import PlayRun
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.ui.app.workplace import Workplace
@@ -52,7 +53,7 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
     session = place.session
     assert session is not None
     place.pages.start("live")
-    session.play()
+    session.do(PlayRun())
     seen: dict[str, list[dict[str, int]]] = {"live": [], "review": []}
     threads: list[int] = []
     for number in range(SWAPS):

@@ -11,8 +11,10 @@ from tests.drive.scripted import scripted
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import camera_message, handshake, messages_in
+from workbench.commands.run import Step
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
+from workbench.session.run.run import EnvsReset
 from workbench.ui.app.workplace import Which, Workplace
 from workbench.ui.server.gated_server import GatedServer
 
@@ -54,11 +56,11 @@ def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServ
             until(lambda number=number: tells(number), "the notice")
         # What is refused at a moment is told too, and not kept for the moments after it.
         begun = session.view().timeline.moments
-        session.reset()
+        session.happen(EnvsReset())
         wait_until(session, lambda view: view.timeline.moments > begun, "the reset")
         session.save_past(before=True)
         assert session.view().recording.saving.failed
-        session.step()
+        session.do(Step())
         wait_until(session, lambda view: not view.recording.saving.message, "the message's end")
     assert len(told) == 2
     place.close()

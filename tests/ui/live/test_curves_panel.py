@@ -11,11 +11,11 @@ import pytest
 from tests.drive.live import Live
 from tests.ui.scenes import running, step_of
 from workbench.commands.run import ToggleCurve
-from workbench.commands.timeline import SeekOnCurve
+from workbench.commands.timeline import Seek, SeekOnCurve
 from workbench.core.env.step_result import StepResult
 from workbench.session.history.curves import Curves, Group, StepCurves
-from workbench.session.live.timeline import TimelineView
 from workbench.session.live.view import SessionView
+from workbench.session.run.past import TimelineView
 
 JOINTS = ("hinge", "slide")
 
@@ -145,7 +145,7 @@ def test_a_click_on_a_curve_asks_for_its_step_and_one_that_is_forgotten_is_named
     view = seen(50, 2)
     live.show(view)
     live.do(SeekOnCurve(step=7))
-    assert live.asked == [("past.seek_tick", 7)]
+    assert live.asked == [Seek(step=7)]
     kept = TimelineView(30, 50, 30, tick=31)
     live.show(replace(view, timeline=kept))
     assert (

@@ -22,6 +22,7 @@ from workbench.commands.envs import (
 )
 from workbench.commands.page import ToggleTable
 from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
+from workbench.session.run.run import EpisodeStepShown, SettingsChanged
 from workbench.ui.live.env_panel import MOST_ROWS
 
 pytestmark = pytest.mark.thorough
@@ -87,9 +88,9 @@ def test_pages_filters_and_rows_are_pressed(table: Table) -> None:
     assert table.envs() == list(range(MOST_ROWS))
     assert table.ask(TurnEnvs(by=1)) == list(range(MOST_ROWS, MANY))
     table.ask(ShowEnvAtEvent(env=MANY - 3))
-    assert table.live.asked == [("change", {"selected_env": MANY - 3})], "there is no moment to go to"
+    assert table.live.asked == [SettingsChanged({"selected_env": MANY - 3})], "there is no moment to go to"
     table.ask(ShowEnvAtEvent(env=MANY - 1))
-    assert table.live.asked[1:] == [("change", {"selected_env": MANY - 1}), ("past.seek_step", MANY - 1, 12)]
+    assert table.live.asked[1:] == [EpisodeStepShown(MANY - 1, 12)]
     table.live.do(TurnEnvs(by=1))  # it is pressed on a page that was drawn before the last one was shown
     table.live.again()
     assert table.envs() == list(range(MOST_ROWS, MANY))
@@ -143,7 +144,8 @@ def test_keys_go_round_the_envs_that_failed_and_that_are_flagged(table: Table) -
         table.live.asked.clear()
         table.show(env=env)
         table.live.do(command)
-        return table.live.asked[0][1]["selected_env"]
+        (asked,) = table.live.asked
+        return asked.env if isinstance(asked, EpisodeStepShown) else asked.values["selected_env"]
 
     assert [after(env, NextFailedEnv()) for env in (0, 1, MANY - 1)] == [1, 3, 1]
     assert [after(env, NextFlaggedEnv()) for env in (0, MANY - 2, MANY - 1)] == [

@@ -7,10 +7,10 @@ from typing import Any
 
 from tests.drive.live import Live
 from tests.ui.scenes import running
-from workbench.session.live.timeline import TimelineView
 from workbench.session.process.jobs import JobProgress
 from workbench.session.record.live import RecordingStatus
 from workbench.session.record.save_past import SaveStatus
+from workbench.session.run.past import TimelineView
 from workbench.ui.live.episodes_panel import (
     ALL_ENVS,
     NEXT,

@@ -9,6 +9,7 @@ import pytest
 from tests.drive.live import Live
 from tests.ui.scenes import running
 from workbench.core.capture.inspection import Inspection, JointReadings, Leaf, Touching
+from workbench.session.run.run import InspectionWanted
 from workbench.ui.live.inspect_panel import (
     CHOICES,
     LONGEST,
@@ -138,7 +139,7 @@ def test_only_what_is_chosen_is_read_and_contacts_for_the_arrows(live_page: Live
     def read() -> list[object]:
         live_page.show(running(2, step_serial=len(asked)))
         asked.extend(live_page.asked_by_drawing)
-        return [call[1] for call in live_page.asked_by_drawing if call[0] == "inspect"]
+        return [call.sections for call in live_page.asked_by_drawing if isinstance(call, InspectionWanted)]
 
     asked: list[object] = []
     inspect = live_page.part("Inspect")

@@ -11,11 +11,21 @@ import pytest
 
 from tests.drive.live import Live
 from tests.ui.scenes import EMPTY, PLAN, problem, running
-from workbench.commands.run import ChooseClass, FillEmptyFile
+from workbench.commands.run import (
+    ChooseClass,
+    FillEmptyFile,
+    Interrupt,
+    RebuildScene,
+    ReloadCameras,
+    ReloadCode,
+    ReloadFile,
+    RestartWorker,
+)
 from workbench.session.live.solver import SolveView
-from workbench.session.live.view import PastLoad, SessionView
+from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy, busy_at
 from workbench.session.protocol.messages import ReloadReport
+from workbench.session.run.run import PastLoad
 from workbench.ui.live.banners import FILL, INTERRUPT, NEW_WORKER, REBUILD, RELOAD, RESTART, SHOWN_AFTER
 from workbench.ui.live.version_panel import MOST_SHOWN
 
@@ -29,7 +39,7 @@ LOOP = Busy(6.4, "in evaluate", "/home/me/push.py", 88, "while True:", "Tracebac
 def live(open_live: Live) -> Iterator[Live]:
     open_live.show(EMPTY)
     open_live.asked.clear()
-    open_live.session.answers["versions.knows_file"] = lambda file: True
+    open_live.session.answers["knows_file"] = lambda file: True
     yield open_live
 
 
@@ -100,15 +110,15 @@ def test_what_can_be_done_about_it_is_offered(live: Live, stage: str, offered: b
         part.press(REBUILD)
     if stage == "worker":
         part.press(NEW_WORKER)
-    wanted = [("versions.reload",), *([("versions.reload", "rebuilt")] if offered else [])]
-    assert live.asked == [*wanted, *([("versions.restart_worker",)] if stage == "worker" else [])]
+    wanted = [ReloadFile(), *([RebuildScene()] if offered else [])]
+    assert live.asked == [*wanted, *([RestartWorker()] if stage == "worker" else [])]
 
 
 def test_an_empty_file_is_filled_by_a_press_and_only_while_it_is_empty(live: Live, tmp_path: Path) -> None:
     file, other = tmp_path / "stack_two.py", tmp_path / "other.py"
     file.write_text("# mine\n\n")
     other.touch()
-    live.session.answers["versions.knows_file"] = str(file).__eq__
+    live.session.answers["knows_file"] = str(file).__eq__
     view = replace(EMPTY, problem=replace(problem(), file=str(file)), problem_serial=1, state="error")
     live.show(view)
     assert live.shows(FILL) and file.read_text() == "# mine\n\n"
@@ -137,7 +147,7 @@ def test_what_takes_long_can_be_ended_and_stands_instead_of_a_problem(live: Live
     assert not banner(live) and "Traceback ..." not in html
     busy.press(INTERRUPT)
     busy.press(RESTART)
-    assert live.asked == [("interrupt",), ("versions.restart_worker",)]
+    assert live.asked == [Interrupt(), RestartWorker()]
     live.show(running(2, busy=replace(LOOP, ignores_interrupt=True)))
     assert not busy.shows(INTERRUPT) and busy.shows(RESTART) and "Traceback ..." in busy.html()
     live.show(running(2, busy=Busy(6.0, EVIL, f"/{EVIL}.py", 1, EVIL, EVIL, ignores_interrupt=True)))
@@ -265,11 +275,9 @@ def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fail
     task = live.part("Code version")
     assert task.field("Task").value == "TwoEnv" and list(task.field("Task").options) == ["OneEnv", "TwoEnv"]
     task.set("Task", "OneEnv")
-    assert live.asked[-1] == ("versions.choose_class", "OneEnv")
+    assert live.asked[-1] == ChooseClass(name="OneEnv")
     live.show(running(4, choices=("OneEnv", "TwoEnv")))
     assert task.field("Task").value == "OneEnv"
-    live.do(ChooseClass(name="ThreeEnv"))
-    assert live.asked[-1] == ("versions.choose_class", "OneEnv") and live.client.notices
 
 
 def test_the_file_is_loaded_again_by_the_level_that_is_pressed(live: Live) -> None:
@@ -277,8 +285,7 @@ def test_the_file_is_loaded_again_by_the_level_that_is_pressed(live: Live) -> No
     part = live.part("Code version")
     for name in ("Reload", REBUILD, "Only reload code", "Only reload cameras"):
         part.press(name)
-    levels = [("versions.reload", level) for level in ("rebuilt", "patched", "cameras")]
-    assert live.asked == [("versions.reload",), *levels]
+    assert live.asked == [ReloadFile(), RebuildScene(), ReloadCode(), ReloadCameras()]
     live.show(running(4, state="stopped"))
     assert not part.shows("Reload")
 

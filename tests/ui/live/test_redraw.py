@@ -32,8 +32,7 @@ from workbench.session.checks.solve_seeds import SeedsView
 from workbench.session.history.curves import StepCurves
 from workbench.session.history.history import RESET, SUCCESS
 from workbench.session.live.solver import SolveView
-from workbench.session.live.timeline import Strip, TimelineView
-from workbench.session.live.view import PastLoad, SessionView
+from workbench.session.live.view import SessionView
 from workbench.session.process.captured_output import Printed, PrintedLine
 from workbench.session.process.heartbeat import Busy
 from workbench.session.process.jobs import JobProgress
@@ -43,6 +42,8 @@ from workbench.session.record.live import RecordingStatus
 from workbench.session.record.save_past import SaveStatus
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
+from workbench.session.run.past import Strip, TimelineView
+from workbench.session.run.run import PastLoad
 
 pytestmark = pytest.mark.thorough
 
@@ -199,7 +200,7 @@ def made() -> Live:
     live = Live(viser.ViserServer(host="127.0.0.1", port=0, verbose=False))
     tick, old = np.arange(20), np.ones(20, np.float32)
     live.session.answers |= {
-        "past.strip": lambda low, high: strip(low, high, live.session.shown.selected_env),
+        "strip": lambda low, high: strip(low, high, live.session.shown.selected_env),
         "rescorer.curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
     }
     live.do(ToggleTable())

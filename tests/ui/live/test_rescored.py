@@ -20,10 +20,11 @@ from workbench.commands.timeline import (
     TurnRescored,
 )
 from workbench.jobs.rescore.verdict import Verdict
-from workbench.session.live.timeline import TimelineView
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
+from workbench.session.run.past import TimelineView
+from workbench.session.run.run import MomentShown
 from workbench.ui.live.rescored import chart_data
 from workbench.ui.widgets.line_chart import LONGEST
 from workbench.ui.widgets.rescored import MOST_ROWS
@@ -120,7 +121,7 @@ def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(rescore
     rescored.panels.ask(ShowRescored(run=f"{last} {10 * last + 5}"))
     rescored.panels.do(ShowRescored(run="99 1"))  # there is no such run
     asked = rescored.live.asked
-    assert asked == [("show", 2, 25), ("show", last, 10 * last + 5)]
+    assert asked == [MomentShown(25, 2), MomentShown(10 * last + 5, last)]
     rescored.panels.ask(TurnRescored(by=-1))
     rescored.draw(many)
     rescored.draw(many, first=500)
@@ -139,10 +140,10 @@ def test_the_key_goes_round(rescored: Rescored) -> None:
     rescored.draw(done(episode(0), episode(1)))
     for env, moment in ((0, 5), (1, 15), (0, 5)):
         rescored.live.do(NextDifference())
-        assert rescored.live.asked[-1] == ("show", env, moment)
+        assert rescored.live.asked[-1] == MomentShown(moment, env)
         rescored.draw(done(episode(0), episode(1)), shown=moment, env=env)
     rescored.live.do(PreviousDifference())
-    assert rescored.live.asked[-1] == ("show", 1, 15)
+    assert rescored.live.asked[-1] == MomentShown(15, 1)
 
 
 def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:

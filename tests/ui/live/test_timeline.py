@@ -12,7 +12,7 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.session import wait_until
 from workbench.commands import COMMANDS
 from workbench.commands.command import Refused
-from workbench.commands.run import ResetAll
+from workbench.commands.run import ResetAll, Step
 from workbench.commands.timeline import (
     ContinueFromHere,
     GoToFirst,
@@ -25,8 +25,9 @@ from workbench.commands.timeline import (
     ZoomTimeline,
 )
 from workbench.session.live.session import Session
-from workbench.session.live.timeline import TimelineView
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.run.past import TimelineView
+from workbench.session.run.run import MomentShown, PastPicturesWanted, RunEvent
 from workbench.ui.app.live_page import Page
 
 pytestmark = pytest.mark.thorough
@@ -54,7 +55,7 @@ class EnvMoment:
     def step(self, count: int) -> None:
         for _ in range(count):
             last = self.past.last
-            self.session.step()
+            self.session.do(Step())
             wait_until(self.session, lambda view, n=last: view.timeline.last > n, "a step")
         self.draw()
 
@@ -159,12 +160,12 @@ def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived
     lived.panels.ask(ZoomTimeline(episode_only=True))
     lived.page.redraw()
     assert lived.ends() == (-2, 0, 0)
-    lived.session.step()
+    lived.session.do(Step())
     wait_until(lived.session, lambda view: view.timeline.last == 8, "a step")
-    lived.session.past.seek(6)
+    lived.session.happen(MomentShown(6))
     lived.page.redraw()
     assert lived.ends() == (-2, 0, -1), "within them: whoever holds the slider is not disturbed"
-    lived.session.past.seek(2)
+    lived.session.happen(MomentShown(2))
     lived.page.redraw()
     assert lived.ends() == (-7, -3, -5), "the episode before"
     lived.draw()
@@ -195,14 +196,22 @@ def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures(
 ) -> None:
     lived.step(3)
     lived.session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),))
-    lived.session.past.seek(1)
+    lived.session.happen(MomentShown(1))
     assert lived.past.wants_pictures
     asked: list[int | None] = []
-    monkeypatch.setattr(lived.session.past, "draw", lambda: asked.append(lived.past.shown))
+    happen = lived.session.happen
+
+    def heard(event: RunEvent) -> None:
+        if isinstance(event, PastPicturesWanted):
+            asked.append(lived.past.shown)
+        else:
+            happen(event)
+
+    monkeypatch.setattr(lived.session, "happen", heard)
     lived.page.redraw()
     lived.clock.passes(0.3)
     lived.page.redraw()
-    lived.session.past.seek(2)
+    lived.session.happen(MomentShown(2))
     for _ in range(2):
         lived.page.redraw()
         lived.clock.passes(0.3)

@@ -8,7 +8,7 @@ import pytest
 
 from tests.ui.scenes import running
 from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
-from workbench.session.live.timeline import Strip, TimelineView
+from workbench.session.run.past import Strip, TimelineView
 from workbench.ui.live.timeline import LINE_HEIGHT as HEIGHT
 from workbench.ui.live.timeline import (
     MOST_MARKS,

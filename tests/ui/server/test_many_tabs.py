@@ -18,8 +18,10 @@ from tests.drive.scripted import scripted
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import Tabs, open_deaf_tab, tabs_of
+from workbench.commands.run import PauseRun, PlayRun
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
+from workbench.session.run.run import PagesCounted, RunEvent
 from workbench.ui.app.live_page import Page
 from workbench.ui.scene.viewpoint import Stage
 from workbench.ui.server import strangers
@@ -52,9 +54,10 @@ class Told(Session):
             str(folder / "push.py"), options, recordings=folder / "recordings", make_worker=scripted(2)
         )
 
-    def set_clients(self, count: int) -> None:
-        self._told.append(count)
-        super().set_clients(count)
+    def happen(self, event: RunEvent) -> None:
+        if isinstance(event, PagesCounted):
+            self._told.append(event.count)
+        super().happen(event)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +95,7 @@ def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
     until(lambda: reads.open, "the tab that reads")
     deaf = open_deaf_tab(house.gated_server.url)
     until(lambda: house.clients() == 2, "the one that does not")
-    house.session.play()
+    house.session.do(PlayRun())
     with caplog.at_level(logging.WARNING, "workbench.door"):
         frames = reads.frames
         until(lambda: reads.frames > frames + 10, "updates for the one that reads")
@@ -101,7 +104,7 @@ def test_a_tab_that_reads_nothing_is_let_go_and_nobody_waits_for_it(
     frames = reads.frames
     until(lambda: reads.frames > frames + 10, "further updates for the one that reads")
     assert reads.open
-    house.session.pause()
+    house.session.do(PauseRun())
     deaf.close()
     house.tabs.close(reads)
 

@@ -19,6 +19,7 @@ from workbench.core.env.keywords import HowMade, Keyword
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.run import OptionsApplied
 from workbench.ui.tasks.env_options import EnvOptionsPanel, merged
 from workbench.ui.widgets.parts import Parts
 
@@ -47,11 +48,15 @@ class Form:
         task = replace(view.task, made=MADE, device="cpu, pictures on llvmpipe")
         self.view: SessionView = replace(view, task=task, options=TaskOptions(4))
         monkeypatch.setattr(session, "view", lambda: self.view)
-        monkeypatch.setattr(session.versions, "apply_options", self.applied.append)
+        monkeypatch.setattr(session, "happen", self._happens)
         self.panel = EnvOptionsPanel(panels.server, session)
         self.parts = Parts([self.panel])
         panels.visitors.do = self.parts.do
         self.draw()
+
+    def _happens(self, event: object) -> None:
+        assert isinstance(event, OptionsApplied)
+        self.applied.append(event.options)
 
     def draw(self) -> None:
         self.parts.draw(self.view)

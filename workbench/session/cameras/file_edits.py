@@ -20,12 +20,11 @@ from workbench.machine.processes.watched_thread import report_failure
 from workbench.session.cameras.edit_state import DONE, LEFT, change_text, copy, mismatch, plan
 from workbench.session.cameras.selection import StudioCameras
 from workbench.session.cameras.view import EditRequest, EditStage, EditState
-from workbench.session.history.history import ShownMoment
 from workbench.session.loop import Aside, begin, on_loop, result_of
 from workbench.session.process.askers import Asker
 from workbench.session.process.jobs import JobFailed, Jobs
-from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import DrawCamera, RunCameras
+from workbench.session.run.run import Run
 
 IN_FILE: tuple[EditStage, ...] = ("written", "checked", "mismatch")
 """Stages in which the change is in the file."""
@@ -46,8 +45,7 @@ class FileEdits:
         on_change: called when `view` has changed.
         open_copy: opens a class of a copied file in place of the task.
         asker: asks the worker that plays.
-        load: returns how the running version was loaded; None before there is one.
-        shown: returns the moment that the page shows.
+        run: returns the present run.
         patience: seconds for the worker to run the hooks: one of them may loop for ever.
     """
 
@@ -57,14 +55,13 @@ class FileEdits:
         on_change: Callable[[], None],
         open_copy: Callable[[Path, str], None],
         asker: Asker,
-        load: Callable[[], Load | None],
-        shown: Callable[[], ShownMoment],
+        run: Callable[[], Run],
         patience: float = 60.0,
     ) -> None:
         self._cameras, self._notify, self._open_copy = cameras, on_change, open_copy
         self.folder = Path.cwd()
         """Folder for a copy of a task: the one in which the program was started."""
-        self._asker, self._load, self._shown, self._patience = asker, load, shown, patience
+        self._asker, self._present, self._patience = asker, run, patience
         self._stopped = threading.Event()
         """Cancels the present question."""
         self.view = EditState()
@@ -113,7 +110,7 @@ class FileEdits:
 
     async def _draw_new(self, request: EditRequest, settings: CameraSettings) -> None:
         """Draw what a new camera would see; cancelled by the next request."""
-        moment, smaller = self._shown(), _LARGEST / min(settings.width, settings.height)
+        moment, smaller = self._present().shown_moment(), _LARGEST / min(settings.width, settings.height)
         poses = moment.of(moment.env)
         question = DrawCamera(request.key, settings, moment.env, poses=poses, scale=min(1.0, smaller))
         picture = None
@@ -130,7 +127,7 @@ class FileEdits:
     def _run(self, texts: Mapping[str, str]) -> HookCameras:
         """Run the hooks of these texts; called off the loop."""
         stopped = self._stopped = threading.Event()
-        load, deadline = self._load(), time.monotonic() + self._patience
+        load, deadline = self._present().running_load(), time.monotonic() + self._patience
         if load is None or self._closing:
             raise RefusedEdit("no task is loaded")
 

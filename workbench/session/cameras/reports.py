@@ -15,12 +15,13 @@ from workbench.core.cameras.conventions import compose
 from workbench.core.cameras.report import CameraReport, OfferedPlacement, SearchSpace, join_reports
 from workbench.session.cameras.selection import StudioCameras
 from workbench.session.cameras.view import MeasuredMoment, PickedPixel, StudioCamera, StudioResults
-from workbench.session.history.history import ShownMoment, ShownPast
+from workbench.session.history.history import ShownMoment
 from workbench.session.loop import on_loop
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.jobs import Job, JobFailed, JobProgress, Jobs
 from workbench.session.protocol.messages import Load, Reset
 from workbench.session.protocol.questions import DrawCamera, MeasureCamera, SuggestCameras
+from workbench.session.run.run import Run
 
 FIRST_SEED = 10_000
 """First seed of every report, so that two reports can be compared; far from the seeds that people start with."""
@@ -48,17 +49,15 @@ class CameraReports:
         asker: Asker,
         background: Background,
         on_change: Callable[[], None],
-        past: ShownPast,
-        load: Callable[[], Load | None],
+        run: Callable[[], Run],
     ) -> None:
         """
         Args:
             asker, background: ask the worker that plays, and the background process.
             on_change: called, on any thread, when `results` or `progress` has changed.
-            past: gives the shown moment.
-            load: returns the running version for another worker; None before there is one.
+            run: returns the present run.
         """
-        self._cameras, self._past, self._load, self._on_change = cameras, past, load, on_change
+        self._cameras, self._run, self._on_change = cameras, run, on_change
         self.results = StudioResults()
         self._live, self._background = asker, background
         self._live_jobs = Jobs(on_change, self._failed)
@@ -80,10 +79,10 @@ class CameraReports:
         """
         camera = self._selected_camera()
         if camera is not None and seeds <= 0:
-            moment = self._past.shown_moment()
+            moment = self._run().shown_moment()
             cases: list[Case] = [(env, moment.of(env), None) for env in range(moment.num_envs)]
             self._measure_live("in all envs", camera, cases, len(cases))
-        elif camera is not None and (load := self._load()) is not None:
+        elif camera is not None and (load := self._run().running_load()) is not None:
             self._measure_seeds(camera, load, min(seeds, MOST_MEASURED))
 
     @on_loop
@@ -94,7 +93,7 @@ class CameraReports:
             most: at most so many steps, evenly spread.
         """
         camera = self._selected_camera()
-        moments = self._past.episode_moments(min(max(1, most), MOST_MEASURED))
+        moments = self._run().episode_moments(min(max(1, most), MOST_MEASURED))
         if camera is not None and moments:
             cases: list[Case] = [
                 (env, step.poses[env], MeasuredMoment(moment.serial, env, int(step.elapsed_steps[env])))
@@ -187,7 +186,7 @@ class CameraReports:
             low, high: corners of the box for the eye; metres, in the frame of the camera's mount, or the env's.
             seeds: number of episodes, at most one an env.
         """
-        camera, load = self._selected_camera(), self._load()
+        camera, load = self._selected_camera(), self._run().running_load()
         if camera is not None and camera.now is None:
             self._set_problem(f"{camera.key[1]} cannot be placed: {camera.refused}.")
         if camera is None or camera.now is None or load is None:
@@ -219,7 +218,7 @@ class CameraReports:
         camera = self._selected_camera()
         if camera is None:
             return
-        key, moment, why_not = camera.key, self._past.shown_moment(), camera.refused or why_no_camera(other)
+        key, moment, why_not = camera.key, self._run().shown_moment(), camera.refused or why_no_camera(other)
 
         async def work(job: Job) -> None:
             now = await self._draw(moment, DrawCamera(key, None, moment.env))
@@ -238,7 +237,7 @@ class CameraReports:
         if camera is None:
             return
         key = camera.key
-        moment, report = self._past.shown_moment(), self.results.report_over_envs(key)
+        moment, report = self._run().shown_moment(), self.results.report_over_envs(key)
         order = list(range(moment.num_envs))
         if report is not None:
             measured = [report.envs[i] for i in report.worst_first()]
@@ -256,7 +255,7 @@ class CameraReports:
     @on_loop
     def pick(self, u: float, v: float) -> None:
         """Probe a pixel of the selected camera: 0, 0 is the upper left corner of the picture, 1, 1 the lower right one."""
-        camera, task, moment = self._selected_camera(), self._cameras.task, self._past.shown_moment()
+        camera, task, moment = self._selected_camera(), self._cameras.task, self._run().shown_moment()
         if camera is None or task is None:
             return
 

@@ -17,12 +17,12 @@ from workbench.session.cameras.file_edits import FileEdits
 from workbench.session.cameras.reports import CameraReports
 from workbench.session.cameras.selection import KeptPlacements, PlacementChange, StudioCameras
 from workbench.session.cameras.view import StudioView
-from workbench.session.history.history import ShownPast
 from workbench.session.loop import do, on_loop
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.jobs import Job, JobFailed, Jobs
-from workbench.session.protocol.messages import Load, PlaceCamera, Placed, ReloadLevel, Request
+from workbench.session.protocol.messages import PlaceCamera, Placed, ReloadLevel, Request
 from workbench.session.protocol.questions import DrawCamera
+from workbench.session.run.run import Run
 
 PREVIEW_MODALITIES = ("rgb", "depth", "segmentation")
 Previewed = tuple[StepResult | None, DrawCamera]
@@ -46,8 +46,7 @@ class CameraStudio:
         asker: Asker,
         background: Background,
         on_change: Callable[[], None],
-        past: ShownPast,
-        load: Callable[[], Load | None],
+        run: Callable[[], Run],
         open_file: Callable[[Path, str], None],
         kept: KeptPlacements | None = None,
     ) -> None:
@@ -56,18 +55,17 @@ class CameraStudio:
             send, asker: send requests to, and ask the worker that plays.
             background: asks the background process.
             on_change: called, on any thread, when `view` has changed.
-            past: gives the shown moment.
-            load: returns the running version for another worker; None while there is none.
+            run: returns the present run.
             open_file: opens a class of another file.
             kept: placements of an earlier session of the task.
         """
         self._send, self._on_change = send, on_change
-        self._shown = past.shown_moment
+        self._run = run
         self._cameras = StudioCameras(kept)
         self._asker = asker
-        self.file = FileEdits(self._cameras, self._notify, open_file, asker, load, self._shown)
+        self.file = FileEdits(self._cameras, self._notify, open_file, asker, run)
         self._serial = 0
-        self.reports = CameraReports(self._cameras, asker, background, self._notify, past, load)
+        self.reports = CameraReports(self._cameras, asker, background, self._notify, run)
         self._previews = Jobs(self._notify, self._preview_failed)
         self._preview_scale = 1.0
         self._preview: Picture | None = None
@@ -156,7 +154,7 @@ class CameraStudio:
             return
         self._previewed, self._preview_problem = (step, question), ""
 
-        question = replace(question, poses=self._shown().of(env))
+        question = replace(question, poses=self._run().shown_moment().of(env))
 
         async def work(job: Job) -> None:
             self._preview = await self._asker.ask(question)

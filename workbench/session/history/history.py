@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,18 +148,6 @@ class ShownMoment:
         return None if self.poses is None else self.poses[env]
 
 
-class ShownPast(Protocol):
-    """Gives the moments that the page shows."""
-
-    def shown_moment(self) -> ShownMoment:
-        """The shown moment."""
-        ...
-
-    def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
-        """At most so many moments of the selected env's episode that contains the shown moment."""
-        ...
-
-
 class History:
     """The moments of one built task, oldest first, append-only. Not thread-safe: its owner locks.
 
@@ -184,7 +171,7 @@ class History:
             joints: names of `StepResult.qpos`.
         """
         self._table, num_envs = table, table.rows().num_envs
-        self._num_envs = num_envs
+        self.num_envs = num_envs
         self.limit = limit
         self._moments: deque[Moment] = deque()
         self._next_serial = first_serial
@@ -220,7 +207,7 @@ class History:
         if stepped.snapshot and parts.content is not None:
             snapshot = WholeSnapshot(stepped.snapshot, parts.content)
         size = _OVERHEAD + len(stepped.snapshot) + stepped.step.nbytes
-        size += EnvRows.bytes_a_step(self._num_envs)
+        size += EnvRows.bytes_a_step(self.num_envs)
         moment = Moment(
             serial=self._next_serial,
             step=stepped.step,
@@ -340,8 +327,8 @@ class History:
 
     def rows_at(self, moment: Moment) -> EnvRows:
         """The table of the envs as it was at a moment."""
-        rewards = np.full((self._num_envs, KEPT_REWARDS), np.nan, np.float32)
-        for env in range(self._num_envs):
+        rewards = np.full((self.num_envs, KEPT_REWARDS), np.nan, np.float32)
+        for env in range(self.num_envs):
             known = self._rewards_until(env, moment, KEPT_REWARDS)
             rewards[env, KEPT_REWARDS - len(known) :] = known
         return replace(moment.rows, rewards=rewards)
@@ -496,7 +483,7 @@ class History:
         step, jumped, restored = stepped.step, stepped.reset_mask, stepped.restored
         if step.action is not None or not jumped.any():
             return step
-        reward = np.full(self._num_envs, np.nan, np.float32)
+        reward = np.full(self.num_envs, np.nan, np.float32)
         terms: dict[str, NDArray[np.float32]] = {}
 
         def take(then: StepResult, to: Sequence[int] | NDArray, of: Sequence[int] | NDArray) -> None:

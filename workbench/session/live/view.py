@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
-from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
+from workbench.core.camera_data import CameraInfo, CameraKey, Picture
 from workbench.core.capture.inspection import Inspection
 from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Finding
@@ -21,17 +21,14 @@ from workbench.session.checks.profile import ProfileView
 from workbench.session.checks.solve_seeds import SeedsView
 from workbench.session.history.curves import Curves
 from workbench.session.live.solver import SolveView
-from workbench.session.live.timeline import TimelineView
 from workbench.session.process.captured_output import NOTHING_PRINTED, Printed
 from workbench.session.process.heartbeat import Busy
 from workbench.session.process.supervisor import Vitals
-from workbench.session.protocol.messages import ReloadLevel, ReloadReport, RulesBroken, Settings
+from workbench.session.protocol.messages import ReloadReport, RulesBroken, Settings
 from workbench.session.record.live import RecordingStatus
 from workbench.session.rescore.background import RescoreView
-
-State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
-"""``starting`` the worker process; ``loading``: a task is being imported or built; ``error``: no version is loaded,
-see `SessionView.problem`; ``stopped``: there is no worker."""
+from workbench.session.run.past import TimelineView
+from workbench.session.run.run import PastLoad, Run, State
 
 
 @dataclass(frozen=True)
@@ -41,7 +38,7 @@ class ShownCameras:
     cameras: tuple[CameraInfo, ...]
     cameras_serial: int
     """Number that differs for each set of cameras."""
-    pictures: dict[CameraKey, Picture]
+    pictures: Mapping[CameraKey, Picture]
     pictures_serial: int
     segmentation: dict[int, str]
     """Names of the ids in a segmentation."""
@@ -57,20 +54,6 @@ class ShownCameras:
     """Why cameras cannot be drawn, as sentences."""
     hidden: tuple[str, ...] = ()
     """Bodies that the task hides from its sensors."""
-
-
-@dataclass(frozen=True)
-class PastLoad:
-    """One attempt to load the file."""
-
-    at: float
-    """Seconds since the epoch."""
-    level: ReloadLevel | None
-    """Level of the reload; None for the first version, and for one that was refused."""
-    reason: str
-    milliseconds: float = 0.0
-    problem: Problem | None = None
-    """Why the version was refused."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +85,7 @@ class SessionView:
     """The shown step: the newest, or a past one (`timeline`)."""
     step_serial: int = 0
     """Serial of the shown moment."""
-    pictures: dict[tuple[CameraKind, str], Picture] = field(default_factory=dict)
+    pictures: Mapping[CameraKey, Picture] = field(default_factory=dict)
     pictures_serial: int = 0
     picture_milliseconds: float | None = None
     failed_cameras: Mapping[CameraKey, str] = field(default_factory=dict)
@@ -141,7 +124,7 @@ class SessionView:
     odd: tuple[Finding, ...] = ()
     """Rules that the running version broke by outliers, one a rule."""
     inspection: Inspection | None = None
-    """The newest answer to `Session.inspect`, of the env that was selected then."""
+    """As `Run.inspection`."""
     recording: RecordingStatus = RecordingStatus()
     printed: Printed = NOTHING_PRINTED
     """The last lines that the author's code printed."""
@@ -188,3 +171,36 @@ class SessionView:
     def selected_env(self) -> int:
         """The env whose pictures and numbers are shown."""
         return self.settings.selected_env
+
+
+_OF_RUN = {one.name for one in fields(SessionView)} & {one.name for one in fields(Run)}
+"""Fields that a view has from the run as they are."""
+
+
+def view_of(run: Run, **known: Any) -> SessionView:
+    """What a page shows of the run, at the shown moment.
+
+    Args:
+        known: further fields of the view.
+    """
+    refused = run.problem if run.stale and not run.problem_at_run else None
+    now = SessionView(**{name: getattr(run, name) for name in _OF_RUN}, refused=refused, **known)
+    past = run.past
+    if past is None:
+        return now
+    view = replace(
+        now,
+        curves=past.history.steps.curves(run.env),
+        timeline=past.view(run.env, run.settings.cameras, run.settings.pictures),
+        odd=past.history.findings,
+    )
+    moment = past.shown
+    if moment is None:
+        return view
+    return replace(
+        view,
+        step=moment.step,
+        step_serial=moment.serial,
+        pictures=past.pictures(run.env),
+        told=moment.step.action,
+    )

@@ -22,6 +22,7 @@ from workbench.session.process.askers import WAITING, Background
 from workbench.session.process.jobs import Job, JobFailed, JobProgress, Jobs
 from workbench.session.protocol.messages import Load, PlaceCamera, Reset
 from workbench.session.protocol.questions import Captured, CaptureMoment
+from workbench.session.run.run import Run
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,34 @@ class SaveRequest:
     placed: tuple[PlaceCamera, ...]
     """Cameras that were placed by hand."""
     episodes: tuple[PastEpisode, ...]
+
+
+def request_of(
+    run: Run, env_idx: tuple[int, ...] | None, placed: tuple[PlaceCamera, ...], before: bool = False
+) -> SaveRequest | str:
+    """What to record of these envs (all if None): for each the episode that contains the shown moment; or the reason why
+    there is nothing.
+
+    Args:
+        placed: cameras that were placed by hand.
+        before: record the episode before that one.
+    """
+    load = run.running_load()
+    if run.task is None or run.past is None or load is None:
+        return "no task is loaded"
+    shown = run.past.shown
+    serial = None if shown is None else shown.serial
+    envs = range(run.num_envs) if env_idx is None else env_idx
+    found = {env: find_episode(run.past.history, env, serial, before) for env in envs}
+    episodes = tuple(
+        replace(episode, played_by=run.version_of(episode.moments[-1][0].serial))
+        for episode in found.values()
+        if isinstance(episode, PastEpisode)
+    )
+    if not episodes:
+        env, why = next(iter(found.items()))
+        return f"nothing was saved of env {env}: {why}"
+    return SaveRequest(run.task, load, placed, episodes)
 
 
 def find_episode(history: History, env: int, serial: int | None, before: bool = False) -> PastEpisode | str:

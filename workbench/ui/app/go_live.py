@@ -15,6 +15,7 @@ import viser
 from workbench.authoring.loading.reference import TaskName
 from workbench.commands.command import Command, Refused
 from workbench.commands.review import ChooseLiveCode, ChooseLiveEnvs, ReturnToFirstTask
+from workbench.commands.run import PauseRun
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.from_recording import (
     CannotEnterRecording,
@@ -248,7 +249,7 @@ class GoLive:
 
     def _open(self, reference: TaskName, options: TaskOptions, folder: Path | None) -> Session:
         if self._place.home is not None:
-            self._place.home.pause()
+            self._place.home.do(PauseRun())
         session = self._make(reference, options)
         self._let_go()
         self._own = session, folder

@@ -28,10 +28,12 @@ from workbench.commands.page import (
     ToggleTheme,
 )
 from workbench.commands.recording import ToggleRecording, ToggleSavePast
-from workbench.commands.run import Interrupt, ReloadFile, RestartWorker
+from workbench.commands.timeline import Seek
 from workbench.machine.kept_choices import close_hints
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run import run
+from workbench.session.run.run import PagesCounted
 from workbench.ui.app.marks import EPISODES, STUDIO, Marks
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras.panel import CamerasPanel
@@ -83,17 +85,13 @@ DOES: frozenset[type[Command]] = frozenset(
         ToggleTheme,
         ToggleOnlySelected,
         CloseHints,
-        ReloadFile,
-        Interrupt,
-        RestartWorker,
         ToggleRecording,
         ToggleSavePast,
-        ChoosePictures,
         CloseDialog,
         *CamerasPanel.does,
     }
 )
-"""Commands that the page itself carries out; its parts carry out the others."""
+"""Commands that the page itself carries out; the session has its own, and the parts of the page have the others."""
 PANELS_EVERY = 0.06
 """Seconds between two drawings of the panels while the envs play, every second frame; numbers cannot be read faster."""
 PICTURES_HINT = (
@@ -143,7 +141,7 @@ class Page:
         self._server, self._visitors = server, visitors
         self._session = session
         self._clock = clock
-        self._link = partial(editor_link, editor, known=session.versions.knows_file)
+        self._link = partial(editor_link, editor, known=session.knows_file)
         self._on_review, self._on_look = on_review, on_look
         self._loop = RedrawLoop(server, "page", session.wait, lambda: self._count_clients() > 0, self.redraw)
         self._panels_due = DrawDue(PANELS_EVERY, clock)
@@ -183,15 +181,15 @@ class Page:
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
         self._forces = ForceArrows(server)
-        self._parts.add(TaskCommands(server, visitors, session))
-        kinds = DOES | self._parts.does | also
+        self._parts.add(TaskCommands(server, visitors))
+        kinds = DOES | run.DOES | self._parts.does | also
         register(server, visitors, kinds, "live page")
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", rows=key_rows(kinds)))
         server.scene.on_click()(self._on_scene_click)
 
     def _is_own(self, file: str) -> bool:
-        return isinstance(self._session.reference, str) and self._session.versions.knows_file(file)
+        return isinstance(self._session.reference, str) and self._session.knows_file(file)
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[SessionView]]]:
         """Returns the Run tab, which gets more content later, and the parts of all tabs."""
@@ -203,7 +201,7 @@ class Page:
             self._run = RunPanel(server, session)
             self._solve = SolvePanel(server, session, self._link)
             self._view_panel = ViewPanel(server, dark, self._view_choice)
-            version = VersionPanel(server, session, self._link)
+            version = VersionPanel(server, self._link)
             options = EnvOptionsPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             degrees = "auto", "exact", "fast"
@@ -224,7 +222,7 @@ class Page:
             reward = [
                 NumbersPanel(server),
                 RescoredAbove(server),
-                CurvesPanel(server, session.past.seek_tick),
+                CurvesPanel(server, lambda tick: session.do(Seek(step=tick))),
             ]
             self._rescored = PastRescorePanel(server, session)
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
@@ -271,7 +269,7 @@ class Page:
         """Stop redrawing; returns when the loop has ended."""
         self._loop.stop()
         # The session may live on under another page, and must not render for this one.
-        self._session.set_clients(0)
+        self._session.happen(PagesCounted(0))
 
     @property
     def dark(self) -> bool:
@@ -316,24 +314,18 @@ class Page:
             case CloseHints():
                 self._hints.content = ""
                 close_hints()
-            case ReloadFile():
-                session.versions.reload()
-            case Interrupt():
-                session.interrupt()
-            case RestartWorker():
-                session.versions.restart_worker()
             case ToggleRecording():
                 self._record.toggle()
             case ToggleSavePast():
                 self._record.save()
-            case ChoosePictures(pictures=pictures):
-                session.change(pictures=pictures)
             case SelectCamera():
                 self._parts.do(command, visitor)
                 self._open_tabs.open(visitor, STUDIO)
             case CloseDialog():
                 if self._opening is not None:
                     self._opening.close()
+            case _ if type(command) in run.DOES:
+                session.do(command, visitor.name)
             case _ if isinstance(command, CamerasPanel.does):
                 self._cameras.do(command, visitor)
             case _:
@@ -371,7 +363,7 @@ class Page:
 
     def _count_clients(self) -> int:
         count = self._framing.follow()
-        self._session.set_clients(count)
+        self._session.happen(PagesCounted(count))
         return count
 
     # --- the 3-D view ----------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from workbench.authoring.loading.find_tasks import is_below
 from workbench.authoring.loading.reference import TaskName, file_and_class
 from workbench.authoring.templates.new_task import write_new_task
+from workbench.commands.run import PauseRun
 from workbench.commands.tasks import TemplateName
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import example_tasks
@@ -164,7 +165,7 @@ class OpenTask:
         place, old = self._place, self._place.home
         place.go_live.let_go()
         if old is not None:
-            old.pause()
+            old.do(PauseRun())
             self._kept[lasting(str(old.reference))] = old.kept_work()
             if isinstance(
                 old.reference, str

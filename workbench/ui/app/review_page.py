@@ -23,7 +23,15 @@ from workbench.commands.page import (
 )
 from workbench.commands.review import RescoreChosen
 from workbench.commands.run import TogglePlay
-from workbench.commands.timeline import GoToFirst, GoToLast, Seek
+from workbench.commands.timeline import (
+    GoToFirst,
+    GoToLast,
+    NextEvent,
+    PreviousEvent,
+    Seek,
+    StepBack,
+    StepForward,
+)
 from workbench.core.camera_data import CameraKey, Picture
 from workbench.recording.library.library import Library
 from workbench.recording.sweeps import RESULTS
@@ -466,17 +474,31 @@ class ReviewTimeline(TimeBar[ReviewView]):
     Each of several recordings has its own line on the strip, placed as they are aligned.
     """
 
+    does = (StepBack, StepForward, PreviousEvent, NextEvent, Seek, GoToFirst, GoToLast)
+
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
-        super().__init__(server, review, "step of the timeline", Seek, "step")
+        super().__init__(server, "step of the timeline", Seek, "step")
         self._review = review
         self._drawn: tuple[object, ...] = ()
         self._fixed: dict[str, object] = {}
 
-    def _to_first(self) -> None:
-        self._review.to_first()
-
-    def _to_last(self) -> None:
-        self._review.to_last()
+    def do(self, command: Command, visitor: Visitor) -> None:
+        review = self._review
+        match command:
+            case StepBack():
+                review.seek_by(-1)
+            case StepForward():
+                review.seek_by(1)
+            case PreviousEvent():
+                review.seek_event(-1)
+            case NextEvent():
+                review.seek_event(1)
+            case Seek(step=step):
+                review.seek(step)
+            case GoToFirst():
+                review.to_first()
+            case GoToLast():
+                review.to_last()
 
     def draw(self, view: ReviewView) -> None:
         if not self._draw_panel(bool(view.opened)):

@@ -178,7 +178,7 @@ def frustum_pose(pose: NDArray, offset: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def without_the_viewpoint(
-    pictures: dict[CameraKey, Picture], seen: dict[CameraKey, Picture]
+    pictures: dict[CameraKey, Picture], seen: Mapping[CameraKey, Picture]
 ) -> dict[CameraKey, Picture]:
     """The pictures to draw while one env is alone in the view.
 

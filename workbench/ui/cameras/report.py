@@ -27,6 +27,7 @@ from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.run import MomentShown
 from workbench.ui.widgets.fields import Field, choice
 from workbench.ui.widgets.images import data_address
 from workbench.ui.widgets.parts import PagePart
@@ -120,7 +121,7 @@ class CameraReportPanel(PagePart[SessionView]):
     def _show_moment(self, position: int) -> None:
         moments = self._session.view().studio.results.report_moments
         if 0 <= position < len(moments):
-            self._session.show(moments[position].env, moments[position].serial)
+            self._session.happen(MomentShown(moments[position].serial, moments[position].env))
 
     def _use(self, plane: str) -> None:
         studio = self._session.view().studio

@@ -26,6 +26,7 @@ from workbench.machine.text import number_text
 from workbench.session.history.env_table import EnvRows, Outcome
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.run import EpisodeStepShown, SettingsChanged
 from workbench.ui.live.env_columns import DOT, EnvColumn, levels, wanted_width
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.live.timeline import polylines
@@ -454,10 +455,10 @@ class EnvPanel(MomentPart):
         rows = self._session.env_rows()
         if rows is None or not 0 <= env < rows.num_envs:
             raise Refused(f"There is no env {env}.")
-        self._session.change(selected_env=env)
         step = moment_of(rows, env)
-        if step is not None:
-            self._session.past.seek_step(env, step)
+        self._session.happen(
+            SettingsChanged({"selected_env": env}) if step is None else EpisodeStepShown(env, step)
+        )
 
     def _toggle_entry(self, name: str) -> None:
         rows = self._session.env_rows()

@@ -19,6 +19,7 @@ from workbench.core.capture.inspection import SECTIONS, Inspection, JointReading
 from workbench.machine.text import number_text
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.run import InspectionWanted
 from workbench.ui.scene.env_grid import InView
 from workbench.ui.widgets.fields import choice, tick
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart
@@ -225,7 +226,7 @@ class InspectPanel(PagePart[SessionView]):
         it steps: until then its list is empty or outdated."""
         if self._now is not None and self._now.env == view.selected_env and self._now.elapsed_steps == 0:
             return True
-        lived = self._session.past.segment() if view.timeline.shown is None else None
+        lived = self._session.look(lambda run: run.segment()) if view.timeline.shown is None else None
         return lived is not None and lived[0] == lived[1]
 
     def _ask(self, view: SessionView, chosen: str) -> None:
@@ -241,7 +242,7 @@ class InspectPanel(PagePart[SessionView]):
         answered = self._asked is None or view.inspection is not self._had
         if waited >= (READ_EVERY if answered else PATIENCE):
             self._asked, self._asked_at, self._had = wanted, self._clock(), view.inspection
-            self._session.inspect(sections)
+            self._session.happen(InspectionWanted(sections))
 
     def _take(self, view: SessionView) -> None:
         new = view.inspection

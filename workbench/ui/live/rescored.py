@@ -18,6 +18,7 @@ from workbench.session.live.view import SessionView
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
+from workbench.session.run.run import MomentShown
 from workbench.ui.widgets.fields import by_name, choice
 from workbench.ui.widgets.line_chart import part_round
 from workbench.ui.widgets.parts import PagePart
@@ -100,7 +101,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
     def _show(self, verdict: Verdict[PastRun]) -> None:
         env, at = _place(verdict)
         if at >= self._session.view().timeline.first:
-            self._session.show(env, at)
+            self._session.happen(MomentShown(at, env))
         else:
             self._session.change(selected_env=env)
 

@@ -34,6 +34,7 @@ from workbench.machine.processes.watched_thread import watched_thread
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import EpisodeEnd
+from workbench.session.run.run import ActionTold
 from workbench.ui.live.episodes_panel import ENVS
 from workbench.ui.widgets.fields import Field, choice, slider
 from workbench.ui.widgets.parts import PagePart
@@ -106,9 +107,9 @@ class ActionSliders:
                 if dimension >= len(self._dimensions):
                     raise Refused(f"The robot's action has {len(self._dimensions)} dimensions.")
                 low, high = slider_bounds(self._dimensions[dimension])
-                self._session.tell((dimension,), (min(max(value, low), high),), envs)
+                self._session.happen(ActionTold((dimension,), (min(max(value, low), high),), envs))
             case HoldStill():
-                self._session.tell((), (), envs)
+                self._session.happen(ActionTold((), (), envs))
             case ChooseMoved(envs=moved):
                 self._moved = moved
 
@@ -195,27 +196,12 @@ def _is_there(reference: str, task_folder: Path | None) -> bool:
 
 
 class RunPanel(PagePart[SessionView]):
-    """The tab's controls. Each asks the session and shows the session's value; none touches an env."""
+    """The tab's controls. Each shows the session's value, and its command goes to the session."""
 
-    does = (
-        TogglePlay,
-        Step,
-        ResetAll,
-        ResetSelected,
-        SelectEnv,
-        NextEnv,
-        PreviousEnv,
-        SetSpeed,
-        SetSeed,
-        ChooseEpisodeEnd,
-        ChooseActions,
-        SetPolicy,
-        *ActionSliders.DOES,
-    )
+    does = ActionSliders.DOES
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._typed_policy: str | None = None
         gui = server.gui
 
         self._transport = gui.add_html("")
@@ -249,55 +235,8 @@ class RunPanel(PagePart[SessionView]):
             self._policy.visible = self._known.visible = self._policy_hint.visible = False
             self._sliders = ActionSliders(server, session)
 
-    # --- what a person does ----------------------------------------------------------------------
-
     def do(self, command: Command, visitor: Visitor) -> None:
-        match command:
-            case TogglePlay():
-                self._toggle_play()
-            case Step():
-                self._session.step()
-            case ResetAll():
-                self._session.reset()
-            case ResetSelected():
-                self._session.reset((self._session.view().selected_env,))
-            case SelectEnv(env=env):
-                if not 0 <= env < self._num_envs():
-                    raise Refused(f"There is no env {env}: they are 0 to {self._num_envs() - 1}.")
-                self._session.change(selected_env=env)
-            case SetSeed(seed=seed):
-                self._session.set_seed(seed)
-            case SetSpeed(speed=speed):
-                self._session.change(speed=math.inf if speed is None else speed)
-            case ChooseEpisodeEnd(rule=rule):
-                self._session.change(episode_end=rule)
-            case ChooseActions(source=source):
-                self._choose_source(source)
-            case SetPolicy(policy=policy):
-                self._set_policy(policy.strip())
-            case NextEnv():
-                self._select_neighbour(1)
-            case PreviousEnv():
-                self._select_neighbour(-1)
-            case _:
-                self._sliders.do(command)
-
-    def _set_policy(self, policy: str) -> None:
-        if policy and ":" not in policy:
-            raise Refused("A policy is written module:function or file.py:function.")
-        self._typed_policy = policy or None
-        self._session.change(action_source="policy", policy=self._typed_policy)
-
-    def _toggle_play(self) -> None:
-        if self._session.view().playing:
-            self._session.pause()
-        else:
-            self._session.play()
-
-    def _select_neighbour(self, step: int) -> None:
-        """Select the next (1) or previous (-1) env, wrapping around."""
-        count = self._num_envs()
-        self._session.change(selected_env=(self._session.view().selected_env + step) % count)
+        self._sliders.do(command)
 
     # --- drawing ---------------------------------------------------------------------------------
 
@@ -326,16 +265,6 @@ class RunPanel(PagePart[SessionView]):
         self._policy_hint.visible = policy_wanted and not view.settings.policy
         self._draw_known(view.settings.policy if policy_wanted else None, policy_wanted)
         self._sliders.draw(view)
-
-    # --- values ----------------------------------------------------------------------------------
-
-    def _num_envs(self) -> int:
-        task = self._session.view().task
-        return 1 if task is None else task.num_envs
-
-    def _choose_source(self, source: ActionSource) -> None:
-        # Without a name it is a source too: the next step reports what is missing.
-        self._session.change(action_source=source, policy=self._typed_policy if source == "policy" else None)
 
     def _draw_known(self, policy: str | None, wanted: bool) -> None:
         known = self._policies.look(self._session.task_folder, policy) if wanted else ()

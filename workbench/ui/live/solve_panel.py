@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
-import msgspec
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -34,6 +32,7 @@ from workbench.session.live.session import Session
 from workbench.session.live.solver import SolveView
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.questions import PlannedEnv
+from workbench.session.run.run import movable_bodies
 from workbench.ui.scene.rollout_traces import RolloutTraces
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.fields import choice, slider, tick
@@ -69,15 +68,7 @@ class SolvePanel(PagePart[SessionView]):
 
     does = (
         SaveSolved,
-        ChoosePlannedEnvs,
-        ChooseMethod,
-        SetRollouts,
-        SetHorizon,
-        SetNoise,
-        SetTemperature,
-        SetPlanEvery,
         ShowRollouts,
-        FollowBody,
         LookAtRollout,
     )
 
@@ -202,18 +193,8 @@ class SolvePanel(PagePart[SessionView]):
                 if not view.solve.solved:
                     raise Refused("No episode is solved.")
                 self._session.save_past(tuple(env for env, _ in view.solve.solved))
-            case ChoosePlannedEnvs(envs=envs):
-                self._session.change(solve_all=envs == "all")
-            case (
-                ChooseMethod() | SetRollouts() | SetHorizon() | SetNoise() | SetTemperature() | SetPlanEvery()
-            ):
-                self._session.change(plan=replace(view.settings.plan, **msgspec.structs.asdict(command)))
             case ShowRollouts(on=on):
                 self._shows_rollouts = on
-            case FollowBody(body=body):
-                if body and body not in movable_bodies(view):
-                    raise Refused("There is no such body that moves.")
-                self._session.change(traced=body)
             case LookAtRollout(number=number):
                 if view.solve.plan is None or number > len(view.solve.plan.drawn):
                     raise Refused("There is no such rollout.")
@@ -278,7 +259,7 @@ class SolvePanel(PagePart[SessionView]):
         self._saving.content = render("saving", saving=saving) if offered else ""
 
     def _draw_traced(self, view: SessionView) -> None:
-        options = {TOOL: "", **{name: name for name in movable_bodies(view)}}
+        options = {TOOL: "", **{name: name for name in movable_bodies(view.task)}}
         traced = view.settings.traced
         self._traced.show(traced if traced in options.values() else "", options=options)
 
@@ -315,15 +296,6 @@ class SolvePanel(PagePart[SessionView]):
 def horizon_seconds(plan: PlanOptions, control_dt: float, has_success: bool = True) -> float:
     """Horizon of a plan in seconds, also for the usual horizon."""
     return plan.steps(control_dt, has_success) * control_dt
-
-
-def movable_bodies(view: SessionView) -> list[str]:
-    """Names of the bodies whose path can be drawn."""
-    if view.task is None:
-        return []
-    geometry = view.task.geometry
-    kinds = zip(geometry.body_names, geometry.body_kinds, strict=True)
-    return [name for name, kind in kinds if kind in ("link", "dynamic")]
 
 
 def offers_better_mode(view: SessionView) -> bool:

@@ -10,11 +10,10 @@ from workbench.commands.cameras import SelectCamera
 from workbench.commands.command import Command
 from workbench.commands.envs import SelectEnv
 from workbench.commands.run import UseControlMode
-from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.widgets.hotkeys import add
 from workbench.ui.widgets.parts import PagePart
-from workbench.ui.widgets.visitors import Visitor, Visitors
+from workbench.ui.widgets.visitors import Visitors
 
 MAX_ENVS = 256
 """Maximum number of envs with an entry; more entries would make every page wait for them."""
@@ -24,16 +23,9 @@ STUDIO = "Studio"
 class TaskCommands(PagePart[SessionView]):
     """Make it in no container, after the commands of the page: the palette lists them in the order of making."""
 
-    does = (UseControlMode,)
-
-    def __init__(self, server: viser.ViserServer, visitors: Visitors, session: Session) -> None:
-        self._server, self._visitors, self._session = server, visitors, session
+    def __init__(self, server: viser.ViserServer, visitors: Visitors) -> None:
+        self._server, self._visitors = server, visitors
         self._handles: list[viser.CommandHandle] = []
-
-    def do(self, command: Command, visitor: Visitor) -> None:
-        match command:
-            case UseControlMode(mode=mode):
-                self._session.versions.use_control_mode(mode)
 
     def key(self, view: SessionView) -> object:
         if view.task is None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import groupby
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import viser
@@ -29,8 +29,9 @@ from workbench.commands.timeline import (
 from workbench.machine.text import number_text
 from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.live.session import Session
-from workbench.session.live.timeline import Strip, TimelineView
 from workbench.session.live.view import SessionView
+from workbench.session.run.past import Strip, TimelineView
+from workbench.session.run.run import MomentShown, PastPicturesWanted
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.widgets.fields import slider
 from workbench.ui.widgets.parts import Clock, PagePart
@@ -55,37 +56,15 @@ UNDO = "undo"
 View = TypeVar("View", contravariant=True)
 
 
-class Seeks(Protocol):
-    """Target of the slider and the buttons, which defines what a place in time is."""
-
-    def seek(self, place: Any, /) -> None: ...
-    def seek_by(self, steps: int, /) -> None: ...
-    def seek_event(self, direction: int, /) -> None: ...
-
-
 class TimeBar(PagePart[View]):
     """A slider over time, a strip under it and a row of buttons, across the bottom of the view.
 
     Args:
-        seeks: What slider, buttons and arrow keys move.
         name: Of the slider.
         kind: The command that the slider's value goes into, in its field `field`.
     """
 
-    does: tuple[type[Command], ...] = (
-        StepBack,
-        StepForward,
-        PreviousEvent,
-        NextEvent,
-        Seek,
-        GoToFirst,
-        GoToLast,
-    )
-
-    def __init__(
-        self, server: viser.ViserServer, seeks: Seeks, name: str, kind: type[Command], field: str
-    ) -> None:
-        self._seeks = seeks
+    def __init__(self, server: viser.ViserServer, name: str, kind: type[Command], field: str) -> None:
         gui = server.gui
         self._panel = gui.add_panel(visible=False, order=10.0)
         with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
@@ -99,33 +78,6 @@ class TimeBar(PagePart[View]):
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
         """Add rows between the strip and the buttons."""
-
-    def do(self, command: Command, visitor: Visitor) -> None:
-        match command:
-            case StepBack():
-                self._seeks.seek_by(-1)
-            case StepForward():
-                self._seeks.seek_by(1)
-            case PreviousEvent():
-                self._seeks.seek_event(-1)
-            case NextEvent():
-                self._seeks.seek_event(1)
-            case Seek(step=step):
-                self._seek(step)
-            case GoToFirst():
-                self._to_first()
-            case GoToLast():
-                self._to_last()
-
-    def _seek(self, step: int) -> None:
-        """Show the moment after this control step."""
-        self._seeks.seek(step)
-
-    def _to_first(self) -> None:
-        raise NotImplementedError
-
-    def _to_last(self) -> None:
-        raise NotImplementedError
 
     def fold(self, wanted: bool) -> None:
         """Fold it to a bar, where it would cover what is looked at, or unfold what this has folded."""
@@ -148,10 +100,10 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     memory; the worker draws pictures only after a while at one moment.
     """
 
-    does = (*TimeBar.does, SeekBack, ZoomTimeline, UndoReset, ContinueFromHere)
+    does = (SeekBack, ZoomTimeline, GoToFirst)
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
-        super().__init__(server, session.past, "step of the past", SeekBack, "steps")
+        super().__init__(server, "step of the past", SeekBack, "steps")
         self._session, self._clock = session, clock
         self._episode_only = False
         self._range = (0, 0)
@@ -172,36 +124,23 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     # --- what a person does ------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
+        session = self._session
         match command:
+            case SeekBack(steps=0):
+                session.do(GoToLast())
             case SeekBack(steps=steps):
-                self._seek_back(steps)
+                session.do(self._seek_to(self._newest + steps))
+            case GoToFirst():
+                # The left end of the slider; a slider with the focus goes there too.
+                if self._episode_only:
+                    session.do(self._seek_to(self._range[0]))
+                else:
+                    session.happen(MomentShown(0))
             case ZoomTimeline(episode_only=wanted):
                 self._episode_only, self._range_at = wanted, -math.inf
-            case UndoReset():
-                self._session.past.undo()
-            case ContinueFromHere(scope=scope):
-                self._session.past.continue_from_shown(scope)
-            case _:
-                super().do(command, visitor)
 
-    def _to_last(self) -> None:
-        self._session.past.seek(None)
-
-    def _to_first(self) -> None:
-        """Go to the left end of the slider; a slider with the focus goes there too."""
-        if self._episode_only:
-            self._session.past.seek_tick(self._range[0], in_episode=True)
-        else:
-            self._session.past.seek(0)
-
-    def _seek_back(self, steps: int) -> None:
-        if steps == 0:
-            self._session.past.seek(None)
-        else:
-            self._seek(self._newest + steps)
-
-    def _seek(self, step: int) -> None:
-        self._session.past.seek_tick(step, self._episode_only)
+    def _seek_to(self, tick: int) -> Seek:
+        return Seek(step=tick, episode_only=self._episode_only)
 
     # --- drawing -----------------------------------------------------------------------------------
 
@@ -221,7 +160,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         moved = past.shown is not None and not self._range[0] <= past.tick <= self._range[1]
         if now - self._range_at >= RANGE_EVERY or moved:
             self._range_at = now
-            episode = self._session.past.episode() if self._episode_only else None
+            episode = self._session.look(lambda run: run.episode_ticks()) if self._episode_only else None
             self._range = (past.first_tick, past.last_tick) if episode is None else episode
             self._newest = past.last_tick
         low, high = (tick - self._newest for tick in self._range)
@@ -251,21 +190,21 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
 
     def _draw_strip(self, view: SessionView) -> None:
         past = view.timeline
-        wanted = (past.first, past.last, past.shown, view.selected_env, self._range)
+        wanted = (past.first, past.last, past.shown, view.selected_env, self._range, self._episode_only)
         if wanted == self._strip_of:
             return
         self._strip_of = wanted
         low, high = self._range
-        strip = self._session.past.strip(low, high)
+        strip = self._session.look(lambda run: run.strip(low, high))
         if strip is not None:
-            self._strip.content = strip_html(strip, view)
+            self._strip.content = strip_html(strip, view, self._seek_to)
 
     def _ask_for_pictures(self, view: SessionView) -> None:
         at = (view.timeline.shown, view.selected_env)
         if at != self._stood[0]:
             self._stood = (at, self._clock())
         elif view.timeline.wants_pictures and self._clock() - self._stood[1] > STANDS_STILL:
-            self._session.past.draw()
+            self._session.happen(PastPicturesWanted())
 
 
 def walk_tools() -> list[Tool]:
@@ -360,8 +299,14 @@ def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
     return [(tick, FLAGS[flag], name) for tick, flag, name in marks.values()]
 
 
-def strip_html(strip: Strip, view: SessionView) -> str:
-    """The strip of one env with its shown moment."""
+def strip_html(
+    strip: Strip, view: SessionView, seek: Callable[[int], Seek] = lambda tick: Seek(step=tick)
+) -> str:
+    """The strip of one env with its shown moment.
+
+    Args:
+        seek: the command that a press on a tick asks for.
+    """
     has_reward = view.task is None or view.task.reward_mode != "none"
     # ManiSkill's reward is 0 where a task has none.
     reward = strip.reward if has_reward else np.full_like(strip.reward, np.nan)
@@ -369,7 +314,7 @@ def strip_html(strip: Strip, view: SessionView) -> str:
     return render(
         "timeline",
         strip=strip,
-        seek=lambda at: Seek(step=at),
+        seek=seek,
         past=view.timeline,
         marks=marks,
         ago=ago_in_words(view.timeline),

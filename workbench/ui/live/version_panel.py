@@ -7,18 +7,16 @@ import time
 import viser
 
 from workbench.authoring.problem import Problem
-from workbench.commands.command import Command, Refused
 from workbench.commands.run import ChooseClass, RebuildScene, ReloadCameras, ReloadCode, ReloadFile
-from workbench.session.live.session import Session
-from workbench.session.live.view import PastLoad, SessionView
+from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import ReloadReport
+from workbench.session.run.run import PastLoad
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.fields import by_name, choice
 from workbench.ui.widgets.hotkeys import with_key
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.tools import Tool, tool, tools_html
-from workbench.ui.widgets.visitors import Visitor
 
 LAST_LOADS = "Last reloads"
 MOST_SHOWN = 8
@@ -32,10 +30,8 @@ class VersionPanel(PagePart[SessionView]):
     only the reward was patched, looks for a bug that is not there.
     """
 
-    does = (ChooseClass, RebuildScene, ReloadCode, ReloadCameras)
-
-    def __init__(self, server: viser.ViserServer, session: Session, link: LinkTo = no_links) -> None:
-        self._session, self._link = session, link
+    def __init__(self, server: viser.ViserServer, link: LinkTo = no_links) -> None:
+        self._link = link
         with server.gui.add_folder("Code version"):
             self._task = choice(
                 server, "Task", ChooseClass, "name", (), "", hint="The file has several tasks."
@@ -83,20 +79,6 @@ class VersionPanel(PagePart[SessionView]):
         )
         self._loads_folder.visible = len(view.loads) > 1
         self._loads.content = loads_html(view.loads, self._link)
-
-    def do(self, command: Command, visitor: Visitor) -> None:
-        versions = self._session.versions
-        match command:
-            case ChooseClass(name=name):
-                if name not in self._session.view().choices:
-                    raise Refused("The file has no such task.")
-                versions.choose_class(name)
-            case RebuildScene():
-                versions.reload("rebuilt")
-            case ReloadCode():
-                versions.reload("patched")
-            case ReloadCameras():
-                versions.reload("cameras")
 
 
 def version_html(

@@ -24,6 +24,7 @@ from workbench.core.env.keywords import MODES, HowMade, Keyword, as_json, read_v
 from workbench.jobs.task import TaskOptions, changed_options, command_line
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.run import OptionsApplied
 from workbench.session.tasks.recents import lasting
 from workbench.ui.widgets.fields import Field, Plain, choice, tick
 from workbench.ui.widgets.parts import PagePart
@@ -134,7 +135,7 @@ class EnvOptionsPanel(PagePart[SessionView]):
         self._values = {keyword.name: _in_effect(keyword) for keyword in self._keywords}
         if view.options_refused is not None:
             # The task works with what is in effect: loading it takes the problem off the page.
-            self._session.versions.apply_options(view.options)
+            self._session.happen(OptionsApplied(view.options))
 
     def _apply(self) -> None:
         options = self._session.view().options
@@ -147,12 +148,13 @@ class EnvOptionsPanel(PagePart[SessionView]):
             raise Refused(str(why)) from None
         wanted = replace(options, num_envs=self._num_envs, env_kwargs=merged(options.env_kwargs, values))
         if changed_options(options, wanted):
-            self._session.versions.apply_options(wanted)
+            self._session.happen(OptionsApplied(wanted))
 
     def _as_the_task_does(self) -> None:
         """Drop the keyword arguments that a person gave."""
         options = self._session.view().options
-        self._session.versions.apply_options(replace(options, env_kwargs=_of_the_machine(options.env_kwargs)))
+        kept = _of_the_machine(options.env_kwargs)
+        self._session.happen(OptionsApplied(replace(options, env_kwargs=kept)))
 
 
 def merged(given: Mapping[str, Any], values: Mapping[Keyword, Any]) -> dict[str, Any]:

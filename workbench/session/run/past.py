@@ -1,23 +1,18 @@
-"""The time slider: which moment of the history is shown, and continuing from it."""
+"""The past of the run: which moment of the history is shown, and going back to it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.camera_data import CameraKind, Picture
 from workbench.jobs.task import ShownPictures, Stepped
-from workbench.session.history.env_table import EnvRows, EnvTable
-from workbench.session.history.history import EnvMoment, History, Moment, ShownMoment
-from workbench.session.loop import on_loop
-from workbench.session.protocol.messages import CameraRequest, DrawPast, Request, Restore
-
-if TYPE_CHECKING:
-    from workbench.session.live.live_state import LiveState
+from workbench.session.history.env_table import EnvRows
+from workbench.session.history.history import History, Moment
+from workbench.session.protocol.messages import CameraRequest, DrawPast, Restore
 
 Scope = Literal["this", "all", "into all"]
 """Which envs go back: the selected one; all, each to its own state; or all to the selected env's state."""
@@ -47,13 +42,13 @@ class TimelineView:
     can_continue: bool = False
     """Whether envs can go back to the shown moment."""
     undo: str | None = None
-    """What `TimeTravel.undo` would undo, as text."""
+    """What `UndoReset` would undo, as text."""
     not_carried: tuple[str, ...] = ()
     """State that the last jump could not restore, each with its reason."""
     arrived: str = ""
     """How the last jump entered a recording; empty if the jump entered none."""
     entered: int = 0
-    """Number of the last finished `Session.enter_recording`; 0 for none."""
+    """Number of the last finished `EnterRun`; 0 for none."""
     wants_pictures: bool = False
     """The shown moment lacks pictures of the watched cameras."""
 
@@ -85,54 +80,60 @@ class Strip:
     """First and last tick of each segment (see `History`), and whether it begins with going back."""
 
 
-class Timeline:
-    """The history of the present task and the shown moment. Used on the loop.
+@dataclass(frozen=True)
+class Past:
+    """The history of the present task, and which of its moments is shown. Methods that change something return another value.
 
     Live is the newest moment. The slider pins another one, and then all that the page draws of the batch (poses, numbers,
     pictures) comes from the server's memory, while the worker continues. The worker gets requests only to continue from a
     moment, to undo a jump, and to draw a moment that has no pictures.
     """
 
-    def __init__(
-        self, table: EnvTable, limit: int, first_serial: int = 0, joints: tuple[str, ...] = ()
-    ) -> None:
-        """See `History`."""
-        self.history = History(table, limit, first_serial, joints)
-        self._num_envs = table.rows().num_envs
-        self._shown: int | None = None
-        self._entered = 0
-        self._requested: tuple[int, int, tuple[CameraRequest, ...]] | None = None
+    history: History
+    """Append-only store: `added` and its kind write into it, and equal values of a past share it."""
+    pinned: int | None = None
+    """Serial of the shown moment; None while live."""
+    entered: int = 0
+    """See `TimelineView.entered`."""
+    requested: tuple[int, int, tuple[CameraRequest, ...]] | None = None
+    """Serial, env and cameras of the last request for pictures."""
 
     # --- events --------------------------------------------------------------------------------------
 
-    def add(self, stepped: Stepped) -> Moment:
+    def added(self, stepped: Stepped) -> tuple[Past, Moment]:
+        """The past with one moment more."""
         moment = self.history.add(stepped)
+        past = self
         if stepped.restored is not None and stepped.restored.number:
-            self._entered = stepped.restored.number
-        if self._shown is not None and self._shown < self.history.first:
-            self._shown = self.history.first  # the shown moment was dropped
-        return moment
+            past = replace(past, entered=stepped.restored.number)
+        if past.pinned is not None and past.pinned < self.history.first:
+            past = replace(past, pinned=self.history.first)  # the shown moment was dropped
+        return past, moment
+
+    def camera_moved(self, kind: CameraKind, name: str) -> Past:
+        """See `History.camera_moved`; pictures of the shown moment are requested again."""
+        self.history.camera_moved(kind, name)
+        return replace(self, requested=None)
 
     # --- the shown moment ----------------------------------------------------------------------------
 
     @property
     def shown(self) -> Moment | None:
         """The pinned moment; None while live."""
-        return None if self._shown is None else self.history.at(self._shown)
+        return None if self.pinned is None else self.history.at(self.pinned)
 
     @property
     def at(self) -> int:
         """Serial of the shown moment, the newest while live."""
-        return self.history.last if self._shown is None else self._shown
+        return self.history.last if self.pinned is None else self.pinned
 
-    def seek(self, serial: int | None) -> None:
+    def seek(self, serial: int | None) -> Past:
         """Pin a moment, or the nearest kept one; the newest, or None, is live."""
         if serial is None or serial >= self.history.last:
-            self._shown = None
-        else:
-            self._shown = max(serial, self.history.first)
+            return replace(self, pinned=None)
+        return replace(self, pinned=max(serial, self.history.first))
 
-    def seek_by(self, env: int, steps: int) -> None:
+    def seek_by(self, env: int, steps: int) -> Past:
         """Go some moments of this env forward (or back, if negative) from the shown one: its control steps, resets and
         jumps back. Those of other envs are passed by."""
         history, at = self.history, self.at
@@ -140,16 +141,17 @@ class Timeline:
             at += 1 if steps > 0 else -1
             while (moment := history.at(at)) is not None and moment.jumped.any() and not moment.jumped[env]:
                 at += 1 if steps > 0 else -1
-        self.seek(at)
+        return self.seek(at)
 
-    def seek_step(self, env: int, step: int) -> None:
+    def seek_step(self, env: int, step: int) -> Past:
         """Go to a control step of the shown episode of this env, through its jumps back; or the nearest kept."""
         episode_backwards = self.history.episode_backwards(env, self.history.segment_at(env, self.at)[1])
         serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in episode_backwards}
-        if serials:
-            self.seek(serials[min(serials, key=lambda known: abs(known - step))])
+        if not serials:
+            return self
+        return self.seek(serials[min(serials, key=lambda known: abs(known - step))])
 
-    def seek_tick(self, tick: int, episode_of: int | None = None) -> None:
+    def seek_tick(self, tick: int, episode_of: int | None = None) -> Past:
         """Go to the moment after a control step (`Curves.serial`), or to the nearest kept one.
 
         Args:
@@ -157,22 +159,16 @@ class Timeline:
                 one before, too.
         """
         first = self.history.first if episode_of is None else self.episode(episode_of)[0]
-        self.seek(max(self.history.serial_of_tick(tick), first))
+        return self.seek(max(self.history.serial_of_tick(tick), first))
 
-    def seek_event(self, env: int, direction: int) -> None:
+    def seek_event(self, env: int, direction: int) -> Past:
         """Go to the next (1) or previous (-1) event of this env; forward from the last one is live."""
         here = self.at
         if direction > 0:
             after = self.history.events(env, here + 1, self.history.last)
-            self.seek(after[0][0] if after else None)
-        else:
-            before = self.history.events(env, self.history.first, here - 1)
-            self.seek(before[-1][0] if before else self.history.first)
-
-    def camera_moved(self, kind: CameraKind, name: str) -> None:
-        """See `History.camera_moved`; the shown moment is drawn again on the next `draw`."""
-        self.history.camera_moved(kind, name)
-        self._requested = None
+            return self.seek(after[0][0] if after else None)
+        before = self.history.events(env, self.history.first, here - 1)
+        return self.seek(before[-1][0] if before else self.history.first)
 
     def pictures(self, env: int) -> dict[tuple[CameraKind, str], Picture]:
         """Stored pictures of the shown moment."""
@@ -194,7 +190,7 @@ class Timeline:
         return TimelineView(
             first=history.first,
             last=history.last,
-            shown=self._shown,
+            shown=self.pinned,
             first_tick=self.tick_of(history.first),
             tick=0 if at is None else at.tick,
             last_tick=self.tick_of(history.last),
@@ -205,7 +201,7 @@ class Timeline:
             undo=None if jump is None else self._jump_text(jump),
             not_carried=tuple(f"{what}: {why}" for what, why in missed.items()),
             arrived=how,
-            entered=self._entered,
+            entered=self.entered,
             wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras, degree)),
         )
 
@@ -223,9 +219,9 @@ class Timeline:
         what = "reset" if jump.restored is None else "jump"
         if jump.restored is not None and jump.restored.recording:
             what = "going live"
-        if self._num_envs == 1:
+        if self.history.num_envs == 1:
             return what
-        if len(envs) == self._num_envs:
+        if len(envs) == self.history.num_envs:
             return f"{what} of all"
         return f"{what} of env {envs[0]}" if len(envs) == 1 else f"{what} of {len(envs)} envs"
 
@@ -282,14 +278,13 @@ class Timeline:
     # --- requests to the worker ------------------------------------------------------------------------
 
     def continue_from_shown(self, env: int, scope: Scope) -> Restore | None:
-        """Request to continue from the shown moment, and show live; None if that is not possible."""
+        """Request to continue from the shown moment; None if that is not possible."""
         moment = self.shown
         snapshot = None if moment is None else self.history.snapshot_at(moment.serial)
         if moment is None or snapshot is None:
             return None
-        envs = (env,) if scope == "this" else tuple(range(self._num_envs))
+        envs = (env,) if scope == "this" else tuple(range(self.history.num_envs))
         source = (env,) * len(envs) if scope == "into all" else envs
-        self._shown = None
         return self._restore(snapshot, envs, source, moment.serial)
 
     def undo(self, env: int) -> Restore | None:
@@ -301,7 +296,6 @@ class Timeline:
         if snapshot is None:
             return None
         envs = self.history.envs_still_at(jump)
-        self._shown = None
         return self._restore(snapshot, envs, envs, jump.serial - 1, undoes=jump.serial)
 
     def _restore(
@@ -321,20 +315,21 @@ class Timeline:
 
     def draw(
         self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "auto"
-    ) -> DrawPast | None:
+    ) -> tuple[Past, DrawPast | None]:
         """Request the missing pictures of the shown moment; only once for each moment, env and set of cameras.
 
         Fast ones are missing too, as exact ones, unless fast ones are asked for: they were drawn while something moved.
         """
         moment = self.shown
         if moment is None:
-            return None
+            return self, None
         lacking = self._lacking(moment, env, cameras, degree)
         requested = (moment.serial, env, lacking)
-        if not lacking or requested == self._requested:
-            return None
-        self._requested = requested
-        return DrawPast(moment.step.poses[env].copy(), env, lacking, moment.serial)
+        if not lacking or requested == self.requested:
+            return self, None
+        return replace(self, requested=requested), DrawPast(
+            moment.step.poses[env].copy(), env, lacking, moment.serial
+        )
 
     def _lacking(
         self, moment: Moment, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures
@@ -350,145 +345,3 @@ class Timeline:
             )
 
         return tuple(camera for camera in cameras if lacks(camera))
-
-
-class TimeTravel:
-    """The timeline as the page uses it. All methods return at once, and may be called on any thread."""
-
-    def __init__(
-        self,
-        state: LiveState,
-        on_change: Callable[[], None],
-        send: Callable[[Request], None],
-        pause: Callable[[], None],
-    ) -> None:
-        """
-        Args:
-            state: the session's.
-            on_change: called when another moment is shown.
-            send: sends a request to the worker.
-            pause: stops playing.
-        """
-        self._state, self._on_change, self._send, self._pause = state, on_change, send, pause
-
-    # --- show ------------------------------------------------------------------------------------
-
-    @on_loop
-    def seek(self, serial: int | None) -> None:
-        """Show the moment of this serial; None shows live."""
-        self._seek(lambda timeline: timeline.seek(serial))
-
-    @on_loop
-    def seek_by(self, steps: int) -> None:
-        """Show a moment of the selected env before (negative) or after the shown one."""
-        env = self._env
-        self._seek(lambda timeline: timeline.seek_by(env, steps))
-
-    @on_loop
-    def seek_step(self, env: int, step: int) -> None:
-        """Show the moment of a step of this env's shown episode."""
-        self._seek(lambda timeline: timeline.seek_step(env, step))
-
-    @on_loop
-    def seek_tick(self, tick: int, in_episode: bool = False) -> None:
-        """Show the moment after a control step, counted as the curves count; of the selected env's shown episode alone if
-        `in_episode`."""
-        env = self._env if in_episode else None
-        self._seek(lambda timeline: timeline.seek_tick(tick, env))
-
-    @on_loop
-    def seek_event(self, direction: int) -> None:
-        """Show the next (1) or previous (-1) event of the selected env: reset, success, fail, truncation, jump back."""
-        env = self._env
-        self._seek(lambda timeline: timeline.seek_event(env, direction))
-
-    @on_loop
-    def draw(self) -> None:
-        """Request pictures of the shown moment, if some of the watched cameras lack one."""
-        s = self._state
-        request = (
-            None
-            if s.timeline is None
-            else s.timeline.draw(self._env, s.now.settings.cameras, s.now.settings.pictures)
-        )
-        if request is not None:
-            self._send(request)
-
-    # --- go back ---------------------------------------------------------------------------------
-
-    @on_loop
-    def continue_from_shown(self, scope: Scope) -> None:
-        """Continue the simulation from the shown moment, in the envs of `scope`."""
-        self._travel(lambda timeline, env: timeline.continue_from_shown(env, scope))
-
-    @on_loop
-    def undo(self) -> None:
-        """Undo the selected env's last reset or jump back, and pause."""
-        self._pause()
-        self._travel(lambda timeline, env: timeline.undo(env))
-
-    # --- read ------------------------------------------------------------------------------------
-
-    @on_loop
-    def strip(self, low: int, high: int) -> Strip | None:
-        """The selected env's history between two ticks; None before a task is loaded."""
-        timeline = self._state.timeline
-        if timeline is None or not len(timeline.history):
-            return None
-        return timeline.strip(self._env, low, high)
-
-    @on_loop
-    def episode(self) -> tuple[int, int] | None:
-        """First and last tick of the selected env's episode that contains the shown moment, also where it went back."""
-        timeline = self._state.timeline
-        if timeline is None or not len(timeline.history):
-            return None
-        begin, end = timeline.episode(self._env)
-        return timeline.tick_of(begin), timeline.tick_of(end)
-
-    @on_loop
-    def segment(self) -> tuple[int, int] | None:
-        """First and last serial of the selected env's segment that contains the shown moment."""
-        timeline = self._state.timeline
-        if timeline is None or not len(timeline.history):
-            return None
-        return timeline.history.segment_at(self._env, timeline.at)
-
-    @on_loop
-    def shown_moment(self) -> ShownMoment:
-        """See `ShownPast`."""
-        s = self._state
-        shown = None if s.timeline is None else s.timeline.shown
-        count = 0 if s.now.task is None else s.now.task.num_envs
-        return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
-
-    @on_loop
-    def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
-        """See `ShownPast`."""
-        s = self._state
-        if s.timeline is None or not len(s.timeline.history):
-            return ()
-        return s.timeline.history.episode(self._env, s.timeline.at, most)
-
-    @property
-    def _env(self) -> int:
-        return self._state.now.settings.selected_env
-
-    def _seek(self, seek: Callable[[Timeline], None]) -> None:
-        timeline = self._state.timeline
-        if timeline is None:
-            return
-        before = timeline.shown
-        seek(timeline)
-        if timeline.shown is before:
-            return
-        self._state.new_pictures()
-        self._on_change()
-
-    def _travel(self, ask: Callable[[Timeline, int], Restore | None]) -> None:
-        timeline = self._state.timeline
-        request = None if timeline is None else ask(timeline, self._env)
-        self._state.new_pictures()
-        if request is not None:
-            self._send(request)
-        self._on_change()
