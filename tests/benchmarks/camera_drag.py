@@ -30,7 +30,7 @@ from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.run import PagesCounted
+from workbench.session.run.events import PagesCounted
 
 BASE: CameraKey = ("sensor", "base_camera")
 BAR = 0.2

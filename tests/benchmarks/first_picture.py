@@ -35,7 +35,7 @@ from workbench.session.process import worker_process
 from workbench.session.process.supervisor import WorkerOptions
 from workbench.session.process.worker_start import start_anew, worker_forks
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.run import PagesCounted
+from workbench.session.run.events import PagesCounted
 
 CAMERAS = (CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human"))
 

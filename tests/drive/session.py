@@ -32,7 +32,7 @@ from workbench.session.process.supervisor import Death, End, Supervisor, Vitals,
 from workbench.session.protocol.messages import Event, Loaded, ReloadReport, Request, Status
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.recordings import Rescorer
-from workbench.session.run.run import MomentShown
+from workbench.session.run.events import MomentShown
 
 TASKS = Path(__file__).parents[2] / "tasks"
 BASE: CameraKey = ("sensor", "base_camera")

@@ -24,7 +24,7 @@ from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
-from workbench.session.run.run import ActionTold
+from workbench.session.run.events import ActionTold
 
 # Recordings are read, recovered and gone into in processes of their own; one is recorded in this one, which asks for a renderer.
 pytestmark = pytest.mark.usefixtures("child_process", "renderer")

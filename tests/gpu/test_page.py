@@ -16,7 +16,7 @@ from workbench.commands.run import PlayRun
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.run import PagesCounted
+from workbench.session.run.events import PagesCounted
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 STEPS, PICTURES = 100, 5

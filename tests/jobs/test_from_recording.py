@@ -26,7 +26,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.episode import EpisodeInfo
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.run import ActionTold
+from workbench.session.run.events import ActionTold
 
 N, STEPS, ENV = 3, 40, 1
 

@@ -19,7 +19,7 @@ from workbench.session.cameras.view import EditRequest, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.run import EnvsReset, MomentShown, PagesCounted
+from workbench.session.run.events import EnvsReset, MomentShown, PagesCounted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

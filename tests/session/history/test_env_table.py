@@ -19,7 +19,7 @@ from tests.drive.session import Told, told_session
 from workbench.core.capture.outliers import OutlierKind
 from workbench.session.history.env_table import KEPT_REWARDS, Outcome
 from workbench.session.history.history import FAIL, SUCCESS
-from workbench.session.run.run import MomentShown
+from workbench.session.run.events import MomentShown
 
 N = 3
 

@@ -15,7 +15,7 @@ from workbench.commands.timeline import Seek
 from workbench.core.camera_data import CameraKind, Picture
 from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.protocol.messages import CameraRequest, PastPictures, Pictures
-from workbench.session.run.run import MomentShown
+from workbench.session.run.events import MomentShown
 
 EYE = CameraRequest("eye", "sensor")
 

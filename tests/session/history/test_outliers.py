@@ -15,7 +15,7 @@ from workbench.commands.run import Step
 from workbench.core.capture.outliers import OUTLIER_RULES, OutlierKind
 from workbench.session.history.env_table import Outcome
 from workbench.session.live.session import Session
-from workbench.session.run.run import EnvsReset
+from workbench.session.run.events import EnvsReset
 
 BROKEN = '''
 import sapien

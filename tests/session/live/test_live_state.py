@@ -38,7 +38,8 @@ from workbench.session.protocol.messages import (
 )
 from workbench.session.protocol.messages import Told as ToldRobots
 from workbench.session.rescore.background import RescoreView
-from workbench.session.run.run import MomentShown, OptionsApplied, PagesCounted, Run
+from workbench.session.run.events import MomentShown, OptionsApplied, PagesCounted
+from workbench.session.run.run import Run
 
 EYE = CameraRequest("eye", "sensor")
 GONE_WRONG = Finding("r", "warn", "m", None, None, "", "", 1, 0)

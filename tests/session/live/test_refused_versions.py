@@ -15,7 +15,7 @@ from tests.drive.session import live_session, save, start_over, step, wait_until
 from workbench.commands.run import PlayRun, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.run import EnvsReset
+from workbench.session.run.events import EnvsReset
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

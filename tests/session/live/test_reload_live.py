@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 
 from tests.drive.session import runs, save, wait_until
+from workbench.commands.command import Refused
 from workbench.commands.run import ChooseClass, PauseRun, PlayRun, RebuildScene, ReloadFile, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.run import EnvsReset, InspectionWanted
+from workbench.session.run.events import EnvsReset, InspectionWanted
 
 DRAWS = True
 
@@ -184,7 +185,8 @@ def test_of_two_tasks_in_a_file_one_can_be_chosen_and_stays_chosen(
     view = save(session, task_file, good + SECOND_TASK)
     assert (view.task.class_name, view.task.others) == ("PushTheOtherEnv", ("PushCubeEnv",))
     assert view.reload.level == "rebuilt" and "a different task" in view.reload.reason
-    session.do(ChooseClass(name="NobodysEnv"))
+    with pytest.raises(Refused):
+        session.do(ChooseClass(name="NobodysEnv"))
     session.do(ChooseClass(name="PushCubeEnv"))
     view = wait_until(session, lambda v: v.task.class_name == "PushCubeEnv", "the other task")
     assert view.task.others == ("PushTheOtherEnv",) and view.task.max_episode_steps == 50

@@ -18,7 +18,7 @@ from workbench.commands.run import PauseRun, PlayRun, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest, EnterRecording
-from workbench.session.run.run import ActionTold, EnvsReset, InspectionWanted, PagesCounted
+from workbench.session.run.events import ActionTold, EnvsReset, InspectionWanted, PagesCounted
 
 pytestmark = pytest.mark.thorough
 
@@ -141,7 +141,7 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
     assert view.problem.stage == "policy" and says in view.problem.message
     assert (view.problem.file, view.problem.line) == (None if line is None else str(policy), line)
     # No other action takes its place: whoever plays or steps hears the same.
-    for again in (lambda: session.do(PlayRun()), session.step):
+    for again in (lambda: session.do(PlayRun()), lambda: session.do(Step())):
         said = session.view().problem_serial
         again()
         view = wait_until(

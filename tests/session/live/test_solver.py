@@ -15,7 +15,7 @@ from workbench.commands.run import Interrupt, PauseRun, PlayRun, Step
 from workbench.planning.options import PlanOptions
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import PlanDropped, PlanWanted, Play
-from workbench.session.run.run import InspectionWanted
+from workbench.session.run.events import InspectionWanted
 
 FEW = PlanOptions(rollouts=16, horizon=0.3, noise=0.8)
 """Enough for a cube that is pushed."""

@@ -15,7 +15,7 @@ from workbench.commands.run import PauseRun, RestartWorker
 from workbench.commands.timeline import ContinueFromHere, UndoReset
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.run import ActionTold, EnvsReset, MomentShown, PagesCounted, PastPicturesWanted
+from workbench.session.run.events import ActionTold, EnvsReset, MomentShown, PagesCounted, PastPicturesWanted
 
 N = 3
 
@@ -31,7 +31,7 @@ def fresh(session: Session) -> int:
     session.do(PauseRun())
     session.change(episode_end="reset")
     session.change(action_source="sliders")
-    session.happen(ActionTold(range(8), (0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0)))
+    session.happen(ActionTold(tuple(range(8)), (0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0)))
     return start_over(session, 0).timeline.last
 
 

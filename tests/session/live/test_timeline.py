@@ -25,8 +25,9 @@ from workbench.session.protocol.messages import (
     Placed,
     Restore,
 )
+from workbench.session.run.events import EpisodeStepShown, MomentShown, PastPicturesWanted
 from workbench.session.run.past import Strip
-from workbench.session.run.run import EpisodeStepShown, MomentShown, PastPicturesWanted, Run
+from workbench.session.run.run import Run
 
 EYE, HAND = CameraRequest("base_camera", "sensor", ("rgb",)), CameraRequest("hand", "sensor", ("rgb",))
 PEOPLE = CameraRequest("base_camera", "human", ("rgb",))

@@ -30,7 +30,7 @@ from workbench.session.process import supervisor
 from workbench.session.process.heartbeat import INTERRUPT_SIGNAL
 from workbench.session.process.supervisor import WorkerOptions
 from workbench.session.process.worker_process import signal_main_thread
-from workbench.session.run.run import EnvsReset, MomentShown
+from workbench.session.run.events import EnvsReset, MomentShown
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -23,7 +23,7 @@ from workbench.recording.maniskill.export import export_maniskill
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.run import EnvsReset
+from workbench.session.run.events import EnvsReset
 
 STEPS = 4
 EYE = "eye=[0.45, 0, 0.6]"

@@ -21,7 +21,7 @@ from workbench.session.history.history import Moment
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.rescore.background import RescoreView, StoppedBy
-from workbench.session.run.run import EnvsReset
+from workbench.session.run.events import EnvsReset
 
 N = 3
 ORIGINAL = (

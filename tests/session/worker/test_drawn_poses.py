@@ -14,7 +14,7 @@ from workbench.commands.run import Step
 from workbench.commands.timeline import ContinueFromHere
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.run import MomentShown, PagesCounted, PastPicturesWanted
+from workbench.session.run.events import MomentShown, PagesCounted, PastPicturesWanted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

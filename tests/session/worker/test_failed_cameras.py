@@ -12,7 +12,7 @@ import pytest
 from tests.drive.session import TASKS, live_session, step, wait_until
 from workbench.core.camera_data import CameraKey
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.run import PagesCounted
+from workbench.session.run.events import PagesCounted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

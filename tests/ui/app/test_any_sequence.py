@@ -24,7 +24,7 @@ from workbench.commands.run import PauseRun, PlayRun, ReloadFile, SetSeed, Step
 from workbench.commands.timeline import ContinueFromHere, UndoReset
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest, LoadFailed, Loading, Status
-from workbench.session.run.run import MomentShown
+from workbench.session.run.events import MomentShown
 from workbench.ui.live.env_panel import TABLE
 
 PROBLEM = Problem("step", "KeyError: 'goal'", "push.py", 7, None, "Traceback")

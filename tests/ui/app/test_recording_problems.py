@@ -14,7 +14,7 @@ from tests.ui.tabs import camera_message, handshake, messages_in
 from workbench.commands.run import Step
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
-from workbench.session.run.run import EnvsReset
+from workbench.session.run.events import EnvsReset
 from workbench.ui.app.workplace import Which, Workplace
 from workbench.ui.server.gated_server import GatedServer
 

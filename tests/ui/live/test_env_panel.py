@@ -22,7 +22,7 @@ from workbench.commands.envs import (
 )
 from workbench.commands.page import ToggleTable
 from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
-from workbench.session.run.run import EpisodeStepShown, SettingsChanged
+from workbench.session.run.events import EpisodeStepShown, SettingsChanged
 from workbench.ui.live.env_panel import MOST_ROWS
 
 pytestmark = pytest.mark.thorough

@@ -9,7 +9,7 @@ import pytest
 from tests.drive.live import Live
 from tests.ui.scenes import running
 from workbench.core.capture.inspection import Inspection, JointReadings, Leaf, Touching
-from workbench.session.run.run import InspectionWanted
+from workbench.session.run.events import InspectionWanted
 from workbench.ui.live.inspect_panel import (
     CHOICES,
     LONGEST,

@@ -23,8 +23,8 @@ from workbench.jobs.rescore.verdict import Verdict
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
+from workbench.session.run.events import MomentShown
 from workbench.session.run.past import TimelineView
-from workbench.session.run.run import MomentShown
 from workbench.ui.live.rescored import chart_data
 from workbench.ui.widgets.line_chart import LONGEST
 from workbench.ui.widgets.rescored import MOST_ROWS

@@ -26,8 +26,8 @@ from workbench.commands.timeline import (
 )
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.run.events import MomentShown, PastPicturesWanted, RunEvent
 from workbench.session.run.past import TimelineView
-from workbench.session.run.run import MomentShown, PastPicturesWanted, RunEvent
 from workbench.ui.app.live_page import Page
 
 pytestmark = pytest.mark.thorough

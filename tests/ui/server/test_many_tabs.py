@@ -21,7 +21,7 @@ from tests.ui.tabs import Tabs, open_deaf_tab, tabs_of
 from workbench.commands.run import PauseRun, PlayRun
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
-from workbench.session.run.run import PagesCounted, RunEvent
+from workbench.session.run.events import PagesCounted, RunEvent
 from workbench.ui.app.live_page import Page
 from workbench.ui.scene.viewpoint import Stage
 from workbench.ui.server import strangers

@@ -19,7 +19,7 @@ from workbench.core.env.keywords import HowMade, Keyword
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.run import OptionsApplied
+from workbench.session.run.events import OptionsApplied
 from workbench.ui.tasks.env_options import EnvOptionsPanel, merged
 from workbench.ui.widgets.parts import Parts
 

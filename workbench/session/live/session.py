@@ -31,6 +31,7 @@ from workbench.session.checks.solve_seeds import SeedsSolver
 from workbench.session.events import Asked
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.solver import Solver
+from workbench.session.live.state import Effect, SessionEvent, State, apply
 from workbench.session.live.view import SessionView, view_of
 from workbench.session.loop import Aside, ChangeCounter, do, on_loop, wait_for_disk
 from workbench.session.process.askers import Asker, Background
@@ -54,35 +55,27 @@ from workbench.session.record.live import LiveRecorder
 from workbench.session.record.save_past import PastSaver, request_of
 from workbench.session.rescore.background import StoppedBy
 from workbench.session.rescore.past import PastRescorer, RescoredPast, rescore_after_load
-from workbench.session.run.run import (
-    Change,
+from workbench.session.run.events import (
     EnvsReset,
     FileOpened,
     FileSaved,
     Follow,
     FollowPolicy,
     InterruptWorker,
+    LoadDone,
     LoadGaveWay,
     Now,
     PolicySaved,
     ReplaceWorker,
-    Run,
-    RunEffect,
-    RunEvent,
     RunToEnter,
     Send,
     SettingsChanged,
     VersionLoaded,
     WorkerBusy,
     WorkerDied,
-    apply,
-    enter_when_loaded,
-    files_at_fault,
-    first_requests,
-    first_run,
-    past_after,
-    watched_files,
 )
+from workbench.session.run.loading import files_at_fault, first_requests, past_after, watched_files
+from workbench.session.run.run import Run, first_run
 
 Value = TypeVar("Value")
 HISTORY_BYTES = 256 * 1024**2
@@ -102,8 +95,8 @@ class KeptWork:
 class Session:
     """One task, one worker, any number of pages. All methods may be called on any thread, and return at once.
 
-    The run is one value (`session.run.run.Run`), which changes on the loop (`session.loop`): `happen` takes an event, `apply`
-    says what the run is after it and what has to be done, and `_perform` begins that. Nothing waits for the env. When the
+    Its state is one value, which changes on the loop (`session.loop`): `happen` takes an event, `apply` says what the state is
+    after it and what has to be done, and `_perform` begins that. Nothing waits for the env. When the
     worker dies, `Supervisor` starts another, which loads the last good version; pages stay open.
     """
 
@@ -142,7 +135,7 @@ class Session:
         settings = Settings()
         if kept is not None:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
-        self._run = first_run(task, options, history_bytes, settings)
+        self._state = State(first_run(task, options, history_bytes, settings))
         self._changes = ChangeCounter()
         self._notify = self._changes.notify
         self._enter_numbers = itertools.count(1)
@@ -204,7 +197,7 @@ class Session:
         """
         self.happen(Asked(command, page))
 
-    def happen(self, event: RunEvent) -> None:
+    def happen(self, event: SessionEvent) -> None:
         """Take an event: what a page asks for, what the worker says, a saved file.
 
         Raises:
@@ -213,20 +206,20 @@ class Session:
         for begun in do(lambda: self._happen(event)):
             wait_for_disk(begun)  # then a save is noticed
 
-    def _happen(self, event: RunEvent) -> list[Future[None]]:
+    def _happen(self, event: SessionEvent) -> list[Future[None]]:
         """Returns what was begun beside the loop."""
-        now = Now(time.monotonic(), time.time())
-        return self._change(apply(self._run, event, now))
-
-    def _change(self, change: Change) -> list[Future[None]]:
-        before = self._run
-        self._run, effects = change
+        before = self._state
+        self._state, effects = apply(before, event, Now(time.monotonic(), time.time()))
         begun = [future for effect in effects if (future := self._perform(effect)) is not None]
-        if self._run is not before:
+        if self._state is not before:
             self._notify()
         return begun
 
-    def _perform(self, effect: RunEffect) -> Future[None] | None:
+    @property
+    def _run(self) -> Run:
+        return self._state.run
+
+    def _perform(self, effect: Effect) -> Future[None] | None:
         """Begin it. Returns what is done beside the loop."""
         match effect:
             case Send(request=request):
@@ -426,7 +419,8 @@ class Session:
     def _first_requests(self) -> list[Request]:
         """First requests to a new worker."""
         run, requests = first_requests(self._run)
-        self._change((run, []))
+        self._state = replace(self._state, run=run)
+        self._notify()
         return requests
 
     def _take(self, event: Event) -> None:
@@ -523,7 +517,7 @@ class Session:
         if recording:
             put_back = past != "gone" or (event.reload is not None and bool(event.reload.carried))
             self._continue_recording(put_back, recording, one_each)
-        self._change(enter_when_loaded(self._run))
+        self._happen(LoadDone())
 
     def _continue_recording(self, put_back: bool, env_idx: tuple[int, ...], one_each: bool) -> None:
         """Continue recording these envs after a version came in.

@@ -32,8 +32,8 @@ from workbench.commands.timeline import Seek
 from workbench.machine.kept_choices import close_hints
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run import run
-from workbench.session.run.run import PagesCounted
+from workbench.session.run import asked
+from workbench.session.run.events import PagesCounted
 from workbench.ui.app.marks import EPISODES, STUDIO, Marks
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras.panel import CamerasPanel
@@ -182,7 +182,7 @@ class Page:
         self._frustums = CameraFrustums(server)
         self._forces = ForceArrows(server)
         self._parts.add(TaskCommands(server, visitors))
-        kinds = DOES | run.DOES | self._parts.does | also
+        kinds = DOES | asked.DOES | self._parts.does | also
         register(server, visitors, kinds, "live page")
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", rows=key_rows(kinds)))
@@ -324,7 +324,7 @@ class Page:
             case CloseDialog():
                 if self._opening is not None:
                     self._opening.close()
-            case _ if type(command) in run.DOES:
+            case _ if type(command) in asked.DOES:
                 session.do(command, visitor.name)
             case _ if isinstance(command, CamerasPanel.does):
                 self._cameras.do(command, visitor)

@@ -27,7 +27,7 @@ from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.run import MomentShown
+from workbench.session.run.events import MomentShown
 from workbench.ui.widgets.fields import Field, choice
 from workbench.ui.widgets.images import data_address
 from workbench.ui.widgets.parts import PagePart

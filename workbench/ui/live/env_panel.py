@@ -26,7 +26,7 @@ from workbench.machine.text import number_text
 from workbench.session.history.env_table import EnvRows, Outcome
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.run import EpisodeStepShown, SettingsChanged
+from workbench.session.run.events import EpisodeStepShown, SettingsChanged
 from workbench.ui.live.env_columns import DOT, EnvColumn, levels, wanted_width
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.live.timeline import polylines

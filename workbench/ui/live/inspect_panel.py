@@ -19,7 +19,7 @@ from workbench.core.capture.inspection import SECTIONS, Inspection, JointReading
 from workbench.machine.text import number_text
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.run import InspectionWanted
+from workbench.session.run.events import InspectionWanted
 from workbench.ui.scene.env_grid import InView
 from workbench.ui.widgets.fields import choice, tick
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart

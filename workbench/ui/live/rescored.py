@@ -18,7 +18,7 @@ from workbench.session.live.view import SessionView
 from workbench.session.rescore import verdict_text
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
-from workbench.session.run.run import MomentShown
+from workbench.session.run.events import MomentShown
 from workbench.ui.widgets.fields import by_name, choice
 from workbench.ui.widgets.line_chart import part_round
 from workbench.ui.widgets.parts import PagePart

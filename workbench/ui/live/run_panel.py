@@ -34,7 +34,7 @@ from workbench.machine.processes.watched_thread import watched_thread
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import EpisodeEnd
-from workbench.session.run.run import ActionTold
+from workbench.session.run.events import ActionTold
 from workbench.ui.live.episodes_panel import ENVS
 from workbench.ui.widgets.fields import Field, choice, slider
 from workbench.ui.widgets.parts import PagePart

@@ -30,8 +30,8 @@ from workbench.machine.text import number_text
 from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.run.events import MomentShown, PastPicturesWanted
 from workbench.session.run.past import Strip, TimelineView
-from workbench.session.run.run import MomentShown, PastPicturesWanted
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.widgets.fields import slider
 from workbench.ui.widgets.parts import Clock, PagePart

@@ -24,7 +24,7 @@ from workbench.core.env.keywords import MODES, HowMade, Keyword, as_json, read_v
 from workbench.jobs.task import TaskOptions, changed_options, command_line
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.run import OptionsApplied
+from workbench.session.run.events import OptionsApplied
 from workbench.session.tasks.recents import lasting
 from workbench.ui.widgets.fields import Field, Plain, choice, tick
 from workbench.ui.widgets.parts import PagePart
