@@ -72,7 +72,8 @@ class Board:
     def press(self, part: Locator) -> bool:
         """Whether the server was asked for something, or a text was copied."""
         before = self.page.evaluate("asked")
-        part.scroll_into_view_if_needed()
+        # Playwright's own would wait for a picture to be stable, which is drawn anew while it waits.
+        part.evaluate("p => p.scrollIntoView({block: 'nearest'})")
         box = part.bounding_box()
         if box is None:
             return False
