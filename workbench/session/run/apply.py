@@ -127,7 +127,7 @@ def apply(run: Run, event: RunEvent, now: Now) -> Change:
             return show(run, None if run.past is None else run.past.seek(serial)), effects
         case EpisodeStepShown(env=env, step=step):
             run, effects = change_settings(run, selected_env=env)
-            return show(run, None if run.past is None else run.past.seek_step(env, step)), effects
+            return show(run, None if run.kept is None else run.kept.seek_step(env, step)), effects
         case PastPicturesWanted():
             return draw_past(run)
         case ActionTold():
