@@ -25,6 +25,7 @@ from workbench.session.protocol.messages import (
 from workbench.session.run.asked import change_settings, do_command, draw_past, enter, reset, show, show_live
 from workbench.session.run.events import (
     ActionTold,
+    DrawSoon,
     EnvsReset,
     EpisodeStepShown,
     FileOpened,
@@ -67,6 +68,14 @@ def apply(run: Run, event: RunEvent, now: Now) -> Change:
     Raises:
         Refused: the command makes no sense now; nothing has changed.
     """
+    new, effects = _apply(run, event, now)
+    stands_at = new.stands_at
+    if new.pages and stands_at is not None and (stands_at != run.stands_at or isinstance(event, Placed)):
+        effects = [*effects, DrawSoon(stands_at)]
+    return new, effects
+
+
+def _apply(run: Run, event: RunEvent, now: Now) -> Change:
     match event:
         case Asked(command=command):
             return do_command(run, command)
@@ -128,8 +137,8 @@ def apply(run: Run, event: RunEvent, now: Now) -> Change:
         case EpisodeStepShown(env=env, step=step):
             run, effects = change_settings(run, selected_env=env)
             return show(run, None if run.kept is None else run.kept.seek_step(env, step)), effects
-        case PastPicturesWanted():
-            return draw_past(run)
+        case PastPicturesWanted(at=at):
+            return draw_past(run) if at in (None, run.stands_at) else (run, [])
         case ActionTold():
             if run.task is None:
                 return run, []

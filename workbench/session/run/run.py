@@ -215,6 +215,13 @@ class Run:
         return None if self.kept is None else self.kept.history.segment_at(self.env, self.kept.at)
 
     @property
+    def stands_at(self) -> object:
+        """What pictures are needed of while a moment of the past is shown; None while live."""
+        if self.past is None or self.past.pinned is None:
+            return None
+        return self.past.pinned, self.env, self.settings.cameras, self.settings.pictures
+
+    @property
     def kept(self) -> Past | None:
         """The past, if it has a moment."""
         return None if self.past is None or not len(self.past.history) else self.past
