@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -222,23 +223,82 @@ def test_what_is_open_at_once_may_take_so_much_memory_and_no_more() -> None:
     review.close()
 
 
-def test_files_that_change_or_go_are_said_and_stay_open(tmp_path: Path) -> None:
+def test_files_that_change_or_go_are_said_and_stay_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.session.review.review.CHECK_SECONDS", 0.01)
     changed, gone = tmp_path / "a.rrd", tmp_path / "a.h5"
     changed.write_text("1")
     gone.write_text("1")
     review, shelf = review_of(a=made(3))
     shelf.extra["a"] = (changed, gone)
     opened(review, "a")
-    shelf.now += 10
-    review.check_files()
+    time.sleep(0.1)  # some checks
     assert review.view().problems == ()
     changed.write_text("another")
     gone.unlink()
-    shelf.now += 10
-    review.check_files()
+    reach(review, lambda view: len(view.problems) == 2, "the word for both")
     said = " ".join(review.view().problems)
     assert "a.rrd has changed" in said and "a.h5 was deleted" in said
+    review.close()
     assert len(review.view().opened) == 1
+
+
+@pytest.fixture
+def filled(child_process: None, tmp_path: Path) -> Iterator[Library]:
+    for seed, minute in ((1, 10), (2, 20), (3, 15)):
+        write(tmp_path, made(3, seed=seed, written_at=f"2026-11-22T10:{minute}:00+00:00"), pictures=False)
+    library = Library(tmp_path)
+    yield library
+    library.close()
+
+
+def test_the_newest_is_opened_by_itself_once_it_is_listed_and_only_once(filled: Library) -> None:
+    review = Review(filled)
+    filled.on_change = review.library_changed
+    review.open_first("newest")
+    assert not review.view().loading
+    filled.refresh()
+    view = reach(review, lambda view: bool(view.opened) and not view.loading, "the newest")
+    assert [one.episode.info.seed for one in view.opened] == [2] and view.by_itself
+    review.close_one(0)
+    write(filled.folder, made(3, seed=4), pictures=False)
+    filled.refresh()
+    assert not review.view().loading and not review.view().opened
+    review.close()
+
+
+def test_a_file_is_opened_by_itself_once_it_is_listed(filled: Library) -> None:
+    filled.refresh()
+    review = Review(filled)
+    filled.on_change = review.library_changed
+    review.open_first("newest")
+    later = write(filled.folder, made(3, seed=4, written_at="2026-11-22T10:00:00+00:00"), pictures=False)
+    review.open_first(later.with_suffix(".rrd"))
+    reach(review, lambda view: not view.loading, "what the second wish came for")
+    filled.refresh()
+    view = reach(review, lambda v: [o.episode.info.seed for o in v.opened] == [4], "the file")
+    assert view.by_itself
+    review.close()
+
+
+def test_nothing_is_opened_by_itself_after_a_person_has_opened_a_recording(
+    filled: Library, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    elsewhere = write(tmp_path_factory.mktemp("other"), made(3, seed=4), pictures=False)
+    filled.refresh()
+    review = Review(filled)
+    filled.on_change = review.library_changed
+    review.open_first(filled.folder / elsewhere.name)
+    (row,) = (row for row in filled.view().rows if row.seed == 1)
+    view = opened(review, row.id)
+    assert not view.by_itself
+    for file in elsewhere.parent.glob(f"{elsewhere.stem}.*"):
+        file.rename(filled.folder / file.name)
+    filled.refresh()
+    assert len(filled.view().rows) == 4
+    assert [one.id for one in review.view().opened] == [row.id] and not review.view().loading
+    review.close()
 
 
 def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,6 +33,7 @@ from workbench.recording.library.trash import (
 )
 from workbench.recording.reader.reading import read_rows
 from workbench.recording.reader.scan import DATASET_KEY, NOTES, RecordingFiles, Scan, key_of, scan_folder
+from workbench.recording.sweeps import RESULTS
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +68,8 @@ class LibraryView:
     trash: Trash = Trash()
     jobs: tuple[JobStatus, ...] = ()
     """Jobs that record into the folder, or have until a while ago."""
+    has_sweep: bool = False
+    """Whether the folder has the results of a sweep."""
 
 
 class Library:
@@ -89,7 +92,9 @@ class Library:
         self._changing = threading.RLock()
         """Held while `_kept` is changed, but not while files are read."""
         self._changed = threading.Lock()
-        self._view = LibraryView(reading=(0, 0))
+        self._view = LibraryView(reading=(0, 0), has_sweep=self._has_sweep())
+        self.on_change: Callable[[], None] = lambda: None
+        """Called when the view has changed, on the thread that changed it."""
         self._by_id: dict[str, LibraryRow] = {}
         self._scan = Scan(fresh=True)
         self._full_scan_at = -1e9
@@ -245,11 +250,17 @@ class Library:
 
     def _publish(self, **changes: object) -> None:
         with self._changed:
-            view = replace(self._view, trash=read_trash(self.folder), **changes)  # type: ignore[arg-type]
+            kept = replace(self._view, trash=read_trash(self.folder), has_sweep=self._has_sweep())
+            view = replace(kept, **changes)  # type: ignore[arg-type]
             if view.rows is not self._view.rows:
                 self._by_id = {row.id: row for row in view.rows}
-            if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
-                self._view = replace(view, serial=self._view.serial + 1)
+            if replace(view, serial=0) == replace(self._view, serial=0) and self._view.serial > 0:
+                return
+            self._view = replace(view, serial=self._view.serial + 1)
+        self.on_change()
+
+    def _has_sweep(self) -> bool:
+        return (self.folder / RESULTS).exists()
 
     # --- operations on recordings ----------------------------------------------------------------------
 

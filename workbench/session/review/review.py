@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import datetime
 import logging
-import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from workbench.core.scene.shapes import SharedShapes
 from workbench.machine.processes.family import allocated_memory
@@ -20,7 +20,7 @@ from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import LibraryRow, UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import read_recording
-from workbench.session.loop import Aside, ChangeCounter, do, on_loop, post
+from workbench.session.loop import Aside, ChangeCounter, begin, do, later, on_loop, post
 from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.process.memory_limit import format_size, total_memory
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
@@ -38,7 +38,7 @@ FIRST_SHOWN = 0.4
 """Seconds after which the recordings read so far are shown, while others are read; doubled each time, since each time
 a scene is built."""
 _NEVER = datetime.datetime.min.replace(tzinfo=datetime.timezone.utc)
-_CHECK_EVERY = 2.0
+CHECK_SECONDS = 2.0
 """Seconds between two checks whether files changed since they were read."""
 
 
@@ -109,8 +109,10 @@ class Review:
         self._files: dict[Path, _Stamp] = {}
         """Files of the open recordings."""
         self._open_problems: tuple[str, ...] = ()
-        self._files_checked = -math.inf
-        """Clock time in seconds of the last check."""
+        self._next_check: asyncio.TimerHandle | None = None
+        self._file_checks = Aside("review-files")
+        self._first: Path | Literal["newest"] | None = None
+        """What to open by itself once the library lists it."""
 
     # --- what the page reads -------------------------------------------------------------------------
 
@@ -161,17 +163,43 @@ class Review:
             wanted = wanted[:MOST_OPEN]
         do(lambda: self._begin(wanted, problems, state))
 
-    def _begin(self, wanted: list[LibraryRow], problems: list[str], state: int | None) -> None:
+    def open_first(self, what: Path | Literal["newest"]) -> None:
+        """Open the recording of this file, or the newest, as soon as the library lists it, unless another is opened before."""
+        post(lambda: self._open_first(what))
+
+    def library_changed(self) -> None:
+        """The library has another view."""
+        post(lambda: self._open_first(self._first))
+
+    def _open_first(self, first: Path | Literal["newest"] | None) -> None:
+        self._first, listed = first, self._library.view()
+        whole = [row for row in listed.rows if row.problem is None]
+        if isinstance(first, Path):
+            row = next((row for row in whole if first.name in [path.name for path in row.paths]), None)
+        elif first == "newest" and listed.rows and listed.reading is None:
+            self._first = None  # also if none of them can be read
+            row = max(whole, key=lambda row: row.written or 0.0, default=None)
+        else:
+            return
+        if row is not None:
+            self._begin([row], [], None, by_itself=True)
+
+    def _begin(
+        self, wanted: list[LibraryRow], problems: list[str], state: int | None, by_itself: bool = False
+    ) -> None:
+        self._first = None
         self._opening.stop()
         self._partly_shown = False
         self._closed = set()
         if not wanted:
-            self._change(problems=tuple(problems), not_opened=(), loading="")
+            self._change(problems=tuple(problems), not_opened=(), loading="", by_itself=False)
             return
         # The library lists the newest first, but a comparison asks what became of the oldest. It is also read first:
         # the recording that is shown first stays selected when others arrive.
         wanted.sort(key=lambda row: (row.date is None, row.date or _NEVER))
-        self._change(loading=_opening_text(wanted, 0), problems=tuple(problems), not_opened=())
+        self._change(
+            loading=_opening_text(wanted, 0), problems=tuple(problems), not_opened=(), by_itself=by_itself
+        )
         self._opening.start("opening", lambda job: self._open(job, wanted, problems, state))
 
     async def _open(self, job: Job, rows: list[LibraryRow], problems: list[str], state: int | None) -> None:
@@ -212,8 +240,14 @@ class Review:
         self._seek(position)
 
     def close(self) -> None:
-        """Stop opening."""
-        do(self._opening.close)
+        """Stop opening, and checking files."""
+        do(self._close)
+
+    def _close(self) -> None:
+        self._opening.close()
+        self._file_checks.end()
+        if self._next_check is not None:
+            self._next_check.cancel()
 
     async def _open_on(
         self, aside: Aside, job: Job, rows: list[LibraryRow], problems: list[str], state: int | None
@@ -273,6 +307,7 @@ class Review:
         Selection and position stay once something of this opening was shown.
         """
         self._files = dict(files)
+        self._check_files_later()
         kept = [one for one in opened if one.id not in self._closed]
         chosen = self._view.chosen if self._partly_shown else None
         selected = next((index for index, one in enumerate(kept) if one is chosen), 0)
@@ -459,16 +494,16 @@ class Review:
 
     # --- files ---------------------------------------------------------------------------------------
 
-    def check_files(self) -> None:
-        """Report files that were deleted or changed since they were read; at most every `_CHECK_EVERY` seconds."""
-        if self._clock() - self._files_checked < _CHECK_EVERY:
-            return
-        self._files_checked = self._clock()
-        files = self._files
-        found = _changed_files(files)
-        do(lambda: self._set_changed_files(files, found))
+    def _check_files_later(self) -> None:
+        if self._next_check is None and self._files:
+            self._next_check = later(CHECK_SECONDS, lambda: begin(self._check_files()))
 
-    def _set_changed_files(self, files: Mapping[Path, _Stamp], found: Sequence[str]) -> None:
+    async def _check_files(self) -> None:
+        """Report files that were deleted or changed since they were read."""
+        files = self._files
+        found = await self._file_checks.run(partial(_changed_files, files))
+        self._next_check = None
+        self._check_files_later()
         problems = tuple(dict.fromkeys((*self._open_problems, *found)))
         if problems != self._view.problems and files is self._files and not self._view.loading:
             self._change(problems=problems)
