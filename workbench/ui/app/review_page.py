@@ -28,7 +28,8 @@ from workbench.core.camera_data import CameraKey, Picture
 from workbench.recording.library.library import Library
 from workbench.session.live.view import ShownCameras
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.review.review import MOST_OPEN, Review
+from workbench.session.review.review import Review
+from workbench.session.review.state import MOST_OPEN
 from workbench.session.review.view import PictureReader, ReviewView, column_at, outcome_text
 from workbench.ui.app.go_live import GoLivePart
 from workbench.ui.cameras.panel import CamerasPanel
@@ -442,16 +443,13 @@ class ReviewTimeline(TimeBar[ReviewView]):
     """
 
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
-        super().__init__(server, review, "step of the timeline", Seek, "step")
+        super().__init__(server, "step of the timeline", Seek, "step")
         self._review = review
         self._drawn: tuple[object, ...] = ()
         self._fixed: dict[str, object] = {}
 
-    def _to_first(self) -> None:
-        self._review.to_first()
-
-    def _to_last(self) -> None:
-        self._review.to_last()
+    def do(self, command: Command, visitor: Visitor) -> None:
+        self._review.do(command, visitor.name)
 
     def draw(self, view: ReviewView) -> None:
         if not self._draw_panel(bool(view.opened)):

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Collection, Sequence
 from itertools import groupby
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import viser
@@ -55,19 +55,10 @@ UNDO = "undo"
 View = TypeVar("View", contravariant=True)
 
 
-class Seeks(Protocol):
-    """Target of the slider and the buttons, which defines what a place in time is."""
-
-    def seek(self, place: Any, /) -> None: ...
-    def seek_by(self, steps: int, /) -> None: ...
-    def seek_event(self, direction: int, /) -> None: ...
-
-
 class TimeBar(PagePart[View]):
     """A slider over time, a strip under it and a row of buttons, across the bottom of the view.
 
     Args:
-        seeks: What slider, buttons and arrow keys move.
         name: Of the slider.
         kind: The command that the slider's value goes into, in its field `field`.
     """
@@ -82,10 +73,7 @@ class TimeBar(PagePart[View]):
         GoToLast,
     )
 
-    def __init__(
-        self, server: viser.ViserServer, seeks: Seeks, name: str, kind: type[Command], field: str
-    ) -> None:
-        self._seeks = seeks
+    def __init__(self, server: viser.ViserServer, name: str, kind: type[Command], field: str) -> None:
         gui = server.gui
         self._panel = gui.add_panel(visible=False, order=10.0)
         with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
@@ -99,33 +87,6 @@ class TimeBar(PagePart[View]):
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
         """Add rows between the strip and the buttons."""
-
-    def do(self, command: Command, visitor: Visitor) -> None:
-        match command:
-            case StepBack():
-                self._seeks.seek_by(-1)
-            case StepForward():
-                self._seeks.seek_by(1)
-            case PreviousEvent():
-                self._seeks.seek_event(-1)
-            case NextEvent():
-                self._seeks.seek_event(1)
-            case Seek(step=step):
-                self._seek(step)
-            case GoToFirst():
-                self._to_first()
-            case GoToLast():
-                self._to_last()
-
-    def _seek(self, step: int) -> None:
-        """Show the moment after this control step."""
-        self._seeks.seek(step)
-
-    def _to_first(self) -> None:
-        raise NotImplementedError
-
-    def _to_last(self) -> None:
-        raise NotImplementedError
 
     def fold(self, wanted: bool) -> None:
         """Fold it to a bar, where it would cover what is looked at, or unfold what this has folded."""
@@ -151,7 +112,7 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     does = (*TimeBar.does, SeekBack, ZoomTimeline, UndoReset, ContinueFromHere)
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
-        super().__init__(server, session.past, "step of the past", SeekBack, "steps")
+        super().__init__(server, "step of the past", SeekBack, "steps")
         self._session, self._clock = session, clock
         self._episode_only = False
         self._range = (0, 0)
@@ -172,36 +133,33 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
     # --- what a person does ------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
+        past = self._session.past
         match command:
+            case StepBack():
+                past.seek_by(-1)
+            case StepForward():
+                past.seek_by(1)
+            case PreviousEvent():
+                past.seek_event(-1)
+            case NextEvent():
+                past.seek_event(1)
+            case Seek(step=step):
+                past.seek_tick(step, self._episode_only)
+            case SeekBack(steps=0) | GoToLast():
+                past.seek(None)
             case SeekBack(steps=steps):
-                self._seek_back(steps)
+                past.seek_tick(self._newest + steps, self._episode_only)
+            case GoToFirst() if self._episode_only:
+                # The left end of the slider: a slider with the focus goes there too.
+                past.seek_tick(self._range[0], in_episode=True)
+            case GoToFirst():
+                past.seek(0)
             case ZoomTimeline(episode_only=wanted):
                 self._episode_only, self._range_at = wanted, -math.inf
             case UndoReset():
-                self._session.past.undo()
+                past.undo()
             case ContinueFromHere(scope=scope):
-                self._session.past.continue_from_shown(scope)
-            case _:
-                super().do(command, visitor)
-
-    def _to_last(self) -> None:
-        self._session.past.seek(None)
-
-    def _to_first(self) -> None:
-        """Go to the left end of the slider; a slider with the focus goes there too."""
-        if self._episode_only:
-            self._session.past.seek_tick(self._range[0], in_episode=True)
-        else:
-            self._session.past.seek(0)
-
-    def _seek_back(self, steps: int) -> None:
-        if steps == 0:
-            self._session.past.seek(None)
-        else:
-            self._seek(self._newest + steps)
-
-    def _seek(self, step: int) -> None:
-        self._session.past.seek_tick(step, self._episode_only)
+                past.continue_from_shown(scope)
 
     # --- drawing -----------------------------------------------------------------------------------
 
