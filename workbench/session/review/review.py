@@ -25,8 +25,6 @@ from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.process.memory_limit import format_size, total_memory
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
 from workbench.session.review.state import (
-    BeginReading,
-    CheckFiles,
     Event,
     FilesChecked,
     FileStamp,
@@ -157,12 +155,10 @@ class Review:
     def _happened(self, event: Event) -> None:
         state, effects = apply(self._state, event, self._clock())
         self._set(state)
-        for effect in effects:
-            match effect:
-                case BeginReading(opening=number, rows=rows):
-                    self._reading.start("opening", partial(self._open, number, rows))
-                case CheckFiles(files=files):
-                    self._next_check = later(CHECK_SECONDS, lambda files=files: begin(self._check(files)))
+        for reading in effects:
+            self._reading.start("opening", partial(self._open, reading.opening, reading.rows))
+        if state.files and self._next_check is None:
+            self._next_check = later(CHECK_SECONDS, lambda: begin(self._check(self._state.files)))
 
     def _set(self, state: ReviewState) -> None:
         before, self._state = self._state, state
@@ -182,6 +178,7 @@ class Review:
 
     async def _check(self, files: Mapping[Path, FileStamp]) -> None:
         changed = await self._file_checks.run(partial(_changed_files, files))
+        self._next_check = None
         self._happened(FilesChecked(files, tuple(changed)))
 
     async def _open(self, number: int, rows: tuple[LibraryRow, ...], job: Job) -> None:

@@ -8,28 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from workbench.commands import review, run, timeline
 from workbench.commands.command import Command, Refused
-from workbench.commands.review import (
-    AlignRecordings,
-    ChoosePlaybackSpeed,
-    CloseRecording,
-    LoopPlayback,
-    NextRecording,
-    OpenAgain,
-    PreviousRecording,
-    SelectRecording,
-    SwapWithFirst,
-)
-from workbench.commands.run import TogglePlay
-from workbench.commands.timeline import (
-    GoToFirst,
-    GoToLast,
-    NextEvent,
-    PreviousEvent,
-    Seek,
-    StepBack,
-    StepForward,
-)
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import LibraryRow
 from workbench.recording.library.library import LibraryView
@@ -90,8 +70,6 @@ class ReviewState:
     opening: Opening = Opening()
     files: Mapping[Path, FileStamp] = field(default_factory=dict)
     """Files of the open recordings."""
-    checking: bool = False
-    """Whether a check of the files is under way."""
     problems: tuple[str, ...] = ()
     """Problems of the last opening, without those of files that changed since."""
 
@@ -202,15 +180,7 @@ class BeginReading:
     rows: tuple[LibraryRow, ...]
 
 
-@dataclass(frozen=True)
-class CheckFiles:
-    """Check after a while whether files changed since they were read."""
-
-    files: Mapping[Path, FileStamp]
-
-
-Effect = BeginReading | CheckFiles
-Result = tuple[ReviewState, list[Effect]]
+Result = tuple[ReviewState, list[BeginReading]]
 
 
 # --- changes -----------------------------------------------------------------------------------------
@@ -226,7 +196,7 @@ def apply(state: ReviewState, event: Event, now: float) -> Result:
     if isinstance(event, Read | NotRead | ReadingEnded | SceneTold) and event.opening != opening.number:
         return state, []
     match event:
-        case Asked(command=OpenAgain()):
+        case Asked(command=review.OpenAgain()):
             ids = *(one.id for one in state.view.opened), *state.view.not_opened
             return _open_ids(state, ids, None, now)
         case Asked(command=command):
@@ -242,24 +212,22 @@ def apply(state: ReviewState, event: Event, now: float) -> Result:
             state = _told(
                 replace(state, opening=opening), *(file.sentence for file in one.episode.broken_files)
             )
-            return _row_done(state, now)
+            return _row_done(state, now), []
         case NotRead(id=id, problem=problem):
             state = _with(_told(state, problem), not_opened=(*state.view.not_opened, id))
-            return _row_done(state, now)
+            return _row_done(state, now), []
         case ReadingEnded(problem=problem):
             state = _with(_told(state, problem) if problem else state, loading="")
             read = tuple(sorted(opening.read, key=lambda one: one.episode.info.written_at))
-            state, effects = _show(state, read, now) if read else (state, [])
-            return replace(state, opening=replace(state.opening, read=())), effects
+            state = _show(state, read, now) if read else state
+            return replace(state, opening=replace(state.opening, read=())), []
         case SceneTold():
             return _scene_told(state, event), []
         case FilesChecked(files=files, changed=changed):
             problems = tuple(dict.fromkeys((*state.problems, *changed)))
             if files is state.files and not state.view.loading and problems != state.view.problems:
                 state = _with(state, problems=problems)
-            return replace(state, checking=bool(state.files)), [
-                CheckFiles(state.files)
-            ] if state.files else []
+            return state, []
         case ProblemFound(sentence=sentence):
             return _told(state, sentence), []
 
@@ -307,40 +275,40 @@ def _told(state: ReviewState, *sentences: str) -> ReviewState:
 def _asked(state: ReviewState, command: Command, now: float) -> ReviewState:
     view, count = state.view, len(state.view.opened)
     match command:
-        case TogglePlay():
+        case run.TogglePlay():
             return _play_or_pause(state, now)
-        case StepBack():
+        case timeline.StepBack():
             return _moved(_paused(state), view.position - 1, now)
-        case StepForward():
+        case timeline.StepForward():
             return _moved(_paused(state), view.position + 1, now)
-        case PreviousEvent():
+        case timeline.PreviousEvent():
             return _to_event(state, -1, now)
-        case NextEvent():
+        case timeline.NextEvent():
             return _to_event(state, 1, now)
-        case Seek(step=step):
+        case timeline.Seek(step=step):
             return _moved(state, step, now)
-        case GoToFirst():
+        case timeline.GoToFirst():
             return _moved(state, view.first, now)
-        case GoToLast():
+        case timeline.GoToLast():
             return _moved(_paused(state), view.last, now)
-        case SelectRecording(id=id):
+        case review.SelectRecording(id=id):
             return _select(state, _index_of(view, id), now)
-        case NextRecording():
+        case review.NextRecording():
             return _select(state, (view.selected + 1) % max(count, 1), now)
-        case PreviousRecording():
+        case review.PreviousRecording():
             return _select(state, (view.selected - 1) % max(count, 1), now)
-        case CloseRecording(id=id):
+        case review.CloseRecording(id=id):
             return _close(state, _index_of(view, id), now)
-        case SwapWithFirst(index=index):
+        case review.SwapWithFirst(index=index):
             return _swap_with_first(state, index, now)
-        case ChoosePlaybackSpeed(speed=speed):
+        case review.ChoosePlaybackSpeed(speed=speed):
             return _moved(_with(state, speed=speed), view.position, now)
-        case LoopPlayback(on=on):
+        case review.LoopPlayback(on=on):
             return _with(state, loop=on)
-        case AlignRecordings(at=at) if at in view.alignments:
+        case review.AlignRecordings(at=at) if at in view.alignments:
             kept = view.states[view.selected] if view.opened else None
             return _align(state, at, kept, now)
-        case AlignRecordings():
+        case review.AlignRecordings():
             raise Refused("The recordings cannot be aligned at that.")
     raise Refused(f"Not possible in a review: {command.help()}.")
 
@@ -476,34 +444,30 @@ def _loading(opening: Opening) -> str:
     return f"opening {name}" if len(rows) == 1 else f"opening {done + 1} of {len(rows)}: {name}"
 
 
-def _row_done(state: ReviewState, now: float) -> Result:
+def _row_done(state: ReviewState, now: float) -> ReviewState:
     """Show those read so far, if a person has waited long enough for the others."""
     opening = replace(state.opening, done=state.opening.done + 1)
-    effects: list[Effect] = []
+    state = replace(state, opening=opening)
     if opening.done < len(opening.rows) and opening.read and now >= opening.show_at:
         pause = 2 * opening.pause
         opening = replace(opening, show_at=now + pause, pause=pause)
-        state, effects = _show(replace(state, opening=opening), opening.read, now)
-        opening = state.opening
-    loading = _loading(opening) or state.view.loading
-    return _with(replace(state, opening=opening), loading=loading), effects
+        state = _show(replace(state, opening=opening), opening.read, now)
+    return _with(state, loading=_loading(opening) or state.view.loading)
 
 
-def _show(state: ReviewState, read: Sequence[Opened], now: float) -> Result:
+def _show(state: ReviewState, read: Sequence[Opened], now: float) -> ReviewState:
     """Show recordings that were read, without those closed again.
 
     Selection and position stay once something of this opening was shown.
     """
     opening, view = state.opening, state.view
     kept = [one for one in read if one.id not in opening.closed]
-    effects: list[Effect] = [CheckFiles(opening.files)] if opening.files and not state.checking else []
-    checking = state.checking or bool(effects)
-    state = replace(state, files=opening.files, checking=checking, opening=replace(opening, shown=True))
+    state = replace(state, files=opening.files, opening=replace(opening, shown=True))
     if opening.shown:
         selected = next((index for index, one in enumerate(kept) if one is view.chosen), 0)
-        return _set_opened(state, kept, selected, view.align, now, stay=True), effects
+        return _set_opened(state, kept, selected, view.align, now, stay=True)
     state = _set_opened(state, kept, 0, START, now)
-    return state if opening.state is None else _moved(state, opening.state, now), effects
+    return state if opening.state is None else _moved(state, opening.state, now)
 
 
 def _set_opened(
