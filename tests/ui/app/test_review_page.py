@@ -62,7 +62,7 @@ def test_the_results_of_a_sweep_have_a_tab_also_if_they_come_later(
         shown.draw()
         assert "reach_weight" not in shown.html()
         sweep_folder(tmp_path)
-        until(lambda: shown.library.view().has_sweep, "the results of the sweep")
+        until(lambda: shown.library.view().sweep, "the results of the sweep")
         until(lambda: shown.draw() or "reach_weight" in shown.part("Sweep").html(), "the points")
 
 

@@ -68,8 +68,8 @@ class LibraryView:
     trash: Trash = Trash()
     jobs: tuple[JobStatus, ...] = ()
     """Jobs that record into the folder, or have until a while ago."""
-    has_sweep: bool = False
-    """Whether the folder has the results of a sweep."""
+    sweep: tuple[int, int] | None = None
+    """Bytes and mtime in ns of the file with the results of a sweep; None if the folder has none."""
 
 
 class Library:
@@ -92,7 +92,7 @@ class Library:
         self._changing = threading.RLock()
         """Held while `_kept` is changed, but not while files are read."""
         self._changed = threading.Lock()
-        self._view = LibraryView(reading=(0, 0), has_sweep=self._has_sweep())
+        self._view = LibraryView(reading=(0, 0), sweep=self._sweep())
         self.on_change: Callable[[], None] = lambda: None
         """Called when the view has changed, on the thread that changed it."""
         self._by_id: dict[str, LibraryRow] = {}
@@ -250,7 +250,7 @@ class Library:
 
     def _publish(self, **changes: object) -> None:
         with self._changed:
-            kept = replace(self._view, trash=read_trash(self.folder), has_sweep=self._has_sweep())
+            kept = replace(self._view, trash=read_trash(self.folder), sweep=self._sweep())
             view = replace(kept, **changes)  # type: ignore[arg-type]
             if view.rows is not self._view.rows:
                 self._by_id = {row.id: row for row in view.rows}
@@ -259,8 +259,12 @@ class Library:
             self._view = replace(view, serial=self._view.serial + 1)
         self.on_change()
 
-    def _has_sweep(self) -> bool:
-        return (self.folder / RESULTS).exists()
+    def _sweep(self) -> tuple[int, int] | None:
+        try:
+            stat = os.stat(self.folder / RESULTS)
+        except OSError:
+            return None
+        return stat.st_size, stat.st_mtime_ns
 
     # --- operations on recordings ----------------------------------------------------------------------
 

@@ -224,10 +224,10 @@ class ReviewPage:
 
     def _sweep_of(self, library: Library) -> SweepPanel | None:
         """The tab with the results of a sweep, if the folder has some."""
-        if not library.view().has_sweep:
+        if library.view().sweep is None:
             return None
         with self._library_window.add_tab("Sweep", viser.Icon.ADJUSTMENTS_HORIZONTAL):
-            return SweepPanel(self._server, library, self._open_of_sweep, self._clock)
+            return SweepPanel(self._server, library, self._open_of_sweep)
 
     def _add_late_sweep(self) -> None:
         """Add the tab of a sweep whose results came after the page."""
