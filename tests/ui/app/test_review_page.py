@@ -348,7 +348,6 @@ def test_a_foreign_recording_of_any_values_is_shown_or_named(
     path.unlink()
     with review_of(gated_server, tmp_path) as reviewed:
         review, rows = reviewed.review, {row.name: row.id for row in reviewed.library.view().rows}
-        reviewed.page.redraw()  # it opens the newest by itself, once
         shown = []
         for number in range(len(HOSTILE)):
             review.open([rows[str(number)]])

@@ -166,7 +166,7 @@ class Review:
             self._changes.notify()
 
     def _wanted(self, event: Asked | Open | OpenFirst) -> None:
-        self._list()  # of a row that is drawn its news may still be on the way
+        self._list()  # the page may draw a row before the loop is told of it
         self._happened(event)
 
     def _list(self) -> None:
