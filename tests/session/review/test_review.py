@@ -274,14 +274,16 @@ def filled(child_process: None, tmp_path: Path) -> Iterator[Library]:
     library.close()
 
 
-def test_the_newest_is_opened_by_itself_once_it_is_listed_and_only_once(filled: Library) -> None:
+def test_the_newest_is_opened_library_stays_once_it_is_listed_and_only_once(filled: Library) -> None:
     review = Review(filled)
     filled.on_change = review.library_changed
     review.open_first("newest")
+    review.add_problem("A killed program left half an episode.")
     assert not review.view().loading
     filled.refresh()
     view = reach(review, lambda view: bool(view.opened) and not view.loading, "the newest")
-    assert [one.episode.info.seed for one in view.opened] == [2] and view.by_itself
+    assert [one.episode.info.seed for one in view.opened] == [2] and view.library_stays
+    assert view.problems == ("A killed program left half an episode.",), "nobody could have read it"
     close_one(review, 0)
     write(filled.folder, made(3, seed=4), pictures=False)
     filled.refresh()
@@ -289,7 +291,7 @@ def test_the_newest_is_opened_by_itself_once_it_is_listed_and_only_once(filled: 
     review.close()
 
 
-def test_a_file_is_opened_by_itself_once_it_is_listed(filled: Library) -> None:
+def test_a_file_is_opened_library_stays_once_it_is_listed(filled: Library) -> None:
     filled.refresh()
     review = Review(filled)
     filled.on_change = review.library_changed
@@ -299,11 +301,11 @@ def test_a_file_is_opened_by_itself_once_it_is_listed(filled: Library) -> None:
     reach(review, lambda view: not view.loading, "what the second wish came for")
     filled.refresh()
     view = reach(review, lambda v: [o.episode.info.seed for o in v.opened] == [4], "the file")
-    assert view.by_itself
+    assert view.library_stays
     review.close()
 
 
-def test_nothing_is_opened_by_itself_after_a_person_has_opened_a_recording(
+def test_nothing_is_opened_library_stays_after_a_person_has_opened_a_recording(
     filled: Library, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     elsewhere = write(tmp_path_factory.mktemp("other"), made(3, seed=4), pictures=False)
@@ -313,7 +315,7 @@ def test_nothing_is_opened_by_itself_after_a_person_has_opened_a_recording(
     review.open_first(filled.folder / elsewhere.name)
     (row,) = (row for row in filled.view().rows if row.seed == 1)
     view = opened(review, row.id)
-    assert not view.by_itself
+    assert not view.library_stays
     for file in elsewhere.parent.glob(f"{elsewhere.stem}.*"):
         file.rename(filled.folder / file.name)
     filled.refresh()

@@ -121,14 +121,15 @@ class Review:
         self._wanted(Asked(command, page))
 
     @on_loop
-    def open(self, ids: Sequence[str], state: int | None = None) -> None:
+    def open(self, ids: Sequence[str], state: int | None = None, library_stays: bool = False) -> None:
         """Show these recordings instead of the open ones, the oldest first.
 
         Args:
             ids: rows of the library; those beyond `MOST_OPEN` are left out, with a message.
             state: of the first recording, to begin at.
+            library_stays: as in `ReviewView`.
         """
-        self._wanted(Open(tuple(ids), state))
+        self._wanted(Open(tuple(ids), state, library_stays))
 
     def open_first(self, what: First) -> None:
         """Open this by itself as soon as the library lists it, unless another recording is opened before."""

@@ -84,6 +84,8 @@ class Open:
     ids: tuple[str, ...]
     state: int | None = None
     """State of the first recording, to begin at."""
+    library_stays: bool = False
+    """As in `ReviewView`."""
 
 
 @dataclass(frozen=True)
@@ -198,11 +200,11 @@ def apply(state: ReviewState, event: Event, now: float) -> Result:
     match event:
         case Asked(command=review.OpenAgain()):
             ids = *(one.id for one in state.view.opened), *state.view.not_opened
-            return _open_ids(state, ids, None, now)
+            return _open_ids(state, Open(ids), now)
         case Asked(command=command):
             return _asked(state, command, now), []
-        case Open(ids=ids, state=at):
-            return _open_ids(state, ids, at, now)
+        case Open():
+            return _open_ids(state, event, now)
         case OpenFirst(what=what):
             return _open_first(replace(state, first=what), now)
         case Listed(library=library):
@@ -384,11 +386,11 @@ def _swap_with_first(state: ReviewState, index: int, now: float) -> ReviewState:
 # --- what is open ------------------------------------------------------------------------------------
 
 
-def _open_ids(state: ReviewState, ids: Sequence[str], at: int | None, now: float) -> Result:
-    rows = {row.id: row for row in state.library.rows}
-    wanted = [rows[id] for id in dict.fromkeys(ids) if id in rows]
+def _open_ids(state: ReviewState, asked: Open, now: float) -> Result:
+    rows, ids = {row.id: row for row in state.library.rows}, dict.fromkeys(asked.ids)
+    wanted = [rows[id] for id in ids if id in rows]
     problems = []
-    if missing := len(dict.fromkeys(ids)) - len(wanted):
+    if missing := len(ids) - len(wanted):
         problems.append(
             "A requested recording is no longer in the folder."
             if missing == 1
@@ -398,7 +400,7 @@ def _open_ids(state: ReviewState, ids: Sequence[str], at: int | None, now: float
         problems.append(
             f"At most {MOST_OPEN} recordings can be open at once; the first {MOST_OPEN} were opened."
         )
-    return _open(state, wanted[:MOST_OPEN], problems, at, now)
+    return _open(state, wanted[:MOST_OPEN], problems, asked.state, now, asked.library_stays)
 
 
 def _open_first(state: ReviewState, now: float) -> Result:
@@ -413,7 +415,7 @@ def _open_first(state: ReviewState, now: float) -> Result:
         row = max(whole, key=lambda row: row.written or 0.0, default=None)
     else:
         return state, []
-    return (state, []) if row is None else _open(state, [row], (), None, now, by_itself=True)
+    return (state, []) if row is None else _open(state, [row], state.problems, None, now, True)
 
 
 def _open(
@@ -422,7 +424,7 @@ def _open(
     problems: Iterable[str],
     at: int | None,
     now: float,
-    by_itself: bool = False,
+    library_stays: bool,
 ) -> Result:
     # The library lists the newest first, but a comparison asks what became of the oldest. It is also read first: the
     # recording that is shown first stays selected when others arrive.
@@ -430,7 +432,7 @@ def _open(
     opening = Opening(state.opening.number + 1, rows, at, show_at=now + FIRST_SHOWN, pause=FIRST_SHOWN)
     state = replace(state, first=None, opening=opening, problems=tuple(problems))
     state = _with(
-        state, loading=_loading(opening), problems=state.problems, not_opened=(), by_itself=by_itself
+        state, loading=_loading(opening), problems=state.problems, not_opened=(), library_stays=library_stays
     )
     return state, [BeginReading(opening.number, rows)]
 

@@ -109,8 +109,8 @@ class ReviewView:
     """Recordings that could not be opened, and files that changed since; a sentence each."""
     not_opened: tuple[str, ...] = ()
     """Ids of the recordings that the last opening could not read."""
-    by_itself: bool = False
-    """Whether what is open, or is being opened, was opened without a press in the library."""
+    library_stays: bool = False
+    """Whether the library stays unfolded next to what is open, or is being opened."""
 
     @property
     def playing(self) -> bool:

@@ -110,8 +110,6 @@ class ReviewPage:
         self._pictures: dict[CameraKey, Picture] = {}
         self._pictures_serial = 0
         self._had_opened = tuple(one.id for one in review.view().opened)
-        self._awaited: tuple[str, ...] = ()
-        """Ids of the episodes of a sweep that are next to its table, until they are open."""
         self._fold_other: Callable[[bool], None] = lambda folded: None
         """Folds and unfolds rerun's panel."""
         self._other_folded = False
@@ -219,7 +217,7 @@ class ReviewPage:
         self._library_window.dock_left()
         self._library_window.set_width(LIBRARY_WIDTH)
         self._library_open = True
-        if self._had_opened and not self._review.view().by_itself:
+        if self._had_opened and not self._review.view().library_stays:
             self._show_library(False)
 
     def _sweep_of(self, library: Library) -> SweepPanel | None:
@@ -236,10 +234,8 @@ class ReviewPage:
             self._parts.add(sweep)
 
     def _open_of_sweep(self, ids: tuple[str, ...]) -> None:
-        self._review.open(ids)
-        if self._smallest_view() >= LEAST_BESIDE_SWEEP:
-            # The panel stays: a person goes from the best episode to the worst.
-            self._had_opened = self._awaited = ids
+        # The panel stays: a person goes from the best episode to the worst.
+        self._review.open(ids, library_stays=self._smallest_view() >= LEAST_BESIDE_SWEEP)
 
     # --- start and stop --------------------------------------------------------------------------
 
@@ -288,16 +284,11 @@ class ReviewPage:
         self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures)
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
-        """On a small screen, minimize the library when a recording is opened, and expand it when all are closed; it stays
-        next to what was opened by itself."""
+        """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""
         ids = tuple(one.id for one in view.opened)
-        if view.by_itself and (ids or view.loading):
+        if view.library_stays and (ids or view.loading):
             self._had_opened = ids
             return
-        if self._awaited and (not ids or view.loading):
-            # Still being read: "nothing is open", or what was, is not news, and what opens then is not another one.
-            return
-        self._awaited = ()
         if ids != self._had_opened:
             self._had_opened = ids
             if not ids or self._smallest_view() < NARROW:
