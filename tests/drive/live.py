@@ -51,12 +51,7 @@ class HandedSession:
             "episode_ticks": lambda: None,
             "segment": lambda: None,
             "rescorer.curve": lambda name, env: None,
-            "checks.after_each_save": True,
         }
-
-    @property
-    def checks(self) -> Any:
-        return self._part("checks", self.shown.checks)
 
     @property
     def seeds_solver(self) -> Any:

@@ -22,11 +22,19 @@ from workbench.commands.run import PauseRun
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.policy import NoPolicy, PolicyFile, find_policy
 from workbench.jobs.task import Stepped, TaskOptions
+from workbench.machine.kept_choices import keep_check_after_save
 from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.session.cameras.selection import KeptPlacements
 from workbench.session.cameras.studio import CameraStudio
-from workbench.session.checks.checks import Checks
-from workbench.session.checks.profile import StepProfiler
+from workbench.session.checks.checks import (
+    BeginCheck,
+    CheckJobs,
+    Checks,
+    ChecksView,
+    EndCheck,
+    KeepCheckAfterSave,
+)
+from workbench.session.checks.profile import BeginProfile, EndProfile, ProfileJobs
 from workbench.session.checks.solve_seeds import SeedsSolver
 from workbench.session.events import Asked
 from workbench.session.history.env_table import EnvRows
@@ -122,7 +130,7 @@ class Session:
             history_bytes: memory limit of the history.
             worker: limits of the worker process, and whether there is a spare one.
             kept: of an earlier session of this task; its options are used in place of `options`.
-            check: whether the rules are checked after each load; `checks` changes it.
+            check: whether the rules are checked after each load, until a `CheckAfterSave`.
             make_worker: makes the supervisor; tests without a worker process give another.
             on_event: called with every event of the worker, and with its death as `LoadFailed`, on the supervisor's thread.
             on_line: called with the lines that the worker printed, from other threads; drops some of a flood.
@@ -135,7 +143,9 @@ class Session:
         settings = Settings()
         if kept is not None:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
-        self._state = State(first_run(task, options, history_bytes, settings))
+        self._state = State(
+            first_run(task, options, history_bytes, settings), Checks(ChecksView(after_each_save=check))
+        )
         self._changes = ChangeCounter()
         self._notify = self._changes.notify
         self._enter_numbers = itertools.count(1)
@@ -161,10 +171,8 @@ class Session:
         """Asks questions of the background process."""
         self.past_saver = PastSaver(recordings, self._recorder.finisher, self._notify, self._background)
         self.rescorer = PastRescorer(self._notify, self._background)
-        self.checks = Checks(self._notify, self._background, check)
-        """Checks the rules of the running version."""
-        self.profiler = StepProfiler(self._notify, self._background)
-        """Measures where the time of a step of the running version goes."""
+        self._checks = CheckJobs(self._background, self._happen)
+        self._profiles = ProfileJobs(self._background, self._happen)
         self.solver = Solver(self._notify, self._send, lambda: self.do(PauseRun()))
         """Plans the actions of the source *solve*."""
         self.seeds_solver = SeedsSolver(self._notify, recordings)
@@ -187,7 +195,7 @@ class Session:
     # --- what happens ------------------------------------------------------------------------------
 
     def do(self, command: Command, page: str = "") -> None:
-        """Carry out a command of `run.DOES`.
+        """Carry out a command of `state.DOES`.
 
         Args:
             page: name of the page that asks.
@@ -232,6 +240,12 @@ class Session:
                 return self._aside.begin(partial(self._watcher.follow, files, texts))
             case FollowPolicy(policy=policy, folder=folder):
                 return self._aside.begin(partial(self._policy_file.follow, policy, folder))
+            case BeginCheck() | EndCheck():
+                self._checks.perform(effect)
+            case KeepCheckAfterSave(wanted=wanted):
+                return self._aside.begin(partial(keep_check_after_save, wanted))
+            case BeginProfile() | EndProfile():
+                self._profiles.perform(effect)
         return None
 
     def _send(self, request: Request) -> None:
@@ -258,8 +272,8 @@ class Session:
             printed=self._printed.view(),
             vitals=self._worker.vitals,
             rescored=self.rescorer.rescoring.view,
-            checks=self.checks.view,
-            profile=self.profiler.view,
+            checks=self._state.checks.view,
+            profile=self._state.profile,
             seeds=self.seeds_solver.view,
             solve=self.solver.view(env),
         )
@@ -378,18 +392,6 @@ class Session:
         return number
 
     @on_loop
-    def check_now(self) -> None:
-        """Check the rules of the running version."""
-        if (load := self._run.running_load()) is not None:
-            self.checks.check(load)
-
-    @on_loop
-    def profile_step(self) -> None:
-        """Time a control step of the running version."""
-        if (load := self._run.running_load()) is not None:
-            self.profiler.profile(load)
-
-    @on_loop
     def solve_seeds(self, seeds: int) -> None:
         """Solve the file as it is saved from seeds 0 to `seeds` - 1."""
         if (load := self._run.running_load()) is not None:
@@ -404,8 +406,8 @@ class Session:
         self._aside.end()
         self._policy_file.close()
         self.rescorer.rescoring.close()
-        self.checks.close()
-        self.profiler.close()
+        self._checks.close()
+        self._profiles.close()
         self.solver.close()
         self.seeds_solver.close()
         self.studio.close()
@@ -509,9 +511,6 @@ class Session:
             self.rescorer.rescore(load, rescored)
         elif what_to_do == "forget":
             self.rescorer.forget()
-        # After the rescoring was begun: the later of two jobs of one priority comes first.
-        self.checks.loaded(load, before.task is not None and before.task.env_id == run.task.env_id)
-        self.profiler.loaded()
         self.seeds_solver.loaded()
         self.studio.send_placements(placed)
         if recording:
@@ -541,7 +540,6 @@ class Session:
         """A watched file was saved."""
         self.solver.stop()
         self.rescorer.stop(StoppedBy.SAVE)
-        self.checks.stop(StoppedBy.SAVE)
         self.studio.interrupted()
         self._happen(FileSaved())
 
