@@ -53,14 +53,6 @@ class HandedSession:
             "rescorer.curve": lambda name, env: None,
         }
 
-    @property
-    def seeds_solver(self) -> Any:
-        return self._part("seeds_solver", self.shown.seeds)
-
-    def _part(self, name: str, view: object) -> Any:
-        self.answers[f"{name}.view"] = view
-        return _Asked(name, self)
-
     def view(self) -> SessionView:
         return self.shown
 

@@ -15,9 +15,12 @@ from workbench.checks.results import HookTime, LineTime, RuleResult, StepProfile
 from workbench.commands.checks import (
     CheckAfterSave,
     CheckNow,
+    ChooseSeeds,
     ShowSolved,
+    SolveSeeds,
     StopChecks,
     StopProfile,
+    StopSolving,
     TimeStep,
     ToggleRule,
     ToggleVerdict,
@@ -241,7 +244,7 @@ def test_seeds_are_solved_as_typed_and_stopped(checks: Checks) -> None:
     assert "0 of 12 seeds" in html and "seed 0 at step 30 of 50" in html and "width: 5%" in html
     assert not checks.live.shows(SOLVE, "button") and checks.live.field("Seeds").off
     checks.live.press(STOP_SOLVING)
-    assert checks.live.asked == [("solve_seeds", 12), ("seeds_solver.stop",)]
+    assert checks.live.asked == [ChooseSeeds(seeds=12), SolveSeeds(), StopSolving()]
     checks.draw(seeds=SeedsView("failed", 3, why="the task failed", total=12))
     assert "the task failed" in checks.live.html() and checks.live.shows(SOLVE, "button")
 

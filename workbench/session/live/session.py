@@ -35,7 +35,7 @@ from workbench.session.checks.checks import (
     KeepCheckAfterSave,
 )
 from workbench.session.checks.profile import BeginProfile, EndProfile, ProfileJobs
-from workbench.session.checks.solve_seeds import SeedsSolver
+from workbench.session.checks.solve_seeds import BeginSeeds, EndSeeds, SeedsJobs
 from workbench.session.events import Asked
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.solver import Solver
@@ -175,8 +175,7 @@ class Session:
         self._profiles = ProfileJobs(self._background, self._happen)
         self.solver = Solver(self._notify, self._send, lambda: self.do(PauseRun()))
         """Plans the actions of the source *solve*."""
-        self.seeds_solver = SeedsSolver(self._notify, recordings)
-        """Solves the task from many seeds."""
+        self._seeds = SeedsJobs(recordings, self._happen)
         self._asker = Asker(self._send)
         self.studio = CameraStudio(
             self._send,
@@ -246,6 +245,8 @@ class Session:
                 return self._aside.begin(partial(keep_check_after_save, wanted))
             case BeginProfile() | EndProfile():
                 self._profiles.perform(effect)
+            case BeginSeeds() | EndSeeds():
+                self._seeds.perform(effect)
         return None
 
     def _send(self, request: Request) -> None:
@@ -274,7 +275,7 @@ class Session:
             rescored=self.rescorer.rescoring.view,
             checks=self._state.checks.view,
             profile=self._state.profile,
-            seeds=self.seeds_solver.view,
+            seeds=self._state.seeds,
             solve=self.solver.view(env),
         )
         recording = replace(self._recorder.status(), saving=self.past_saver.status(_shown(self._run)))
@@ -391,12 +392,6 @@ class Session:
         self.happen(RunToEnter(run, number, everywhere, source_file, source))
         return number
 
-    @on_loop
-    def solve_seeds(self, seeds: int) -> None:
-        """Solve the file as it is saved from seeds 0 to `seeds` - 1."""
-        if (load := self._run.running_load()) is not None:
-            self.seeds_solver.solve(load, seeds, self._run.settings.plan)
-
     def close(self) -> None:
         """End all processes and threads; waits for episodes that are being written. Called on another thread than the loop."""
         stop_listening(self._log)
@@ -409,7 +404,7 @@ class Session:
         self._checks.close()
         self._profiles.close()
         self.solver.close()
-        self.seeds_solver.close()
+        self._seeds.close()
         self.studio.close()
         self.past_saver.close()
         self._background.close()
@@ -511,7 +506,6 @@ class Session:
             self.rescorer.rescore(load, rescored)
         elif what_to_do == "forget":
             self.rescorer.forget()
-        self.seeds_solver.loaded()
         self.studio.send_placements(placed)
         if recording:
             put_back = past != "gone" or (event.reload is not None and bool(event.reload.carried))

@@ -7,14 +7,21 @@ from dataclasses import dataclass, fields
 from workbench.commands.command import Command
 from workbench.session.checks import checks as of_checks
 from workbench.session.checks import profile as of_profile
+from workbench.session.checks import solve_seeds as of_seeds
 from workbench.session.run import apply as of_run
 from workbench.session.run import asked
 from workbench.session.run.events import Now, RunEffect, RunEvent
 from workbench.session.run.run import Run
 
-SessionEvent = RunEvent | of_checks.CheckEvent | of_profile.ProfileEvent
-Effect = RunEffect | of_checks.CheckEffect | of_checks.KeepCheckAfterSave | of_profile.ProfileEffect
-DOES: frozenset[type[Command]] = asked.DOES | of_checks.DOES | of_profile.DOES
+SessionEvent = RunEvent | of_checks.CheckEvent | of_profile.ProfileEvent | of_seeds.SeedsEvent
+Effect = (
+    RunEffect
+    | of_checks.CheckEffect
+    | of_checks.KeepCheckAfterSave
+    | of_profile.ProfileEffect
+    | of_seeds.SeedsEffect
+)
+DOES: frozenset[type[Command]] = asked.DOES | of_checks.DOES | of_profile.DOES | of_seeds.DOES
 """Commands that a session takes."""
 
 
@@ -27,6 +34,8 @@ class State:
     """The rules of the running version."""
     profile: of_profile.ProfileView = of_profile.ProfileView()
     """Where the time of a step of the running version goes."""
+    seeds: of_seeds.SeedsView = of_seeds.SeedsView()
+    """The task solved from many seeds."""
 
 
 def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
@@ -38,6 +47,7 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     run, effects = of_run.apply(state.run, event, now)
     checks, for_checks = of_checks.apply(state.checks, event, state.run, run)
     profile, for_profile = of_profile.apply(state.profile, event, state.run, run)
-    new = State(run, checks, profile)
+    seeds, for_seeds = of_seeds.apply(state.seeds, event, state.run, run)
+    new = State(run, checks, profile, seeds)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
-    return (state if same else new), [*effects, *for_checks, *for_profile]
+    return (state if same else new), [*effects, *for_checks, *for_profile, *for_seeds]
