@@ -18,7 +18,6 @@ from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem
 from workbench.commands.command import Command
-from workbench.commands.run import PauseRun
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.policy import NoPolicy, PolicyFile, find_policy
 from workbench.jobs.task import Stepped, TaskOptions
@@ -36,9 +35,9 @@ from workbench.session.checks.checks import (
 )
 from workbench.session.checks.profile import BeginProfile, EndProfile, ProfileJobs
 from workbench.session.checks.solve_seeds import BeginSeeds, EndSeeds, SeedsJobs
-from workbench.session.events import Asked
+from workbench.session.events import Ask, Asked
 from workbench.session.history.env_table import EnvRows
-from workbench.session.live.solver import Solver
+from workbench.session.live.solver import BeginPlan, EndPlan, PlanJobs
 from workbench.session.live.state import Effect, SessionEvent, State, apply
 from workbench.session.live.view import SessionView, view_of
 from workbench.session.loop import Aside, ChangeCounter, do, on_loop, wait_for_disk
@@ -51,8 +50,6 @@ from workbench.session.protocol.messages import (
     Loaded,
     LoadFailed,
     Placed,
-    PlanDropped,
-    PlanWanted,
     Progress,
     Request,
     SetCapture,
@@ -173,8 +170,7 @@ class Session:
         self.rescorer = PastRescorer(self._notify, self._background)
         self._checks = CheckJobs(self._background, self._happen)
         self._profiles = ProfileJobs(self._background, self._happen)
-        self.solver = Solver(self._notify, self._send, lambda: self.do(PauseRun()))
-        """Plans the actions of the source *solve*."""
+        self._plans = PlanJobs(self._happen)
         self._seeds = SeedsJobs(recordings, self._happen)
         self._asker = Asker(self._send)
         self.studio = CameraStudio(
@@ -245,6 +241,10 @@ class Session:
                 return self._aside.begin(partial(keep_check_after_save, wanted))
             case BeginProfile() | EndProfile():
                 self._profiles.perform(effect)
+            case BeginPlan() | EndPlan():
+                self._plans.perform(effect)
+            case Ask(command=command):
+                self._happen(Asked(command))
             case BeginSeeds() | EndSeeds():
                 self._seeds.perform(effect)
         return None
@@ -276,7 +276,7 @@ class Session:
             checks=self._state.checks.view,
             profile=self._state.profile,
             seeds=self._state.seeds,
-            solve=self.solver.view(env),
+            solve=self._state.solving.view(env),
         )
         recording = replace(self._recorder.status(), saving=self.past_saver.status(_shown(self._run)))
         return replace(view, recording=recording, studio=self.studio.view(view.step, env))
@@ -403,7 +403,7 @@ class Session:
         self.rescorer.rescoring.close()
         self._checks.close()
         self._profiles.close()
-        self.solver.close()
+        self._plans.close()
         self._seeds.close()
         self.studio.close()
         self.past_saver.close()
@@ -441,7 +441,6 @@ class Session:
         """Returns the problem to show, if any, and whether there is a version to bring back."""
         if death.end is not End.HANDED_OVER:
             self._recorder.stop()
-        self.solver.stop()
         self.studio.interrupted()
         before = self._run.problem_serial
         self._happen(WorkerDied(death, self._printed.tail(20)))
@@ -462,16 +461,10 @@ class Session:
                 self._on_loaded(event, on_disk)
             case Stepped():
                 self._happen(event)
-                self.solver.stepped(event, self._run.settings.action_source == "solve")
                 self._recorder.take(event)
             case Answer() | Progress():
                 self._asker.take(event)
                 self._notify()
-            case PlanWanted():
-                if (load := self._run.running_load()) is not None:
-                    self.solver.plan(event, load, self._run.settings)
-            case PlanDropped():
-                self.solver.stop()
             case _:
                 self._happen(event)
                 if isinstance(event, Placed):
@@ -532,7 +525,6 @@ class Session:
     @on_loop
     def _on_files_changed(self, paths: set[Path]) -> None:
         """A watched file was saved."""
-        self.solver.stop()
         self.rescorer.stop(StoppedBy.SAVE)
         self.studio.interrupted()
         self._happen(FileSaved())
