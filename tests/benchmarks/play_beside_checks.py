@@ -19,6 +19,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.session import TASKS, live_session, wait_until
+from workbench.commands.checks import CheckNow, StopChecks
 from workbench.commands.run import PlayRun
 from workbench.session.checks.checks import RUNNING
 from workbench.session.live.session import Session
@@ -40,14 +41,14 @@ def steps_a_second(session: Session, seconds: float, checking: bool) -> float:
     """Of all envs together as one step; while rules are checked, until the last is."""
     first, begun = session.view().timeline.last, time.perf_counter()
     while time.perf_counter() - begun < seconds:
-        if checking and session.checks.view.state != "checking":
+        if checking and session.view().checks.state != "checking":
             break
         time.sleep(0.02)
     return (session.view().timeline.last - first) / (time.perf_counter() - begun)
 
 
 def begin_check(session: Session) -> None:
-    session.check_now()
+    session.do(CheckNow())
     wait_until(session, lambda view: view.checks.state != "loading", "the begin of the checks")
 
 
@@ -55,7 +56,7 @@ def whole_check(session: Session) -> float:
     """Seconds of all rules, once the version is loaded there."""
     begin_check(session)
     wait_until(session, lambda view: view.checks.state not in RUNNING, "the end of the checks")
-    return session.checks.view.seconds
+    return session.view().checks.seconds
 
 
 def main(options: Options) -> None:
@@ -63,19 +64,18 @@ def main(options: Options) -> None:
         tempfile.TemporaryDirectory() as folder,
         live_session(options.task, Path(folder), options.num_envs, draw=True) as session,
     ):
-        session.checks.check_after_each_save(False)
         session.change(speed=options.speed)
         whole_check(session)  # shaders are compiled
         alone = whole_check(session)
         session.do(PlayRun())
         without, beside = [], []
         for _ in range(options.windows):
-            session.checks.stop()
+            session.do(StopChecks())
             without.append(steps_a_second(session, options.seconds, checking=False))
             begin_check(session)
             beside.append(steps_a_second(session, options.seconds, checking=True))
         took = whole_check(session)
-        rules = len(session.checks.view.results)
+        rules = len(session.view().checks.results)
     one, other = statistics.median(without), statistics.median(beside)
     print(
         f"{Path(options.task).name}, {options.num_envs} envs, speed {options.speed:g}, {options.windows} windows of each kind"

@@ -51,20 +51,7 @@ class HandedSession:
             "episode_ticks": lambda: None,
             "segment": lambda: None,
             "rescorer.curve": lambda name, env: None,
-            "checks.after_each_save": True,
         }
-
-    @property
-    def checks(self) -> Any:
-        return self._part("checks", self.shown.checks)
-
-    @property
-    def seeds_solver(self) -> Any:
-        return self._part("seeds_solver", self.shown.seeds)
-
-    def _part(self, name: str, view: object) -> Any:
-        self.answers[f"{name}.view"] = view
-        return _Asked(name, self)
 
     def view(self) -> SessionView:
         return self.shown

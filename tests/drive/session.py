@@ -25,6 +25,7 @@ from workbench.core.camera_data import CameraKey
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Restored, Stepped, TaskDescription, TaskOptions
 from workbench.session.cameras.view import StudioCamera, StudioView
+from workbench.session.checks.checks import CheckJobs
 from workbench.session.history.history import History, Moment
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -365,6 +366,11 @@ def moments_of(session: Session) -> list[Moment]:
     view = session.view().timeline
     found = (moment_at(session, serial) for serial in range(view.first, view.last + 1))
     return [one for one in found if one is not None]
+
+
+def check_with(session: Session, background: Any) -> None:
+    """Rules are checked by this, in place of a process."""
+    session._checks = CheckJobs(background, session._happen)
 
 
 def background_pid(session: Session) -> int | None:

@@ -31,6 +31,7 @@ from tests.sweeps.upstream_faults import faults_of
 from workbench.authoring.loading.load import undo_load
 from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.cli.main import main as workbench
+from workbench.commands.checks import CheckNow
 from workbench.core.env.actions import hold_action
 from workbench.jobs.open_task import open_task
 from workbench.jobs.task import TaskOptions
@@ -173,7 +174,7 @@ def opened(task: str, reference: Path | str, folder: Path, num_envs: int, checks
         step(session, 3)
         if not checks:
             return Ran(task, "open", 0, round(time.monotonic() - began, 1), None)
-        session.check_now()
+        session.do(CheckNow())
         until(
             lambda: session.view().checks.state not in RUNNING,
             "the end of the checks",

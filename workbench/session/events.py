@@ -1,4 +1,4 @@
-"""What can happen to a session or a review, apart from what a worker says (`protocol.messages.Event`)."""
+"""What can happen to a session or a review, apart from what a worker says (`protocol.messages.Event`), and what follows."""
 
 from __future__ import annotations
 
@@ -14,3 +14,10 @@ class Asked:
     command: Command
     page: str = ""
     """Name of the page that asks; empty for none."""
+
+
+@dataclass(frozen=True)
+class Ask:
+    """Effect: the session asks itself for a command."""
+
+    command: Command

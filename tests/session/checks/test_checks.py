@@ -5,31 +5,34 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
-from tests.drive.session import live_session, wait_until
+from tests.drive.session import Told, check_with, live_session, told_session, wait_until
 from tests.drive.waiting import until
 from workbench.checks.results import RuleResult
+from workbench.commands.checks import CheckAfterSave, CheckNow, StopChecks
+from workbench.commands.command import Refused
 from workbench.commands.run import PlayRun
 from workbench.core.rules import Finding
 from workbench.jobs.task import TaskOptions
-from workbench.session.checks.checks import RUNNING, Checks, ChecksView
+from workbench.machine.kept_choices import kept_choices
+from workbench.session.checks.checks import RUNNING, ChecksView
 from workbench.session.process.askers import GaveWay
 from workbench.session.process.jobs import Job, JobFailed, ProcessDied
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.session.rescore.background import StoppedBy
+from workbench.session.run.events import FileSaved
 
 FIRST, SECOND = "success-at-reset", "reward-changes"
 GROUPS = ((FIRST,), (SECOND,))
 FILE = "/home/me/push.py"
-LOAD = Load("push.py", TaskOptions(), {FILE: "def evaluate(self):\n    return 1\n"})
-NEXT = replace(LOAD, source={FILE: "def evaluate(self):\n    print()\n    return 1\n"})
-MENDED = replace(LOAD, source={FILE: "def evaluate(self):\n    return 2\n"})
+FIRST_TEXT = "def evaluate(self):\n    return 1\n"
+NEXT_TEXT = "def evaluate(self):\n    print()\n    return 1\n"
+MENDED_TEXT = "def evaluate(self):\n    return 2\n"
 
 
 def finding(rule: str, line: int = 7) -> Finding:
@@ -96,15 +99,21 @@ def background() -> ScriptedBackground:
 
 
 @pytest.fixture
-def checks(background: ScriptedBackground) -> Iterator[Checks]:
-    made = Checks(lambda: None, cast(Any, background), after_each_save=True)
-    yield made
-    made.close()
+def checks(background: ScriptedBackground, tmp_path: Path) -> Iterator[Told]:
+    with told_session(tmp_path / "recordings", check=True) as told:
+        check_with(told.session, background)
+        yield told
 
 
-def ended(checks: Checks) -> ChecksView:
-    until(lambda: checks.view.state not in RUNNING, "the end of the checks", seen=lambda: checks.view)
-    return checks.view
+def load(told: Told, text: str = FIRST_TEXT, **changes: Any) -> None:
+    told.load("patched", source={FILE: text}, **changes)
+
+
+def ended(told: Told) -> ChecksView:
+    until(
+        lambda: told.view.checks.state not in RUNNING, "the end of the checks", seen=lambda: told.view.checks
+    )
+    return told.view.checks
 
 
 def rules_of(view: ChecksView) -> list[str]:
@@ -112,24 +121,24 @@ def rules_of(view: ChecksView) -> list[str]:
 
 
 def test_each_load_is_checked_group_by_group_with_the_degree_of_each_rule(
-    checks: Checks, background: ScriptedBackground
+    checks: Told, background: ScriptedBackground
 ) -> None:
     background.comes_to = {SECOND: broken(SECOND)}
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     view = ended(checks)
     assert (view.state, view.total, rules_of(view)) == ("done", 2, [FIRST, SECOND])
     assert view.findings == (finding(SECOND),)
     assert [question.group for question in background.asked] == [0, 1]
     assert background.asked[0].degrees[FIRST] == "stop" and background.asked[0].degrees[SECOND] == "warn"
-    assert background.loads[0] is LOAD
+    assert background.loads[0].source == {FILE: FIRST_TEXT}
 
 
-def test_the_same_version_is_not_checked_twice(checks: Checks, background: ScriptedBackground) -> None:
+def test_the_same_version_is_not_checked_twice(checks: Told, background: ScriptedBackground) -> None:
     for _ in range(2):
-        checks.loaded(LOAD, same_task=True)
+        load(checks)
         ended(checks)
     assert len(background.asked) == 2
-    checks.check(LOAD)
+    checks.session.do(CheckNow())
     ended(checks)
     assert len(background.asked) == 4
 
@@ -143,85 +152,84 @@ def test_the_same_version_is_not_checked_twice(checks: Checks, background: Scrip
     ids=lambda changed: next(iter(changed)),
 )
 def test_envs_that_are_made_otherwise_are_checked_anew(
-    checks: Checks, background: ScriptedBackground, changed: dict[str, Any]
+    checks: Told, background: ScriptedBackground, changed: dict[str, Any]
 ) -> None:
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     ended(checks)
-    checks.loaded(replace(LOAD, options=replace(LOAD.options, **changed)), same_task=True)
+    load(checks, options=TaskOptions(3, **changed))
     ended(checks)
     assert len(background.asked) == 4
 
 
 def test_findings_of_the_version_before_stay_until_their_rule_is_checked(
-    checks: Checks, background: ScriptedBackground
+    checks: Told, background: ScriptedBackground
 ) -> None:
     background.comes_to = {FIRST: broken(FIRST), SECOND: broken(SECOND)}
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     ended(checks)
     background.comes_to = {SECOND: broken(SECOND)}
     background.hold()
-    checks.stop(StoppedBy.SAVE)
-    checks.loaded(NEXT, same_task=True)
-    assert [one.rule for one in checks.view.before] == [FIRST, SECOND] and checks.view.findings == ()
+    checks.session.happen(FileSaved())
+    load(checks, NEXT_TEXT)
+    assert [one.rule for one in checks.view.checks.before] == [
+        FIRST,
+        SECOND,
+    ] and checks.view.checks.findings == ()
     background.let.release()
-    until(lambda: len(checks.view.results) == 1, "the first rule")
-    assert [one.rule for one in checks.view.before] == [SECOND]
+    until(lambda: len(checks.view.checks.results) == 1, "the first rule")
+    assert [one.rule for one in checks.view.checks.before] == [SECOND]
     background.let.release()
     view = ended(checks)
     assert view.before == () and [one.rule for one in view.findings] == [SECOND]
 
 
-def test_a_finding_goes_with_the_line_that_it_is_about(
-    checks: Checks, background: ScriptedBackground
-) -> None:
+def test_a_finding_goes_with_the_line_that_it_is_about(checks: Told, background: ScriptedBackground) -> None:
     background.comes_to = {FIRST: broken(FIRST)}
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     ended(checks)
     background.hold()
-    checks.loaded(MENDED, same_task=True)
-    assert checks.view.before == () and checks.view.findings == ()
+    load(checks, MENDED_TEXT)
+    assert checks.view.checks.before == () and checks.view.checks.findings == ()
 
 
-def test_another_task_has_no_findings_of_the_one_before(
-    checks: Checks, background: ScriptedBackground
-) -> None:
+def test_another_task_has_no_findings_of_the_one_before(checks: Told, background: ScriptedBackground) -> None:
     background.comes_to = {FIRST: broken(FIRST)}
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     ended(checks)
     background.hold()
-    checks.loaded(replace(LOAD, task="pull.py"), same_task=False)
-    assert checks.view.before == () and checks.view.findings == ()
+    load(checks, env_id="Pull-v1")
+    assert checks.view.checks.before == () and checks.view.checks.findings == ()
 
 
-def test_a_save_stops_it_and_what_is_known_stays(checks: Checks, background: ScriptedBackground) -> None:
+def test_a_save_stops_it_and_what_is_known_stays(checks: Told, background: ScriptedBackground) -> None:
     background.hold()
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     background.let.release()
-    until(lambda: len(checks.view.results) == 1, "the first rule")
-    checks.stop(StoppedBy.SAVE)
-    assert (checks.view.state, checks.view.stopped_by) == ("stopped", StoppedBy.SAVE)
-    assert rules_of(checks.view) == [FIRST]
+    until(lambda: len(checks.view.checks.results) == 1, "the first rule")
+    checks.session.happen(FileSaved())
+    assert (checks.view.checks.state, checks.view.checks.stopped_by) == ("stopped", StoppedBy.SAVE)
+    assert rules_of(checks.view.checks) == [FIRST]
     # The same text again, or what could not be loaded taken back.
     background.let = threading.Semaphore(10)
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     assert ended(checks).state == "done"
 
 
 def test_a_group_that_gave_way_is_asked_without_the_rules_that_are_known(
-    checks: Checks, background: ScriptedBackground
+    checks: Told, background: ScriptedBackground
 ) -> None:
     background.give_way_after = 1
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     assert ended(checks).state == "done"
     assert [question.group for question in background.asked] == [0, 0, 1]
     assert [question.known for question in background.asked] == [(), (FIRST,), (FIRST,)]
 
 
 def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
-    checks: Checks, background: ScriptedBackground
+    checks: Told, background: ScriptedBackground
 ) -> None:
     background.dies_at = FIRST
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     view = ended(checks)
     assert view.state == "done" and [result.state for result in view.results] == ["failed", "kept"]
     first = view.results[0]
@@ -230,16 +238,40 @@ def test_a_rule_that_ends_the_process_fails_and_the_others_go_on(
 
 
 def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
-    checks: Checks, background: ScriptedBackground
+    checks: Told, background: ScriptedBackground
 ) -> None:
     background.comes_to = {FIRST: broken(FIRST)}
-    checks.loaded(LOAD, same_task=True)
+    load(checks)
     ended(checks)
-    checks.check_after_each_save(False)
-    checks.loaded(NEXT, same_task=True)
-    view = checks.view
+    checks.session.do(CheckAfterSave(on=False))
+    load(checks, NEXT_TEXT)
+    view = checks.view.checks
     assert view.state == "none" and [one.rule for one in view.before] == [FIRST] and not view.results
     assert len(background.asked) == 2
+
+
+def test_the_choice_is_kept_and_what_was_not_checked_is_checked_as_soon_as_it_is_wanted(
+    checks: Told, background: ScriptedBackground
+) -> None:
+    with pytest.raises(Refused):
+        checks.session.do(CheckNow())
+    for wanted in (True, False):
+        checks.session.do(CheckAfterSave(on=wanted))
+        assert kept_choices().check_after_save == wanted == checks.view.checks.after_each_save
+    load(checks)
+    assert background.asked == []
+    checks.session.do(CheckAfterSave(on=True))
+    assert ended(checks).state == "done"
+
+
+def test_what_is_stopped_by_hand_says_so(checks: Told, background: ScriptedBackground) -> None:
+    background.hold()
+    load(checks)
+    checks.session.do(StopChecks())
+    view = checks.view.checks
+    assert (view.state, view.stopped_by) == ("stopped", StoppedBy.HAND)
+    checks.session.do(StopChecks())
+    assert checks.view.checks == view
 
 
 # --- with processes -----------------------------------------------------------------------------------
@@ -253,7 +285,7 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
     good, bad = "(distance < GOAL_RADIUS)", "(distance < 1)"
     line = text[: text.index(good)].count("\n") + 1
     with live_session(task_file, task_file.parent / "recordings") as session:
-        session.checks.check_after_each_save(True)
+        session.do(CheckAfterSave(on=True))
         session.do(PlayRun())
         task_file.write_text(text.replace(good, bad))
 

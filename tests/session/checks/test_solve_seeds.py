@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from tests.drive.session import TASKS
+from tests.drive.session import TASKS, Told, told_session
 from tests.drive.waiting import until
 from workbench.authoring.loading.reference import RecordedTask
+from workbench.commands.checks import ChooseSeeds, SolveSeeds, StopSolving
+from workbench.commands.command import Refused
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
-from workbench.session.checks.solve_seeds import RUNNING, SeedsSolver
-from workbench.session.protocol.messages import Load
+from workbench.session.checks.solve_seeds import RUNNING, SeedsView
 
 FEW = PlanOptions(rollouts=16, horizon=0.3, noise=0.8)
 MADE = TaskOptions(
@@ -21,45 +23,59 @@ MADE = TaskOptions(
 )
 
 
-@pytest.fixture
-def solver(child_process: None, tmp_path: Path) -> Iterator[SeedsSolver]:
-    solver = SeedsSolver(lambda: None, tmp_path / "recordings")
-    yield solver
-    solver.close()
+@contextmanager
+def solving(task: object, recordings: Path) -> Iterator[Told]:
+    with told_session(recordings, task) as told:
+        told.session.change(plan=FEW)
+        told.load(options=MADE)
+        yield told
 
 
-def ended(solver: SeedsSolver) -> None:
-    until(lambda: solver.view.state not in RUNNING, "the end", 120.0, seen=lambda: solver.view)
+def solve(told: Told, seeds: int) -> SeedsView:
+    told.session.do(ChooseSeeds(seeds=seeds))
+    told.session.do(SolveSeeds())
+    return told.view.seeds
 
 
 @pytest.mark.slow
 def test_each_seed_is_solved_recorded_and_told_and_what_is_done_stays_when_it_is_stopped(
-    solver: SeedsSolver, tmp_path: Path
+    child_process: None, tmp_path: Path
 ) -> None:
-    solver.solve(Load(str(TASKS / "push_cube.py"), MADE), 200, FEW)
-    assert solver.view.state == "starting" and solver.view.total == 200
-    until(lambda: solver.view.report is not None, "the first seed", 120.0, seen=lambda: solver.view)
-    solver.stop()
-    view = solver.view
-    assert view.state == "stopped" and view.report is not None
-    first = view.report.seeds[0]
-    assert first.seed == 0 and bool(first.solved_at) != bool(first.in_the_way)
-    assert first.path.is_file() and first.path.parent == tmp_path / "recordings"
-    solver.loaded()
-    assert solver.view.stale and solver.view.report is view.report
+    with solving(str(TASKS / "push_cube.py"), tmp_path / "recordings") as told:
+        view = solve(told, 200)
+        assert view.state == "starting" and view.total == 200
+        until(
+            lambda: told.view.seeds.report is not None, "the first seed", 120.0, seen=lambda: told.view.seeds
+        )
+        told.session.do(StopSolving())
+        view = told.view.seeds
+        assert view.state == "stopped" and view.report is not None
+        first = view.report.seeds[0]
+        assert first.seed == 0 and bool(first.solved_at) != bool(first.in_the_way)
+        assert first.path.is_file() and first.path.parent == tmp_path / "recordings"
+        told.load("patched")
+        assert told.view.seeds.stale and told.view.seeds.report is view.report
 
 
 @pytest.mark.slow
-def test_a_task_that_fails_says_where(solver: SeedsSolver, tmp_path: Path) -> None:
+def test_a_task_that_fails_says_where(child_process: None, tmp_path: Path) -> None:
     file = tmp_path / "broken.py"
     file.write_text("raise KeyError('goal')\n")
-    solver.solve(Load(str(file), MADE), 2, FEW)
-    ended(solver)
-    view = solver.view
+    with solving(str(file), tmp_path / "recordings") as told:
+        solve(told, 2)
+        until(lambda: told.view.seeds.state not in RUNNING, "the end", 120.0, seen=lambda: told.view.seeds)
+        view = told.view.seeds
     assert view.state == "failed" and view.problem is not None and view.problem.line == 1
     assert "KeyError" in view.problem.message and view.report is None
 
 
-def test_a_task_that_a_recording_names_is_not_run_from_the_disk(solver: SeedsSolver) -> None:
-    solver.solve(Load(RecordedTask("PushCube-v1"), MADE), 2, FEW)
-    assert solver.view.state == "failed" and "open its file" in solver.view.why
+def test_a_task_that_a_recording_names_is_not_run_from_the_disk(tmp_path: Path) -> None:
+    with solving(RecordedTask("PushCube-v1"), tmp_path / "recordings") as told:
+        view = solve(told, 2)
+    assert view.state == "failed" and "open its file" in view.why
+
+
+def test_without_a_task_there_is_nothing_to_solve(told: Told) -> None:
+    with pytest.raises(Refused):
+        solve(told, 2)
+    assert (told.view.seeds.state, told.view.seeds.chosen) == ("none", 2)

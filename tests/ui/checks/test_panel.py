@@ -12,9 +12,20 @@ from tests.drive.live import Live
 from tests.ui.scenes import running
 from workbench.authoring.problem import Problem
 from workbench.checks.results import HookTime, LineTime, RuleResult, StepProfile, failed
-from workbench.commands.checks import ShowSolved, ToggleRule, ToggleVerdict
+from workbench.commands.checks import (
+    CheckAfterSave,
+    CheckNow,
+    ChooseSeeds,
+    ShowSolved,
+    SolveSeeds,
+    StopChecks,
+    StopProfile,
+    StopSolving,
+    TimeStep,
+    ToggleRule,
+    ToggleVerdict,
+)
 from workbench.core.rules import Finding
-from workbench.machine.kept_choices import kept_choices
 from workbench.planning.report import SolvedSeed, SolveReport
 from workbench.planning.verdicts import RewardVerdict
 from workbench.session.checks.checks import ChecksView
@@ -144,21 +155,14 @@ def test_one_line_says_how_far_it_is(checks: ChecksView, says: str) -> None:
     assert says in status_html(checks, [])
 
 
-def test_only_what_runs_can_be_stopped_and_the_choice_is_kept(checks: Checks) -> None:
+def test_only_what_runs_can_be_stopped(checks: Checks) -> None:
     checks.draw(ChecksView("checking", total=58))
     assert not checks.live.shows(CHECK_NOW)
     checks.live.press(STOP_CHECKS)
     checks.draw()
     checks.live.press(CHECK_NOW)
     checks.live.set(AFTER_SAVE, False)
-    assert not kept_choices().check_after_save
-    checks.live.set(AFTER_SAVE, True)
-    asked = [
-        ("checks.stop",),
-        ("check_now",),
-        *(("checks.check_after_each_save", wanted) for wanted in (False, True)),
-    ]
-    assert kept_choices().check_after_save and checks.live.asked == asked
+    assert checks.live.asked == [StopChecks(), CheckNow(), CheckAfterSave(on=False)]
 
 
 def test_what_was_seen_while_playing_is_in_the_same_list_and_leaves_it(checks: Checks) -> None:
@@ -195,7 +199,7 @@ def test_where_a_step_goes_is_asked_for_and_shown_by_hook_and_line(checks: Check
     checks.draw(profile=ProfileView("running", 1))
     assert not checks.live.shows(PROFILE)
     checks.live.press(STOP_PROFILE)
-    assert checks.live.asked == [("profile_step",), ("profiler.stop",)]
+    assert checks.live.asked == [TimeStep(), StopProfile()]
     few = tuple(LineTime("evaluate", "/home/me/push.py", 90 + k, "x", 0.05, 0.004) for k in range(9))
     checks.draw(profile=ProfileView("done", 2, replace(PROFILED, lines=(*PROFILED.lines, *few))))
     text = checks.live.html("wb-profile")
@@ -240,7 +244,7 @@ def test_seeds_are_solved_as_typed_and_stopped(checks: Checks) -> None:
     assert "0 of 12 seeds" in html and "seed 0 at step 30 of 50" in html and "width: 5%" in html
     assert not checks.live.shows(SOLVE, "button") and checks.live.field("Seeds").off
     checks.live.press(STOP_SOLVING)
-    assert checks.live.asked == [("solve_seeds", 12), ("seeds_solver.stop",)]
+    assert checks.live.asked == [ChooseSeeds(seeds=12), SolveSeeds(), StopSolving()]
     checks.draw(seeds=SeedsView("failed", 3, why="the task failed", total=12))
     assert "the task failed" in checks.live.html() and checks.live.shows(SOLVE, "button")
 

@@ -11,13 +11,18 @@ from typing import Any, Literal
 from workbench.authoring.problem import Problem
 from workbench.checks.results import RuleResult, by_rule, failed
 from workbench.checks.rules import core_rules_of, degree_of_each
+from workbench.commands.checks import CheckAfterSave, CheckNow, StopChecks
+from workbench.commands.command import Command, Refused
 from workbench.core.rules import Finding
-from workbench.session.loop import on_loop
+from workbench.session.events import Asked
+from workbench.session.loop import do
 from workbench.session.process.askers import WAITING, Background, Priority
 from workbench.session.process.jobs import Job, JobFailed, Jobs, ProcessDied
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.session.rescore.background import StoppedBy
+from workbench.session.run.events import FileSaved, LoadDone, VersionLoaded
+from workbench.session.run.run import Run
 
 AHEAD = 2.0
 """Seconds of checking at low priority; then at the lowest, since a person waits more for the rescored history than
@@ -26,6 +31,8 @@ MOST_DEATHS = 5
 """Most processes that may die in one check; the rule that was running fails, and the next process checks the others."""
 ChecksState = Literal["none", "off", "loading", "checking", "done", "stopped", "failed"]
 RUNNING: tuple[ChecksState, ...] = ("loading", "checking")
+DOES: frozenset[type[Command]] = frozenset({CheckNow, StopChecks, CheckAfterSave})
+"""Commands that `apply` takes."""
 
 
 @dataclass(frozen=True)
@@ -61,78 +68,221 @@ class ChecksView:
         return tuple(finding for result in self.results for finding in result.findings)
 
 
+@dataclass(frozen=True)
 class Checks:
-    """Checks the running version, and keeps the findings of the version before until each rule has been checked again.
+    """What is known of the checks."""
+
+    view: ChecksView = ChecksView()
+    version: object = None
+    """The version that `view` belongs to."""
+
+
+# --- events and effects -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CheckWaits:
+    """Another job has the background process, or no longer."""
+
+    waits: bool
+
+
+@dataclass(frozen=True)
+class GroupBegan:
+    """The version is loaded in the background process; a group of rules is checked."""
+
+
+@dataclass(frozen=True)
+class RuleChecked:
+    """A rule has its result."""
+
+    result: RuleResult
+    seconds: float
+    """Seconds since the version was loaded in the background process."""
+    total: int | None = None
+    """Number of rules to check; None if a process that died has not told it."""
+
+
+@dataclass(frozen=True)
+class GroupChecked:
+    """All rules of a group have their results."""
+
+    total: int
+    """Number of rules to check."""
+    looks_at: str
+    """What the next group looks at."""
+
+
+@dataclass(frozen=True)
+class CheckDone:
+    """All rules have their results."""
+
+
+@dataclass(frozen=True)
+class CheckFailed:
+    """The job failed."""
+
+    why: str
+    problem: Problem | None
+
+
+@dataclass(frozen=True)
+class BeginCheck:
+    """Check this version in place of the one before."""
+
+    load: Load
+
+
+@dataclass(frozen=True)
+class EndCheck:
+    """Stop the job."""
+
+
+@dataclass(frozen=True)
+class KeepCheckAfterSave:
+    """Keep for the next run whether each version that loads is checked."""
+
+    wanted: bool
+
+
+CheckEvent = CheckWaits | GroupBegan | RuleChecked | GroupChecked | CheckDone | CheckFailed
+CheckEffect = BeginCheck | EndCheck
+Change = tuple[Checks, list[CheckEffect | KeepCheckAfterSave]]
+"""The checks after an event, and what has to be done."""
+
+
+def apply(checks: Checks, event: object, before: Run, run: Run) -> Change:
+    """The checks after an event, and what has to be done. Findings of the version before are kept until each rule has
+    been checked again.
+
+    Args:
+        before: the run before the event.
+        run: the run after it.
+
+    Raises:
+        Refused: the command makes no sense now.
+    """
+    match event:
+        case Asked(command=CheckNow()):
+            if (load := run.running_load()) is None:
+                raise Refused("No task is loaded yet.")
+            return _check(checks, load)
+        case Asked(command=StopChecks()):
+            return _stop(checks, StoppedBy.HAND)
+        case FileSaved():
+            return _stop(checks, StoppedBy.SAVE)
+        case Asked(command=CheckAfterSave(on=wanted)):
+            effects: list[CheckEffect | KeepCheckAfterSave] = [KeepCheckAfterSave(wanted)]
+            checks = _changed(checks, after_each_save=wanted)
+            if wanted and checks.view.state == "none" and (load := run.running_load()) is not None:
+                checks, begun = _check(checks, load)
+                effects += begun
+            return checks, effects
+        case VersionLoaded() if _task_id(before) != _task_id(run):
+            return _changed(checks, before=(), results=()), []
+        # Not with `VersionLoaded`: the later of two jobs of one priority comes first, and rescoring begins with that.
+        case LoadDone() if (load := run.running_load()) is not None:
+            return _check_loaded(checks, load)
+        case _ if checks.view.state in RUNNING:
+            return _take(checks, event), []
+    return checks, []
+
+
+def _check_loaded(checks: Checks, load: Load) -> Change:
+    """A version runs in the worker that plays."""
+    if checks.version == _version(load) and checks.view.state in ("done", "off"):
+        return checks, []
+    if checks.view.after_each_save:
+        return _check(checks, load)
+    return _begin(checks, load, "none"), [EndCheck()]
+
+
+def _check(checks: Checks, load: Load) -> Change:
+    """Check this version; a running check is cancelled."""
+    if all(degree == "off" for degree in degree_of_each(choice=load.options.rules).values()):
+        return _begin(checks, load, "off"), [EndCheck()]
+    return _begin(checks, load, "loading"), [BeginCheck(load)]
+
+
+def _begin(checks: Checks, load: Load, state: ChecksState) -> Checks:
+    """Begin the view of a version whose results are not known; findings of earlier versions move to
+    `ChecksView.before`."""
+    view = checks.view
+    before = {
+        finding.key: finding
+        for finding in (*view.before, *view.findings)
+        if _still_there(finding, load.source)
+    }
+    begun = ChecksView(
+        state,
+        serial=view.serial + 1,
+        before=() if state == "off" else tuple(before.values()),
+        total=view.total,
+        after_each_save=view.after_each_save,
+    )
+    return Checks(begun, _version(load))
+
+
+def _stop(checks: Checks, why: StoppedBy) -> Change:
+    """End the check; results so far stay."""
+    if checks.view.state not in RUNNING:
+        return checks, []
+    stopped = _changed(checks, state="stopped", stopped_by=why, why=why.value, looks_at="", waits=False)
+    return stopped, [EndCheck()]
+
+
+def _take(checks: Checks, event: object) -> Checks:
+    """Take what a running check tells."""
+    view = checks.view
+    match event:
+        case CheckWaits(waits=waits) if waits != view.waits:
+            return _changed(checks, waits=waits)
+        case GroupBegan():
+            return _changed(checks, state="checking")
+        case RuleChecked(result=result, seconds=seconds, total=total):
+            results = tuple(by_rule((*view.results, result)).values())
+            before = tuple(finding for finding in view.before if finding.rule != result.rule)
+            total = view.total if total is None else total
+            return _changed(checks, results=results, before=before, total=total, seconds=seconds)
+        case GroupChecked(total=total, looks_at=looks_at):
+            return _changed(checks, total=total, looks_at=looks_at)
+        case CheckDone():
+            return _changed(checks, state="done", before=(), looks_at="", waits=False)
+        case CheckFailed(why=why, problem=problem):
+            return _changed(checks, state="failed", why=why, problem=problem, looks_at="", waits=False)
+    return checks
+
+
+def _changed(checks: Checks, **values: Any) -> Checks:
+    return replace(checks, view=replace(checks.view, serial=checks.view.serial + 1, **values))
+
+
+class CheckJobs:
+    """Performs the effects: one check at a time. Used on the loop, but for `close`.
 
     Nothing of it runs in the worker that plays. The process gives way to whatever a person waits for; a group that was cut
-    short is asked again without the rules that are known. Methods return at once.
+    short is asked again without the rules that are known.
     """
 
-    def __init__(self, on_change: Callable[[], None], process: Background, after_each_save: bool) -> None:
+    def __init__(self, process: Background, happen: Callable[[CheckEvent], object]) -> None:
         """
         Args:
-            on_change: called when `view` has changed.
             process: where it runs; other jobs come first.
-            after_each_save: whether `loaded` begins to check.
+            happen: takes what the check comes to.
         """
-        self._process, self._on_change = process, on_change
-        self._view = ChecksView(after_each_save=after_each_save)
-        self._of: object = None
-        """The version that `view` belongs to."""
-        self._jobs = Jobs(on_change, self._failed)
+        self._process, self._happen = process, happen
+        self._jobs = Jobs(self._on_progress, self._failed)
 
-    @property
-    def view(self) -> ChecksView:
-        progress = self._jobs.progress
-        return replace(self._view, waits=progress is not None and progress.what == WAITING)
+    def perform(self, effect: CheckEffect) -> None:
+        match effect:
+            case BeginCheck(load=load):
+                self._jobs.start("checks", lambda job: self._check(job, load))
+            case EndCheck():
+                self._jobs.stop()
 
-    @on_loop
-    def loaded(self, load: Load, same_task: bool) -> None:
-        """A version runs in the worker that plays.
-
-        Args:
-            load: loads it.
-            same_task: whether it is another version of the task that ran.
-        """
-        if not same_task:
-            self._set(before=(), results=())
-        if self._of == _version(load) and self._view.state in ("done", "off"):
-            return
-        if self._view.after_each_save:
-            self.check(load)
-        else:
-            self._jobs.stop()
-            self._begin(load, "none")
-
-    @on_loop
-    def check(self, load: Load) -> None:
-        """Check this version; a running check is cancelled."""
-        if all(degree == "off" for degree in degree_of_each(choice=load.options.rules).values()):
-            self._jobs.stop()
-            self._begin(load, "off")
-            return
-        self._jobs.start("checks", lambda job: self._check(job, load))
-        self._begin(load, "loading")
-
-    @on_loop
-    def check_after_each_save(self, wanted: bool) -> None:
-        """Set whether `loaded` begins a check."""
-        self._set(after_each_save=wanted)
-
-    @on_loop
-    def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
-        """End the check; results so far stay."""
-        self._jobs.stop()
-        if self._view.state in RUNNING:
-            self._set(state="stopped", stopped_by=why, why=why.value, looks_at="")
-
-    @on_loop
     def close(self) -> None:
-        """Stop, and check nothing more."""
-        self.stop(StoppedBy.CLOSING)
-        self._jobs.close()
-
-    # --- the job -------------------------------------------------------------------------------------
+        """Stop, and check nothing more. Called on any thread."""
+        do(self._jobs.close)
 
     async def _check(self, job: Job, load: Load) -> None:
         degrees = degree_of_each(choice=load.options.rules)
@@ -141,19 +291,23 @@ class Checks:
         under_way: str | None = None
         deaths = 0
 
+        def checked(result: RuleResult, total: int | None = None) -> None:
+            done.add(result.rule)
+            seconds = time.monotonic() - (began or time.monotonic())
+            self._happen(RuleChecked(result, seconds, total))
+
         async def ask(group: int) -> CheckedGroup:
             nonlocal began
             await load_version(self._process, job, load)
             began = began or time.monotonic()
-            self._set(state="checking")
+            self._happen(GroupBegan())
             return await self._process.ask(CheckGroup(group, degrees, tuple(done)), hear)
 
         def hear(count: int, total: int, now: RuleProgress) -> None:
             nonlocal under_way
             under_way = now.rule if now.result is None else None
             if now.result is not None:
-                done.add(now.rule)
-                self._take(began, total, now.result)
+                checked(now.result, total)
 
         group, groups = 0, 1
         while group < groups:
@@ -169,47 +323,20 @@ class Checks:
                 problem = Problem("worker", str(died), None, None, None, "")
                 rules = core_rules_of(degrees) if under_way == "" else filter(None, [under_way])
                 for rule in rules:
-                    done.add(rule)
-                    self._take(began, self._view.total, failed(rule, problem))
+                    checked(failed(rule, problem))
                 group += under_way == ""  # that is the last one
                 under_way = None
                 continue
             group, groups = group + 1, answer.groups
-            self._set(total=answer.rules, looks_at=answer.next)
-        self._set(state="done", before=(), looks_at="")
+            self._happen(GroupChecked(answer.rules, answer.next))
+        self._happen(CheckDone())
 
-    def _take(self, began: float | None, total: int, result: RuleResult) -> None:
-        results = by_rule((*self._view.results, result))
-        before = tuple(finding for finding in self._view.before if finding.rule != result.rule)
-        seconds = time.monotonic() - (began or time.monotonic())
-        self._set(results=tuple(results.values()), before=before, total=total, seconds=seconds)
+    def _on_progress(self) -> None:
+        progress = self._jobs.progress
+        self._happen(CheckWaits(progress is not None and progress.what == WAITING))
 
     def _failed(self, failure: JobFailed) -> None:
-        self._set(state="failed", why=str(failure), problem=failure.problem, looks_at="")
-
-    # --- the view ------------------------------------------------------------------------------------
-
-    def _set(self, **values: Any) -> None:
-        self._view = replace(self._view, serial=self._view.serial + 1, **values)
-        self._on_change()
-
-    def _begin(self, load: Load, state: ChecksState) -> None:
-        """Begin the view of a version whose results are not known; findings of earlier versions move to
-        `ChecksView.before`."""
-        self._of, view = _version(load), self._view
-        before = {
-            finding.key: finding
-            for finding in (*view.before, *view.findings)
-            if _still_there(finding, load.source)
-        }
-        self._view = ChecksView(
-            state,
-            serial=view.serial + 1,
-            before=() if state == "off" else tuple(before.values()),
-            total=view.total,
-            after_each_save=view.after_each_save,
-        )
-        self._on_change()
+        self._happen(CheckFailed(str(failure), failure.problem))
 
 
 async def load_version(process: Background, job: Job, load: Load) -> None:
@@ -233,6 +360,10 @@ def _still_there(finding: Finding, source: Mapping[str, str] | None) -> bool:
         return True
     text = source.get(finding.file)
     return text is None or any(line.strip() == finding.code for line in text.splitlines())
+
+
+def _task_id(run: Run) -> str | None:
+    return None if run.task is None else run.task.env_id
 
 
 def _version(load: Load) -> object:

@@ -8,13 +8,20 @@ from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
 from workbench.checks.results import StepProfile
+from workbench.commands.checks import StopProfile, TimeStep
+from workbench.commands.command import Command, Refused
 from workbench.session.checks.checks import load_version
-from workbench.session.loop import on_loop
+from workbench.session.events import Asked
+from workbench.session.loop import do
 from workbench.session.process.askers import Background
 from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import ProfileStep
+from workbench.session.run.events import VersionLoaded
+from workbench.session.run.run import Run
 
+DOES: frozenset[type[Command]] = frozenset({TimeStep, StopProfile})
+"""Commands that `apply` takes."""
 ProfileState = Literal["none", "running", "done", "stopped", "failed"]
 
 
@@ -35,54 +42,102 @@ class ProfileView:
     """What the code raised."""
 
 
-class StepProfiler:
-    """Makes one profile at a time; a person waits for it. Methods return at once."""
+# --- events and effects -----------------------------------------------------------------------------
 
-    def __init__(self, on_change: Callable[[], None], process: Background) -> None:
+
+@dataclass(frozen=True)
+class StepTimed:
+    """The job has its result."""
+
+    profile: StepProfile
+
+
+@dataclass(frozen=True)
+class ProfileFailed:
+    """The job failed."""
+
+    why: str
+    problem: Problem | None
+
+
+@dataclass(frozen=True)
+class BeginProfile:
+    """Time a step of this version in place of the one before."""
+
+    load: Load
+
+
+@dataclass(frozen=True)
+class EndProfile:
+    """Stop the job."""
+
+
+ProfileEvent = StepTimed | ProfileFailed
+ProfileEffect = BeginProfile | EndProfile
+
+
+def apply(view: ProfileView, event: object, before: Run, run: Run) -> tuple[ProfileView, list[ProfileEffect]]:
+    """The profile after an event, and what has to be done.
+
+    Args:
+        before: the run before the event.
+        run: the run after it.
+
+    Raises:
+        Refused: the command makes no sense now.
+    """
+    running = view.state == "running"
+    match event:
+        case Asked(command=TimeStep()):
+            if (load := run.running_load()) is None:
+                raise Refused("No task is loaded yet.")
+            return _changed(view, state="running", why="", problem=None), [BeginProfile(load)]
+        case Asked(command=StopProfile()) if running:
+            return _changed(view, state="stopped"), [EndProfile()]
+        case VersionLoaded():
+            state = "stopped" if running else view.state
+            stale = view.profile is not None
+            return _changed(view, state=state, stale=stale), [EndProfile()] if running else []
+        case StepTimed(profile=profile) if running:
+            return _changed(view, state="done", profile=profile, stale=False), []
+        case ProfileFailed(why=why, problem=problem) if running:
+            return _changed(view, state="failed", why=why, problem=problem), []
+    return view, []
+
+
+def _changed(view: ProfileView, **values: Any) -> ProfileView:
+    return replace(view, serial=view.serial + 1, **values)
+
+
+class ProfileJobs:
+    """Performs the effects: one job at a time, for which a person waits. Used on the loop, but for `close`."""
+
+    def __init__(self, process: Background, happen: Callable[[ProfileEvent], object]) -> None:
         """
         Args:
-            on_change: called when `view` has changed.
-            process: where it runs.
+            process: where a job runs.
+            happen: takes what a job comes to.
         """
-        self._process, self._on_change = process, on_change
-        self.view = ProfileView()
-        self._jobs = Jobs(on_change, self._failed)
+        self._process, self._happen = process, happen
+        self._jobs = Jobs(lambda: None, self._failed)
 
-    @on_loop
-    def profile(self, load: Load) -> None:
-        """Time a step of this version."""
-        self._jobs.start("profile", lambda job: self._profile(job, load))
-        self._set(state="running", why="", problem=None)
+    def perform(self, effect: ProfileEffect) -> None:
+        match effect:
+            case BeginProfile(load=load):
+                self._jobs.start("profile", lambda job: self._profile(job, load))
+            case EndProfile():
+                self._jobs.stop()
 
-    @on_loop
-    def loaded(self) -> None:
-        """Another version runs: a running profile ends, and the last one is of an earlier version."""
-        self.stop()
-        self._set(stale=self.view.profile is not None)
-
-    @on_loop
-    def stop(self) -> None:
-        """End a running profile."""
-        self._jobs.stop()
-        if self.view.state == "running":
-            self._set(state="stopped")
-
-    @on_loop
     def close(self) -> None:
-        """Stop, and begin no more profiles."""
-        self.stop()
-        self._jobs.close()
+        """Stop, and begin no more profiles. Called on any thread."""
+        do(self._jobs.close)
 
     async def _profile(self, job: Job, load: Load) -> None:
         async def ask() -> StepProfile:
             await load_version(self._process, job, load)
             return await self._process.ask(ProfileStep())
 
-        self._set(state="done", profile=await self._process.in_turns(job, ask), stale=False)
+        self._happen(StepTimed(await self._process.in_turns(job, ask)))
 
     def _failed(self, failure: JobFailed) -> None:
-        self._set(state="failed", why=str(failure), problem=failure.problem)
-
-    def _set(self, **values: Any) -> None:
-        self.view = replace(self.view, serial=self.view.serial + 1, **values)
-        self._on_change()
+        self._happen(ProfileFailed(str(failure), failure.problem))

@@ -9,17 +9,24 @@ from pathlib import Path
 from typing import Any, Literal
 
 from workbench.authoring.problem import Problem, TaskError
+from workbench.commands.checks import ChooseSeeds, SolveSeeds, StopSolving
+from workbench.commands.command import Command, Refused
 from workbench.jobs.pool.deal import Deal, ItemQueue, PoolError, Work
 from workbench.jobs.pool.processes import Processes
 from workbench.jobs.task import TaskOptions
 from workbench.planning.options import PlanOptions
 from workbench.planning.report import SolveReport, underway_text
-from workbench.session.loop import Aside, on_loop, post
+from workbench.planning.verdicts import ENOUGH_SEEDS
+from workbench.session.events import Asked
+from workbench.session.loop import Aside, do, post
 from workbench.session.process.jobs import Job, JobFailed, Jobs
-from workbench.session.protocol.messages import Load
+from workbench.session.run.events import VersionLoaded
+from workbench.session.run.run import Run
 
 _NICENESS = 10
 """Niceness of the solving processes: the worker that plays comes first."""
+DOES: frozenset[type[Command]] = frozenset({ChooseSeeds, SolveSeeds, StopSolving})
+"""Commands that `apply` takes."""
 SeedsState = Literal["none", "starting", "solving", "done", "stopped", "failed"]
 RUNNING: tuple[SeedsState, ...] = ("starting", "solving")
 
@@ -45,10 +52,15 @@ class SeedsView:
     """Why solving failed, as text."""
     problem: Problem | None = None
     """What the author's code raised."""
+    chosen: int = ENOUGH_SEEDS
+    """Seeds that a person chose to solve next."""
+
+
+# --- events and effects -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Update:
+class SeedsTold:
     """An update from the other process."""
 
     activity: str = ""
@@ -56,6 +68,92 @@ class _Update:
     done: float | None = None
     """New value of `SeedsView.done`; None before the first seed."""
     report: SolveReport | None = None
+
+
+@dataclass(frozen=True)
+class SeedsDone:
+    """All seeds are tried."""
+
+
+@dataclass(frozen=True)
+class SeedsFailed:
+    """The job failed."""
+
+    why: str
+    problem: Problem | None
+
+
+@dataclass(frozen=True)
+class BeginSeeds:
+    """Solve seeds 0 to `seeds` - 1; a running job ends, and keeps what is done."""
+
+    task: str
+    options: TaskOptions
+    seeds: int
+    plan: PlanOptions
+
+
+@dataclass(frozen=True)
+class EndSeeds:
+    """Stop the job."""
+
+
+SeedsEvent = SeedsTold | SeedsDone | SeedsFailed
+SeedsEffect = BeginSeeds | EndSeeds
+Change = tuple[SeedsView, list[SeedsEffect]]
+"""The results after an event, and what has to be done."""
+
+
+def apply(view: SeedsView, event: object, before: Run, run: Run) -> Change:
+    """The results after an event, and what has to be done.
+
+    Args:
+        before: the run before the event.
+        run: the run after it.
+
+    Raises:
+        Refused: the command makes no sense now.
+    """
+    running = view.state in RUNNING
+    match event:
+        case Asked(command=ChooseSeeds(seeds=seeds)):
+            return _changed(view, chosen=seeds), []
+        case Asked(command=SolveSeeds()):
+            return _solve(view, run)
+        case Asked(command=StopSolving()) if running:
+            return _changed(view, state="stopped", activity=""), [EndSeeds()]
+        case VersionLoaded() if view.report is not None:
+            return _changed(view, stale=True), []
+        case SeedsTold() if running:
+            return _take(view, event), []
+        case SeedsDone() if running:
+            return _changed(view, state="done", activity=""), []
+        case SeedsFailed(why=why, problem=problem) if running:
+            return _changed(view, state="failed", why=why, problem=problem, activity=""), []
+    return view, []
+
+
+def _solve(view: SeedsView, run: Run) -> Change:
+    if (load := run.running_load()) is None:
+        raise Refused("No task is loaded yet.")
+    if not isinstance(load.task, str):
+        # Only the texts of a recording's task were cleared, not the file that bears its name.
+        why = "this task comes from a recording: open its file to solve it"
+        return _changed(view, state="failed", why=why), []
+    begun = SeedsView("starting", view.serial + 1, total=view.chosen, chosen=view.chosen)
+    return begun, [BeginSeeds(load.task, load.options, view.chosen, run.settings.plan)]
+
+
+def _take(view: SeedsView, told: SeedsTold) -> SeedsView:
+    if told.report is not None:
+        return _changed(view, state="solving", report=told.report)
+    if told.done is not None:
+        return _changed(view, state="solving", done=told.done, activity=told.activity)
+    return _changed(view, activity=told.activity)
+
+
+def _changed(view: SeedsView, **values: Any) -> SeedsView:
+    return replace(view, serial=view.serial + 1, **values)
 
 
 @dataclass(frozen=True)
@@ -70,80 +168,48 @@ class _Setup:
     options: TaskOptions
 
 
-class SeedsSolver:
-    """Solves seeds 0 to N - 1 of the task's file as it is saved. All methods but `close` return at once."""
+class SeedsJobs:
+    """Performs the effects: one job at a time. Used on the loop, but for `close`."""
 
-    def __init__(self, on_change: Callable[[], None], recordings: Path) -> None:
+    def __init__(self, recordings: Path, happen: Callable[[SeedsEvent], object]) -> None:
         """
         Args:
-            on_change: called when `view` has changed.
             recordings: the folder for the episodes.
+            happen: takes what a job comes to.
         """
-        self._recordings, self._on_change = recordings.absolute(), on_change
-        self.view = SeedsView()
-        self._jobs = Jobs(on_change, self._failed)
+        self._recordings, self._happen = recordings.absolute(), happen
+        self._jobs = Jobs(lambda: None, self._failed)
         self._aside = Aside("solve-seeds")
 
-    @on_loop
-    def solve(self, load: Load, seeds: int, plan: PlanOptions) -> None:
-        """Solve so many seeds; a running job ends, and keeps what is done.
-
-        Args:
-            load: loads the running version.
-        """
-        if not isinstance(load.task, str):
-            # Only the texts of a recording's task were cleared, not the file that bears its name.
-            self._set(state="failed", why="this task comes from a recording: open its file to solve it")
-            return
-        workers = max(1, min(seeds, len(os.sched_getaffinity(0)) // 2))
-        setup = _Setup(load.task, self._recordings, seeds, workers, plan, replace(load.options, seed=0))
-        self._jobs.start("solving seeds", lambda job: self._solve(job, setup))
-        self._set(
-            state="starting",
-            report=None,
-            total=seeds,
-            done=0.0,
-            activity="",
-            stale=False,
-            why="",
-            problem=None,
-        )
-
-    @on_loop
-    def loaded(self) -> None:
-        """Another version runs: mark the results as those of an earlier version."""
-        if self.view.report is not None:
-            self._set(stale=True)
-
-    @on_loop
-    def stop(self) -> None:
-        """End the job; finished seeds stay, with their recordings."""
-        self._jobs.stop()
-        if self.view.state in RUNNING:
-            self._set(state="stopped", activity="")
+    def perform(self, effect: SeedsEffect) -> None:
+        match effect:
+            case BeginSeeds(task=task, options=options, seeds=seeds, plan=plan):
+                workers = max(1, min(seeds, len(os.sched_getaffinity(0)) // 2))
+                setup = _Setup(task, self._recordings, seeds, workers, plan, replace(options, seed=0))
+                self._jobs.start("solving seeds", lambda job: self._solve(job, setup))
+            case EndSeeds():
+                self._jobs.stop()
 
     def close(self) -> None:
         """Stop; returns when the processes have ended. Called on another thread than the loop."""
-        self.stop()
+        do(self._jobs.stop)
         self._aside.close()
-
-    # --- the job -------------------------------------------------------------------------------------
 
     async def _solve(self, job: Job, setup: _Setup) -> None:
         await self._aside.run(lambda: self._run(job, setup))
-        self._set(state="done", activity="")
+        self._happen(SeedsDone())
 
     def _run(self, job: Job, setup: _Setup) -> None:
         """Run the job on its own thread."""
         if job.stopped:
             return
-        work = Work(_run, setup, SolveReport, _Update, "that solves")
+        work = Work(_run, setup, SolveReport, SeedsTold, "that solves")
 
-        def tell(news: _Update) -> None:
-            post(lambda: job.stopped or self._take(news))
+        def tell(news: SeedsTold) -> None:
+            post(lambda: job.stopped or self._happen(news))
 
-        deal: Deal[SolveReport, _Update] = Deal(
-            range(1), lambda number, report: tell(_Update(report=report)), tell, lambda: job.stopped
+        deal: Deal[SolveReport, SeedsTold] = Deal(
+            range(1), lambda number, report: tell(SeedsTold(report=report)), tell, lambda: job.stopped
         )
         try:
             Processes(1).run(work, deal)
@@ -154,20 +220,8 @@ class SeedsSolver:
         except PoolError as error:
             raise JobFailed(str(error)) from error
 
-    def _take(self, news: _Update) -> None:
-        if news.report is not None:
-            self._set(state="solving", report=news.report)
-        elif news.done is not None:
-            self._set(state="solving", done=news.done, activity=news.activity)
-        else:
-            self._set(activity=news.activity)
-
     def _failed(self, failure: JobFailed) -> None:
-        self._set(state="failed", why=str(failure), problem=failure.problem, activity="")
-
-    def _set(self, **values: Any) -> None:
-        self.view = replace(self.view, serial=self.view.serial + 1, **values)
-        self._on_change()
+        self._happen(SeedsFailed(str(failure), failure.problem))
 
 
 def _run(setup: _Setup, queue: ItemQueue) -> None:
@@ -182,12 +236,12 @@ def _run(setup: _Setup, queue: ItemQueue) -> None:
     what = SolveOptions(setup.task, setup.out, setup.seeds, setup.workers, plan=setup.plan, options=options)
     report = solve(
         what,
-        on_activity=lambda activity: queue.send_update(_Update(activity)),
+        on_activity=lambda activity: queue.send_update(SeedsTold(activity)),
         on_progress=lambda now: queue.send_update(
-            _Update(underway_text(now.by_seed(0), now.limit), now.done)
+            SeedsTold(underway_text(now.by_seed(0), now.limit), now.done)
         ),
         stop=lambda: queue.limit() == 0,
         on_finding=lambda finding: None,
-        on_report=lambda report: queue.send_update(_Update(report=report)),
+        on_report=lambda report: queue.send_update(SeedsTold(report=report)),
     )
     queue.send_result(0, report)

@@ -19,19 +19,26 @@ from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem
 from workbench.commands.command import Command
-from workbench.commands.run import PauseRun
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.policy import NoPolicy, PolicyFile, find_policy
 from workbench.jobs.task import Stepped, TaskOptions
+from workbench.machine.kept_choices import keep_check_after_save
 from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.session.cameras.selection import KeptPlacements
 from workbench.session.cameras.studio import CameraStudio
-from workbench.session.checks.checks import Checks
-from workbench.session.checks.profile import StepProfiler
-from workbench.session.checks.solve_seeds import SeedsSolver
-from workbench.session.events import Asked
+from workbench.session.checks.checks import (
+    BeginCheck,
+    CheckJobs,
+    Checks,
+    ChecksView,
+    EndCheck,
+    KeepCheckAfterSave,
+)
+from workbench.session.checks.profile import BeginProfile, EndProfile, ProfileJobs
+from workbench.session.checks.solve_seeds import BeginSeeds, EndSeeds, SeedsJobs
+from workbench.session.events import Ask, Asked
 from workbench.session.history.env_table import EnvRows
-from workbench.session.live.solver import Solver
+from workbench.session.live.solver import BeginPlan, EndPlan, PlanJobs
 from workbench.session.live.state import Effect, SessionEvent, State, apply
 from workbench.session.live.view import SessionView, view_of
 from workbench.session.loop import Aside, ChangeCounter, do, later, on_loop, wait_for_disk
@@ -44,8 +51,6 @@ from workbench.session.protocol.messages import (
     Loaded,
     LoadFailed,
     Placed,
-    PlanDropped,
-    PlanWanted,
     Progress,
     Request,
     SetCapture,
@@ -127,7 +132,7 @@ class Session:
             history_bytes: memory limit of the history.
             worker: limits of the worker process, and whether there is a spare one.
             kept: of an earlier session of this task; its options are used in place of `options`.
-            check: whether the rules are checked after each load; `checks` changes it.
+            check: whether the rules are checked after each load, until a `CheckAfterSave`.
             make_worker: makes the supervisor; tests without a worker process give another.
             on_event: called with every event of the worker, and with its death as `LoadFailed`, on the supervisor's thread.
             on_line: called with the lines that the worker printed, from other threads; drops some of a flood.
@@ -140,7 +145,9 @@ class Session:
         settings = Settings()
         if kept is not None:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
-        self._state = State(first_run(task, options, history_bytes, settings))
+        self._state = State(
+            first_run(task, options, history_bytes, settings), Checks(ChecksView(after_each_save=check))
+        )
         self._changes = ChangeCounter()
         self._notify = self._changes.notify
         self._enter_numbers = itertools.count(1)
@@ -168,14 +175,10 @@ class Session:
         """Asks questions of the background process."""
         self.past_saver = PastSaver(recordings, self._recorder.finisher, self._notify, self._background)
         self.rescorer = PastRescorer(self._notify, self._background)
-        self.checks = Checks(self._notify, self._background, check)
-        """Checks the rules of the running version."""
-        self.profiler = StepProfiler(self._notify, self._background)
-        """Measures where the time of a step of the running version goes."""
-        self.solver = Solver(self._notify, self._send, lambda: self.do(PauseRun()))
-        """Plans the actions of the source *solve*."""
-        self.seeds_solver = SeedsSolver(self._notify, recordings)
-        """Solves the task from many seeds."""
+        self._checks = CheckJobs(self._background, self._happen)
+        self._profiles = ProfileJobs(self._background, self._happen)
+        self._plans = PlanJobs(self._happen)
+        self._seeds = SeedsJobs(recordings, self._happen)
         self._asker = Asker(self._send)
         self.studio = CameraStudio(
             self._send,
@@ -194,7 +197,7 @@ class Session:
     # --- what happens ------------------------------------------------------------------------------
 
     def do(self, command: Command, page: str = "") -> None:
-        """Carry out a command of `run.DOES`.
+        """Carry out a command of `state.DOES`.
 
         Args:
             page: name of the page that asks.
@@ -243,6 +246,18 @@ class Session:
                 if self._to_draw is not None:
                     self._to_draw.cancel()
                 self._to_draw = later(STANDS_STILL, lambda: self._happen(PastPicturesWanted(at)))
+            case BeginCheck() | EndCheck():
+                self._checks.perform(effect)
+            case KeepCheckAfterSave(wanted=wanted):
+                return self._aside.begin(partial(keep_check_after_save, wanted))
+            case BeginProfile() | EndProfile():
+                self._profiles.perform(effect)
+            case BeginPlan() | EndPlan():
+                self._plans.perform(effect)
+            case Ask(command=command):
+                self._happen(Asked(command))
+            case BeginSeeds() | EndSeeds():
+                self._seeds.perform(effect)
         return None
 
     def _send(self, request: Request) -> None:
@@ -269,10 +284,10 @@ class Session:
             printed=self._printed.view(),
             vitals=self._worker.vitals,
             rescored=self.rescorer.rescoring.view,
-            checks=self.checks.view,
-            profile=self.profiler.view,
-            seeds=self.seeds_solver.view,
-            solve=self.solver.view(env),
+            checks=self._state.checks.view,
+            profile=self._state.profile,
+            seeds=self._state.seeds,
+            solve=self._state.solving.view(env),
         )
         recording = replace(self._recorder.status(), saving=self.past_saver.status(_shown(self._run)))
         return replace(view, recording=recording, studio=self.studio.view(view.step, env))
@@ -388,24 +403,6 @@ class Session:
         self.happen(RunToEnter(run, number, everywhere, source_file, source))
         return number
 
-    @on_loop
-    def check_now(self) -> None:
-        """Check the rules of the running version."""
-        if (load := self._run.running_load()) is not None:
-            self.checks.check(load)
-
-    @on_loop
-    def profile_step(self) -> None:
-        """Time a control step of the running version."""
-        if (load := self._run.running_load()) is not None:
-            self.profiler.profile(load)
-
-    @on_loop
-    def solve_seeds(self, seeds: int) -> None:
-        """Solve the file as it is saved from seeds 0 to `seeds` - 1."""
-        if (load := self._run.running_load()) is not None:
-            self.seeds_solver.solve(load, seeds, self._run.settings.plan)
-
     def close(self) -> None:
         """End all processes and threads; waits for episodes that are being written. Called on another thread than the loop."""
         stop_listening(self._log)
@@ -416,10 +413,10 @@ class Session:
         self._aside.end()
         self._policy_file.close()
         self.rescorer.rescoring.close()
-        self.checks.close()
-        self.profiler.close()
-        self.solver.close()
-        self.seeds_solver.close()
+        self._checks.close()
+        self._profiles.close()
+        self._plans.close()
+        self._seeds.close()
         self.studio.close()
         self.past_saver.close()
         self._background.close()
@@ -456,7 +453,6 @@ class Session:
         """Returns the problem to show, if any, and whether there is a version to bring back."""
         if death.end is not End.HANDED_OVER:
             self._recorder.stop()
-        self.solver.stop()
         self.studio.interrupted()
         before = self._run.problem_serial
         self._happen(WorkerDied(death, self._printed.tail(20)))
@@ -477,16 +473,10 @@ class Session:
                 self._on_loaded(event, on_disk)
             case Stepped():
                 self._happen(event)
-                self.solver.stepped(event, self._run.settings.action_source == "solve")
                 self._recorder.take(event)
             case Answer() | Progress():
                 self._asker.take(event)
                 self._notify()
-            case PlanWanted():
-                if (load := self._run.running_load()) is not None:
-                    self.solver.plan(event, load, self._run.settings)
-            case PlanDropped():
-                self.solver.stop()
             case _:
                 self._happen(event)
                 if isinstance(event, Placed):
@@ -521,10 +511,6 @@ class Session:
             self.rescorer.rescore(load, rescored)
         elif what_to_do == "forget":
             self.rescorer.forget()
-        # After the rescoring was begun: the later of two jobs of one priority comes first.
-        self.checks.loaded(load, before.task is not None and before.task.env_id == run.task.env_id)
-        self.profiler.loaded()
-        self.seeds_solver.loaded()
         self.studio.send_placements(placed)
         if recording:
             put_back = past != "gone" or (event.reload is not None and bool(event.reload.carried))
@@ -551,9 +537,7 @@ class Session:
     @on_loop
     def _on_files_changed(self, paths: set[Path]) -> None:
         """A watched file was saved."""
-        self.solver.stop()
         self.rescorer.stop(StoppedBy.SAVE)
-        self.checks.stop(StoppedBy.SAVE)
         self.studio.interrupted()
         self._happen(FileSaved())
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -11,14 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
+from workbench.commands.run import PauseRun
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Stepped
+from workbench.planning.options import PlanOptions
 from workbench.session.checks.checks import load_version
-from workbench.session.loop import on_loop
+from workbench.session.events import Ask
+from workbench.session.loop import do
 from workbench.session.process.askers import Background
 from workbench.session.process.jobs import Job, JobFailed, Jobs
-from workbench.session.protocol.messages import FollowPlan, Load, PlanWanted, Request, Settings
+from workbench.session.protocol.messages import FollowPlan, Load, PlanDropped, PlanWanted
 from workbench.session.protocol.questions import PlanActions, Planned, PlannedEnv
+from workbench.session.run.events import FileSaved, Send, WorkerDied
+from workbench.session.run.run import Run
 
 _NICENESS = 5
 """Niceness of the planning process: between the worker that plays and work that nobody waits for."""
@@ -58,14 +63,14 @@ class SolveView:
     """Env-steps of rollouts that the last plan made a second, restoring and planning included."""
 
 
-@dataclass
-class _Episode:
+@dataclass(frozen=True)
+class Episode:
     """What is known of the running episode of an env."""
 
     begins: int = 0
     """Control steps of the env's episode before the first one that is kept here."""
-    rewards: list[float] = field(default_factory=list)
-    predicted: dict[int, float] = field(default_factory=dict)
+    rewards: tuple[float, ...] = ()
+    predicted: Mapping[int, float] = field(default_factory=dict)
     """Predicted reward a step, by index into `rewards`."""
     horizon: int = 1
     plan: PlannedEnv | None = None
@@ -74,137 +79,225 @@ class _Episode:
     rate: float = 0.0
 
 
-class Solver:
-    """Answers what the worker that plays wants planned, one plan at a time; a newer wish replaces the one before.
+@dataclass(frozen=True)
+class Solving:
+    """What is known of the plans."""
 
-    A process of its own has the same version of the task with the envs of the rollouts. It is started with the first plan,
-    and ends a while after the last. Used on the loop, but for `close`.
-    """
-
-    def __init__(
-        self, on_change: Callable[[], None], send: Callable[[Request], None], pause: Callable[[], None]
-    ) -> None:
-        """
-        Args:
-            on_change: called when `view` has changed.
-            send: sends to the worker that plays.
-            pause: pauses it, where there is no plan to follow.
-        """
-        self._on_change, self._send, self._pause = on_change, send, pause
-        self._process = Background(_NICENESS)
-        self._state: SolveView = SolveView()
-        """The view without the fields of a single env."""
-        self._episodes: dict[int, _Episode] = {}
-        self._jobs = Jobs(on_change, self._refuse)
+    shared: SolveView = SolveView()
+    """The view without the fields of a single env."""
+    episodes: Mapping[int, Episode] = field(default_factory=dict)
+    """By env."""
 
     def view(self, env: int) -> SolveView:
         """The view of this env."""
-        progress, state, episode = self._jobs.progress, self._state, self._episodes.get(env, _Episode())
-        solved = tuple((e, one.solved_at) for e, one in sorted(self._episodes.items()) if one.solved_at)
+        episode = self.episodes.get(env, Episode())
         predicted, achieved = _curves(episode)
         return replace(
-            state,
-            activity=progress.what if progress is not None and state.state == "starting" else "",
+            self.shared,
             plan=episode.plan,
             plan_step=episode.plan_step,
             predicted=predicted,
             achieved=achieved,
             begins=episode.begins,
             solved_at=episode.solved_at,
-            solved=solved,
+            solved=tuple((e, one.solved_at) for e, one in sorted(self.episodes.items()) if one.solved_at),
             steps_per_second=episode.rate,
         )
 
-    def plan(self, wanted: PlanWanted, load: Load, settings: Settings) -> None:
-        """Plan, and send the worker the actions to follow.
 
-        Args:
-            load: loads the running version.
-            settings: how to plan.
+# --- events and effects -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RolloutsStart:
+    """The version with the envs of the rollouts is not loaded yet in the planning process."""
+
+
+@dataclass(frozen=True)
+class PlanActivity:
+    """What the job does now."""
+
+    activity: str
+
+
+@dataclass(frozen=True)
+class PlanMade:
+    """The job has its result."""
+
+    wanted: PlanWanted
+    envs: tuple[PlannedEnv, ...]
+    steps_per_second: float
+    """Env-steps of rollouts."""
+
+
+@dataclass(frozen=True)
+class PlanFailed:
+    """The job failed."""
+
+    why: str
+    problem: Problem | None
+
+
+@dataclass(frozen=True)
+class BeginPlan:
+    """Plan in place of the wish before."""
+
+    wanted: PlanWanted
+    load: Load
+    """Loads the running version with one env."""
+    options: PlanOptions
+    traced: str
+    """The body to trace."""
+
+
+@dataclass(frozen=True)
+class EndPlan:
+    """Stop the job."""
+
+
+SolverEvent = RolloutsStart | PlanActivity | PlanMade | PlanFailed
+SolverEffect = BeginPlan | EndPlan
+Change = tuple[Solving, list[SolverEffect | Ask | Send]]
+"""The plans after an event, and what has to be done."""
+
+
+def apply(solving: Solving, event: object, before: Run, run: Run) -> Change:
+    """The plans after an event, and what has to be done. The last plan stays visible when planning ends.
+
+    Args:
+        before: the run before the event.
+        run: the run after it.
+    """
+    state = solving.shared.state
+    runs = state in ("starting", "planning")
+    match event:
+        case PlanWanted() if (load := run.running_load()) is not None:
+            if event.why_not:
+                return _refuse(solving, event.why_not, None)
+            # One env of the task is enough to make the rollouts' envs like it, and its seed decides nothing.
+            alone = replace(load, options=replace(load.options, num_envs=1, seed=0))
+            settings = run.settings
+            begun = _changed(solving, state="planning", activity="", why="", problem=None)
+            return begun, [BeginPlan(event, alone, settings.plan, settings.traced)]
+        case PlanDropped() | FileSaved() | WorkerDied() if runs:
+            return _changed(solving, state="none", activity=""), [EndPlan()]
+        case Stepped():
+            return _stepped(solving, event, run.settings.action_source == "solve"), []
+        case RolloutsStart() if runs:
+            return _changed(solving, state="starting"), []
+        case PlanActivity(activity=activity) if state == "starting":
+            return _changed(solving, activity=activity), []
+        case PlanMade(wanted=wanted, envs=envs) if runs:
+            follow = FollowPlan(wanted.number, wanted.env_idx, np.stack([one.actions for one in envs], 1))
+            return _planned(solving, event), [Send(follow)]
+        case PlanFailed(why=why, problem=problem) if runs:
+            return _refuse(solving, why, problem)
+    return solving, []
+
+
+def _refuse(solving: Solving, why: str, problem: Problem | None) -> Change:
+    """There is no plan to follow: the worker that plays is paused."""
+    return _changed(solving, state="failed", activity="", why=why, problem=problem), [Ask(PauseRun())]
+
+
+def _planned(solving: Solving, made: PlanMade) -> Solving:
+    episodes = dict(solving.episodes)
+    for one in made.envs:
+        episode = episodes.get(one.env, Episode())
+        place = len(episode.rewards)
+        episodes[one.env] = replace(
+            episode,
+            plan=one,
+            horizon=one.horizon,
+            plan_step=episode.begins + place,
+            predicted={**episode.predicted, place: float(one.returns[0]) / one.horizon},
+            rate=made.steps_per_second,
+        )
+    return _changed(replace(solving, episodes=episodes), state="planning", activity="")
+
+
+def _stepped(solving: Solving, event: Stepped, planned: bool) -> Solving:
+    """Note what the worker that plays came to.
+
+    Args:
+        planned: the source of its actions is *solve*.
+    """
+    if not planned and not solving.episodes:
+        return solving
+    episodes: dict[int, Episode] = {}
+    for env, jumped in enumerate(event.reset_mask if planned else ()):
+        known = None if jumped else solving.episodes.get(env)
+        episodes[env] = _noted(known, env, event.step)
+    return _changed(replace(solving, episodes=episodes))
+
+
+def _noted(episode: Episode | None, env: int, step: StepResult) -> Episode:
+    elapsed = int(step.elapsed_steps[env])
+    if episode is None:
+        return Episode(elapsed)
+    solved_at, success = episode.solved_at, step.evaluate.get("success")
+    if success is not None and bool(np.all(success[env])) and not solved_at:
+        solved_at = elapsed
+    return replace(episode, rewards=(*episode.rewards, float(step.reward[env])), solved_at=solved_at)
+
+
+def _changed(solving: Solving, **values: Any) -> Solving:
+    shared = solving.shared
+    return replace(solving, shared=replace(shared, serial=shared.serial + 1, **values))
+
+
+class PlanJobs:
+    """Performs the effects: one plan at a time. Used on the loop, but for `close`.
+
+    A process of its own has the same version of the task with the envs of the rollouts. It is started with the first plan,
+    and ends a while after the last.
+    """
+
+    def __init__(self, happen: Callable[[SolverEvent], object]) -> None:
         """
-        if wanted.why_not:
-            self._refuse(JobFailed(wanted.why_not))
-            return
-        # One env of the task is enough to make the rollouts' envs like it, and its seed decides nothing.
-        alone = replace(load, options=replace(load.options, num_envs=1, seed=0))
-        loaded = self._process.has_loaded(alone)
-        self._set(state="planning" if loaded else "starting", why="", problem=None)
-        self._jobs.start("planning", lambda job: self._plan(job, wanted, alone, settings))
-
-    def stepped(self, event: Stepped, planned: bool) -> None:
-        """Note what the worker that plays came to.
-
         Args:
-            planned: the source of its actions is *solve*.
+            happen: takes what a job comes to.
         """
-        if not planned and not self._episodes:
-            return
-        for env in range(len(event.reset_mask)):
-            if event.reset_mask[env] or not planned:
-                self._episodes.pop(env, None)
-            if planned:
-                self._note(env, event.step, bool(event.reset_mask[env]))
-        self._set()
+        self._happen = happen
+        self._process = Background(_NICENESS)
+        self._jobs = Jobs(self._on_progress, self._failed)
 
-    @on_loop
-    def stop(self) -> None:
-        """End the planning; the last plan stays visible."""
-        self._jobs.stop()
-        if self._state.state in ("starting", "planning"):
-            self._set(state="none")
-        self._on_change()
+    def perform(self, effect: SolverEffect) -> None:
+        match effect:
+            case BeginPlan():
+                if not self._process.has_loaded(effect.load):
+                    self._happen(RolloutsStart())
+                self._jobs.start("planning", lambda job: self._plan(job, effect))
+            case EndPlan():
+                self._jobs.stop()
 
     def close(self) -> None:
         """Stop; returns when the process has ended. Called on another thread than the loop."""
-        self.stop()
+        do(self._jobs.stop)
         self._process.close()
 
-    # --- the job -------------------------------------------------------------------------------------
-
-    async def _plan(self, job: Job, wanted: PlanWanted, load: Load, settings: Settings) -> None:
+    async def _plan(self, job: Job, what: BeginPlan) -> None:
         began = time.monotonic()
 
         async def ask() -> Planned:
-            await load_version(self._process, job, load)
-            question = PlanActions(wanted.snapshot, wanted.bodies, settings.plan, settings.traced)
+            await load_version(self._process, job, what.load)
+            question = PlanActions(what.wanted.snapshot, what.wanted.bodies, what.options, what.traced)
             return await self._process.ask(question, lambda done, total, part: job.report(done, total))
 
         planned = await self._process.in_turns(job, ask)
-        actions = np.stack([one.actions for one in planned.envs], 1)
         seconds = time.monotonic() - began
-        made = sum(len(one.returns) * one.horizon for one in planned.envs) * settings.plan.rounds
-        for one in planned.envs:
-            episode = self._episodes.setdefault(one.env, _Episode())
-            episode.plan, episode.horizon = one, one.horizon
-            episode.plan_step = episode.begins + len(episode.rewards)
-            episode.predicted[len(episode.rewards)] = float(one.returns[0]) / one.horizon
-            episode.rate = made / max(seconds, 1e-6)
-        self._set(state="planning")
-        self._send(FollowPlan(wanted.number, wanted.env_idx, actions))
+        made = sum(len(one.returns) * one.horizon for one in planned.envs) * what.options.rounds
+        self._happen(PlanMade(what.wanted, planned.envs, made / max(seconds, 1e-6)))
 
-    def _refuse(self, failure: JobFailed) -> None:
-        self._set(state="failed", why=str(failure), problem=failure.problem)
-        self._pause()
-        self._on_change()
+    def _on_progress(self) -> None:
+        if (progress := self._jobs.progress) is not None:
+            self._happen(PlanActivity(progress.what))
 
-    # --- what is kept --------------------------------------------------------------------------------
-
-    def _note(self, env: int, step: StepResult, begins: bool) -> None:
-        elapsed = int(step.elapsed_steps[env])
-        if begins or env not in self._episodes:
-            self._episodes[env] = _Episode(elapsed)
-            return
-        episode = self._episodes[env]
-        episode.rewards.append(float(step.reward[env]))
-        success = step.evaluate.get("success")
-        if success is not None and bool(np.all(success[env])) and not episode.solved_at:
-            episode.solved_at = elapsed
-
-    def _set(self, **values: Any) -> None:
-        self._state = replace(self._state, serial=self._state.serial + 1, **values)
+    def _failed(self, failure: JobFailed) -> None:
+        self._happen(PlanFailed(str(failure), failure.problem))
 
 
-def _curves(episode: _Episode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _curves(episode: Episode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Predicted and achieved reward a step, from each step of the episode on."""
     rewards = np.array(episode.rewards, np.float32)
     count = max(len(rewards), max(episode.predicted, default=-1) + 1)

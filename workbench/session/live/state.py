@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+from workbench.commands.command import Command
+from workbench.session.checks import checks as of_checks
+from workbench.session.checks import profile as of_profile
+from workbench.session.checks import solve_seeds as of_seeds
+from workbench.session.events import Ask
+from workbench.session.live import solver as of_solver
 from workbench.session.run import apply as of_run
+from workbench.session.run import asked
 from workbench.session.run.events import Now, RunEffect, RunEvent
 from workbench.session.run.run import Run
 
-SessionEvent = RunEvent
-Effect = RunEffect
+SessionEvent = (
+    RunEvent | of_checks.CheckEvent | of_profile.ProfileEvent | of_seeds.SeedsEvent | of_solver.SolverEvent
+)
+Effect = (
+    RunEffect
+    | of_checks.CheckEffect
+    | of_checks.KeepCheckAfterSave
+    | of_profile.ProfileEffect
+    | of_seeds.SeedsEffect
+    | of_solver.SolverEffect
+    | Ask
+)
+DOES: frozenset[type[Command]] = asked.DOES | of_checks.DOES | of_profile.DOES | of_seeds.DOES
+"""Commands that a session takes."""
 
 
 @dataclass(frozen=True)
@@ -17,6 +36,14 @@ class State:
     """One moment of a session. Parts that an event did not change are the same objects."""
 
     run: Run
+    checks: of_checks.Checks = of_checks.Checks()
+    """The rules of the running version."""
+    profile: of_profile.ProfileView = of_profile.ProfileView()
+    """Where the time of a step of the running version goes."""
+    seeds: of_seeds.SeedsView = of_seeds.SeedsView()
+    """The task solved from many seeds."""
+    solving: of_solver.Solving = of_solver.Solving()
+    """Plans of the source of actions *solve*."""
 
 
 def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
@@ -26,4 +53,10 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
         Refused: a command makes no sense now; nothing has changed.
     """
     run, effects = of_run.apply(state.run, event, now)
-    return (state if run is state.run else State(run)), effects
+    checks, for_checks = of_checks.apply(state.checks, event, state.run, run)
+    profile, for_profile = of_profile.apply(state.profile, event, state.run, run)
+    seeds, for_seeds = of_seeds.apply(state.seeds, event, state.run, run)
+    solving, for_solver = of_solver.apply(state.solving, event, state.run, run)
+    new = State(run, checks, profile, seeds, solving)
+    same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
+    return (state if same else new), [*effects, *for_checks, *for_profile, *for_seeds, *for_solver]

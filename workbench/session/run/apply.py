@@ -22,7 +22,16 @@ from workbench.session.protocol.messages import (
     Tell,
     Told,
 )
-from workbench.session.run.asked import change_settings, do_command, draw_past, enter, reset, show, show_live
+from workbench.session.run.asked import (
+    DOES,
+    change_settings,
+    do_command,
+    draw_past,
+    enter,
+    reset,
+    show,
+    show_live,
+)
 from workbench.session.run.events import (
     ActionTold,
     DrawSoon,
@@ -39,7 +48,6 @@ from workbench.session.run.events import (
     PagesCounted,
     PastPicturesWanted,
     PolicySaved,
-    RunEvent,
     RunToEnter,
     Send,
     SettingsChanged,
@@ -60,7 +68,7 @@ from workbench.session.run.loading import (
 from workbench.session.run.run import Change, Run, at_rest, new_pictures, with_problem
 
 
-def apply(run: Run, event: RunEvent, now: Now) -> Change:
+def apply(run: Run, event: object, now: Now) -> Change:
     """The run after an event, and what has to be done.
 
     Only the history is written into in place (see `Past.history`): all else is in the value.
@@ -75,9 +83,9 @@ def apply(run: Run, event: RunEvent, now: Now) -> Change:
     return new, effects
 
 
-def _apply(run: Run, event: RunEvent, now: Now) -> Change:
+def _apply(run: Run, event: object, now: Now) -> Change:
     match event:
-        case Asked(command=command):
+        case Asked(command=command) if type(command) in DOES:
             return do_command(run, command)
         case VersionLoaded():
             return loaded(run, event.loaded, event.on_disk, now)

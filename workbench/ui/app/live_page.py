@@ -30,9 +30,9 @@ from workbench.commands.page import (
 from workbench.commands.recording import ToggleRecording, ToggleSavePast
 from workbench.commands.timeline import Seek
 from workbench.machine.kept_choices import close_hints
+from workbench.session.live import state
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run import asked
 from workbench.session.run.events import PagesCounted
 from workbench.ui.app.marks import EPISODES, STUDIO, Marks
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
@@ -182,7 +182,7 @@ class Page:
         self._frustums = CameraFrustums(server)
         self._forces = ForceArrows(server)
         self._parts.add(TaskCommands(server, visitors))
-        kinds = DOES | asked.DOES | self._parts.does | also
+        kinds = DOES | state.DOES | self._parts.does | also
         register(server, visitors, kinds, "live page")
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", rows=key_rows(kinds)))
@@ -231,9 +231,9 @@ class Page:
             self._record = RecordPanel(server, session)
             server.gui.add_html(tools_html([tool("Review recordings", ShowRecordings())]))
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
-            checks = ChecksPanel(server, session, checks_tab, self._link)
+            checks = ChecksPanel(server, checks_tab, self._link)
             seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
-            profile = StepProfilePanel(server, session, self._link)
+            profile = StepProfilePanel(server, self._link)
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             log = LogPanel(server, session.clear_printed)
         parts = [
@@ -324,7 +324,7 @@ class Page:
             case CloseDialog():
                 if self._opening is not None:
                     self._opening.close()
-            case _ if type(command) in asked.DOES:
+            case _ if type(command) in state.DOES:
                 session.do(command, visitor.name)
             case _ if isinstance(command, CamerasPanel.does):
                 self._cameras.do(command, visitor)

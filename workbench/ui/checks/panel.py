@@ -11,9 +11,7 @@ from workbench.checks.comments import Comment, comments_without_effect
 from workbench.checks.rules import RULES
 from workbench.commands.checks import CheckAfterSave, CheckNow, StopChecks, ToggleRule
 from workbench.commands.command import Command
-from workbench.machine.kept_choices import keep_check_after_save
 from workbench.session.checks.checks import RUNNING, ChecksView
-from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.checks.findings import MOST_SHOWN, Card, cards, count, summary, undecided, without_finding
 from workbench.ui.server.viser_private import set_tab_label
@@ -39,18 +37,15 @@ class ChecksPanel(PagePart[SessionView]):
 
     Args:
         server: The page.
-        session: The session.
         tab: The tab that it is in: its label has the number of findings.
         link: Links the lines of the author's files.
     """
 
     every = 0.25
-    does = (CheckNow, StopChecks, CheckAfterSave, ToggleRule)
+    does = (ToggleRule,)
 
-    def __init__(
-        self, server: viser.ViserServer, session: Session, tab: viser.GuiTabHandle, link: LinkTo = no_links
-    ) -> None:
-        self._session, self._tab, self._link = session, tab, link
+    def __init__(self, server: viser.ViserServer, tab: viser.GuiTabHandle, link: LinkTo = no_links) -> None:
+        self._tab, self._link = tab, link
         self._open: set[str] = set()
         """Ids of unfolded rules, and `REST`."""
         self._status = server.gui.add_html("")
@@ -79,20 +74,8 @@ class ChecksPanel(PagePart[SessionView]):
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
-            case CheckNow():
-                self._session.check_now()
-            case StopChecks():
-                self._session.checks.stop()
-            case CheckAfterSave(on=on):
-                self._check_after_save(on)
             case ToggleRule(rule=rule):
                 self._open.symmetric_difference_update({rule})
-
-    def _check_after_save(self, wanted: bool) -> None:
-        keep_check_after_save(wanted)
-        self._session.checks.check_after_each_save(wanted)
-        if wanted and self._session.checks.view.state == "none":
-            self._session.check_now()
 
 
 def _toggle(rule: str) -> ToggleRule:

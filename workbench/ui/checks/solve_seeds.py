@@ -42,7 +42,7 @@ class SolveSeedsPanel(PagePart[SessionView]):
     """
 
     every = 0.25
-    does = (ChooseSeeds, SolveSeeds, StopSolving, ToggleVerdict, ShowSolved)
+    does = (ToggleVerdict, ShowSolved)
 
     def __init__(
         self,
@@ -55,23 +55,22 @@ class SolveSeedsPanel(PagePart[SessionView]):
         self._open: set[str] = set()
         """Ids of unfolded rules."""
         # Who comes back from a recording finds the rows that led there.
-        before = session.seeds_solver.view
-        self._count = before.total or ENOUGH_SEEDS
+        before = session.view().seeds
         with server.gui.add_folder(TITLE, expand_by_default=before.state != "none"):
-            self._seeds = Field(server, "Seeds", ChooseSeeds, "seeds", str(self._count), hint=HINT)
+            self._seeds = Field(server, "Seeds", ChooseSeeds, "seeds", str(before.chosen), hint=HINT)
             self._tools = server.gui.add_html("")
             self._html = server.gui.add_html("")
             self._list = server.gui.add_html("", visible=False)
 
     def key(self, view: SessionView) -> object:
-        return view.seeds.serial, view.task_serial, self._count, tuple(sorted(self._open))
+        return view.seeds.serial, view.task_serial, tuple(sorted(self._open))
 
     def draw(self, view: SessionView) -> None:
         seeds = view.seeds
         running = seeds.state in RUNNING
         pressed = tool(STOP_SOLVING, StopSolving()) if running else tool(SOLVE, SolveSeeds())
         self._tools.content = tools_html([pressed] if running or view.task is not None else [])
-        self._seeds.show(str(self._count), off=running)
+        self._seeds.show(str(seeds.chosen), off=running)
         self._html.content = seeds_html(seeds, self._link)
         found = [] if seeds.report is None else verdict_cards(seeds.report, seeds.stale)
         self._list.visible = bool(found)
@@ -80,19 +79,13 @@ class SolveSeedsPanel(PagePart[SessionView]):
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
-            case ChooseSeeds(seeds=seeds):
-                self._count = seeds
-            case SolveSeeds():
-                self._session.solve_seeds(self._count)
-            case StopSolving():
-                self._session.seeds_solver.stop()
             case ToggleVerdict(rule=rule):
                 self._open.symmetric_difference_update({rule})
             case ShowSolved(seed=seed):
                 self._look_at(seed)
 
     def _look_at(self, seed: int) -> None:
-        report = self._session.seeds_solver.view.report
+        report = self._session.view().seeds.report
         for one in () if report is None else report.seeds:
             if one.seed == seed:
                 self._on_look(one.path)

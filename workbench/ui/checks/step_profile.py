@@ -5,15 +5,12 @@ from __future__ import annotations
 import viser
 
 from workbench.commands.checks import StopProfile, TimeStep
-from workbench.commands.command import Command
 from workbench.session.checks.profile import ProfileView
-from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.tools import tool, tools_html
-from workbench.ui.widgets.visitors import Visitor
 
 TITLE = "Where does a step go"
 PROFILE, STOP_PROFILE = "Time a step", "Stop timing"
@@ -27,15 +24,13 @@ class StepProfilePanel(PagePart[SessionView]):
 
     Args:
         server: The page.
-        session: The session.
         link: Links the lines of the author's files.
     """
 
     every = 0.25
-    does = (TimeStep, StopProfile)
 
-    def __init__(self, server: viser.ViserServer, session: Session, link: LinkTo = no_links) -> None:
-        self._session, self._link = session, link
+    def __init__(self, server: viser.ViserServer, link: LinkTo = no_links) -> None:
+        self._link = link
         with server.gui.add_folder(TITLE, expand_by_default=False):
             self._tools = server.gui.add_html("")
             self._html = server.gui.add_html("")
@@ -48,13 +43,6 @@ class StepProfilePanel(PagePart[SessionView]):
         pressed = tool(STOP_PROFILE, StopProfile()) if running else tool(PROFILE, TimeStep())
         self._tools.content = tools_html([pressed] if running or view.task is not None else [])
         self._html.content = profile_html(view.profile, self._link)
-
-    def do(self, command: Command, visitor: Visitor) -> None:
-        match command:
-            case TimeStep():
-                self._session.profile_step()
-            case StopProfile():
-                self._session.profiler.stop()
 
 
 def profile_html(shown: ProfileView, link: LinkTo = no_links) -> str:
