@@ -20,7 +20,7 @@ import pytest
 from tests.drive.session import live_session, runs, save, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import calm, edit, line_of, provocation, provoke, write_task
-from workbench.commands.run import Interrupt, PauseRun, PlayRun, ReloadFile, RestartWorker, Step
+from workbench.commands.run import Interrupt, PauseRun, PlayRun, ReloadFile, ResetAll, RestartWorker, Step
 from workbench.commands.timeline import ContinueFromHere
 from workbench.jobs.task import TaskOptions
 from workbench.recording.rerun.read import read_properties
@@ -327,7 +327,7 @@ def test_what_would_wait_or_leave_or_is_no_ordinary_exception_is_named_with_its_
 ) -> None:
     worker = session.worker_pid
     provoke(file, place, what)
-    (session.reset if place == "reset" else session.step)()
+    session.do(ResetAll() if place == "reset" else Step())
     view = wait_until(session, lambda v: v.problem is not None, "the problem")
     assert says in view.problem.message and view.problem.stage == place
     assert (view.problem.file, view.problem.line) == (str(file), line_of(file, code))
