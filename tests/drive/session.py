@@ -26,6 +26,7 @@ from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Restored, Stepped, TaskDescription, TaskOptions
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.checks.checks import CheckJobs
+from workbench.session.checks.profile import ProfileJobs
 from workbench.session.history.history import History, Moment
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -368,9 +369,10 @@ def moments_of(session: Session) -> list[Moment]:
     return [one for one in found if one is not None]
 
 
-def check_with(session: Session, background: Any) -> None:
-    """Rules are checked by this, in place of a process."""
+def work_with(session: Session, background: Any) -> None:
+    """Rules are checked and steps are timed by this, in place of a process."""
     session._checks = CheckJobs(background, session._happen)
+    session._profiles = ProfileJobs(background, session._happen)
 
 
 def background_pid(session: Session) -> int | None:

@@ -138,6 +138,16 @@ FEATURES = {
         (solver.EndPlan, solver.PlanMade, solver.PlanFailed),
     ),
 }
+
+
+def test_the_check_of_a_load_begins_last_so_that_it_comes_before_the_rescoring() -> None:
+    loaded = VersionLoaded(Loaded(description(GEOMETRY), step_of(POSES), {}), True)
+    value, effects = checks.apply(checks.Checks(), loaded, NOTHING, PUSH)
+    assert effects == []
+    _, effects = checks.apply(value, LoadDone(), PUSH, PUSH)
+    assert [type(effect) for effect in effects] == [checks.BeginCheck]
+
+
 features = pytest.mark.parametrize("feature", FEATURES.values(), ids=FEATURES)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.drive.session import Told, check_with, live_session, told_session, wait_until
+from tests.drive.session import Told, live_session, told_session, wait_until, work_with
 from tests.drive.waiting import until
 from workbench.checks.results import RuleResult
 from workbench.commands.checks import CheckAfterSave, CheckNow, StopChecks
@@ -101,7 +101,7 @@ def background() -> ScriptedBackground:
 @pytest.fixture
 def checks(background: ScriptedBackground, tmp_path: Path) -> Iterator[Told]:
     with told_session(tmp_path / "recordings", check=True) as told:
-        check_with(told.session, background)
+        work_with(told.session, background)
         yield told
 
 

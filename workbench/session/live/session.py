@@ -146,7 +146,8 @@ class Session:
         if kept is not None:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
         self._state = State(
-            first_run(task, options, history_bytes, settings), Checks(ChecksView(after_each_save=check))
+            first_run(task, options, history_bytes, settings),
+            checks=Checks(ChecksView(after_each_save=check)),
         )
         self._changes = ChangeCounter()
         self._notify = self._changes.notify

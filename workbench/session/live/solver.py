@@ -88,6 +88,11 @@ class Solving:
     episodes: Mapping[int, Episode] = field(default_factory=dict)
     """By env."""
 
+    @property
+    def solved(self) -> tuple[int, ...]:
+        """Envs whose episode is solved."""
+        return tuple(env for env, episode in sorted(self.episodes.items()) if episode.solved_at)
+
     def view(self, env: int) -> SolveView:
         """The view of this env."""
         episode = self.episodes.get(env, Episode())
@@ -100,7 +105,7 @@ class Solving:
             achieved=achieved,
             begins=episode.begins,
             solved_at=episode.solved_at,
-            solved=tuple((e, one.solved_at) for e, one in sorted(self.episodes.items()) if one.solved_at),
+            solved=tuple((e, self.episodes[e].solved_at) for e in self.solved),
             steps_per_second=episode.rate,
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from workbench.commands.command import Command
 from workbench.session.checks import checks as of_checks
@@ -57,6 +57,6 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     profile, for_profile = of_profile.apply(state.profile, event, state.run, run)
     seeds, for_seeds = of_seeds.apply(state.seeds, event, state.run, run)
     solving, for_solver = of_solver.apply(state.solving, event, state.run, run)
-    new = State(run, checks, profile, seeds, solving)
+    new = replace(state, run=run, checks=checks, profile=profile, seeds=seeds, solving=solving)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
     return (state if same else new), [*effects, *for_checks, *for_profile, *for_seeds, *for_solver]
