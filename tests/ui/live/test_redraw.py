@@ -38,8 +38,8 @@ from workbench.session.process.heartbeat import Busy
 from workbench.session.process.jobs import JobProgress
 from workbench.session.process.supervisor import Vitals
 from workbench.session.protocol.messages import ReloadReport, RulesBroken
-from workbench.session.record.live import RecordingStatus
-from workbench.session.record.save_past import SaveStatus
+from workbench.session.record.recording import RecordingStatus
+from workbench.session.record.saving import SaveStatus
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
 from workbench.session.run.past import Strip, TimelineView

@@ -36,7 +36,7 @@ from workbench.session.live.view import SessionView, view_of
 from workbench.session.loop import Aside, ChangeCounter, do, on_loop, wait_for_disk
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.captured_output import PrintedLine, PrintedLog
-from workbench.session.process.supervisor import Death, End, Supervisor, WorkerOptions
+from workbench.session.process.supervisor import Death, Supervisor, WorkerOptions
 from workbench.session.protocol.messages import (
     Answer,
     Event,
@@ -47,12 +47,13 @@ from workbench.session.protocol.messages import (
     PlanWanted,
     Progress,
     Request,
-    SetCapture,
     Settings,
     WarmUp,
 )
 from workbench.session.record.live import LiveRecorder
-from workbench.session.record.save_past import PastSaver, request_of
+from workbench.session.record.recording import BeginEpisodes, EndEpisodes, Recording, TakeStep
+from workbench.session.record.save_past import PastSaver
+from workbench.session.record.saving import BeginSaving, EndSaving
 from workbench.session.rescore.background import StoppedBy
 from workbench.session.rescore.past import PastRescorer, RescoredPast, rescore_after_load
 from workbench.session.run.events import (
@@ -135,7 +136,7 @@ class Session:
         settings = Settings()
         if kept is not None:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
-        self._state = State(first_run(task, options, history_bytes, settings))
+        self._state = State(first_run(task, options, history_bytes, settings), Recording(str(recordings)))
         self._changes = ChangeCounter()
         self._notify = self._changes.notify
         self._enter_numbers = itertools.count(1)
@@ -154,12 +155,8 @@ class Session:
             own_files=lambda: self.look(lambda run: run.own_files),
             output=self._printed.feed,
         )
-        self._recorder = LiveRecorder(
-            recordings, self._notify, lambda envs: self._send(SetCapture(envs, from_reset=True)), on_notice
-        )
         self._background = Background()
         """Asks questions of the background process."""
-        self.past_saver = PastSaver(recordings, self._recorder.finisher, self._notify, self._background)
         self.rescorer = PastRescorer(self._notify, self._background)
         self.checks = Checks(self._notify, self._background, check)
         """Checks the rules of the running version."""
@@ -180,6 +177,9 @@ class Session:
             None if kept is None else kept.cameras,
         )
         """The camera studio."""
+        # Last: what it recovers happens at once.
+        self._recorder = LiveRecorder(recordings, self._happen, on_notice)
+        self._past_saver = PastSaver(recordings, self._recorder.finisher, self._background, self._happen)
         listen(self._log)
         self._watcher.follow(watched_files(self._run))
         self._worker.start()
@@ -187,7 +187,7 @@ class Session:
     # --- what happens ------------------------------------------------------------------------------
 
     def do(self, command: Command, page: str = "") -> None:
-        """Carry out a command of `run.DOES`.
+        """Carry out a command of `state.DOES`.
 
         Args:
             page: name of the page that asks.
@@ -209,7 +209,8 @@ class Session:
     def _happen(self, event: SessionEvent) -> list[Future[None]]:
         """Returns what was begun beside the loop."""
         before = self._state
-        self._state, effects = apply(before, event, Now(time.monotonic(), time.time()))
+        now = Now(time.monotonic(), time.time())
+        self._state, effects = apply(before, event, now, self.solver.solved)
         begun = [future for effect in effects if (future := self._perform(effect)) is not None]
         if self._state is not before:
             self._notify()
@@ -232,6 +233,14 @@ class Session:
                 return self._aside.begin(partial(self._watcher.follow, files, texts))
             case FollowPolicy(policy=policy, folder=folder):
                 return self._aside.begin(partial(self._policy_file.follow, policy, folder))
+            case BeginEpisodes() | TakeStep() | EndEpisodes():
+                self._recorder.perform(effect)
+            case BeginSaving():
+                self._past_saver.begin(effect, self.studio.placed_cameras())
+            case EndSaving():
+                self._past_saver.end()
+            case EnvsReset():
+                self._happen(effect)
         return None
 
     def _send(self, request: Request) -> None:
@@ -257,14 +266,14 @@ class Session:
             self._run,
             printed=self._printed.view(),
             vitals=self._worker.vitals,
+            recording=self._state.recording.status(self._run),
             rescored=self.rescorer.rescoring.view,
             checks=self.checks.view,
             profile=self.profiler.view,
             seeds=self.seeds_solver.view,
             solve=self.solver.view(env),
         )
-        recording = replace(self._recorder.status(), saving=self.past_saver.status(_shown(self._run)))
-        return replace(view, recording=recording, studio=self.studio.view(view.step, env))
+        return replace(view, studio=self.studio.view(view.step, env))
 
     def env_rows(self) -> EnvRows | None:
         """See `Run.env_rows`."""
@@ -321,50 +330,6 @@ class Session:
         self._printed.clear()
         self._notify()
 
-    @on_loop
-    def start_recording(
-        self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False, goes_on: bool = False
-    ) -> None:
-        """Reset these envs (all if None) and record them until `stop_recording`.
-
-        Args:
-            next_episode: do not reset; record only the episode of each env that begins with its next reset.
-            goes_on: as `LiveRecorder.start` has it.
-        """
-        task = self._run.task
-        if task is None:
-            return
-        envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
-        self.past_saver.forget()
-        self._recorder.start(task, envs, one_each=next_episode, goes_on=goes_on)
-        self._send(SetCapture(envs, from_reset=True))
-        if not next_episode:
-            self.happen(EnvsReset(None if env_idx is None else envs))
-        self._notify()
-
-    @on_loop
-    def stop_recording(self) -> None:
-        """Stop recording; the running episodes are written as far as they are."""
-        self._send(SetCapture(()))
-        self._recorder.stop()
-        self._notify()
-
-    @on_loop
-    def save_past(self, env_idx: tuple[int, ...] | None = None, before: bool = False) -> None:
-        """Record from the history: for each of these envs (all if None) the episode that contains the shown moment.
-
-        While live, the running episode is saved; if it has no step yet, the one before. `SessionView.recording` has progress
-        and result.
-
-        Args:
-            before: record the episode before that one.
-        """
-        what = request_of(self._run, env_idx, self.studio.placed_cameras(), before)
-        if isinstance(what, str):
-            self.past_saver.refuse(what, _shown(self._run))
-        else:
-            self.past_saver.save(what)
-
     def enter_recording(
         self,
         run: RecordedRun,
@@ -409,7 +374,7 @@ class Session:
         self.solver.close()
         self.seeds_solver.close()
         self.studio.close()
-        self.past_saver.close()
+        self._past_saver.close()
         self._background.close()
         self._recorder.close()
 
@@ -442,8 +407,6 @@ class Session:
 
     def _died(self, death: Death) -> tuple[Problem | None, bool]:
         """Returns the problem to show, if any, and whether there is a version to bring back."""
-        if death.end is not End.HANDED_OVER:
-            self._recorder.stop()
         self.solver.stop()
         self.studio.interrupted()
         before = self._run.problem_serial
@@ -466,7 +429,6 @@ class Session:
             case Stepped():
                 self._happen(event)
                 self.solver.stepped(event, self._run.settings.action_source == "solve")
-                self._recorder.take(event)
             case Answer() | Progress():
                 self._asker.take(event)
                 self._notify()
@@ -485,12 +447,7 @@ class Session:
 
     def _on_loaded(self, event: Loaded, on_disk: bool) -> None:
         self._worker.reset_deaths()
-        recording, one_each = self._recorder.recording, self._recorder.one_each
         level = None if event.reload is None else event.reload.level
-        if level != "same":
-            # An episode must not mix steps of two versions, nor of two processes.
-            self._recorder.stop()
-            self.past_saver.forget()
         before = self._run
         past = past_after(before.task, event, before.recovery.restoring)
         what_to_do = rescore_after_load(past, self.rescorer.rescoring.view)
@@ -514,25 +471,7 @@ class Session:
         self.profiler.loaded()
         self.seeds_solver.loaded()
         self.studio.send_placements(placed)
-        if recording:
-            put_back = past != "gone" or (event.reload is not None and bool(event.reload.carried))
-            self._continue_recording(put_back, recording, one_each)
         self._happen(LoadDone())
-
-    def _continue_recording(self, put_back: bool, env_idx: tuple[int, ...], one_each: bool) -> None:
-        """Continue recording these envs after a version came in.
-
-        Args:
-            put_back: it goes on with episodes that are under way.
-        """
-        if not put_back:
-            self.start_recording(env_idx, next_episode=one_each, goes_on=True)
-        elif not self._recorder.recording:
-            # No reset, which would lose the present moment: recording continues with each env's next episode.
-            task = self._run.task
-            if task is not None:
-                self._recorder.start(task, env_idx, one_each, goes_on=True)
-                self._send(SetCapture(env_idx, from_reset=True))
 
     # --- files and output ----------------------------------------------------------------------------
 
@@ -572,9 +511,3 @@ def _is_on_disk(source: Mapping[str, str]) -> bool:
         except (OSError, SyntaxError):
             return False
     return True
-
-
-def _shown(run: Run) -> object:
-    """The version, env and moment that are shown."""
-    past = run.past
-    return run.task_serial, run.env, None if past is None else (past.at, past.pinned)

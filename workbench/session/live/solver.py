@@ -97,10 +97,15 @@ class Solver:
         self._episodes: dict[int, _Episode] = {}
         self._jobs = Jobs(on_change, self._refuse)
 
+    @property
+    def solved(self) -> tuple[int, ...]:
+        """Envs whose episode is solved."""
+        return tuple(env for env, episode in sorted(self._episodes.items()) if episode.solved_at)
+
     def view(self, env: int) -> SolveView:
         """The view of this env."""
         progress, state, episode = self._jobs.progress, self._state, self._episodes.get(env, _Episode())
-        solved = tuple((e, one.solved_at) for e, one in sorted(self._episodes.items()) if one.solved_at)
+        solved = tuple((e, self._episodes[e].solved_at) for e in self.solved)
         predicted, achieved = _curves(episode)
         return replace(
             state,

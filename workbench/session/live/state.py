@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from workbench.commands.command import Command
+from workbench.session.record import recording as of_recording
+from workbench.session.record.recording import RecordEffect, RecordEvent, Recording, RecordingWanted
+from workbench.session.record.saving import SaveEvent, SaveWanted
 from workbench.session.run import apply as of_run
+from workbench.session.run import asked
 from workbench.session.run.events import Now, RunEffect, RunEvent
 from workbench.session.run.run import Run
 
-SessionEvent = RunEvent
-Effect = RunEffect
+DOES: frozenset[type[Command]] = asked.DOES | of_recording.DOES
+"""Commands that `apply` takes."""
+SessionEvent = RunEvent | RecordingWanted | RecordEvent | SaveWanted | SaveEvent
+Effect = RunEffect | RecordEffect
 
 
 @dataclass(frozen=True)
@@ -17,13 +24,24 @@ class State:
     """One moment of a session. Parts that an event did not change are the same objects."""
 
     run: Run
+    recording: Recording
 
 
-def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
+def apply(
+    state: State, event: SessionEvent, now: Now, solved: tuple[int, ...] = ()
+) -> tuple[State, list[Effect]]:
     """The state after an event, and what has to be done.
+
+    Args:
+        solved: envs whose episode is solved.
 
     Raises:
         Refused: a command makes no sense now; nothing has changed.
     """
-    run, effects = of_run.apply(state.run, event, now)
-    return (state if run is state.run else State(run)), effects
+    run, for_run = of_run.apply(state.run, event, now)
+    recording, for_recording = of_recording.apply(state.recording, event, state.run, run, now, solved)
+    # Those of the run come last: after a load a recording continues before a recorded run is entered.
+    effects = [*for_recording, *for_run]
+    if run is state.run and recording is state.recording:
+        return state, effects
+    return replace(state, run=run, recording=recording), effects

@@ -27,12 +27,11 @@ from workbench.commands.page import (
     ToggleTable,
     ToggleTheme,
 )
-from workbench.commands.recording import ToggleRecording, ToggleSavePast
 from workbench.commands.timeline import Seek
 from workbench.machine.kept_choices import close_hints
+from workbench.session.live import state
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run import asked
 from workbench.session.run.events import PagesCounted
 from workbench.ui.app.marks import EPISODES, STUDIO, Marks
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
@@ -85,8 +84,6 @@ DOES: frozenset[type[Command]] = frozenset(
         ToggleTheme,
         ToggleOnlySelected,
         CloseHints,
-        ToggleRecording,
-        ToggleSavePast,
         CloseDialog,
         *CamerasPanel.does,
     }
@@ -182,7 +179,7 @@ class Page:
         self._frustums = CameraFrustums(server)
         self._forces = ForceArrows(server)
         self._parts.add(TaskCommands(server, visitors))
-        kinds = DOES | asked.DOES | self._parts.does | also
+        kinds = DOES | state.DOES | self._parts.does | also
         register(server, visitors, kinds, "live page")
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", rows=key_rows(kinds)))
@@ -228,7 +225,7 @@ class Page:
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, clock)
         with tabs.add_tab(EPISODES, viser.Icon.MOVIE):
-            self._record = RecordPanel(server, session)
+            self._record = RecordPanel(server)
             server.gui.add_html(tools_html([tool("Review recordings", ShowRecordings())]))
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, session, checks_tab, self._link)
@@ -314,17 +311,13 @@ class Page:
             case CloseHints():
                 self._hints.content = ""
                 close_hints()
-            case ToggleRecording():
-                self._record.toggle()
-            case ToggleSavePast():
-                self._record.save()
             case SelectCamera():
                 self._parts.do(command, visitor)
                 self._open_tabs.open(visitor, STUDIO)
             case CloseDialog():
                 if self._opening is not None:
                     self._opening.close()
-            case _ if type(command) in asked.DOES:
+            case _ if type(command) in state.DOES:
                 session.do(command, visitor.name)
             case _ if isinstance(command, CamerasPanel.does):
                 self._cameras.do(command, visitor)
