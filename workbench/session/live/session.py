@@ -55,7 +55,9 @@ from workbench.session.record.recording import BeginEpisodes, EndEpisodes, Recor
 from workbench.session.record.save_past import PastSaver
 from workbench.session.record.saving import BeginSaving, EndSaving
 from workbench.session.rescore.background import StoppedBy
-from workbench.session.rescore.past import PastRescorer, RescoredPast, rescore_after_load
+from workbench.session.rescore.past import RescoredCurve
+from workbench.session.rescore.past_rescorer import PastRescorer
+from workbench.session.rescore.rescoring import BeginRescoring, EndRescoring
 from workbench.session.run.events import (
     EnvsReset,
     FileOpened,
@@ -75,7 +77,7 @@ from workbench.session.run.events import (
     WorkerBusy,
     WorkerDied,
 )
-from workbench.session.run.loading import files_at_fault, first_requests, past_after, watched_files
+from workbench.session.run.loading import files_at_fault, first_requests, watched_files
 from workbench.session.run.run import Run, first_run
 
 Value = TypeVar("Value")
@@ -157,7 +159,6 @@ class Session:
         )
         self._background = Background()
         """Asks questions of the background process."""
-        self.rescorer = PastRescorer(self._notify, self._background)
         self.checks = Checks(self._notify, self._background, check)
         """Checks the rules of the running version."""
         self.profiler = StepProfiler(self._notify, self._background)
@@ -180,6 +181,7 @@ class Session:
         # Last: what it recovers happens at once.
         self._recorder = LiveRecorder(recordings, self._happen, on_notice)
         self._past_saver = PastSaver(recordings, self._recorder.finisher, self._background, self._happen)
+        self._past_rescorer = PastRescorer(self._background, self._happen)
         listen(self._log)
         self._watcher.follow(watched_files(self._run))
         self._worker.start()
@@ -239,6 +241,8 @@ class Session:
                 self._past_saver.begin(effect, self.studio.placed_cameras())
             case EndSaving():
                 self._past_saver.end()
+            case BeginRescoring() | EndRescoring():
+                self._past_rescorer.perform(effect)
             case EnvsReset():
                 self._happen(effect)
         return None
@@ -267,7 +271,7 @@ class Session:
             printed=self._printed.view(),
             vitals=self._worker.vitals,
             recording=self._state.recording.status(self._run),
-            rescored=self.rescorer.rescoring.view,
+            rescored=self._state.rescoring.view,
             checks=self.checks.view,
             profile=self.profiler.view,
             seeds=self.seeds_solver.view,
@@ -278,6 +282,11 @@ class Session:
     def env_rows(self) -> EnvRows | None:
         """See `Run.env_rows`."""
         return self.look(Run.env_rows)
+
+    @on_loop
+    def rescored_curve(self, name: str, env: int) -> RescoredCurve | None:
+        """See `PastRescoring.curve`."""
+        return self._state.rescoring.curve(name, env)
 
     def wait(self, seen: int, timeout: float) -> int:
         """Block until the counter of changes differs from `seen`; returns the counter."""
@@ -368,7 +377,7 @@ class Session:
         self._watcher.stop()
         self._aside.end()
         self._policy_file.close()
-        self.rescorer.rescoring.close()
+        self._past_rescorer.close()
         self.checks.close()
         self.profiler.close()
         self.solver.close()
@@ -449,23 +458,11 @@ class Session:
         self._worker.reset_deaths()
         level = None if event.reload is None else event.reload.level
         before = self._run
-        past = past_after(before.task, event, before.recovery.restoring)
-        what_to_do = rescore_after_load(past, self.rescorer.rescoring.view)
-        rescored = None
-        if what_to_do == "rescore" and before.past is not None:
-            versions = [task for task in (before.task, event.task) if task is not None]
-            has_reward = any(task.reward_mode != "none" for task in versions)
-            # Made before the newest moment gets the new version's scores.
-            rescored = RescoredPast(before.past.history, before.past.at, has_reward)
         self._happen(VersionLoaded(event, on_disk))
         run = self._run
         load = run.running_load()
         assert run.task is not None and load is not None
         placed = self.studio.loaded(run.task, level)
-        if rescored is not None:
-            self.rescorer.rescore(load, rescored)
-        elif what_to_do == "forget":
-            self.rescorer.forget()
         # After the rescoring was begun: the later of two jobs of one priority comes first.
         self.checks.loaded(load, before.task is not None and before.task.env_id == run.task.env_id)
         self.profiler.loaded()
@@ -479,10 +476,9 @@ class Session:
     def _on_files_changed(self, paths: set[Path]) -> None:
         """A watched file was saved."""
         self.solver.stop()
-        self.rescorer.stop(StoppedBy.SAVE)
-        self.checks.stop(StoppedBy.SAVE)
         self.studio.interrupted()
         self._happen(FileSaved())
+        self.checks.stop(StoppedBy.SAVE)
 
     def _on_policy_saved(self) -> None:
         """Read the policy again. Called on the watcher's thread."""
