@@ -32,6 +32,7 @@ LEAVES = "show_recordings", "show_live", "continue_live"
 """What shows another page is not pressed."""
 PRESSED = "[data-do]" + "".join(f":not([data-do*={name}])" for name in LEAVES) + ", [data-copy]"
 MOST = 150
+TRIES = 5
 LIVE = ("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Checks", "Log")
 REVIEW = ("Review", "Cameras", "Share")
 
@@ -72,7 +73,8 @@ class Board:
     def press(self, part: Locator) -> bool:
         """Whether the server was asked for something, or a text was copied."""
         before = self.page.evaluate("asked")
-        part.scroll_into_view_if_needed()
+        # Playwright's own would wait for a picture to be stable, which is drawn anew while it waits.
+        part.evaluate("p => p.scrollIntoView({block: 'nearest'})")
         box = part.bounding_box()
         if box is None:
             return False
@@ -89,8 +91,8 @@ class Board:
                 return dead
             key, part = found
             what = part.inner_text()[:40]
-            # Twice: what is drawn anew at that moment moves away from under the mouse.
-            did = self.press(part) or not part.is_visible() or self.press(part)
+            # Again: what is drawn anew at that moment moves away from under the mouse.
+            did = any(self.press(part) or not part.is_visible() for _ in range(TRIES))
             if self.page.locator(".mantine-Modal-overlay").count():
                 self.page.keyboard.press("Escape")
             if not did:

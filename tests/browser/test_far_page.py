@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 BITS, DELAY = 2e6, 0.04
 
 
-def test_play_and_pause_answer_and_nothing_queues_for_a_second(tmp_path: Path, browser: Browser) -> None:
+def test_play_and_pause_answer_and_nothing_queues_for_seconds(tmp_path: Path, browser: Browser) -> None:
     file = shutil.copy(TASK, tmp_path)
     with (
         open_workbench(str(file), "--num-envs", "64", "--no-spare", cwd=tmp_path) as opened,
@@ -34,5 +34,6 @@ def test_play_and_pause_answer_and_nothing_queues_for_a_second(tmp_path: Path, b
             page.get_by_role("button", name="Pause", exact=True).click()
             expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
         assert line.down - before > 20_000, "it played"
-        assert most < BITS / 8, f"{8 * most / BITS:.1f} s of the line waited in it"
+        # One message may be large; without a bound the socket takes megabytes.
+        assert most < 2 * BITS / 8, f"{8 * most / BITS:.1f} s of the line waited in it"
         assert not errors

@@ -10,6 +10,8 @@ import viser
 
 from tests.drive.panels import Clock, Panels, forget_what_was_drawn
 from tests.drive.waiting import until
+from workbench.commands.review import SelectRecording
+from workbench.commands.timeline import Seek
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.ui.app.review_page import ReviewPage
@@ -54,8 +56,11 @@ class Reviewed(Panels):
         )
         self.draw()
 
+    def select(self, index: int) -> None:
+        self.review.do(SelectRecording(id=self.review.view().opened[index].id))
+
     def seek(self, position: int) -> None:
-        self.review.seek(position)
+        self.review.do(Seek(step=position))
         self.draw()
 
     def chart(self, title: str) -> viser.GuiUplotHandle:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from tests.drive.session import Told, camera, seek, seek_by, told_session
+from tests.drive.waiting import until
 from workbench.commands.run import PlayRun, ResetAll, Step
 from workbench.commands.timeline import ContinueFromHere, NextEvent, PreviousEvent, Seek, UndoReset
 from workbench.core.camera_data import CameraKind, Picture
@@ -25,7 +26,7 @@ from workbench.session.protocol.messages import (
     Placed,
     Restore,
 )
-from workbench.session.run.events import EpisodeStepShown, MomentShown, PastPicturesWanted
+from workbench.session.run.events import EpisodeStepShown, MomentShown, PagesCounted, PastPicturesWanted
 from workbench.session.run.past import Strip
 from workbench.session.run.run import Run
 
@@ -62,6 +63,22 @@ def test_every_env_is_asked_for_its_own_pictures_of_a_past_moment_and_once(playe
     assert [one.origin for one in drawn(played, 0, EYE, HAND)] == [1]
     played.session.happen(MomentShown(None))
     assert drawn(played, 0, EYE) == []
+
+
+def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures_and_whoever_drags_none(played: Told) -> None:
+    played.session.happen(PagesCounted(1))
+    played.session.change(cameras=(EYE,))
+    played.asked(object)
+    seek(played.session, 1)
+    seek(played.session, 2)
+    (asked,) = until(lambda: played.asked(DrawPast), "the pictures")
+    assert asked.origin == 2
+    seek(played.session, 1)
+    seek(played.session, None)
+    seek(played.session, 2)
+    seek(played.session, 0)
+    (asked,) = until(lambda: played.asked(DrawPast), "the pictures of where it stands at last")
+    assert asked.origin == 0
 
 
 def test_only_what_is_lacking_or_no_longer_so_is_asked_for(played: Told) -> None:

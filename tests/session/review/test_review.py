@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -16,6 +17,18 @@ from hypothesis import strategies as st
 
 from tests.drive.episodes import made, poses_of, write
 from tests.drive.waiting import until
+from workbench.commands.command import Refused
+from workbench.commands.review import (
+    AlignRecordings,
+    ChoosePlaybackSpeed,
+    CloseRecording,
+    LoopPlayback,
+    OpenAgain,
+    SelectRecording,
+    SwapWithFirst,
+)
+from workbench.commands.run import TogglePlay
+from workbench.commands.timeline import NextEvent, PreviousEvent, Seek, StepForward
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.library.library import Library
@@ -81,21 +94,29 @@ def opened(review: Review, *ids: str) -> ReviewView:
     )
 
 
+def select(review: Review, index: int) -> None:
+    review.do(SelectRecording(id=review.view().opened[index].id))
+
+
+def close_one(review: Review, index: int) -> None:
+    review.do(CloseRecording(id=review.view().opened[index].id))
+
+
 def test_plays_at_the_control_rate_and_stops_at_the_end() -> None:
     review, shelf = review_of(a=made(10))
     assert opened(review, "a").last == 10
-    review.toggle_play()
+    review.do(TogglePlay())
     shelf.now += 0.26
     assert review.view().position == 5 and review.view().playing
-    review.set_speed(2.0)
+    review.do(ChoosePlaybackSpeed(speed=2.0))
     shelf.now += 0.11
     assert review.view().position == 9
     shelf.now += 10
     view = review.view()
     assert view.position == 10 and not view.playing
-    review.toggle_play()
+    review.do(TogglePlay())
     assert review.view().position == 0, "from the end it begins anew"
-    review.set_loop(True)
+    review.do(LoopPlayback(on=True))
     shelf.now += 0.05 * 11 / 2 + 1e-3
     assert review.view().position == 0 and review.view().playing
 
@@ -103,16 +124,16 @@ def test_plays_at_the_control_rate_and_stops_at_the_end() -> None:
 def test_goes_frame_by_frame_and_from_event_to_event() -> None:
     review, _ = review_of(a=made(10, success_from=7))
     opened(review, "a")
-    review.seek_by(1)
+    review.do(StepForward())
     assert review.view().position == 1
-    review.seek_event(1)
+    review.do(NextEvent())
     assert review.view().position == 7
-    review.seek_event(1)
+    review.do(NextEvent())
     assert review.view().position == 10, "the end is where the last jump leads"
-    review.seek_event(-1)
-    review.seek_event(-1)
+    review.do(PreviousEvent())
+    review.do(PreviousEvent())
     assert review.view().position == 0
-    review.seek(10**9)
+    review.do(Seek(step=10**9))
     assert review.view().position == 10
 
 
@@ -120,31 +141,31 @@ def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
     review, _ = review_of(a=made(10, success_from=7), b=made(6, success_from=2), c=made(4))
     view = opened(review, "a", "b", "c")
     assert view.states == (0, 0, 0)
-    review.seek(5)
-    review.align("first success")
+    review.do(Seek(step=5))
+    review.do(AlignRecordings(at="first success"))
     view = review.view()
     assert view.states == (5, 0, 0), "what is shown of the selected one stays"
     assert (view.first, view.last) == (-7, 4)
-    review.seek(0)
+    review.do(Seek(step=0))
     assert review.view().states == (7, 2, 0)
-    review.seek(2)
+    review.do(Seek(step=2))
     assert review.view().states == (9, 4, 2)
-    with pytest.raises(ValueError, match="align"):
-        review.align("first kiss")
-    review.close_one(0)
+    with pytest.raises(Refused, match="align"):
+        review.do(AlignRecordings(at="first kiss"))
+    close_one(review, 0)
     assert [o.id for o in review.view().opened] == ["b", "c"]
     assert review.view().align == "first success"
-    review.close_one(0)
-    review.close_one(0)
+    close_one(review, 0)
+    close_one(review, 0)
     assert review.view().opened == () and review.view().states == ()
-    review.toggle_play()
-    review.seek_by(1)
-    review.seek_event(1)
+    review.do(TogglePlay())
+    review.do(StepForward())
+    review.do(NextEvent())
 
 
 def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "workbench.session.review.review.FIRST_SHOWN", 0.0
+        "workbench.session.review.state.FIRST_SHOWN", 0.0
     )  # it is seen before the other is read
     review, _ = review_of(
         new=made(4, written_at="2026-11-22T10:00:00+00:00"),
@@ -153,13 +174,14 @@ def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytes
     review.open(["new", "old"])
     view = reach(review, lambda view: len(view.opened) == 2 and not view.loading, "opening")
     assert [one.id for one in view.opened] == ["old", "new"] and view.selected == 0
-    review.select(1)
-    review.seek(3)
-    review.swap(0, 1)
+    select(review, 1)
+    review.do(Seek(step=3))
+    review.do(SwapWithFirst(index=1))
     view = review.view()
     assert [one.id for one in view.opened] == ["new", "old"]
     assert view.chosen is not None and view.chosen.id == "new" and view.states == (3, 3)
-    review.swap(0, 7)
+    with pytest.raises(Refused):
+        review.do(SwapWithFirst(index=7))
     assert [one.id for one in review.view().opened] == ["new", "old"]
 
 
@@ -191,7 +213,7 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
     )
     assert "no longer in the folder" in said and view.not_opened == ("b", "c", "d")
     readable.clear()
-    review.open_again()
+    review.do(OpenAgain())
     assert review.view().not_opened == () and review.view().loading
     readable.set()
     view = reach(review, lambda view: len(view.not_opened) == 3 and not view.loading, "the second try")
@@ -222,27 +244,88 @@ def test_what_is_open_at_once_may_take_so_much_memory_and_no_more() -> None:
     review.close()
 
 
-def test_files_that_change_or_go_are_said_and_stay_open(tmp_path: Path) -> None:
+def test_files_that_change_or_go_are_said_and_stay_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.session.review.review.CHECK_SECONDS", 0.01)
     changed, gone = tmp_path / "a.rrd", tmp_path / "a.h5"
     changed.write_text("1")
     gone.write_text("1")
     review, shelf = review_of(a=made(3))
     shelf.extra["a"] = (changed, gone)
     opened(review, "a")
-    shelf.now += 10
-    review.check_files()
+    time.sleep(0.1)  # some checks
     assert review.view().problems == ()
     changed.write_text("another")
     gone.unlink()
-    shelf.now += 10
-    review.check_files()
+    reach(review, lambda view: len(view.problems) == 2, "the word for both")
     said = " ".join(review.view().problems)
     assert "a.rrd has changed" in said and "a.h5 was deleted" in said
+    review.close()
     assert len(review.view().opened) == 1
 
 
+@pytest.fixture
+def filled(child_process: None, tmp_path: Path) -> Iterator[Library]:
+    for seed, minute in ((1, 10), (2, 20), (3, 15)):
+        write(tmp_path, made(3, seed=seed, written_at=f"2026-11-22T10:{minute}:00+00:00"), pictures=False)
+    library = Library(tmp_path)
+    yield library
+    library.close()
+
+
+def test_the_newest_is_opened_library_stays_once_it_is_listed_and_only_once(filled: Library) -> None:
+    review = Review(filled)
+    filled.on_change = review.library_changed
+    review.open_first("newest")
+    review.add_problem("A killed program left half an episode.")
+    assert not review.view().loading
+    filled.refresh()
+    view = reach(review, lambda view: bool(view.opened) and not view.loading, "the newest")
+    assert [one.episode.info.seed for one in view.opened] == [2] and view.library_stays
+    assert view.problems == ("A killed program left half an episode.",), "nobody could have read it"
+    close_one(review, 0)
+    write(filled.folder, made(3, seed=4), pictures=False)
+    filled.refresh()
+    assert not review.view().loading and not review.view().opened
+    review.close()
+
+
+def test_a_file_is_opened_library_stays_once_it_is_listed(filled: Library) -> None:
+    filled.refresh()
+    review = Review(filled)
+    filled.on_change = review.library_changed
+    review.open_first("newest")
+    later = write(filled.folder, made(3, seed=4, written_at="2026-11-22T10:00:00+00:00"), pictures=False)
+    review.open_first(later.with_suffix(".rrd"))
+    reach(review, lambda view: not view.loading, "what the second wish came for")
+    filled.refresh()
+    view = reach(review, lambda v: [o.episode.info.seed for o in v.opened] == [4], "the file")
+    assert view.library_stays
+    review.close()
+
+
+def test_nothing_is_opened_library_stays_after_a_person_has_opened_a_recording(
+    filled: Library, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    elsewhere = write(tmp_path_factory.mktemp("other"), made(3, seed=4), pictures=False)
+    filled.refresh()
+    review = Review(filled)
+    filled.on_change = review.library_changed
+    review.open_first(filled.folder / elsewhere.name)
+    (row,) = (row for row in filled.view().rows if row.seed == 1)
+    view = opened(review, row.id)
+    assert not view.library_stays
+    for file in elsewhere.parent.glob(f"{elsewhere.stem}.*"):
+        file.rename(filled.folder / file.name)
+    filled.refresh()
+    assert len(filled.view().rows) == 4
+    assert [one.id for one in review.view().opened] == [row.id] and not review.view().loading
+    review.close()
+
+
 def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workbench.session.review.review.FIRST_SHOWN", 0.0)
+    monkeypatch.setattr("workbench.session.review.state.FIRST_SHOWN", 0.0)
     review, shelf = review_of(a=made(10), b=made(20), c=made(10), d=made(30, success_from=9), e=made(10))
     reached, go_on = threading.Event(), threading.Event()
 
@@ -257,14 +340,14 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
     assert reached.wait(60)
     view = reach(review, lambda view: len(view.opened) == 3, "the first three")
     assert view.loading == "opening 4 of 5: file d" and view.position == 4
-    review.select(1)
-    review.seek(15)
-    review.toggle_play()
-    review.close_one(0)
+    select(review, 1)
+    review.do(Seek(step=15))
+    review.do(TogglePlay())
+    close_one(review, 0)
     view = review.view()
     assert [o.id for o in view.opened] == ["b", "c"] and view.selected == 0
-    review.seek(15)
-    review.toggle_play()
+    review.do(Seek(step=15))
+    review.do(TogglePlay())
     go_on.set()
     view = reach(review, lambda view: not view.loading, "the others")
     assert [o.id for o in view.opened] == ["b", "c", "d", "e"], "what was closed does not come back"
@@ -276,7 +359,7 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
 
 
 def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workbench.session.review.review.FIRST_SHOWN", 0.0)
+    monkeypatch.setattr("workbench.session.review.state.FIRST_SHOWN", 0.0)
     shelf = Shelf({"a": made(10), "b": made(20), "c": made(30)})
     reached, go_on = threading.Event(), threading.Event()
 

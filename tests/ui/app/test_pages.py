@@ -127,4 +127,3 @@ def test_a_recording_that_is_wanted_is_opened_also_if_it_is_not_the_newest(
         tabs.open()
         opened = until(lambda: review.view().opened, "an open recording", seen=lambda: review.view().problems)
     assert [one.episode.info.seed for one in opened] == [3]
-    assert place.wanted is None

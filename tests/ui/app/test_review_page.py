@@ -17,10 +17,15 @@ from tests.drive.panels import difference
 from tests.drive.reviewed import Reviewed, review_of
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
+from workbench.commands.command import Command
 from workbench.commands.review import (
     AlignRecordings,
+    ChoosePlaybackSpeed,
     ChooseReviewCurve,
     CompareWith,
+    LoopPlayback,
+    NextRecording,
+    PreviousRecording,
     SwapWithFirst,
     ToggleOverlaid,
 )
@@ -57,41 +62,39 @@ def test_the_results_of_a_sweep_have_a_tab_also_if_they_come_later(
         shown.draw()
         assert "reach_weight" not in shown.html()
         sweep_folder(tmp_path)
+        until(lambda: shown.library.view().sweep, "the results of the sweep")
         until(lambda: shown.draw() or "reach_weight" in shown.part("Sweep").html(), "the points")
 
 
-CHANGES: dict[str, tuple[Any, Any]] = {
-    "another moment": (lambda review: review.seek(5), lambda review: review.seek(8)),
-    "beyond the end of one": (lambda review: review.seek(9), lambda review: review.seek(8)),
-    "the other one selected": (lambda review: review.select(1), lambda review: review.select(0)),
-    "aligned at the success": (
-        lambda review: review.align("first success"),
-        lambda review: review.align("start"),
-    ),
-    "in another order": (lambda review: review.swap(0, 1), lambda review: review.swap(0, 1)),
-    "another speed": (lambda review: review.set_speed(2.0), lambda review: review.set_speed(1.0)),
-    "round and round": (lambda review: review.set_loop(True), lambda review: review.set_loop(False)),
+CHANGES: dict[str, tuple[Command, Command]] = {
+    "another moment": (Seek(step=5), Seek(step=8)),
+    "beyond the end of one": (Seek(step=9), Seek(step=8)),
+    "the other one selected": (NextRecording(), PreviousRecording()),
+    "aligned at the success": (AlignRecordings(at="first success"), AlignRecordings(at="start")),
+    "in another order": (SwapWithFirst(index=1), SwapWithFirst(index=1)),
+    "another speed": (ChoosePlaybackSpeed(speed=2.0), ChoosePlaybackSpeed(speed=1.0)),
+    "round and round": (LoopPlayback(on=True), LoopPlayback(on=False)),
 }
 
 
 def test_what_is_changed_is_seen_and_gone_when_it_is_taken_back(shown: Reviewed) -> None:
     shown.open(1, 2)
-    shown.review.align("start")
+    shown.review.do(AlignRecordings(at="start"))
     for what, (change, back) in CHANGES.items():
-        change(shown.review)
-        back(shown.review)
-        shown.review.seek(8)
-        shown.review.select(0)
+        shown.review.do(change)
+        shown.review.do(back)
+        shown.review.do(Seek(step=8))
+        shown.select(0)
         for _ in range(3):
             shown.draw()
         before = shown.everything()
-        change(shown.review)
+        shown.review.do(change)
         shown.draw()
         changed = shown.everything()
         assert difference(before, changed), f"{what} is not seen"
         assert difference(changed, shown.all_drawn()) == "", f"a part was not drawn that shows {what}"
-        back(shown.review)
-        shown.review.seek(8)
+        shown.review.do(back)
+        shown.review.do(Seek(step=8))
         for _ in range(3):
             shown.draw()
         assert difference(before, shown.everything()) == "", what
@@ -104,7 +107,7 @@ def test_what_was_open_leaves_nothing_in_what_is_open_then(shown: Reviewed) -> N
     alone = shown.everything()
     shown.open(1, 2)
     shown.seek(5)
-    shown.review.align("first success")
+    shown.review.do(AlignRecordings(at="first success"))
     shown.draw()
     shown.open(2)
     shown.seek(0)
@@ -146,11 +149,11 @@ def test_two_recordings_are_compared_and_aligned(shown: Reviewed, monkeypatch: p
     (name,) = shown.nodes("/names")
     away = np.linalg.norm(cubes.batched_positions - name.position, axis=1)
     assert away[1] < away[0], "at its own place"
-    shown.review.select(1)
+    shown.select(1)
     shown.draw()
     assert sorted(shown.labels()) == ["A", "B, seed 2"]
-    shown.review.select(0)
-    shown.review.align("first success")
+    shown.select(0)
+    shown.review.do(AlignRecordings(at="first success"))
     shown.draw()
     assert "B has no success" in shown.part("Review").html()
     bounds = shown.field(SLIDER).bounds
@@ -233,8 +236,8 @@ def test_the_strip_has_each_recording_where_it_is_aligned(shown: Reviewed) -> No
     shown.seek(8)
     assert strip_of(shown)["extents"] == [("0.0", "100.0", "#228be6"), ("0.0", "60.0", "#f08c00")]
     assert ">A: step 8 / 10, 0.40 s<" in shown.html("wb-timeline")
-    shown.review.select(1)
-    shown.review.align("first success")
+    shown.select(1)
+    shown.review.do(AlignRecordings(at="first success"))
     shown.draw()
     strip = strip_of(shown)
     assert strip["extents"] == [("0.0", "76.923", "#228be6"), ("53.846", "46.154", "#f08c00")]
@@ -267,15 +270,15 @@ def test_the_timeline_has_its_buttons_and_is_not_drawn_again_where_nothing_moved
     assert strip.content is before
     shown.seek(3)
     assert "step 3 / 10" in strip.content
-    shown.review.toggle_play()
+    shown.review.do(TogglePlay())
     shown.draw()
     assert ">pause<" in shown.html("wb-tools")
-    shown.review.toggle_play()
+    shown.review.do(TogglePlay())
 
 
 def test_pressing_a_row_of_the_comparison_goes_there(shown: Reviewed) -> None:
     shown.open(1, 2)
-    shown.review.seek(9)
+    shown.review.do(Seek(step=9))
     shown.part("Compare").ask(Seek(step=1))
     assert shown.review.view().position == 1
 
@@ -345,7 +348,6 @@ def test_a_foreign_recording_of_any_values_is_shown_or_named(
     path.unlink()
     with review_of(gated_server, tmp_path) as reviewed:
         review, rows = reviewed.review, {row.name: row.id for row in reviewed.library.view().rows}
-        reviewed.page.redraw()  # it opens the newest by itself, once
         shown = []
         for number in range(len(HOSTILE)):
             review.open([rows[str(number)]])

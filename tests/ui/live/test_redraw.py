@@ -201,7 +201,7 @@ def made() -> Live:
     tick, old = np.arange(20), np.ones(20, np.float32)
     live.session.answers |= {
         "strip": lambda low, high: strip(low, high, live.session.shown.selected_env),
-        "rescorer.curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
+        "rescored_curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
     }
     live.do(ToggleTable())
     return live

@@ -25,8 +25,7 @@ from workbench.commands.timeline import (
     ZoomTimeline,
 )
 from workbench.session.live.session import Session
-from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.events import MomentShown, PastPicturesWanted, RunEvent
+from workbench.session.run.events import MomentShown
 from workbench.session.run.past import TimelineView
 from workbench.ui.app.live_page import Page
 
@@ -189,35 +188,6 @@ def test_one_moment_alone_has_nothing_to_slide_along(lived: EnvMoment) -> None:
     lived.step(1)
     assert not lived.panels.field(SLIDER).off and lived.ends() == (-1, 0, 0)
     assert "history: 1 step," in lived.strip()
-
-
-def test_whoever_stands_still_at_a_moment_is_drawn_its_pictures(
-    lived: EnvMoment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lived.step(3)
-    lived.session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),))
-    lived.session.happen(MomentShown(1))
-    assert lived.past.wants_pictures
-    asked: list[int | None] = []
-    happen = lived.session.happen
-
-    def heard(event: RunEvent) -> None:
-        if isinstance(event, PastPicturesWanted):
-            asked.append(lived.past.shown)
-        else:
-            happen(event)
-
-    monkeypatch.setattr(lived.session, "happen", heard)
-    lived.page.redraw()
-    lived.clock.passes(0.3)
-    lived.page.redraw()
-    lived.session.happen(MomentShown(2))
-    for _ in range(2):
-        lived.page.redraw()
-        lived.clock.passes(0.3)
-    assert asked == [], "whoever drags draws none"
-    lived.page.redraw()
-    assert asked == [2]
 
 
 def test_home_is_the_left_end_of_the_slider(lived: EnvMoment) -> None:

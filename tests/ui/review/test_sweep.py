@@ -14,7 +14,7 @@ import pytest
 import viser
 
 from tests.drive.episodes import made
-from tests.drive.panels import Clock, Panels
+from tests.drive.panels import Panels
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
 from workbench.commands.command import Command, name_of
@@ -36,18 +36,17 @@ from workbench.ui.review.sweep import SweepPanel, best_first
 class Tab:
     """The tab on a page, with a hand on it."""
 
-    def __init__(self, server: viser.ViserServer, folder: Path, clock: Clock) -> None:
+    def __init__(self, server: viser.ViserServer, folder: Path) -> None:
         self.library = Library(folder)
         self.library.refresh()
         self.opened: list[tuple[str, ...]] = []
-        self.panel = SweepPanel(server, self.library, self.opened.append, clock)
-        self.panels, self.clock = Panels(server), clock
+        self.panel = SweepPanel(server, self.library, self.opened.append)
+        self.panels = Panels(server)
         self.panels.visitors.do = self.panel.do
         self.view = ReviewView()
         until(lambda: self.draw() or "Reading" not in self.panels.html("wb-note"), "the results")
 
     def draw(self) -> None:
-        self.clock.passes()
         self.panel.key(self.view)
         self.panel.draw(self.view)
 
@@ -75,8 +74,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def tab(child_process: None, server: viser.ViserServer, folder: Path, clock: Clock) -> Iterator[Tab]:
-    tab = Tab(server, folder, clock)
+def tab(child_process: None, server: viser.ViserServer, folder: Path) -> Iterator[Tab]:
+    tab = Tab(server, folder)
     yield tab
     tab.library.close()
 
@@ -120,11 +119,10 @@ def test_another_order_and_other_values_begin_on_the_first_page(
     child_process: None,
     server: viser.ViserServer,
     folder: Path,
-    clock: Clock,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sweep, "ROWS", 2)
-    tab = Tab(server, folder, clock)
+    tab = Tab(server, folder)
     for command in (
         SortSweep(column="set reach_weight"),
         FilterSweep(name="robot_uids", value='"fetch"'),
@@ -153,6 +151,7 @@ def test_the_point_of_the_open_episode_is_shown_until_another_one_is_chosen(tab:
 def test_new_results_are_shown_by_themselves(tab: Tab, folder: Path) -> None:
     results = sweep_folder(folder)
     write_results(folder / RESULTS, replace(results, actions="zero"))
+    tab.library.refresh()
     until(lambda: tab.draw() or "zero" in tab.panels.html("wb-note"), "the new results")
 
 
@@ -172,14 +171,14 @@ HOSTILE = SweepResults(
 
 
 def test_hostile_results_are_shown_as_text_and_open_nothing(
-    child_process: None, server: viser.ViserServer, folder: Path, clock: Clock
+    child_process: None, server: viser.ViserServer, folder: Path
 ) -> None:
     write_results(folder / RESULTS, HOSTILE)
     table = pq.read_table(folder / RESULTS)
     about = json.loads(table.schema.metadata[b"workbench.sweep"]) | {"points": HOSTILE_POINTS}
     table = table.replace_schema_metadata({b"workbench.sweep": json.dumps(about).encode()})
     pq.write_table(table, folder / RESULTS)
-    tab = Tab(server, folder, clock)
+    tab = Tab(server, folder)
     shown = "".join(handle.content for handle in tab.panels.htmls())
     assert "<img src=x" not in shown and "\u202e" not in shown and html.escape("<img src=x") in shown
     assert max(map(len, re.findall(r"\S+", shown))) < 1000
@@ -191,10 +190,10 @@ def test_hostile_results_are_shown_as_text_and_open_nothing(
 
 @pytest.mark.parametrize("content", [b"", b"PAR1 nonsense PAR1"])
 def test_a_file_that_is_no_sweep_says_so(
-    child_process: None, server: viser.ViserServer, folder: Path, clock: Clock, content: bytes
+    child_process: None, server: viser.ViserServer, folder: Path, content: bytes
 ) -> None:
     (folder / RESULTS).write_bytes(content)
-    tab = Tab(server, folder, clock)
+    tab = Tab(server, folder)
     assert (
         "results.parquet cannot be read" in tab.panels.html("wb-note")
         and tab.panels.html("wb-parallel") == ""
@@ -206,13 +205,12 @@ def test_a_link_to_results_elsewhere_is_not_followed(
     child_process: None,
     server: viser.ViserServer,
     folder: Path,
-    clock: Clock,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     elsewhere = tmp_path_factory.mktemp("elsewhere") / "secret.parquet"
     (folder / RESULTS).rename(elsewhere)
     (folder / RESULTS).symlink_to(elsewhere)
-    tab = Tab(server, folder, clock)
+    tab = Tab(server, folder)
     assert tab.points() == [] and "denied" in tab.panels.html("wb-note").lower()
     tab.library.close()
 

@@ -33,6 +33,7 @@ from workbench.recording.library.trash import (
 )
 from workbench.recording.reader.reading import read_rows
 from workbench.recording.reader.scan import DATASET_KEY, NOTES, RecordingFiles, Scan, key_of, scan_folder
+from workbench.recording.sweeps import RESULTS
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +68,8 @@ class LibraryView:
     trash: Trash = Trash()
     jobs: tuple[JobStatus, ...] = ()
     """Jobs that record into the folder, or have until a while ago."""
+    sweep: tuple[int, int] | None = None
+    """Bytes and mtime in ns of the file with the results of a sweep; None if the folder has none."""
 
 
 class Library:
@@ -89,7 +92,9 @@ class Library:
         self._changing = threading.RLock()
         """Held while `_kept` is changed, but not while files are read."""
         self._changed = threading.Lock()
-        self._view = LibraryView(reading=(0, 0))
+        self._view = LibraryView(reading=(0, 0), sweep=self._sweep())
+        self.on_change: Callable[[], None] = lambda: None
+        """Called when the view has changed, on the thread that changed it."""
         self._by_id: dict[str, LibraryRow] = {}
         self._scan = Scan(fresh=True)
         self._full_scan_at = -1e9
@@ -245,11 +250,21 @@ class Library:
 
     def _publish(self, **changes: object) -> None:
         with self._changed:
-            view = replace(self._view, trash=read_trash(self.folder), **changes)  # type: ignore[arg-type]
+            kept = replace(self._view, trash=read_trash(self.folder), sweep=self._sweep())
+            view = replace(kept, **changes)  # type: ignore[arg-type]
             if view.rows is not self._view.rows:
                 self._by_id = {row.id: row for row in view.rows}
-            if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
-                self._view = replace(view, serial=self._view.serial + 1)
+            if replace(view, serial=0) == replace(self._view, serial=0) and self._view.serial > 0:
+                return
+            self._view = replace(view, serial=self._view.serial + 1)
+        self.on_change()
+
+    def _sweep(self) -> tuple[int, int] | None:
+        try:
+            stat = os.stat(self.folder / RESULTS)
+        except OSError:
+            return None
+        return stat.st_size, stat.st_mtime_ns
 
     # --- operations on recordings ----------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import time
+from asyncio import TimerHandle
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
@@ -33,7 +34,7 @@ from workbench.session.history.env_table import EnvRows
 from workbench.session.live.solver import Solver
 from workbench.session.live.state import Effect, SessionEvent, State, apply
 from workbench.session.live.view import SessionView, view_of
-from workbench.session.loop import Aside, ChangeCounter, do, on_loop, wait_for_disk
+from workbench.session.loop import Aside, ChangeCounter, do, later, on_loop, wait_for_disk
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.captured_output import PrintedLine, PrintedLog
 from workbench.session.process.supervisor import Death, Supervisor, WorkerOptions
@@ -59,6 +60,7 @@ from workbench.session.rescore.past import RescoredCurve
 from workbench.session.rescore.past_rescorer import PastRescorer
 from workbench.session.rescore.rescoring import BeginRescoring, EndRescoring
 from workbench.session.run.events import (
+    DrawSoon,
     EnvsReset,
     FileOpened,
     FileSaved,
@@ -68,6 +70,7 @@ from workbench.session.run.events import (
     LoadDone,
     LoadGaveWay,
     Now,
+    PastPicturesWanted,
     PolicySaved,
     ReplaceWorker,
     RunToEnter,
@@ -83,6 +86,8 @@ from workbench.session.run.run import Run, first_run
 Value = TypeVar("Value")
 HISTORY_BYTES = 256 * 1024**2
 """Default memory limit of the history."""
+STANDS_STILL = 0.35
+"""Seconds at one moment of the past before its pictures are drawn; with less, every drag would draw some."""
 
 
 @dataclass(frozen=True)
@@ -142,6 +147,8 @@ class Session:
         self._changes = ChangeCounter()
         self._notify = self._changes.notify
         self._enter_numbers = itertools.count(1)
+        self._to_draw: TimerHandle | None = None
+        """Draws pictures of the past soon."""
         self._printed = PrintedLog(self._on_lines)
         self._aside = Aside("follow")
         """Begins to watch files, for which they are read."""
@@ -235,6 +242,10 @@ class Session:
                 return self._aside.begin(partial(self._watcher.follow, files, texts))
             case FollowPolicy(policy=policy, folder=folder):
                 return self._aside.begin(partial(self._policy_file.follow, policy, folder))
+            case DrawSoon(at=at):
+                if self._to_draw is not None:
+                    self._to_draw.cancel()
+                self._to_draw = later(STANDS_STILL, lambda: self._happen(PastPicturesWanted(at)))
             case BeginEpisodes() | TakeStep() | EndEpisodes():
                 self._recorder.perform(effect)
             case BeginSaving():
@@ -372,6 +383,7 @@ class Session:
     def close(self) -> None:
         """End all processes and threads; waits for episodes that are being written. Called on another thread than the loop."""
         stop_listening(self._log)
+        do(lambda: self._to_draw and self._to_draw.cancel())
         self._changes.close()
         self._worker.stop()
         self._watcher.stop()

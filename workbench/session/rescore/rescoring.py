@@ -94,7 +94,7 @@ class BeginRescoring:
     job: int
     load: Load
     """The new code."""
-    past: RescoredPast
+    past: RescoredPast = field(compare=False)
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,15 @@ class Opened:
 
 
 @dataclass(frozen=True)
+class Playback:
+    """Position and time at which playing began."""
+
+    position: int
+    at: float
+    """Clock time in seconds."""
+
+
+@dataclass(frozen=True)
 class ReviewView:
     """Immutable snapshot of the open recordings and of the position.
 
@@ -76,8 +85,6 @@ class ReviewView:
     an episode shows its first state, after its end its last.
     """
 
-    serial: int = 0
-    """Grows with every change of anything here."""
     opened: tuple[Opened, ...] = ()
     opened_serial: int = 0
     """Grows when other recordings are open, or one of them has got its scene."""
@@ -92,7 +99,8 @@ class ReviewView:
     first: int = 0
     last: int = 0
     """First and last position, both included."""
-    playing: bool = False
+    playback: Playback | None = None
+    """None while nothing plays."""
     speed: float = 1.0
     loop: bool = False
     loading: str = ""
@@ -101,6 +109,12 @@ class ReviewView:
     """Recordings that could not be opened, and files that changed since; a sentence each."""
     not_opened: tuple[str, ...] = ()
     """Ids of the recordings that the last opening could not read."""
+    library_stays: bool = False
+    """Whether the library stays unfolded next to what is open, or is being opened."""
+
+    @property
+    def playing(self) -> bool:
+        return self.playback is not None
 
     @property
     def states(self) -> tuple[int, ...]:

@@ -34,6 +34,7 @@ from workbench.session.run.asked import (
 )
 from workbench.session.run.events import (
     ActionTold,
+    DrawSoon,
     EnvsReset,
     EpisodeStepShown,
     FileOpened,
@@ -75,6 +76,14 @@ def apply(run: Run, event: object, now: Now) -> Change:
     Raises:
         Refused: the command makes no sense now; nothing has changed.
     """
+    new, effects = _apply(run, event, now)
+    stands_at = new.stands_at
+    if new.pages and stands_at is not None and (stands_at != run.stands_at or isinstance(event, Placed)):
+        effects = [*effects, DrawSoon(stands_at)]
+    return new, effects
+
+
+def _apply(run: Run, event: object, now: Now) -> Change:
     match event:
         case Asked(command=command) if type(command) in DOES:
             return do_command(run, command)
@@ -135,9 +144,9 @@ def apply(run: Run, event: object, now: Now) -> Change:
             return show(run, None if run.past is None else run.past.seek(serial)), effects
         case EpisodeStepShown(env=env, step=step):
             run, effects = change_settings(run, selected_env=env)
-            return show(run, None if run.past is None else run.past.seek_step(env, step)), effects
-        case PastPicturesWanted():
-            return draw_past(run)
+            return show(run, None if run.kept is None else run.kept.seek_step(env, step)), effects
+        case PastPicturesWanted(at=at):
+            return draw_past(run) if at in (None, run.stands_at) else (run, [])
         case ActionTold():
             if run.task is None:
                 return run, []

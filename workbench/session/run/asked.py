@@ -189,9 +189,9 @@ def do_command(run: Run, command: Command) -> Change:
 
 def _travel(run: Run, command: Command) -> Change:
     """Commands of the timeline."""
-    past, env = run.past, run.env
+    past, env = run.kept, run.env
     if past is None:
-        raise Refused("No task is loaded yet.")
+        raise Refused("There is no step yet.")
     match command:
         case StepBack():
             return show(run, past.seek_by(env, -1)), []

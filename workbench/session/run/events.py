@@ -142,6 +142,9 @@ class EpisodeStepShown:
 class PastPicturesWanted:
     """Draw the pictures that the shown moment lacks."""
 
+    at: object = None
+    """`Run.stands_at` when this was asked for: where it has changed since, nothing is drawn. None for whatever is shown."""
+
 
 @dataclass(frozen=True)
 class ActionTold:
@@ -227,4 +230,11 @@ class FollowPolicy:
     folder: Path | None
 
 
-RunEffect = Send | ReplaceWorker | InterruptWorker | Follow | FollowPolicy
+@dataclass(frozen=True)
+class DrawSoon:
+    """Let `PastPicturesWanted` happen after a moment, instead of what was to be drawn before: a drag draws none."""
+
+    at: object
+
+
+RunEffect = Send | ReplaceWorker | InterruptWorker | Follow | FollowPolicy | DrawSoon

@@ -201,21 +201,28 @@ class Run:
 
     def strip(self, low: int, high: int) -> Strip | None:
         """The selected env's history between two ticks; None before a task is loaded."""
-        return None if self._kept is None else self._kept.strip(self.env, low, high)
+        return None if self.kept is None else self.kept.strip(self.env, low, high)
 
     def episode_ticks(self) -> tuple[int, int] | None:
         """First and last tick of the selected env's episode that contains the shown moment, also where it went back."""
-        if self._kept is None:
+        if self.kept is None:
             return None
-        begin, end = self._kept.episode(self.env)
-        return self._kept.tick_of(begin), self._kept.tick_of(end)
+        begin, end = self.kept.episode(self.env)
+        return self.kept.tick_of(begin), self.kept.tick_of(end)
 
     def segment(self) -> tuple[int, int] | None:
         """First and last serial of the selected env's segment that contains the shown moment."""
-        return None if self._kept is None else self._kept.history.segment_at(self.env, self._kept.at)
+        return None if self.kept is None else self.kept.history.segment_at(self.env, self.kept.at)
 
     @property
-    def _kept(self) -> Past | None:
+    def stands_at(self) -> object:
+        """What pictures are needed of while a moment of the past is shown; None while live."""
+        if self.past is None or self.past.pinned is None:
+            return None
+        return self.past.pinned, self.env, self.settings.cameras, self.settings.pictures
+
+    @property
+    def kept(self) -> Past | None:
         """The past, if it has a moment."""
         return None if self.past is None or not len(self.past.history) else self.past
 

@@ -34,10 +34,10 @@ from workbench.commands.timeline import (
 )
 from workbench.core.camera_data import CameraKey, Picture
 from workbench.recording.library.library import Library
-from workbench.recording.sweeps import RESULTS
 from workbench.session.live.view import ShownCameras
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.review.review import MOST_OPEN, Review
+from workbench.session.review.review import Review
+from workbench.session.review.state import MOST_OPEN
 from workbench.session.review.view import PictureReader, ReviewView, column_at, outcome_text
 from workbench.ui.app.go_live import GoLivePart
 from workbench.ui.cameras.panel import CamerasPanel
@@ -66,8 +66,6 @@ if TYPE_CHECKING:
 
 TOLD_EVERY = 0.1
 """Seconds between two drawings of the panels while a recording plays; numbers cannot be read faster."""
-SWEEP_EVERY = 1.0
-"""Seconds between two checks for the results of a sweep."""
 PANEL_WIDTH = 340
 LIBRARY_WIDTH = 520
 LEAST_VIEW = 240
@@ -105,27 +103,27 @@ class ReviewPage:
     Args:
         place: The recordings, and what can be done with them.
         dark: The first theme.
+        anew: Show the first tab also to a browser that left the page at another one.
         clock: Of all parts of the page.
     """
 
-    def __init__(self, place: Workplace, dark: bool = True, clock: Clock = time.monotonic) -> None:
+    def __init__(
+        self, place: Workplace, dark: bool = True, anew: bool = False, clock: Clock = time.monotonic
+    ) -> None:
         self._place, self._clock = place, clock
         self._server, self._review = server, review = place.server, place.shelf.review
-        self._loop = RedrawLoop(server, "review-page", review.wait, self._has_viewers, self._look_and_redraw)
+        self._loop = RedrawLoop(server, "review-page", review.wait, self._has_viewers, self.redraw)
         self._reader = PictureReader()
         self._requests: tuple[CameraRequest, ...] = ()
         self._pictures: dict[CameraKey, Picture] = {}
         self._pictures_serial = 0
         self._had_opened = tuple(one.id for one in review.view().opened)
-        self._awaited: tuple[str, ...] = ()
-        """Ids of the newest recording until it is open."""
         self._fold_other: Callable[[bool], None] = lambda folded: None
         """Folds and unfolds rerun's panel."""
         self._other_folded = False
         self._unfolded = "", 0.0
         """Name of the panel (library or rerun) that was unfolded last, and when, until the width was checked."""
         self._told = DrawDue(TOLD_EVERY, clock)
-        self._looked = DrawDue(SWEEP_EVERY, clock)
         self._framing = place.stage.framing
 
         server.gui.main_panel.dock_right()
@@ -135,7 +133,7 @@ class ReviewPage:
         self._opening = OpenDialog(server, place.open_task)
         self._opening.add_button()
         self._open_tabs = OpenTabs(place.visitors)
-        server.gui.add_html(render("which", which="review", anew=place.wanted is not None, says=False))
+        server.gui.add_html(render("which", which="review", anew=anew, says=False))
         place.stage.in_software.ask()
         self._add_way_back()
         review_tab, in_tabs = self._add_tabs(dark)
@@ -227,29 +225,25 @@ class ReviewPage:
         self._library_window.dock_left()
         self._library_window.set_width(LIBRARY_WIDTH)
         self._library_open = True
-        if self._had_opened:
+        if self._had_opened and not self._review.view().library_stays:
             self._show_library(False)
 
     def _sweep_of(self, library: Library) -> SweepPanel | None:
         """The tab with the results of a sweep, if the folder has some."""
-        if not (library.folder / RESULTS).exists():
+        if library.view().sweep is None:
             return None
         with self._library_window.add_tab("Sweep", viser.Icon.ADJUSTMENTS_HORIZONTAL):
-            return SweepPanel(self._server, library, self._open_of_sweep, self._clock)
+            return SweepPanel(self._server, library, self._open_of_sweep)
 
-    def _look_for_sweep(self) -> None:
+    def _add_late_sweep(self) -> None:
         """Add the tab of a sweep whose results came after the page."""
-        if self._sweep is not None or not self._looked.is_due(object()):
-            return
-        if (sweep := self._sweep_of(self._place.shelf.library)) is not None:
+        if self._sweep is None and (sweep := self._sweep_of(self._place.shelf.library)) is not None:
             self._sweep = sweep
             self._parts.add(sweep)
 
     def _open_of_sweep(self, ids: tuple[str, ...]) -> None:
-        self._review.open(ids)
-        if self._smallest_view() >= LEAST_BESIDE_SWEEP:
-            # The panel stays: a person goes from the best episode to the worst.
-            self._had_opened = self._awaited = ids
+        # The panel stays: a person goes from the best episode to the worst.
+        self._review.open(ids, library_stays=self._smallest_view() >= LEAST_BESIDE_SWEEP)
 
     # --- start and stop --------------------------------------------------------------------------
 
@@ -269,10 +263,6 @@ class ReviewPage:
     def _has_viewers(self) -> bool:
         return self._framing.follow() > 0
 
-    def _look_and_redraw(self) -> None:
-        self._review.check_files()
-        self.redraw()
-
     def redraw(self) -> None:
         """Draw the present state of the review."""
         view = self._review.view()
@@ -283,8 +273,7 @@ class ReviewPage:
         """Draw the panels, all from one view; while it plays, less often than the 3-D view."""
         if not self._told.is_due(object(), urgent=None if view.playing else object()):
             return
-        self._look_for_sweep()
-        self._open_the_newest(view)
+        self._add_late_sweep()
         self._make_way_for_the_first(view)
         self._fold_what_crowds()
         self._status.content = render(
@@ -302,34 +291,12 @@ class ReviewPage:
         pictures = self._pictures if self._cameras.show_frustums else {}
         self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures)
 
-    def _open_the_newest(self, view: ReviewView) -> None:
-        """Begin with a recording, once, or with the one that was wanted; the library stays as it is, also on a small screen."""
-        place = self._place
-        listed = place.shelf.library.view()
-        if place.wanted is not None:
-            named = {path.name: row for row in listed.rows if row.problem is None for path in row.paths}
-            if (row := named.get(place.wanted.name)) is None:
-                return  # it was written a moment ago, and is listed in another
-            place.wanted, place.newest_opened = None, True
-            self._had_opened = self._awaited = (row.id,)
-            self._review.open(self._awaited)
-            return
-        if place.newest_opened or (not view.opened and (listed.reading is not None or not listed.rows)):
-            return
-        place.newest_opened = True
-        whole = [row for row in listed.rows if row.problem is None]
-        if whole and not view.opened:
-            newest = max(whole, key=lambda row: row.written or 0.0)
-            self._had_opened = self._awaited = (newest.id,)
-            self._review.open(self._awaited)
-
     def _make_way_for_the_first(self, view: ReviewView) -> None:
         """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""
         ids = tuple(one.id for one in view.opened)
-        if self._awaited and (not ids or view.loading):
-            # Still being read: "nothing is open", or what was, is not news, and what opens then is not another one.
+        if view.library_stays and (ids or view.loading):
+            self._had_opened = ids
             return
-        self._awaited = ()
         if ids != self._had_opened:
             self._had_opened = ids
             if not ids or self._smallest_view() < NARROW:
@@ -483,22 +450,7 @@ class ReviewTimeline(TimeBar[ReviewView]):
         self._fixed: dict[str, object] = {}
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        review = self._review
-        match command:
-            case StepBack():
-                review.seek_by(-1)
-            case StepForward():
-                review.seek_by(1)
-            case PreviousEvent():
-                review.seek_event(-1)
-            case NextEvent():
-                review.seek_event(1)
-            case Seek(step=step):
-                review.seek(step)
-            case GoToFirst():
-                review.to_first()
-            case GoToLast():
-                review.to_last()
+        self._review.do(command, visitor.name)
 
     def draw(self, view: ReviewView) -> None:
         if not self._draw_panel(bool(view.opened)):

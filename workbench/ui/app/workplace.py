@@ -103,10 +103,8 @@ class Workplace:
         self.home = session
         """The session that a person opened, by command or from the list. `session` is another one while a recording of
         another task is continued."""
-        self.newest_opened = False
-        """Whether the review has opened the newest recording; it does so once."""
-        self.wanted: Path | None = None
-        """A file of the recording that a person wants to look at, until the review has opened it."""
+        self._looks_at = False
+        """Whether the next review page is for a recording that a person chose on another page."""
         self.dialog = TrustDialog(self.server)
         clearances = Clearances(self.task_files, self.dialog.ask, all_trusted=trust)
         self.go_live = GoLive(self, make_session, clearances, base)
@@ -127,12 +125,21 @@ class Workplace:
     @property
     def shelf(self) -> Shelf:
         """The folder is read at the first access, by the first review page; it stays open until the program ends."""
+        return self._shelf_with("newest")
+
+    def _shelf_with(self, first: Path | Literal["newest"]) -> Shelf:
+        """The shelf, whose review opens this recording; the newest only when the shelf is made."""
         with self._lock:
-            if self._shelf is None:
+            if self._shelf is not None:
+                if first != "newest":
+                    self._shelf.review.open_first(first)
+            else:
                 library = Library(self._recordings)
+                review = Review(library, make_scene=SceneProcess(self._tasks, self._imports))
+                library.on_change = review.library_changed
+                review.open_first(first)
                 library.watch()
-                scenes = SceneProcess(self._tasks, self._imports)
-                self._shelf = Shelf(library, Review(library, make_scene=scenes))
+                self._shelf = Shelf(library, review)
                 if self.session is None:
                     # With a live env its recorder has recovered them already, and is writing.
                     self._recovering = threading.Thread(
@@ -208,7 +215,8 @@ class Workplace:
 
     def look_at(self, recording: Path) -> None:
         """Open the recording with this file in the review."""
-        self.wanted = recording
+        self._shelf_with(recording)
+        self._looks_at = True
         self.pages.show("review")
 
     def _page(self, which: Which, dark: bool) -> Page | ReviewPage | StartPage:
@@ -216,7 +224,8 @@ class Workplace:
             return StartPage(self, dark)
         if which == "review":
             self.shelf.library.request_scan()
-            return ReviewPage(self, dark)
+            anew, self._looks_at = self._looks_at, False
+            return ReviewPage(self, dark, anew)
         # Imported late: a review alone does not need it.
         from workbench.ui.app.live_page import Page
 

@@ -30,7 +30,7 @@ from workbench.machine.text import number_text
 from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.events import MomentShown, PastPicturesWanted
+from workbench.session.run.events import MomentShown
 from workbench.session.run.past import Strip, TimelineView
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.widgets.fields import slider
@@ -46,8 +46,6 @@ HEIGHT = 205
 """Height in pixels of the view that it covers; framing a scene leaves these out."""
 RANGE_EVERY = 0.5
 """Seconds between two changes of the slider's range. A slider whose ends move at every step cannot be held."""
-STANDS_STILL = 0.35
-"""Seconds at one moment before its pictures are drawn; with less, every drag would draw some."""
 LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
 EPISODE, EVERYTHING = "this episode", "all episodes"
 GO_ON = "Continue from here"
@@ -113,7 +111,6 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         self._range_at = -math.inf
         self._strip_of: object = None
         """Key of the data that the strip was drawn for."""
-        self._stood: tuple[object, float] = (None, 0.0)
 
     def _add_rows(self, gui: viser.GuiApi) -> None:
         # One of these two is shown, and they have the same height: a panel that grows is moved up a moment later, its
@@ -153,7 +150,6 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
             self._draw_slider(view)
             self._draw_buttons(view)
             self._draw_strip(view)
-            self._ask_for_pictures(view)
 
     def _draw_slider(self, view: SessionView) -> None:
         past, now = view.timeline, self._clock()
@@ -198,13 +194,6 @@ class TimelinePanel(TimeBar[SessionView], MomentPart):
         strip = self._session.look(lambda run: run.strip(low, high))
         if strip is not None:
             self._strip.content = strip_html(strip, view, self._seek_to)
-
-    def _ask_for_pictures(self, view: SessionView) -> None:
-        at = (view.timeline.shown, view.selected_env)
-        if at != self._stood[0]:
-            self._stood = (at, self._clock())
-        elif view.timeline.wants_pictures and self._clock() - self._stood[1] > STANDS_STILL:
-            self._session.happen(PastPicturesWanted())
 
 
 def walk_tools() -> list[Tool]:

@@ -97,16 +97,15 @@ class ReviewComparePanel(PagePart[ReviewView]):
         )
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        opened = len(self._review.view().opened)
         match command:
-            case CompareWith(index=index) | SwapWithFirst(index=index) if index >= opened:
+            case CompareWith(index=index) if index >= len(self._review.view().opened):
                 raise Refused("It is not open any more.")
             case CompareWith(index=index):
                 self._wish = index
-            case SwapWithFirst(index=index):
-                self._review.swap(0, index)
             case ChooseTolerance(metres=metres):
                 self._metres = metres
+            case _:
+                self._review.do(command, visitor.name)
 
 
 def headline(found: Difference) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import viser
 
-from workbench.commands.command import Command, Refused
+from workbench.commands.command import Command
 from workbench.commands.review import (
     AlignRecordings,
     ArrangeRecordings,
@@ -26,7 +26,8 @@ from workbench.commands.run import TogglePlay
 from workbench.core.camera_data import moved_cameras_text
 from workbench.jobs.from_recording import ChangesOnDisk, recorded_version
 from workbench.recording.episode.episode import acted_by_text
-from workbench.session.review.review import MOST_COMPARED, SPEEDS, Review
+from workbench.session.review.review import SPEEDS, Review
+from workbench.session.review.state import MOST_COMPARED
 from workbench.session.review.view import Opened, ReviewView, outcome_text
 from workbench.ui.widgets.fields import by_name, choice, tick
 from workbench.ui.widgets.hotkeys import with_key
@@ -105,39 +106,14 @@ class ReviewPanel(PagePart[ReviewView]):
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
-            case TogglePlay():
-                self._review.toggle_play()
-            case NextRecording():
-                self._select_neighbour(1)
-            case PreviousRecording():
-                self._select_neighbour(-1)
-            case SelectRecording(id=id):
-                self._review.select(self._index_of(id))
-            case CloseRecording(id=id):
-                self._review.close_one(self._index_of(id))
-            case ChoosePlaybackSpeed(speed=speed):
-                self._review.set_speed(speed)
-            case LoopPlayback(on=on):
-                self._review.set_loop(on)
-            case OpenAgain():
-                self._review.open_again()
             case ArrangeRecordings(layout=layout):
                 self._arranged = layout
             case ToggleOverlaid():
                 self._arranged = GRID if self._arranged == GHOSTS else GHOSTS
-            case AlignRecordings(at=at):
-                try:
-                    self._review.align(at)
-                except ValueError as error:
-                    raise Refused(str(error)) from None
             case ContinueLive():
                 self._enter_recording()
-
-    def _index_of(self, id: str) -> int:
-        for index, one in enumerate(self._review.view().opened):
-            if one.id == id:
-                return index
-        raise Refused("It is not open any more.")
+            case _:
+                self._review.do(command, visitor.name)
 
     def lay_side_by_side(self) -> None:
         self._arranged = GRID
@@ -146,12 +122,6 @@ class ReviewPanel(PagePart[ReviewView]):
         view = self._review.view()
         if view.chosen is not None:
             self._on_go_live(view.chosen.id, view.states[view.selected])
-
-    def _select_neighbour(self, step: int) -> None:
-        """Select the next (1) or previous (-1) open recording, wrapping around."""
-        view = self._review.view()
-        if view.opened:
-            self._review.select((view.selected + step) % len(view.opened))
 
     def draw(self, view: ReviewView) -> None:
         there = bool(view.opened)

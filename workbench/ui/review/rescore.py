@@ -12,8 +12,8 @@ import viser
 
 from workbench.authoring.loading.reference import RecordedTask, named_file
 from workbench.commands.command import Command, Refused
-from workbench.commands.review import ChooseRescoreCode, RescoreOpen, RestoreRecordedStates
-from workbench.commands.timeline import StopRescoring
+from workbench.commands.review import ChooseRescoreCode, RescoreOpen, RestoreRecordedStates, SelectRecording
+from workbench.commands.timeline import Seek, StopRescoring
 from workbench.jobs.from_recording import class_in, recorded_version, reference_of
 from workbench.jobs.rescore.verdict import Verdict, by_change
 from workbench.recording.episode.episode import EpisodeInfo
@@ -255,9 +255,9 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         if opened is None:
             self._review.open((verdict.of.id,), verdict.first_difference)
             return
-        self._review.select(opened)
+        self._review.do(SelectRecording(id=verdict.of.id))
         if verdict.first_difference is not None:
-            self._review.seek(verdict.first_difference - view.anchors[opened])
+            self._review.do(Seek(step=verdict.first_difference - view.anchors[opened]))
 
     def _draw_curve(self) -> None:
         chosen = next((v for v in self._listed if v.of.id == self._selected), None)

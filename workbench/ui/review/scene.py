@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.commands.command import Refused
+from workbench.commands.review import SelectRecording
 from workbench.core.camera_data import CameraInfo, CameraKey, Picture
 from workbench.core.scene.shapes import BodyKind, Material, SceneGeometry, Visual, fingerprint
 from workbench.recording.episode.episode import CameraTrack
 from workbench.session.review.compare import distances
-from workbench.session.review.review import MOST_COMPARED, Review
+from workbench.session.review.review import Review
+from workbench.session.review.state import MOST_COMPARED
 from workbench.session.review.view import Opened, ReviewView
 from workbench.ui.cameras.frustums import SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.live.timeline import HEIGHT as TIMELINE_HEIGHT
@@ -295,7 +299,8 @@ class ReviewIn3D:
             return
         index = env_under_ray(scene.layout, np.array(event.ray_origin), np.array(event.ray_direction))
         if index is not None:
-            self._review.select(index)
+            with suppress(Refused):  # it was closed since it was drawn
+                self._review.do(SelectRecording(id=view.opened[index].id))
 
 
 def human_camera(view: ReviewView) -> CameraTrack | None:

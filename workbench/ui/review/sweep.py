@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -30,14 +28,12 @@ from workbench.recording.reader.reading import read_sweep
 from workbench.recording.sweeps import RESULTS, PointSummary, SweepEpisode, SweepResults, value_text
 from workbench.session.review.view import ReviewView
 from workbench.ui.widgets.paged import Paged
-from workbench.ui.widgets.parts import Clock, PagePart
+from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render, short_text
 from workbench.ui.widgets.visitors import Visitor
 
 log = logging.getLogger(__name__)
 
-LOOK_SECONDS = 1.0
-"""Seconds between two checks of the file's modification time."""
 ROWS = 12
 """Number of rows of a page of the table."""
 MOST_AXES = 9
@@ -186,9 +182,8 @@ class SweepPanel(PagePart[ReviewView]):
         server: viser.ViserServer,
         library: Library,
         on_open: Callable[[tuple[str, ...]], None],
-        clock: Clock = time.monotonic,
     ) -> None:
-        self._library, self._on_open, self._clock = library, on_open, clock
+        self._library, self._on_open = library, on_open
         self._file = library.folder / RESULTS
         self._note = server.gui.add_html("")
         self._plot = server.gui.add_html("")
@@ -200,8 +195,7 @@ class SweepPanel(PagePart[ReviewView]):
         self._point_of: dict[str, int] = {}
         """Index of the point of each recording, by path of the recording."""
         self._problem = ""
-        self._seen: object = None
-        self._looked = -math.inf
+        self._seen: tuple[int, int] | None = None
         self._serial = 0
         """Counter that grows with every change of what is shown."""
         self.shown = Shown()
@@ -213,15 +207,7 @@ class SweepPanel(PagePart[ReviewView]):
 
     def _look(self) -> None:
         """Read the file when it has changed, on a thread of its own."""
-        now = self._clock()
-        if now - self._looked < LOOK_SECONDS:
-            return
-        self._looked = now
-        try:
-            stat = os.stat(self._file)
-            seen: object = (stat.st_mtime_ns, stat.st_size)
-        except OSError:
-            seen = None
+        seen = self._library.view().sweep
         if seen != self._seen:
             self._seen = seen
             watched_thread("sweep results", self._read).start()
