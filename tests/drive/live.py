@@ -50,7 +50,7 @@ class HandedSession:
             "strip": lambda low, high: None,
             "episode_ticks": lambda: None,
             "segment": lambda: None,
-            "rescorer.curve": lambda name, env: None,
+            "rescored_curve": lambda name, env: None,
         }
 
     def view(self) -> SessionView:

@@ -34,6 +34,7 @@ from workbench.session.process.supervisor import Death, End, Supervisor, Vitals,
 from workbench.session.protocol.messages import Event, Loaded, ReloadReport, Request, Status
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.recordings import Rescorer
+from workbench.session.rescore.rescoring import BeginRescoring, RescoreEffect
 from workbench.session.run.events import MomentShown
 
 TASKS = Path(__file__).parents[2] / "tasks"
@@ -111,7 +112,7 @@ class Told:
         self.session, self._worker = session, worker
         self.rescored: list[object] = []
         """Loads with which the past was to be rescored; no process does it."""
-        session.rescorer.rescore = lambda load, rescored: self.rescored.append(load)
+        session._past_rescorer.perform = self._rescore
         self._elapsed = np.zeros(0, np.int32)
         self._number = 0
 
@@ -129,6 +130,10 @@ class Told:
         sent = self._worker.sent[:]
         self._worker.sent.clear()
         return [request for request in sent if isinstance(request, kind)]
+
+    def _rescore(self, effect: RescoreEffect) -> None:
+        if isinstance(effect, BeginRescoring):
+            self.rescored.append(effect.load)
 
     def greet(self) -> list[Request]:
         """What a new worker is sent first."""

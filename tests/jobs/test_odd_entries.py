@@ -23,6 +23,7 @@ from workbench.jobs.replay import replay_to
 from workbench.recording.episode.episode import Episode
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
+from workbench.session.record.recording import RecordingWanted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -123,7 +124,7 @@ def test_the_page_plays_and_records_it(session: Session, file: Path) -> None:
     def shown(step: StepResult | None) -> bool:
         return step is not None and "best" in step.others and step.others["best"].numbers is not None
 
-    session.start_recording((0, 1))
+    session.happen(RecordingWanted((0, 1)))
     session.do(PlayRun())
     view = wait_until(session, lambda view: shown(view.step), "a later step")
     assert view.problem is None and view.step.others["phase"].texts == ("push",)

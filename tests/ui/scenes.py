@@ -17,7 +17,7 @@ from workbench.jobs.task import ActionDimension, TaskDescription
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import Settings
 from workbench.session.protocol.questions import PlannedEnv
-from workbench.session.record.live import RecordingStatus
+from workbench.session.record.recording import RecordingStatus
 
 
 def box_mesh(size: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Mesh:

@@ -24,6 +24,7 @@ from workbench.session.cameras import selection
 from workbench.session.cameras.view import EditRequest
 from workbench.session.protocol.messages import PlaceCamera, Placed
 from workbench.session.protocol.questions import RunCameras
+from workbench.session.record.recording import RecordingWanted
 
 pytestmark = pytest.mark.thorough
 
@@ -311,7 +312,7 @@ def test_no_thread_of_a_session_is_left_when_it_is_closed_whatever_waited(tmp_pa
         session.studio.reports.pick(0.5, 0.5)
         heard: list[Call] = []
         until(lambda: heard.extend(told.asked(Call)) or len(heard) == 2, "both questions")
-        session.start_recording()
+        session.happen(RecordingWanted())
         told.reset()
         told.step(2)
         assert len(set(threading.enumerate()) - before) >= 5

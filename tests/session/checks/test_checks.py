@@ -24,6 +24,7 @@ from workbench.session.process.askers import GaveWay
 from workbench.session.process.jobs import Job, JobFailed, ProcessDied
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
+from workbench.session.record.saving import SaveWanted
 from workbench.session.rescore.background import StoppedBy
 from workbench.session.run.events import FileSaved
 
@@ -297,7 +298,7 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
         assert (one.file, one.line, one.degree) == (str(task_file), line, "stop") and bad in one.code
         assert view.playing
         # Somebody waits for this: the checks give way, and go on.
-        session.save_past((0,))
+        session.happen(SaveWanted((0,)))
         wait_until(session, lambda view: view.recording.saving.message != "", "the saved episode")
         task_file.write_text(text)
         wait_until(

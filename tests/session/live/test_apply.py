@@ -44,6 +44,7 @@ from workbench.session.protocol.messages import (
     Settings,
     Status,
 )
+from workbench.session.record.recording import Recording
 from workbench.session.run.events import (
     FileSaved,
     MomentShown,
@@ -111,11 +112,12 @@ EVENTS = st.one_of(
 
 
 def plain(value: object) -> Any:
-    """What can be compared. The history is a store, of which its moments count."""
+    """What can be compared: all but the stores, of which the history is one."""
     if isinstance(value, np.ndarray):
         return repr(value.tolist())
     if is_dataclass(value) and not isinstance(value, type):
-        return {one.name: plain(getattr(value, one.name)) for one in fields(value) if one.name != "history"}
+        compared = [one.name for one in fields(value) if one.compare and one.name != "history"]
+        return {name: plain(getattr(value, name)) for name in compared}
     if isinstance(value, dict):
         return {str(key): plain(one) for key, one in value.items()}
     if isinstance(value, (tuple, list)):
@@ -125,7 +127,10 @@ def plain(value: object) -> Any:
 
 def after(events: list[Any]) -> tuple[State, list[object]]:
     run = first_run("push.py", TaskOptions(ENVS), 10**6, Settings())
-    state, done = State(replace(run, own_file=Path("push.py"), own_folder=Path())), list[object]()
+    state, done = (
+        State(replace(run, own_file=Path("push.py"), own_folder=Path()), Recording("recordings")),
+        list[object](),
+    )
     for at, event in enumerate(events):
         try:
             new, effects = apply(state, event, Now(float(at), float(at)))

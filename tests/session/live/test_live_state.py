@@ -37,7 +37,7 @@ from workbench.session.protocol.messages import (
     Status,
 )
 from workbench.session.protocol.messages import Told as ToldRobots
-from workbench.session.rescore.background import RescoreView
+from workbench.session.rescore.rescoring import CodeLoads, MomentsRescored, RescoringDone
 from workbench.session.run.events import MomentShown, OptionsApplied, PagesCounted
 from workbench.session.run.run import Run
 
@@ -103,17 +103,17 @@ def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes(played
 def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_shown(played: Told) -> None:
     session = played.session
     session.change(selected_env=2, cameras=(EYE,))
+    played.load("patched", source_hash="b")
+    assert played.view.rescored.state == "loading" and played.view.rescored.total == 3
+    session.happen(CodeLoads(1))
+    session.happen(MomentsRescored(1, done=3, seconds=1.0))
+    session.happen(RescoringDone(1))
+    assert (played.view.rescored.state, played.view.rescored.done) == ("done", 3)
     session.happen(MomentShown(1))
     session.happen(MomentShown(None))
     told = np.ones((3, 2), np.float32)
     played.tell(pictures(2), ToldRobots(told), Inspection(2, 3), RulesBroken((GONE_WRONG,)))
     played.tell(CameraFailed(EYE.key, "no shader"))
-
-    async def nothing(job: object) -> None:
-        """It is done at once."""
-
-    session.rescorer.rescoring.begin(RescoreView("rescoring", total=3), nothing)
-    until(lambda: played.view.rescored.state == "done", "the judgement of this past")
     before = played.view
     assert (
         before.pictures

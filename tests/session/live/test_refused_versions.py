@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from tests.drive.session import live_session, save, start_over, step, wait_until
+from workbench.commands.recording import StopRecording
 from workbench.commands.run import PlayRun, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.record.recording import RecordingWanted
 from workbench.session.run.events import EnvsReset
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -172,7 +174,7 @@ def test_recording_and_playing_go_on_after_a_refused_version(
     file.write_text(good)
     with live_session(file, tmp_path / "recordings") as session:
         session.change(speed=8.0)
-        session.start_recording((0,))
+        session.happen(RecordingWanted((0,)))
         session.do(PlayRun())
         wait_until(session, lambda v: v.recording.steps > 3, "some recorded steps")
         file.write_text(in_evaluate(good, "raise ValueError('enough')"))
@@ -182,5 +184,5 @@ def test_recording_and_playing_go_on_after_a_refused_version(
         wait_until(session, lambda v: v.recording.episodes_written >= 1, "the episode that was running")
         session.happen(EnvsReset((0,)))
         wait_until(session, lambda v: v.recording.steps > 3, "steps of the next episode")
-        session.stop_recording()
+        session.do(StopRecording())
         wait_until(session, lambda v: v.recording.episodes_written >= 2, "both episodes")

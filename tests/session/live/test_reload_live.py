@@ -15,9 +15,11 @@ import pytest
 
 from tests.drive.session import runs, save, wait_until
 from workbench.commands.command import Refused
+from workbench.commands.recording import StopRecording
 from workbench.commands.run import ChooseClass, PauseRun, PlayRun, RebuildScene, ReloadFile, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.record.recording import RecordingWanted
 from workbench.session.run.events import EnvsReset, InspectionWanted
 
 DRAWS = True
@@ -202,7 +204,7 @@ def test_of_two_tasks_in_a_file_one_can_be_chosen_and_stays_chosen(
 def test_recording_goes_on_with_the_next_episode_and_the_moment_stays(
     session: Session, task_file: Path, good: str
 ) -> None:
-    session.start_recording((0,))
+    session.happen(RecordingWanted((0,)))
     before = played(session, 5)
     assert before.recording.steps > 0
     view = save(session, task_file, reward_plus(good, 41))
@@ -212,4 +214,4 @@ def test_recording_goes_on_with_the_next_episode_and_the_moment_stays(
     session.happen(EnvsReset((0,)))
     played(session, 3)
     assert session.view().recording.steps >= 3
-    session.stop_recording()
+    session.do(StopRecording())

@@ -13,8 +13,10 @@ from tests.drive.session import Told, told_session
 from tests.drive.waiting import until
 from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem
+from workbench.commands.recording import StopRecording
 from workbench.commands.run import Step
 from workbench.session.protocol.messages import LoadFailed, SingleStep
+from workbench.session.record.recording import RecordingWanted
 
 
 @pytest.fixture
@@ -58,7 +60,7 @@ def test_a_recording_that_cannot_be_written_keeps_no_step(
 ) -> None:
     with told_session(tmp_path / "kept") as told:
         told.play(0)
-        told.session.start_recording((0,))
+        told.session.happen(RecordingWanted((0,)))
         hangs = threading.Event()
         write = os.pwrite
 
@@ -72,7 +74,7 @@ def test_a_recording_that_cannot_be_written_keeps_no_step(
         told.step(3)
         assert hangs.wait(60)
         assert answers(told) and told.view.recording.active
-        told.session.stop_recording()
+        told.session.do(StopRecording())
         assert answers(told)
         disk.set()
         until(

@@ -15,6 +15,7 @@ from workbench.commands.run import Interrupt, PauseRun, PlayRun, Step
 from workbench.planning.options import PlanOptions
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import PlanDropped, PlanWanted, Play
+from workbench.session.record.saving import SaveWanted
 from workbench.session.run.events import InspectionWanted
 
 FEW = PlanOptions(rollouts=16, horizon=0.3, noise=0.8)
@@ -85,7 +86,7 @@ def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(ses
     assert plan.paths.shape == (16, 7, 3) and plan.traced == "panda/panda_hand_tcp"
     # What is predicted and what comes is of one size: the best of the last plan is a success.
     assert np.isfinite(view.solve.predicted).all() and view.solve.predicted[-1] == pytest.approx(1, abs=0.6)
-    session.save_past((0,))
+    session.happen(SaveWanted((0,)))
     view = wait_until(session, lambda view: bool(view.recording.saving.message), "the recording")
     assert view.recording.episodes_written == 1 and not view.recording.saving.failed, (
         "it is kept like any other"

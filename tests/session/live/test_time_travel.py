@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from tests.drive.session import jump, live_session, moment_at, start_over, step, wait_until
+from workbench.commands.recording import StopRecording
 from workbench.commands.run import PauseRun, RestartWorker
 from workbench.commands.timeline import ContinueFromHere, UndoReset
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.record.recording import RecordingWanted
 from workbench.session.run.events import ActionTold, EnvsReset, MomentShown, PagesCounted, PastPicturesWanted
 
 N = 3
@@ -129,7 +131,7 @@ def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     written = session.view().recording.episodes_written
     step(session, 1)
     last = session.view().timeline.last
-    session.start_recording((0,))
+    session.happen(RecordingWanted((0,)))
     wait_until(session, lambda v: v.timeline.last > last, "the fresh episode")
     step(session, 3)
     session.happen(MomentShown(start + 1))
@@ -138,7 +140,7 @@ def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     assert view.recording.active and view.recording.problem is None
     step(session, 1)
     assert session.view().recording.steps == 0, "what was not begun by a reset is not recorded"
-    session.stop_recording()
+    session.do(StopRecording())
 
 
 @pytest.mark.slow

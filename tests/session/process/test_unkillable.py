@@ -20,6 +20,7 @@ import pytest
 from tests.drive.session import live_session, runs, save, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import calm, edit, line_of, provocation, provoke, write_task
+from workbench.commands.recording import StopRecording
 from workbench.commands.run import Interrupt, PauseRun, PlayRun, ReloadFile, ResetAll, RestartWorker, Step
 from workbench.commands.timeline import ContinueFromHere
 from workbench.jobs.task import TaskOptions
@@ -30,6 +31,7 @@ from workbench.session.process import supervisor
 from workbench.session.process.heartbeat import INTERRUPT_SIGNAL
 from workbench.session.process.supervisor import WorkerOptions
 from workbench.session.process.worker_process import signal_main_thread
+from workbench.session.record.recording import RecordingWanted
 from workbench.session.run.events import EnvsReset, MomentShown
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -274,7 +276,7 @@ def test_a_new_version_that_kills_whoever_imports_it_costs_one_worker(session: S
 
 def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, file: Path) -> None:
     written = another_version(session, file).recording.episodes_written
-    session.start_recording((1,))
+    session.happen(RecordingWanted((1,)))
     for count in (1, 2, 3, 4, 5):
         session.do(Step())
         wait_until(session, lambda v, n=count: v.recording.steps == n, f"recorded step {count}")
@@ -418,11 +420,11 @@ def test_a_task_that_goes_to_another_folder_is_reloaded_and_recorded_as_before(
         wait_until(
             session, lambda v: v.task_serial > before.task_serial and v.problem is None, "the new version"
         )
-        session.start_recording()
+        session.happen(RecordingWanted())
         wait_until(session, lambda v: v.recording.active, "the recording")
         session.do(Step())
         wait_until(session, lambda v: v.recording.steps == 1, "a recorded step")
-        session.stop_recording()
+        session.do(StopRecording())
         view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the file")
         assert Path(view.recording.last_file).resolve().parent == tmp_path / "recordings"
 

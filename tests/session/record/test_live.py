@@ -15,6 +15,7 @@ import pytest
 
 from tests.drive.session import BASE, TASKS, camera, live_session, moved, step, wait_until
 from workbench.authoring.loading.load import load_task
+from workbench.commands.recording import StopRecording
 from workbench.commands.run import Step
 from workbench.recording.episode.episode import Episode
 from workbench.recording.lerobot.export import ExportOptions, export_lerobot
@@ -23,6 +24,8 @@ from workbench.recording.maniskill.export import export_maniskill
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.record.recording import RecordingWanted
+from workbench.session.record.saving import SaveWanted
 from workbench.session.run.events import EnvsReset
 
 STEPS = 4
@@ -74,14 +77,14 @@ def assert_same(one: Episode, other: Episode) -> None:
 
 @pytest.mark.slow
 def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session) -> None:
-    session.start_recording()
+    session.happen(RecordingWanted())
     wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
     step(session, STEPS)
     view = wait_until(session, lambda view: view.recording.steps == 2 * STEPS, "the steps")
     assert view.recording.bytes_written > 0
-    session.stop_recording()
+    session.do(StopRecording())
     live = written(session, 2)
-    session.save_past()
+    session.happen(SaveWanted())
     wait_until(session, lambda view: bool(view.recording.saving.message), "the keeping")
     said = f"saved 2 episodes, {2 * STEPS} steps; none of them had ended"
     assert session.view().recording.saving.message == said
@@ -111,13 +114,13 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
             session.change(action_source="random" if made == 0 else "hold")
             session.do(Step())
         wait_until(session, lambda view, n=steps: elapsed(view) == n, "the steps")
-    session.save_past((0,), before=True)
+    session.happen(SaveWanted((0,), before=True))
     kept = written(session, count + 1)[-1]
     assert kept.length == 3 and kept.info.env_index == 0
     # Nobody recorded, so both envs were reset at once: the first of them as alone, and the other otherwise.
     said = session.view().recording.saving.message
     assert kept.info.seed == 5 and "seed" not in said
-    session.save_past((1,), before=True)
+    session.happen(SaveWanted((1,), before=True))
     kept = written(session, count + 2)[-1]
     assert kept.info.env_index == 1 and kept.info.seed == -1
     said = wait_until(
@@ -145,7 +148,7 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
     wait_until(
         session, lambda view: view.task is not None and view.task.source_hash != version.source_hash, "it"
     )
-    session.save_past((0,))
+    session.happen(SaveWanted((0,)))
     kept = written(session, count + 1)[-1]
     assert kept.info.source_hash == version.source_hash
     assert list(kept.info.source.values()) == list(version.source.values())
@@ -166,7 +169,7 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
 def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_a_reset(
     session: Session,
 ) -> None:
-    session.start_recording((0,))
+    session.happen(RecordingWanted((0,)))
     wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
     step(session, 3)
     count = session.view().recording.episodes_written
@@ -179,7 +182,7 @@ def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_
     assert len(written(session, count + 1)[-1].action) == 3
     view = wait_until(session, lambda view: view.recording.active, "it to go on")
     assert view.recording.waiting == 1 and elapsed(view) == 3
-    session.stop_recording()
+    session.do(StopRecording())
     file.write_text(text)
     wait_until(
         session, lambda view: view.task is not None and view.task.source_hash == before.source_hash, "it"
@@ -189,7 +192,7 @@ def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_
 @pytest.mark.slow
 def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:
     before = session.view().recording.episodes_written
-    session.start_recording((1,), next_episode=True)
+    session.happen(RecordingWanted((1,), next_episode=True))
     step(session, 1)
     view = wait_until(session, lambda view: view.recording.waiting == 1, "the waiting")
     assert view.recording.active and view.recording.steps == 0
@@ -215,17 +218,17 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
     folder.mkdir(exist_ok=True)  # nothing may have been recorded yet
     aside = folder.rename(folder.with_name("aside"))
     folder.write_text("in the way")
-    session.start_recording((0,))
+    session.happen(RecordingWanted((0,)))
     view = wait_until(session, lambda view: view.recording.problem is not None, "the problem")
     assert not view.recording.active and "is not a folder" in str(view.recording.problem)
     step(session, 2)
     assert session.view().problem is None
     folder.unlink()
     aside.rename(folder)
-    session.start_recording((0,))
+    session.happen(RecordingWanted((0,)))
     wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
     assert session.view().recording.problem is None
-    session.stop_recording()
+    session.do(StopRecording())
 
 
 @pytest.mark.slow
@@ -239,17 +242,17 @@ def test_what_is_recorded_says_where_a_moved_camera_was_and_where_the_file_has_i
     count = session.view().recording.episodes_written
     session.studio.place(BASE, there)
     wait_until(session, lambda view: moved(view) == {BASE}, "the placement")
-    session.start_recording((0,))
+    session.happen(RecordingWanted((0,)))
     wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
     step(session, 2)
-    session.save_past((0,))
+    session.happen(SaveWanted((0,)))
     past = written(session, count + 1)[-1]
     session.studio.back_to_file(BASE)
     wait_until(session, lambda view: not moved(view), "the file's placement")
     step(session, 2)
     view = wait_until(session, lambda view: view.recording.steps == 4, "the steps")
     assert view.recording.episodes == 0 and time.time() - view.recording.since < 600
-    session.stop_recording()
+    session.do(StopRecording())
     live = written(session, count + 2)[-1]
     assert [(m.state, m.name, m.used, m.in_file) for m in live.info.moved_cameras] == [
         (0, "base_camera", there, in_file),

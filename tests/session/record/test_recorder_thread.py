@@ -13,11 +13,14 @@ import pytest
 from tests.drive.episodes import begin, made
 from tests.drive.session import Told, moment, moment_at, told_session
 from tests.drive.waiting import until
+from workbench.commands.command import Refused
+from workbench.commands.recording import StopRecording
 from workbench.machine.processes.watched_thread import listen, stop_listening
 from workbench.recording.reader.read_episode import read_episode
 from workbench.session.protocol.messages import Reset, SetCapture
-from workbench.session.record import live
-from workbench.session.record.live import LiveRecorder
+from workbench.session.record import live, recording
+from workbench.session.record.recording import RecordingWanted
+from workbench.session.record.saving import SaveWanted
 
 
 def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
@@ -36,12 +39,15 @@ def test_what_is_stopped_or_dies_in_the_middle_of_an_episode_is_written(
     child_process: None, tmp_path: Path
 ) -> None:
     with told_session(tmp_path) as told:
-        told.session.start_recording()
+        with pytest.raises(Refused):
+            told.session.happen(RecordingWanted())
         assert told.asked(SetCapture) == [], "before there is a task"
         told.play(0)
-        for count, end in enumerate((told.session.stop_recording, told.die), 1):
+        with pytest.raises(Refused):
+            told.session.do(StopRecording())
+        for count, end in enumerate((lambda: told.session.do(StopRecording()), told.die), 1):
             told.asked(object)
-            told.session.start_recording((0, 2))
+            told.session.happen(RecordingWanted((0, 2)))
             assert [type(one) for one in told.asked((SetCapture, Reset))] == [SetCapture, Reset]  # type: ignore[arg-type]
             told.reset((2,))
             told.step()
@@ -62,7 +68,7 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
     listen(said.append)
     try:
         for _ in range(2):
-            played.session.start_recording((0,))
+            played.session.happen(RecordingWanted((0,)))
             assert played.view.recording.problem is None, "that of the one before is forgotten"
             played.reset((0,))
             now: Any = played.view.step
@@ -77,14 +83,14 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
 
 def test_what_cannot_be_saved_of_the_past_is_refused_for_what_is_shown_alone(tmp_path: Path) -> None:
     with told_session(tmp_path, history_bytes=20_000) as told:
-        told.session.save_past((0,))
+        told.session.happen(SaveWanted((0,)))
         assert told.view.recording.saving.failed, "no task"
         told.play(0)
-        told.session.save_past((0,))
+        told.session.happen(SaveWanted((0,)))
         assert told.view.recording.saving.failed, "no step"
         told.step(100)
         assert told.view.timeline.first > 0 and not told.view.recording.saving.message
-        told.session.save_past((0,))
+        told.session.happen(SaveWanted((0,)))
         refused = told.view.recording.saving
         assert refused.failed and "no longer in memory" in refused.message and refused.progress is None
         told.session.change(selected_env=1)
@@ -96,9 +102,9 @@ def test_what_cannot_be_saved_of_the_past_is_refused_for_what_is_shown_alone(tmp
         told.reset()
         told.step(2)
         told.reset()
-        told.session.save_past((0,), before=True)
+        told.session.happen(SaveWanted((0,), before=True))
         assert told.view.recording.saving.failed, "the one before began earlier than what is kept"
-        told.session.start_recording()
+        told.session.happen(RecordingWanted())
         assert not told.view.recording.saving.message, "something else is recorded"
         assert moment_at(told.session, 0) is None
 
@@ -107,42 +113,45 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However much a recording holds in all: it ends only where too much waits at once, and the next begins anew."""
-    monkeypatch.setattr(live, "_MOST_WAITING", 10_500)
+    monkeypatch.setattr(recording, "MOST_WAITING_BYTES", 10_500)
     taker = Taker()
-    task: Any = SimpleNamespace()
-    elapsed: Any = SimpleNamespace(nbytes=396)
-    step: Any = SimpleNamespace(step=elapsed, columns={}, captured=(), snapshot=bytes(604), new_parts={})
     monkeypatch.setattr(live, "EpisodeGatherer", lambda *given, **named: taker)
-    recorder = LiveRecorder(tmp_path, lambda: None, lambda envs: None)
-    try:
+    with told_session(tmp_path) as told:
+        told.play(0)
         given = 0
-        for _ in range(2):
+        try:
+            for _ in range(2):
+                taker.disk.set()
+                told.session.happen(RecordingWanted((0,)))
+                told.step(snapshot=b"")
+                given += 1
+                size = told.view.step.nbytes  # pyright: ignore[reportOptionalMemberAccess]
+                at_once = 10_500 // size
+                assert at_once > 2
+                for _ in range(3):
+                    told.step(at_once - 1, snapshot=b"")
+                    given += at_once - 1
+                    until(lambda given=given: told.view.recording.steps == given, "the steps to be taken")
+                    assert told.view.recording.problem is None and told.view.recording.active
+                taker.disk.clear()
+                told.step(at_once, snapshot=b"")
+                given += at_once
+                assert told.view.recording.active
+                told.step(snapshot=b"")
+                assert not told.view.recording.active and told.view.recording.problem is not None
+                taker.disk.set()
+        finally:
             taker.disk.set()
-            recorder.start(task, (0,))
-            for _ in range(4):
-                for _ in range(8):
-                    recorder.take(step)
-                given += 8
-                until(lambda given=given: taker.taken == given, "the steps to be taken")
-                assert recorder.status().problem is None and recorder.status().active
-            taker.disk.clear()
-            count = 0
-            while recorder.status().active and count < 100:
-                recorder.take(step)
-                count += 1
-            assert 9 <= count <= 12 and recorder.status().problem is not None
-            given += count - 1  # the last was one too many
-            taker.disk.set()
-    finally:
-        taker.disk.set()
-        recorder.close()
 
 
 class Taker:
     """Takes every step, if the disk does."""
 
     env_idx = (0,)
-    under_way = ()
+
+    @property
+    def under_way(self) -> tuple[Any, ...]:
+        return (SimpleNamespace(steps=self.taken, writer=SimpleNamespace(bytes_written=0)),)
 
     def __init__(self) -> None:
         self.disk = threading.Event()

@@ -21,8 +21,9 @@ from workbench.session.history.history import History
 from workbench.session.process.askers import Background
 from workbench.session.process.jobs import Job
 from workbench.session.protocol.messages import Load
-from workbench.session.rescore.background import StoppedBy
-from workbench.session.rescore.past import PastRescorer, RescoredPast
+from workbench.session.rescore.past import RescoredPast
+from workbench.session.rescore.past_rescorer import PastRescorer
+from workbench.session.rescore.rescoring import BeginRescoring, EndRescoring
 
 BODIES = 4
 
@@ -181,7 +182,7 @@ def test_a_moment_that_is_judged_anew_is_compared_anew_and_not_a_number_is_a_dif
 
 def test_a_judgement_that_is_stopped_before_its_turn_keeps_nothing_of_the_past(shared: Told) -> None:
     process = Background()
-    rescore = PastRescorer(lambda: None, process)
+    rescorer = PastRescorer(process, lambda event: None)
     old, _, jumped = drawn(1, 6, 2)
     goes_on = loop.do(asyncio.Event)
 
@@ -192,17 +193,19 @@ def test_a_judgement_that_is_stopped_before_its_turn_keeps_nothing_of_the_past(s
     try:
         history = recorded(shared, old, jumped)
         moment = weakref.ref(history.at(history.first))
-        rescore.rescore(Load("Nothing-v1", TaskOptions()), RescoredPast(history))
+        rescored = RescoredPast(history)
+        begin = BeginRescoring(1, Load("Nothing-v1", TaskOptions()), rescored)
+        loop.do(lambda: rescorer.perform(begin))
         del history
         shared.load("rebuilt")  # the session keeps it no longer
         gc.collect()
         assert moment() is not None
-        rescore.stop(StoppedBy.HAND)
+        loop.do(lambda: rescorer.perform(EndRescoring()))
         loop.do(gc.collect)
-        assert moment() is None and rescore.curve("reward", 0) is not None
+        assert moment() is None and rescored.curve("reward", 0) is not None
     finally:
         loop.do(goes_on.set)
-        rescore.rescoring.close()
+        rescorer.close()
         process.close()
 
 

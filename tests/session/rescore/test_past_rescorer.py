@@ -8,6 +8,7 @@ import math
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,9 @@ import pytest
 
 from tests.drive.session import TASKS, background_pid, live_session, moments_of, wait_until
 from tests.drive.waiting import until
+from workbench.commands.command import Refused
 from workbench.commands.run import PauseRun, PlayRun, RebuildScene
+from workbench.commands.timeline import StopRescoring
 from workbench.session.history.history import Moment
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -54,8 +57,8 @@ class Desk:
         session.do(RebuildScene())
         first = session.view().timeline.last
         wait_until(session, lambda v: v.timeline.first > first and v.timeline.moments == 1, "a new history")
-        session.rescorer.stop()
-        wait_until(session, lambda v: v.rescored.state not in ("loading", "rescoring"), "its end")
+        with suppress(Refused):  # nothing may be rescored
+            session.do(StopRescoring())
         session.change(speed=math.inf)
         session.do(PlayRun())
         wait_until(session, lambda v: v.timeline.moments >= steps, "the steps")
@@ -111,7 +114,7 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
     rewards = np.array([moment.step.reward for moment in steps_of(record)])
     assert (view.done, view.total) == (len(rewards), len(rewards))
     for env in range(N):
-        curve = desk.session.rescorer.curve("reward", env)
+        curve = desk.session.rescored_curve("reward", env)
         np.testing.assert_array_equal(curve.old, rewards[:, env])
         np.testing.assert_array_equal(curve.new, 2 * rewards[:, env])
     assert all(verdict.metres == verdict.radians == 0 for verdict in view.verdicts)
@@ -161,7 +164,7 @@ def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk,
     assert "KeyError: 'late'" in view.problem.message
     assert Path(view.problem.file) == desk.file
     assert desk.file.read_text().splitlines()[view.problem.line - 1].strip() == late
-    curve = desk.session.rescorer.curve("reward", 1)
+    curve = desk.session.rescored_curve("reward", 1)
     rewards = np.array([moment.step.reward[1] for moment in steps_of(record)])
     np.testing.assert_array_equal(curve.old, rewards)
     assert np.isfinite(curve.new).sum() == view.done
@@ -187,7 +190,7 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
     view = desk.rescored("done")
     assert len(calls.read_text()) < view.done
     for env in range(N):
-        curve = session.rescorer.curve("reward", env)
+        curve = session.rescored_curve("reward", env)
         # What was played since the first of the two saves was rewarded twofold when it was recorded.
         factor = np.where(curve.serial <= record[-1].serial, 4, 2)
         np.testing.assert_array_equal(curve.new, factor * curve.old)
@@ -202,7 +205,7 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
     until(loops.exists, "the loop")
     desk.note()
     process = background_pid(desk.session)
-    desk.session.rescorer.stop()
+    desk.session.do(StopRescoring())
     view = desk.rescored("stopped")
     assert view.done < view.total and view.stopped_by is StoppedBy.HAND
     wait_until(

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS, live_session, step, wait_until
+from workbench.commands.recording import StopRecording
 from workbench.core.camera_data import CameraKey
 from workbench.session.protocol.messages import CameraRequest
+from workbench.session.record.recording import RecordingWanted
 from workbench.session.run.events import PagesCounted
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -74,10 +76,10 @@ def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
         view = wait_until(session, lambda v: SENSOR in v.failed_cameras and HUMAN in v.pictures, "both")
         assert f"{file}:{line}" in view.failed_cameras[SENSOR] and [*view.failed_cameras] == [SENSOR]
         # Of the recording it is left out.
-        session.start_recording()
+        session.happen(RecordingWanted())
         step(session, 3)
         wait_until(session, lambda v: v.recording.steps > 0, "recorded steps")
-        session.stop_recording()
+        session.do(StopRecording())
         view = wait_until(session, lambda v: v.recording.episodes_written == 2, "the files")
         assert view.recording.problem is None and view.problem is None
         # What it can give it gives.

@@ -12,7 +12,7 @@ from workbench.commands.envs import ShowFirstFlagged
 from workbench.core.capture.outliers import Outlier, OutlierKind
 from workbench.session.history.env_table import EnvRows
 from workbench.session.process.jobs import JobProgress
-from workbench.session.record.save_past import SaveStatus
+from workbench.session.record.saving import SaveStatus
 from workbench.ui.app.marks import Marks
 from workbench.ui.widgets.open_tabs import OpenTabs
 
@@ -23,9 +23,6 @@ class OneTable:
 
     def env_rows(self) -> EnvRows:
         return self.rows
-
-    def stop_recording(self) -> None:
-        raise AssertionError("nothing is recorded")
 
 
 def marks(panels: Panels, rows: EnvRows) -> Marks:

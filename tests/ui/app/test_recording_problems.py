@@ -14,6 +14,8 @@ from tests.ui.tabs import camera_message, handshake, messages_in
 from workbench.commands.run import Step
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
+from workbench.session.record.recording import RecordingWanted
+from workbench.session.record.saving import SaveWanted
 from workbench.session.run.events import EnvsReset
 from workbench.ui.app.workplace import Which, Workplace
 from workbench.ui.server.gated_server import GatedServer
@@ -52,13 +54,13 @@ def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServ
             return any(str(folder) in text for text in texts) and len(told) == number
 
         for number in (1, 2):
-            session.start_recording()
+            session.happen(RecordingWanted())
             until(lambda number=number: tells(number), "the notice")
         # What is refused at a moment is told too, and not kept for the moments after it.
         begun = session.view().timeline.moments
         session.happen(EnvsReset())
         wait_until(session, lambda view: view.timeline.moments > begun, "the reset")
-        session.save_past(before=True)
+        session.happen(SaveWanted(before=True))
         assert session.view().recording.saving.failed
         session.do(Step())
         wait_until(session, lambda view: not view.recording.saving.message, "the message's end")

@@ -7,9 +7,16 @@ from typing import Any
 
 from tests.drive.live import Live
 from tests.ui.scenes import running
+from workbench.commands.recording import (
+    ChooseRecordedEnvs,
+    RecordNextEpisode,
+    SavePreviousEpisode,
+    ToggleRecording,
+    ToggleSavePast,
+)
 from workbench.session.process.jobs import JobProgress
-from workbench.session.record.live import RecordingStatus
-from workbench.session.record.save_past import SaveStatus
+from workbench.session.record.recording import RecordingStatus
+from workbench.session.record.saving import SaveStatus
 from workbench.session.run.past import TimelineView
 from workbench.ui.live.episodes_panel import (
     ALL_ENVS,
@@ -40,13 +47,12 @@ def test_what_can_be_done_is_offered_and_asked_for_of_the_chosen_envs(live_page:
     tab.press(SAVE)
     tab.press(SAVE_BEFORE)
     tab.set("Envs", ALL_ENVS)
-    tab.press(SAVE)
     assert live_page.asked == [
-        ("start_recording", (1,)),
-        ("start_recording", (1,), {"next_episode": True}),
-        ("save_past", (1,)),
-        ("save_past", (1,), {"before": True}),
-        ("save_past", None),
+        ToggleRecording(),
+        RecordNextEpisode(),
+        ToggleSavePast(),
+        SavePreviousEpisode(),
+        ChooseRecordedEnvs(envs="all"),
     ]
     live_page.asked.clear()
     show(past=replace(PAST, first_tick=33, first=33))
@@ -59,6 +65,8 @@ def test_what_can_be_done_is_offered_and_asked_for_of_the_chosen_envs(live_page:
     show(RecordingStatus(saving=SaveStatus(progress=JobProgress("drawing", 1, 2))))
     assert not tab.shows(SAVE_BEFORE)
     tab.press(STOP_SAVING)
-    assert live_page.asked == [("stop_recording",), ("stop_recording",), ("past_saver.stop",)]
+    assert live_page.asked == [ToggleRecording(), ToggleRecording(), ToggleSavePast()]
+    show(RecordingStatus(chosen="all"))
+    assert tab.field("Envs").value == ALL_ENVS
     show(task=None)
     assert tab.button(RECORD).command is None

@@ -38,8 +38,8 @@ from workbench.session.process.heartbeat import Busy
 from workbench.session.process.jobs import JobProgress
 from workbench.session.process.supervisor import Vitals
 from workbench.session.protocol.messages import ReloadReport, RulesBroken
-from workbench.session.record.live import RecordingStatus
-from workbench.session.record.save_past import SaveStatus
+from workbench.session.record.recording import RecordingStatus
+from workbench.session.record.saving import SaveStatus
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
 from workbench.session.run.past import Strip, TimelineView
@@ -201,7 +201,7 @@ def made() -> Live:
     tick, old = np.arange(20), np.ones(20, np.float32)
     live.session.answers |= {
         "strip": lambda low, high: strip(low, high, live.session.shown.selected_env),
-        "rescorer.curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
+        "rescored_curve": lambda name, env: RescoredCurve(tick, tick, old * env, 2 * old),
     }
     live.do(ToggleTable())
     return live

@@ -17,6 +17,7 @@ from workbench.commands.timeline import (
     NextDifference,
     PreviousDifference,
     ShowRescored,
+    StopRescoring,
     TurnRescored,
 )
 from workbench.jobs.rescore.verdict import Verdict
@@ -56,7 +57,7 @@ def done(*verdicts: Verdict[PastRun], **changes: Any) -> RescoreView:
 class Rescored:
     def __init__(self, live: Live) -> None:
         self.live, self.panels = live, live.part("Reward")
-        live.session.answers["rescorer.curve"] = self.curve
+        live.session.answers["rescored_curve"] = self.curve
 
     def curve(self, name: str, env: int) -> RescoredCurve | None:
         tick, old = np.arange(20), np.full(20, env, np.float32)
@@ -84,7 +85,7 @@ def test_the_stand_is_said_above_and_below_and_only_what_runs_can_be_stopped(res
         assert shown.shows(STOP) is (state != "done") and says in shown.html()
         if state == "rescoring":
             shown.press(STOP)
-            assert rescored.live.asked == [("rescorer.stop",)]
+            assert rescored.live.asked == [StopRescoring()]
     rescored.draw(RescoreView("stopped", 9, why="the file was saved again"))
     assert "the file was saved again" in rescored.panels.html()
 

@@ -26,8 +26,8 @@ from workbench.planning.options import PlanOptions
 from workbench.session.live.solver import SolveView
 from workbench.session.process.jobs import JobProgress
 from workbench.session.protocol.messages import Settings
-from workbench.session.record.live import RecordingStatus
-from workbench.session.record.save_past import SaveStatus
+from workbench.session.record.recording import RecordingStatus
+from workbench.session.record.saving import SaveStatus
 from workbench.ui.live.solve_panel import (
     ALL_ENVS,
     SAVE_SOLVED,
@@ -129,17 +129,14 @@ def test_a_solved_episode_is_saved_and_a_playing_one_is_not_offered(solve: Solve
     assert not solve.live.shows(SAVE_SOLVED)
     solve.draw()
     solve.live.press(SAVE_SOLVED)
-    assert solve.live.asked == [("save_past", (0,))]
+    assert solve.live.asked == [SaveSolved()]
     part = solve.live.part("Solve")
     solve.draw(recording=RecordingStatus(saving=SaveStatus(progress=JobProgress("rendering it again", 2, 8))))
     assert "2 of 8 moments" in part.html() and part.button(SAVE_SOLVED).command is None
-    solve.live.do(SaveSolved())
     solve.draw(recording=RecordingStatus(saving=SaveStatus("saved 1 episode, 7 steps")))
     assert "saved 1 episode, 7 steps" in part.html() and part.button(SAVE_SOLVED).command is not None
     solve.draw(replace(SOLVED, solved=()))
     assert not solve.live.shows(SAVE_SOLVED)
-    solve.live.do(SaveSolved())
-    assert solve.live.asked == [("save_past", (0,))] and len(solve.live.client.notices) == 2
 
 
 def test_a_success_is_told_once_for_each_episode(solve: Solve, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,7 +44,7 @@ from workbench.session.live.view import SessionView, view_of
 from workbench.session.loop import Aside, ChangeCounter, do, later, on_loop, wait_for_disk
 from workbench.session.process.askers import Asker, Background
 from workbench.session.process.captured_output import PrintedLine, PrintedLog
-from workbench.session.process.supervisor import Death, End, Supervisor, WorkerOptions
+from workbench.session.process.supervisor import Death, Supervisor, WorkerOptions
 from workbench.session.protocol.messages import (
     Answer,
     Event,
@@ -53,14 +53,16 @@ from workbench.session.protocol.messages import (
     Placed,
     Progress,
     Request,
-    SetCapture,
     Settings,
     WarmUp,
 )
 from workbench.session.record.live import LiveRecorder
-from workbench.session.record.save_past import PastSaver, request_of
-from workbench.session.rescore.background import StoppedBy
-from workbench.session.rescore.past import PastRescorer, RescoredPast, rescore_after_load
+from workbench.session.record.recording import BeginEpisodes, EndEpisodes, Recording, TakeStep
+from workbench.session.record.save_past import PastSaver
+from workbench.session.record.saving import BeginSaving, EndSaving
+from workbench.session.rescore.past import RescoredCurve
+from workbench.session.rescore.past_rescorer import PastRescorer
+from workbench.session.rescore.rescoring import BeginRescoring, EndRescoring
 from workbench.session.run.events import (
     DrawSoon,
     EnvsReset,
@@ -82,7 +84,7 @@ from workbench.session.run.events import (
     WorkerBusy,
     WorkerDied,
 )
-from workbench.session.run.loading import files_at_fault, first_requests, past_after, watched_files
+from workbench.session.run.loading import files_at_fault, first_requests, watched_files
 from workbench.session.run.run import Run, first_run
 
 Value = TypeVar("Value")
@@ -147,6 +149,7 @@ class Session:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
         self._state = State(
             first_run(task, options, history_bytes, settings),
+            Recording(str(recordings)),
             checks=Checks(ChecksView(after_each_save=check)),
         )
         self._changes = ChangeCounter()
@@ -169,13 +172,8 @@ class Session:
             own_files=lambda: self.look(lambda run: run.own_files),
             output=self._printed.feed,
         )
-        self._recorder = LiveRecorder(
-            recordings, self._notify, lambda envs: self._send(SetCapture(envs, from_reset=True)), on_notice
-        )
         self._background = Background()
         """Asks questions of the background process."""
-        self.past_saver = PastSaver(recordings, self._recorder.finisher, self._notify, self._background)
-        self.rescorer = PastRescorer(self._notify, self._background)
         self._checks = CheckJobs(self._background, self._happen)
         self._profiles = ProfileJobs(self._background, self._happen)
         self._plans = PlanJobs(self._happen)
@@ -191,6 +189,10 @@ class Session:
             None if kept is None else kept.cameras,
         )
         """The camera studio."""
+        # Last: what it recovers happens at once.
+        self._recorder = LiveRecorder(recordings, self._happen, on_notice)
+        self._past_saver = PastSaver(recordings, self._recorder.finisher, self._background, self._happen)
+        self._past_rescorer = PastRescorer(self._background, self._happen)
         listen(self._log)
         self._watcher.follow(watched_files(self._run))
         self._worker.start()
@@ -259,6 +261,16 @@ class Session:
                 self._happen(Asked(command))
             case BeginSeeds() | EndSeeds():
                 self._seeds.perform(effect)
+            case BeginEpisodes() | TakeStep() | EndEpisodes():
+                self._recorder.perform(effect)
+            case BeginSaving():
+                self._past_saver.begin(effect, self.studio.placed_cameras())
+            case EndSaving():
+                self._past_saver.end()
+            case BeginRescoring() | EndRescoring():
+                self._past_rescorer.perform(effect)
+            case EnvsReset():
+                self._happen(effect)
         return None
 
     def _send(self, request: Request) -> None:
@@ -284,18 +296,23 @@ class Session:
             self._run,
             printed=self._printed.view(),
             vitals=self._worker.vitals,
-            rescored=self.rescorer.rescoring.view,
+            recording=self._state.recording.status(self._run),
+            rescored=self._state.rescoring.view,
             checks=self._state.checks.view,
             profile=self._state.profile,
             seeds=self._state.seeds,
             solve=self._state.solving.view(env),
         )
-        recording = replace(self._recorder.status(), saving=self.past_saver.status(_shown(self._run)))
-        return replace(view, recording=recording, studio=self.studio.view(view.step, env))
+        return replace(view, studio=self.studio.view(view.step, env))
 
     def env_rows(self) -> EnvRows | None:
         """See `Run.env_rows`."""
         return self.look(Run.env_rows)
+
+    @on_loop
+    def rescored_curve(self, name: str, env: int) -> RescoredCurve | None:
+        """See `PastRescoring.curve`."""
+        return self._state.rescoring.curve(name, env)
 
     def wait(self, seen: int, timeout: float) -> int:
         """Block until the counter of changes differs from `seen`; returns the counter."""
@@ -348,50 +365,6 @@ class Session:
         self._printed.clear()
         self._notify()
 
-    @on_loop
-    def start_recording(
-        self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False, goes_on: bool = False
-    ) -> None:
-        """Reset these envs (all if None) and record them until `stop_recording`.
-
-        Args:
-            next_episode: do not reset; record only the episode of each env that begins with its next reset.
-            goes_on: as `LiveRecorder.start` has it.
-        """
-        task = self._run.task
-        if task is None:
-            return
-        envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
-        self.past_saver.forget()
-        self._recorder.start(task, envs, one_each=next_episode, goes_on=goes_on)
-        self._send(SetCapture(envs, from_reset=True))
-        if not next_episode:
-            self.happen(EnvsReset(None if env_idx is None else envs))
-        self._notify()
-
-    @on_loop
-    def stop_recording(self) -> None:
-        """Stop recording; the running episodes are written as far as they are."""
-        self._send(SetCapture(()))
-        self._recorder.stop()
-        self._notify()
-
-    @on_loop
-    def save_past(self, env_idx: tuple[int, ...] | None = None, before: bool = False) -> None:
-        """Record from the history: for each of these envs (all if None) the episode that contains the shown moment.
-
-        While live, the running episode is saved; if it has no step yet, the one before. `SessionView.recording` has progress
-        and result.
-
-        Args:
-            before: record the episode before that one.
-        """
-        what = request_of(self._run, env_idx, self.studio.placed_cameras(), before)
-        if isinstance(what, str):
-            self.past_saver.refuse(what, _shown(self._run))
-        else:
-            self.past_saver.save(what)
-
     def enter_recording(
         self,
         run: RecordedRun,
@@ -413,13 +386,13 @@ class Session:
         self._watcher.stop()
         self._aside.end()
         self._policy_file.close()
-        self.rescorer.rescoring.close()
+        self._past_rescorer.close()
         self._checks.close()
         self._profiles.close()
         self._plans.close()
         self._seeds.close()
         self.studio.close()
-        self.past_saver.close()
+        self._past_saver.close()
         self._background.close()
         self._recorder.close()
 
@@ -452,8 +425,6 @@ class Session:
 
     def _died(self, death: Death) -> tuple[Problem | None, bool]:
         """Returns the problem to show, if any, and whether there is a version to bring back."""
-        if death.end is not End.HANDED_OVER:
-            self._recorder.stop()
         self.studio.interrupted()
         before = self._run.problem_serial
         self._happen(WorkerDied(death, self._printed.tail(20)))
@@ -474,7 +445,6 @@ class Session:
                 self._on_loaded(event, on_disk)
             case Stepped():
                 self._happen(event)
-                self._recorder.take(event)
             case Answer() | Progress():
                 self._asker.take(event)
                 self._notify()
@@ -488,57 +458,18 @@ class Session:
 
     def _on_loaded(self, event: Loaded, on_disk: bool) -> None:
         self._worker.reset_deaths()
-        recording, one_each = self._recorder.recording, self._recorder.one_each
         level = None if event.reload is None else event.reload.level
-        if level != "same":
-            # An episode must not mix steps of two versions, nor of two processes.
-            self._recorder.stop()
-            self.past_saver.forget()
-        before = self._run
-        past = past_after(before.task, event, before.recovery.restoring)
-        what_to_do = rescore_after_load(past, self.rescorer.rescoring.view)
-        rescored = None
-        if what_to_do == "rescore" and before.past is not None:
-            versions = [task for task in (before.task, event.task) if task is not None]
-            has_reward = any(task.reward_mode != "none" for task in versions)
-            # Made before the newest moment gets the new version's scores.
-            rescored = RescoredPast(before.past.history, before.past.at, has_reward)
         self._happen(VersionLoaded(event, on_disk))
-        run = self._run
-        load = run.running_load()
-        assert run.task is not None and load is not None
-        placed = self.studio.loaded(run.task, level)
-        if rescored is not None:
-            self.rescorer.rescore(load, rescored)
-        elif what_to_do == "forget":
-            self.rescorer.forget()
+        assert self._run.task is not None, "a version was loaded"
+        placed = self.studio.loaded(self._run.task, level)
         self.studio.send_placements(placed)
-        if recording:
-            put_back = past != "gone" or (event.reload is not None and bool(event.reload.carried))
-            self._continue_recording(put_back, recording, one_each)
         self._happen(LoadDone())
-
-    def _continue_recording(self, put_back: bool, env_idx: tuple[int, ...], one_each: bool) -> None:
-        """Continue recording these envs after a version came in.
-
-        Args:
-            put_back: it goes on with episodes that are under way.
-        """
-        if not put_back:
-            self.start_recording(env_idx, next_episode=one_each, goes_on=True)
-        elif not self._recorder.recording:
-            # No reset, which would lose the present moment: recording continues with each env's next episode.
-            task = self._run.task
-            if task is not None:
-                self._recorder.start(task, env_idx, one_each, goes_on=True)
-                self._send(SetCapture(env_idx, from_reset=True))
 
     # --- files and output ----------------------------------------------------------------------------
 
     @on_loop
     def _on_files_changed(self, paths: set[Path]) -> None:
         """A watched file was saved."""
-        self.rescorer.stop(StoppedBy.SAVE)
         self.studio.interrupted()
         self._happen(FileSaved())
 
@@ -569,9 +500,3 @@ def _is_on_disk(source: Mapping[str, str]) -> bool:
         except (OSError, SyntaxError):
             return False
     return True
-
-
-def _shown(run: Run) -> object:
-    """The version, env and moment that are shown."""
-    past = run.past
-    return run.task_serial, run.env, None if past is None else (past.at, past.pinned)

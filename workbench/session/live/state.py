@@ -10,16 +10,30 @@ from workbench.session.checks import profile as of_profile
 from workbench.session.checks import solve_seeds as of_seeds
 from workbench.session.events import Ask
 from workbench.session.live import solver as of_solver
+from workbench.session.record import recording as of_recording
+from workbench.session.record.saving import SaveEvent, SaveWanted
+from workbench.session.rescore import rescoring as of_rescoring
 from workbench.session.run import apply as of_run
 from workbench.session.run import asked
 from workbench.session.run.events import Now, RunEffect, RunEvent
 from workbench.session.run.run import Run
 
 SessionEvent = (
-    RunEvent | of_checks.CheckEvent | of_profile.ProfileEvent | of_seeds.SeedsEvent | of_solver.SolverEvent
+    RunEvent
+    | of_recording.RecordingWanted
+    | of_recording.RecordEvent
+    | SaveWanted
+    | SaveEvent
+    | of_rescoring.RescoreEvent
+    | of_checks.CheckEvent
+    | of_profile.ProfileEvent
+    | of_seeds.SeedsEvent
+    | of_solver.SolverEvent
 )
 Effect = (
     RunEffect
+    | of_recording.RecordEffect
+    | of_rescoring.RescoreEffect
     | of_checks.CheckEffect
     | of_checks.KeepCheckAfterSave
     | of_profile.ProfileEffect
@@ -27,8 +41,10 @@ Effect = (
     | of_solver.SolverEffect
     | Ask
 )
-DOES: frozenset[type[Command]] = asked.DOES | of_checks.DOES | of_profile.DOES | of_seeds.DOES
-"""Commands that a session takes."""
+DOES: frozenset[type[Command]] = (
+    asked.DOES | of_recording.DOES | of_rescoring.DOES | of_checks.DOES | of_profile.DOES | of_seeds.DOES
+)
+"""Commands that `apply` takes."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +52,9 @@ class State:
     """One moment of a session. Parts that an event did not change are the same objects."""
 
     run: Run
+    recording: of_recording.Recording
+    rescoring: of_rescoring.PastRescoring = of_rescoring.PastRescoring()
+    """The history rescored with the new code."""
     checks: of_checks.Checks = of_checks.Checks()
     """The rules of the running version."""
     profile: of_profile.ProfileView = of_profile.ProfileView()
@@ -52,11 +71,26 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     Raises:
         Refused: a command makes no sense now; nothing has changed.
     """
-    run, effects = of_run.apply(state.run, event, now)
-    checks, for_checks = of_checks.apply(state.checks, event, state.run, run)
-    profile, for_profile = of_profile.apply(state.profile, event, state.run, run)
-    seeds, for_seeds = of_seeds.apply(state.seeds, event, state.run, run)
-    solving, for_solver = of_solver.apply(state.solving, event, state.run, run)
-    new = replace(state, run=run, checks=checks, profile=profile, seeds=seeds, solving=solving)
+    before, solved = state.run, state.solving.solved
+    run, for_run = of_run.apply(before, event, now)
+    recording, for_recording = of_recording.apply(state.recording, event, before, run, now, solved)
+    rescoring, for_rescoring = of_rescoring.apply(state.rescoring, event, before, run)
+    checks, for_checks = of_checks.apply(state.checks, event, before, run)
+    profile, for_profile = of_profile.apply(state.profile, event, before, run)
+    seeds, for_seeds = of_seeds.apply(state.seeds, event, before, run)
+    solving, for_solver = of_solver.apply(state.solving, event, before, run)
+    new = replace(
+        state,
+        run=run,
+        recording=recording,
+        rescoring=rescoring,
+        checks=checks,
+        profile=profile,
+        seeds=seeds,
+        solving=solving,
+    )
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
-    return (state if same else new), [*effects, *for_checks, *for_profile, *for_seeds, *for_solver]
+    # Rescoring begins before checks: the later of two jobs of one priority comes first. What the run has to do comes last:
+    # after a load a recording continues before a recorded run is entered.
+    for_jobs = [*for_recording, *for_rescoring, *for_checks, *for_profile, *for_seeds, *for_solver]
+    return state if same else new, [*for_jobs, *for_run]

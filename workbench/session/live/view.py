@@ -25,7 +25,7 @@ from workbench.session.process.captured_output import NOTHING_PRINTED, Printed
 from workbench.session.process.heartbeat import Busy
 from workbench.session.process.supervisor import Vitals
 from workbench.session.protocol.messages import ReloadReport, RulesBroken, Settings
-from workbench.session.record.live import RecordingStatus
+from workbench.session.record.recording import RecordingStatus
 from workbench.session.rescore.background import RescoreView
 from workbench.session.run.past import TimelineView
 from workbench.session.run.run import PastLoad, Run, State

@@ -64,6 +64,16 @@ class RescoreView:
         """Control steps per second; 0 while unknown."""
         return self.steps / self.seconds if self.seconds > 0.5 else 0.0
 
+    def changed(self, **values: Any) -> RescoreView:
+        """The next view, with these values."""
+        return replace(self, serial=self.serial + 1, **values)
+
+    def stopped(self, why: StoppedBy) -> RescoreView:
+        """The view once the job is cancelled; the same if none runs."""
+        if self.state not in RUNNING:
+            return self
+        return self.changed(state="stopped", stopped_by=why, why=why.value)
+
 
 class Rescoring:
     """Runs one job at a time; a new one replaces the one before. Methods return at once."""
@@ -85,25 +95,18 @@ class Rescoring:
             await work(job)
             self.update(state="done")
 
-        self._put(view)
+        self._put(replace(view, serial=self.view.serial + 1))
         self._jobs.start("rescoring", run)
 
     def update(self, **values: Any) -> None:
         """Change fields of `view`; called by the job."""
-        self._put(replace(self.view, **values))
+        self._put(self.view.changed(**values))
 
     @on_loop
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
         """Cancel the running job; results so far stay."""
         self._jobs.stop()
-        if self.view.state in RUNNING:
-            self.update(state="stopped", stopped_by=why, why=why.value)
-
-    @on_loop
-    def forget(self) -> None:
-        """Cancel the running job and clear the view."""
-        self.stop(StoppedBy.LOSS)
-        self._put(RescoreView())
+        self._put(self.view.stopped(why))
 
     @on_loop
     def close(self) -> None:
@@ -112,7 +115,7 @@ class Rescoring:
         self._jobs.close()
 
     def _put(self, view: RescoreView) -> None:
-        self.view = replace(view, serial=self.view.serial + 1)
+        self.view = view
         self._on_change()
 
     def _failed(self, failure: JobFailed) -> None:

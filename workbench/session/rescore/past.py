@@ -1,13 +1,9 @@
-"""Rescores the history: replays its moments with the new code and compares them with the record."""
+"""Old and new scores of the history, and how they compare."""
 
 from __future__ import annotations
 
 import pickle
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Literal
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +12,7 @@ from workbench.core.capture.recorded_run import pose_distances
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.rescore.verdict import Scores, Verdict, compare, scalar_entries
 from workbench.session.history.history import History, Moment
-from workbench.session.loop import on_loop
-from workbench.session.process.askers import Background
-from workbench.session.process.jobs import Job, JobFailed
-from workbench.session.protocol.messages import Load
-from workbench.session.protocol.questions import MomentToRescore, RescoredMoments, RescoreMoments
-from workbench.session.rescore.background import RescoreView, Rescoring, StoppedBy
+from workbench.session.protocol.questions import MomentToRescore
 
 MOST_ENTRIES = 24
 """Most entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""
@@ -63,7 +54,7 @@ class RescoredCurve:
 
 
 class RescoredPast:
-    """Old and new scores of the history, one row a moment, filled as results come. Not thread-safe: its owner locks.
+    """Old and new scores of the history, one row a moment, filled as results come. Used on the loop.
 
     The bodies' drift from the record is kept for each moment and env, since it decides whether a comparison is good. From
     a kept reset on it is mostly zero to the last bit: there envs have the same physics without a past (measured:
@@ -95,7 +86,7 @@ class RescoredPast:
             self._jumped[0], self._is_step[0] = True, False
         self._serial = np.array([m.serial for m in self._moments], np.int64)
         self._tick = np.array([m.tick for m in self._moments], np.int64)
-        self._elapsed = np.array([m.step.elapsed_steps for m in self._moments]).reshape(count, envs)
+        self._elapsed = np.array([m.as_recorded.elapsed_steps for m in self._moments]).reshape(count, envs)
         self._rescored = np.zeros(count, bool)
         self._old: dict[str, NDArray[np.float32]] = {}
         self._new: dict[str, NDArray[np.float32]] = {}
@@ -223,149 +214,3 @@ class RescoredPast:
                     continue
                 table[name] = np.full(self._jumped.shape, np.nan, np.float32)
             table[name][row] = value
-
-
-_CHUNK_SECONDS = 0.1
-"""Desired seconds of one question: it decides how soon progress is shown and a stop takes effect."""
-_MOST_AT_ONCE = 64
-_SUMMARY_EVERY = 0.5
-"""Seconds between two summaries."""
-
-
-def rescore_after_load(
-    past: Literal["same", "patched", "gone"], view: RescoreView
-) -> Literal["rescore", "keep", "forget"]:
-    """Whether to rescore the history with the loaded version, keep the last results, or forget them with the episodes.
-
-    Args:
-        past: what the load means for the history.
-    """
-    if past == "patched":
-        return "rescore"
-    if past == "same":
-        # Saved again without a relevant change: resume the job that the save stopped.
-        return "rescore" if view.stopped_by is StoppedBy.SAVE else "keep"
-    return "forget"
-
-
-class PastRescorer:
-    """Rescores the history in the background process, some moments at a time.
-
-    To stop, it sends no more; a process that does not answer (the new code may loop for ever) is ended.
-    """
-
-    def __init__(self, on_change: Callable[[], None], process: Background) -> None:
-        """
-        Args:
-            on_change: called when `rescoring` has changed.
-            process: where it runs; other jobs come first.
-        """
-        self.rescoring = Rescoring(on_change)
-        self._process = process
-        self._rescored: RescoredPast | None = None
-        """Scores of the running or the last job."""
-
-    @on_loop
-    def curve(self, name: str, env: int) -> RescoredCurve | None:
-        """The curve of `RescoredPast.curve`; None before the first job."""
-        return None if self._rescored is None else self._rescored.curve(name, env)
-
-    @on_loop
-    def rescore(self, load: Load, rescored: RescoredPast) -> None:
-        """Start a job, replacing the one before.
-
-        Args:
-            load: the new code.
-            rescored: made from the history; belongs to this object from now on.
-        """
-        if rescored.steps == 0:
-            return
-        self.stop(StoppedBy.LOAD)
-        self._rescored = rescored
-        view = RescoreView("loading", total=rescored.steps, task="the new code")
-        self.rescoring.begin(view, lambda job: self._rescore(job, load, rescored))
-
-    @on_loop
-    def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
-        """Cancel the running job, as `Rescoring.stop` does, and free its moments; results so far stay."""
-        self.rescoring.stop(why)
-        if self._rescored is not None:
-            self._rescored.release()
-
-    @on_loop
-    def forget(self) -> None:
-        """Stop and clear the view: the history is gone."""
-        self.rescoring.forget()
-        self._rescored = None
-
-    # --- the job -------------------------------------------------------------------------------------
-
-    async def _rescore(self, job: Job, load: Load, rescored: RescoredPast) -> None:
-        summed_up, missed = 0.0, dict[str, str]()
-
-        def on_answer(answer: RescoredMoments, seconds: float) -> None:
-            nonlocal summed_up
-            missed.update(answer.not_carried)
-            now, done = time.monotonic(), rescored.rescored_steps
-            if answer.problem is not None or done == rescored.steps or now - summed_up > _SUMMARY_EVERY:
-                summed_up = now
-                names, differing = rescored.names()
-                verdicts = tuple(rescored.verdicts())
-                self.rescoring.update(verdicts=verdicts, names=names, differing_names=differing)
-            self.rescoring.update(
-                state="rescoring",
-                done=done,
-                steps=done,
-                seconds=self.rescoring.view.seconds + seconds,
-                warnings=tuple(f"not restored: {what}: {why}" for what, why in missed.items()),
-            )
-            if answer.problem is not None:
-                raise JobFailed("the new code raised", answer.problem)
-
-        async def rescore_rows(rows: range) -> None:
-            await self._load(job, load, rescored)
-            await self._replay_steps(rescored, rows, on_answer)
-
-        try:
-            for rows in rescored.runs():
-                await self._process.in_turns(job, partial(rescore_rows, rows), priority="low")
-        finally:
-            rescored.release()
-
-    async def _load(self, job: Job, load: Load, rescored: RescoredPast) -> None:
-        if self._process.has_loaded(load):
-            return
-        self.rescoring.update(state="loading")
-        if self._process.num_envs == rescored.num_envs:
-            # Loading tries the new code at the env's present moment, where the last job ended. There it may raise or
-            # loop although it runs from the recorded beginnings: so go to one of these first.
-            await self._ask(rescored, rescored.runs()[0][:1])
-        try:
-            await self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))
-        except JobFailed as failure:
-            if failure.problem is None:
-                raise
-            raise JobFailed("the new code could not be loaded to rescore with", failure.problem) from failure
-
-    async def _replay_steps(
-        self, rescored: RescoredPast, rows: range, on_answer: Callable[[RescoredMoments, float], None]
-    ) -> None:
-        at, count = rows.start, 2
-        while at < rows.stop:
-            chunk = range(at, min(at + count, rows.stop))
-            began = time.monotonic()
-            answer = await self._ask(rescored, chunk)
-            took = time.monotonic() - began
-            for row, step in zip(chunk, answer.steps, strict=False):
-                try:
-                    rescored.add(row, step)
-                except ValueError as error:
-                    raise JobFailed(f"the episodes cannot be compared: {error}") from error
-            on_answer(answer, took)
-            in_time = count * _CHUNK_SECONDS / max(took, 1e-3)
-            count = max(1, min(int(in_time), 2 * count, _MOST_AT_ONCE))
-            at = chunk.stop
-
-    async def _ask(self, rescored: RescoredPast, rows: range) -> RescoredMoments:
-        moments = tuple(rescored.moment_to_rescore(row) for row in rows)
-        return await self._process.ask(RescoreMoments(moments))

@@ -27,7 +27,6 @@ from workbench.commands.page import (
     ToggleTable,
     ToggleTheme,
 )
-from workbench.commands.recording import ToggleRecording, ToggleSavePast
 from workbench.commands.timeline import Seek
 from workbench.machine.kept_choices import close_hints
 from workbench.session.live import state
@@ -85,8 +84,6 @@ DOES: frozenset[type[Command]] = frozenset(
         ToggleTheme,
         ToggleOnlySelected,
         CloseHints,
-        ToggleRecording,
-        ToggleSavePast,
         CloseDialog,
         *CamerasPanel.does,
     }
@@ -228,7 +225,7 @@ class Page:
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, clock)
         with tabs.add_tab(EPISODES, viser.Icon.MOVIE):
-            self._record = RecordPanel(server, session)
+            self._record = RecordPanel(server)
             server.gui.add_html(tools_html([tool("Review recordings", ShowRecordings())]))
         with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
             checks = ChecksPanel(server, checks_tab, self._link)
@@ -314,10 +311,6 @@ class Page:
             case CloseHints():
                 self._hints.content = ""
                 close_hints()
-            case ToggleRecording():
-                self._record.toggle()
-            case ToggleSavePast():
-                self._record.save()
             case SelectCamera():
                 self._parts.do(command, visitor)
                 self._open_tabs.open(visitor, STUDIO)

@@ -43,7 +43,7 @@ class Marks(PagePart[SessionView]):
 
     every = 0.25
 
-    does = (StopRecording, PutMovedCamerasBack, ShowCameraChange, ShowChecks)
+    does = (PutMovedCamerasBack, ShowCameraChange, ShowChecks)
 
     def __init__(self, server: viser.ViserServer, session: Session, tabs: OpenTabs) -> None:
         self._session, self._tabs = session, tabs
@@ -51,8 +51,6 @@ class Marks(PagePart[SessionView]):
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
-            case StopRecording():
-                self._session.stop_recording()
             case PutMovedCamerasBack():
                 self._put_back()
             case ShowCameraChange():

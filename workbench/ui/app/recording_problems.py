@@ -9,7 +9,7 @@ import viser
 
 from workbench.machine.processes.watched_thread import watched_thread
 from workbench.session.live.session import Session
-from workbench.session.record.live import RecordingStatus
+from workbench.session.record.recording import RecordingStatus
 from workbench.ui.widgets.notices import tell_all
 
 _LOOK_SECONDS = 0.5

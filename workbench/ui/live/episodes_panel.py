@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from typing import Literal
 
 import viser
 
-from workbench.commands.command import Command
 from workbench.commands.recording import (
     ChooseRecordedEnvs,
     RecordNextEpisode,
@@ -16,15 +14,13 @@ from workbench.commands.recording import (
     ToggleSavePast,
 )
 from workbench.recording.reader.reading import recovered_text
-from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.record.live import RecordingStatus
+from workbench.session.record.recording import RecordingStatus
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.widgets.fields import choice
 from workbench.ui.widgets.hotkeys import with_key
 from workbench.ui.widgets.templates import counted, render
 from workbench.ui.widgets.tools import Tool, tool, tools_html
-from workbench.ui.widgets.visitors import Visitor
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
 ENVS = {THIS_ENV: "selected", ALL_ENVS: "all"}
@@ -42,51 +38,20 @@ class RecordPanel(MomentPart):
     reset; *Save what I just saw* makes a recording of the past.
     """
 
-    does = (RecordNextEpisode, SavePreviousEpisode, ChooseRecordedEnvs)
-
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._session = session
-        self._chosen: Literal["selected", "all"] = "selected"
+    def __init__(self, server: viser.ViserServer) -> None:
         self._record = server.gui.add_html("")
-        self._which = choice(server, "Envs", ChooseRecordedEnvs, "envs", ENVS, self._chosen)
+        self._which = choice(server, "Envs", ChooseRecordedEnvs, "envs", ENVS, "selected")
         self._others = server.gui.add_html("")
         self._about = server.gui.add_html("")
         self._status = server.gui.add_html("")
 
-    @property
-    def _envs(self) -> tuple[int, ...] | None:
-        return None if self._chosen == "all" else (self._session.view().selected_env,)
-
-    def do(self, command: Command, visitor: Visitor) -> None:
-        match command:
-            case RecordNextEpisode():
-                self._session.start_recording(self._envs, next_episode=True)
-            case SavePreviousEpisode():
-                self._session.save_past(self._envs, before=True)
-            case ChooseRecordedEnvs(envs=envs):
-                self._chosen = envs
-
-    def toggle(self) -> None:
-        """Start or stop recording."""
-        if self._session.view().recording.active:
-            self._session.stop_recording()
-        else:
-            self._session.start_recording(self._envs)
-
-    def save(self) -> None:
-        """Start or stop keeping the past episode."""
-        if self._session.view().recording.saving.progress is not None:
-            self._session.past_saver.stop()
-        else:
-            self._session.save_past(self._envs)
-
     def key(self, view: SessionView) -> object:
-        return view.recording, view.timeline, view.step_serial, self._chosen
+        return view.recording, view.timeline, view.step_serial
 
     def urgent(self, view: SessionView) -> object:
         recording = view.recording
         stand = recording.active, recording.waiting, recording.saving.progress is None
-        return super().urgent(view), self._chosen, *stand, view.timeline.moments == 0
+        return super().urgent(view), recording.chosen, *stand, view.timeline.moments == 0
 
     def draw(self, view: SessionView) -> None:
         recording, saving = view.recording, view.recording.saving.progress is not None
@@ -96,7 +61,7 @@ class RecordPanel(MomentPart):
         off = not can_record and not recording.active
         hint = with_key(ToggleRecording, RECORD_HINT)
         self._record.content = tools_html([Tool(record, ToggleRecording(), hint, off=off, tone="main")])
-        self._which.show(self._chosen, off=not can_record)
+        self._which.show(recording.chosen, off=not can_record)
         self._which.visible = view.task is None or view.task.num_envs > 1
         # Off, not left out: the next button would move under the pointer.
         following = tool(NEXT, RecordNextEpisode(), off=not can_record or recording.active)
@@ -108,7 +73,7 @@ class RecordPanel(MomentPart):
         )
         before = [tool(SAVE_BEFORE, SavePreviousEpisode())] if has_one_before(view) and not saving else []
         self._others.content = tools_html([following], [save], before)
-        about = what_saving_means(view, self._chosen == "all")
+        about = what_saving_means(view, recording.chosen == "all")
         self._about.content = render("note", text=about) if about and not saving else ""
         self._status.content = recording_html(recording)
 

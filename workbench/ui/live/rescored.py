@@ -35,7 +35,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         super().__init__(server, "env")
         self._session = session
-        self._add_status("Stop rescoring", session.rescorer.stop)
+        self._add_status("Stop rescoring")
         self._name = "reward"
         self._curve = choice(
             server,
@@ -76,7 +76,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
         name = self._name if self._name in names else names[0]
         self._curve.show(name, options=by_name(names))
         differs = bool(self._listed or rescored.differing_names)
-        curve = self._session.rescorer.curve(name, env) if differs else None
+        curve = self._session.rescored_curve(name, env) if differs else None
         self._curve.visible = curve is not None
         if curve is None:
             self._chart.hide()

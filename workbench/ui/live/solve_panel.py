@@ -66,11 +66,7 @@ class SolvePanel(PagePart[SessionView]):
         link: Links the lines of the author's files.
     """
 
-    does = (
-        SaveSolved,
-        ShowRollouts,
-        LookAtRollout,
-    )
+    does = (ShowRollouts, LookAtRollout)
 
     def __init__(self, server: viser.ViserServer, session: Session, link: LinkTo = no_links) -> None:
         self._server, self._session, self._link = server, session, link
@@ -187,12 +183,6 @@ class SolvePanel(PagePart[SessionView]):
     def do(self, command: Command, visitor: Visitor) -> None:
         view = self._session.view()
         match command:
-            case SaveSolved():
-                if view.recording.saving.progress is not None:
-                    raise Refused("An episode is being saved.")
-                if not view.solve.solved:
-                    raise Refused("No episode is solved.")
-                self._session.save_past(tuple(env for env, _ in view.solve.solved))
             case ShowRollouts(on=on):
                 self._shows_rollouts = on
             case LookAtRollout(number=number):

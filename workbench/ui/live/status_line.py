@@ -12,7 +12,7 @@ from workbench.jobs.task import TaskDescription
 from workbench.machine.text import rate_text
 from workbench.session.live.view import SessionView
 from workbench.session.process.heartbeat import Busy
-from workbench.session.record.live import RecordingStatus
+from workbench.session.record.recording import RecordingStatus
 from workbench.ui.live.moment import MomentPart
 from workbench.ui.live.timeline import ago_in_words, step_in_words
 from workbench.ui.live.version_panel import took

@@ -13,7 +13,7 @@ import viser
 from workbench.authoring.loading.reference import RecordedTask, named_file
 from workbench.commands.command import Command, Refused
 from workbench.commands.review import ChooseRescoreCode, RescoreOpen, RestoreRecordedStates, SelectRecording
-from workbench.commands.timeline import Seek
+from workbench.commands.timeline import Seek, StopRescoring
 from workbench.jobs.from_recording import class_in, recorded_version, reference_of
 from workbench.jobs.rescore.verdict import Verdict, by_change
 from workbench.recording.episode.episode import EpisodeInfo
@@ -119,7 +119,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         known: Further task files that the server knows.
     """
 
-    does = (*RescoredPanel.does, RescoreOpen, ChooseRescoreCode, RestoreRecordedStates)
+    does = (*RescoredPanel.does, StopRescoring, RescoreOpen, ChooseRescoreCode, RestoreRecordedStates)
     advice = verdict_text.PUT_IN
 
     def __init__(
@@ -156,7 +156,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
             choices.use_env_states,
             hint="Restore the recorded state after every step, so that nothing drifts",
         )
-        self._add_status("Stop", rescorer.rescoring.stop)
+        self._add_status("Stop")
         self._add_list()
         self._add_chart()
         self._selected: str | None = None
@@ -194,6 +194,8 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
                 self._choices.code = code
             case RestoreRecordedStates(on=on):
                 self._choices.use_env_states = on
+            case StopRescoring():
+                self._rescorer.rescoring.stop()
             case _:
                 super().do(command, visitor)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
 import viser
@@ -37,7 +37,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
     """
 
     every = 0.25
-    does: tuple[type[Command], ...] = (ShowRescored, TurnRescored, StopRescoring)
+    does: tuple[type[Command], ...] = (ShowRescored, TurnRescored)
     advice = ""
     """Sentence that is shown where bodies were far from the record."""
 
@@ -47,8 +47,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         self._failed_since = ""
         """Reason of a failed rescoring, as the status shows it; the rows do not repeat it."""
 
-    def _add_status(self, label: str, stop: Callable[[], None]) -> None:
-        self._stop_rescoring = stop
+    def _add_status(self, label: str) -> None:
         self._stop = self._server.gui.add_html(tools_html([tool(label, StopRescoring())]), visible=False)
         self._status = self._server.gui.add_html("")
 
@@ -101,8 +100,6 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
                         break
             case TurnRescored(by=by):
                 self._pages.turn(by)
-            case StopRescoring():
-                self._stop_rescoring()
 
     def _key_of(self, verdict: Verdict[Of]) -> str:
         """Key that distinguishes its run from the others."""

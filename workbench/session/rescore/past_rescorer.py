@@ -1,0 +1,135 @@
+"""Rescores the history: replays its moments with the new code and compares them with the record."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+from workbench.session.loop import do
+from workbench.session.process.askers import Background
+from workbench.session.process.jobs import Job, JobFailed, Jobs
+from workbench.session.protocol.messages import Load
+from workbench.session.protocol.questions import RescoredMoments, RescoreMoments
+from workbench.session.rescore.past import RescoredPast
+from workbench.session.rescore.rescoring import (
+    BeginRescoring,
+    CodeLoads,
+    EndRescoring,
+    MomentsRescored,
+    RescoreEffect,
+    RescoreEvent,
+    RescoreSummary,
+    RescoringDone,
+    RescoringFailed,
+)
+
+_CHUNK_SECONDS = 0.1
+"""Desired seconds of one question: it decides how soon progress is shown and a stop takes effect."""
+_MOST_AT_ONCE = 64
+_SUMMARY_EVERY = 0.5
+"""Seconds between two summaries."""
+
+
+class PastRescorer:
+    """Rescores the history in the background process, some moments at a time.
+
+    To stop, it sends no more; a process that does not answer (the new code may loop for ever) is ended.
+    """
+
+    def __init__(self, process: Background, happen: Callable[[RescoreEvent], object]) -> None:
+        """
+        Args:
+            process: where it runs; other jobs come first.
+            happen: takes what comes of a job; called on the loop.
+        """
+        self._process, self._happen = process, happen
+        self._jobs = Jobs(lambda: None, self._failed)
+        self._job = 0
+        """Number of the running or the last job."""
+        self._past: RescoredPast | None = None
+
+    def perform(self, effect: RescoreEffect) -> None:
+        """Begin it; called on the loop."""
+        self._jobs.stop()
+        if self._past is not None:
+            self._past.release()
+        match effect:
+            case BeginRescoring(job=number, load=load, past=past):
+                self._job, self._past = number, past
+                self._jobs.start("rescoring", lambda job: self._rescore(job, number, load, past))
+            case EndRescoring():
+                self._past = None
+
+    def close(self) -> None:
+        """Cancel the job, and begin no more."""
+        do(self._jobs.close)
+
+    def _failed(self, failure: JobFailed) -> None:
+        self._happen(RescoringFailed(self._job, str(failure), failure.problem))
+
+    # --- the job -------------------------------------------------------------------------------------
+
+    async def _rescore(self, job: Job, number: int, load: Load, past: RescoredPast) -> None:
+        summed_up, missed = 0.0, dict[str, str]()
+
+        def on_answer(answer: RescoredMoments, seconds: float) -> None:
+            nonlocal summed_up
+            missed.update(answer.not_carried)
+            now, done, summary = time.monotonic(), past.rescored_steps, None
+            if answer.problem is not None or done == past.steps or now - summed_up > _SUMMARY_EVERY:
+                summed_up = now
+                summary = RescoreSummary(tuple(past.verdicts()), *past.names())
+            self._happen(MomentsRescored(number, done, seconds, tuple(missed.items()), summary))
+            if answer.problem is not None:
+                raise JobFailed("the new code raised", answer.problem)
+
+        async def rescore_rows(rows: range) -> None:
+            await self._load(job, number, load, past)
+            await self._replay_steps(past, rows, on_answer)
+
+        try:
+            for rows in past.runs():
+                await self._process.in_turns(job, partial(rescore_rows, rows), priority="low")
+        finally:
+            past.release()
+        self._happen(RescoringDone(number))
+
+    async def _load(self, job: Job, number: int, load: Load, past: RescoredPast) -> None:
+        if self._process.has_loaded(load):
+            return
+        self._happen(CodeLoads(number))
+        if self._process.num_envs == past.num_envs:
+            # Loading tries the new code at the env's present moment, where the last job ended. There it may raise or
+            # loop although it runs from the recorded beginnings: so go to one of these first.
+            await self._ask(past, past.runs()[0][:1])
+        try:
+            await self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))
+        except JobFailed as failure:
+            if failure.problem is None:
+                raise
+            raise JobFailed("the new code could not be loaded to rescore with", failure.problem) from failure
+
+    async def _replay_steps(
+        self, past: RescoredPast, rows: range, on_answer: Callable[[RescoredMoments, float], None]
+    ) -> None:
+        at, count = rows.start, 2
+        while at < rows.stop:
+            chunk = range(at, min(at + count, rows.stop))
+            began = time.monotonic()
+            answer = await self._ask(past, chunk)
+            took = time.monotonic() - began
+            for row, step in zip(chunk, answer.steps, strict=False):
+                try:
+                    past.add(row, step)
+                except ValueError as error:
+                    raise JobFailed(f"the episodes cannot be compared: {error}") from error
+            on_answer(answer, took)
+            in_time = count * _CHUNK_SECONDS / max(took, 1e-3)
+            count = max(1, min(int(in_time), 2 * count, _MOST_AT_ONCE))
+            at = chunk.stop
+
+    async def _ask(self, past: RescoredPast, rows: range) -> RescoredMoments:
+        moments = tuple(past.moment_to_rescore(row) for row in rows)
+        return await self._process.ask(RescoreMoments(moments))
