@@ -20,7 +20,7 @@ from tests.ui.scenes import camera as scene_camera
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.conventions import LookAt, pose_from_look_at, target_of, with_pose
 from workbench.machine.processes.wire import Call
-from workbench.session.cameras import selection
+from workbench.session.cameras import studio as of_studio
 from workbench.session.cameras.view import EditRequest
 from workbench.session.protocol.messages import PlaceCamera, Placed
 from workbench.session.protocol.questions import RunCameras
@@ -48,7 +48,6 @@ def loaded(
     info = replace(scene_camera(), settings=settings, mount=mount)
     told.load(level, cameras=() if settings is None else (info,), source_hash=str(settings))
     told.reset()
-    told.view  # noqa: B018  (as a page draws it)
 
 
 @pytest.fixture
@@ -152,7 +151,7 @@ def test_what_one_hand_does_without_a_pause_is_one_step_of_undo(
 ) -> None:
     studio = one.session.studio
     for height, (hand, seconds, pause) in zip((0.61, 0.62, 0.63), calls, strict=True):
-        monkeypatch.setattr(selection, "time", SimpleNamespace(monotonic=lambda seconds=seconds: seconds))
+        monkeypatch.setattr(of_studio, "time", SimpleNamespace(monotonic=lambda seconds=seconds: seconds))
         studio.place(BASE, at(height), hand, pause)
     undone = []
     while one.view.studio.undo is not None:

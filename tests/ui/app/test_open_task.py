@@ -114,7 +114,7 @@ def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
     first = desk.session_of("push.py")
     desk.place.pages.wait_for("live", 60)
     first.change(selected_env=1, speed=2.0)
-    now = next(one for one in first.studio.view(None, 0).cameras if one.key == CAMERA).now
+    now = next(one for one in first.view().studio.cameras if one.key == CAMERA).now
     assert now is not None
     placed = replace(now, position=(1.0, 2.0, 3.0))
     first.studio.place(CAMERA, placed)

@@ -286,24 +286,26 @@ class FileEdits:
         Returns:
             Whether the camera moved from its placement to the file's pose.
         """
-        went_back = False
-        placements, undone = self._cameras.placements, self.view.stage == "undone"
+        went_back, placements = False, self._cameras.placements
+        undone = self.view.stage == "undone"
         now, placed = placements.now(request.key), placements.placed.get(request.key)
         if request.what == "rename":
             pair = (request.result, request.key) if undone else (request.key, request.result)
-            placements.rename(*pair)
+            placements = placements.rename(*pair)
         elif request.what == "duplicate" and not undone and placed is not None:
-            placements.placed[request.result] = placed
+            placements = placements.with_placed(request.result, placed)
         elif request.what == "edit" and request.settings is not None:
             if undone and in_file is not None:
-                went_back = placements.edit_undone(request.key, request.settings, in_file)
+                back = placements.edit_undone(request.key, request.settings, in_file)
+                went_back, placements = back is not None, back or placements
             elif not undone and now is not None and not differences(now, request.settings):
-                placements.placed.pop(request.key, None)  # up to rounding, the file has it now
+                placements = placements.without(request.key)  # up to rounding, the file has it now
         elif request.what == "remove":
             if not undone and placed is not None:
                 self._removed[request.key] = placed
             elif undone and request.key in self._removed:
-                placements.placed[request.key] = self._removed.pop(request.key)
+                placements = placements.with_placed(request.key, self._removed.pop(request.key))
+        self._cameras.placements = placements
         if not undone and request.what in ("add", "duplicate", "rename"):
             self._cameras.selected = request.result
         return went_back

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +15,7 @@ from workbench.core.cameras.conventions import axes_of, pose_in_env
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.view import StudioCamera
+from workbench.session.run.run import Run
 
 _MOST_STEPS = 500
 NEAREST_TARGET, FARTHEST_TARGET, USUAL = 0.1, 3.0, 1.0
@@ -34,31 +34,26 @@ class PlacementChange:
     control: object = None
     """Id of the control that made it."""
     at: float = 0.0
-    """Seconds of `time.monotonic`."""
+    """Seconds of a monotonic clock."""
 
 
+@dataclass(frozen=True)
 class Placements:
-    """Placements of cameras, with undo and redo.
+    """Placements of cameras, with undo and redo. Methods that change something return another value.
 
     A step holds a camera's whole settings before and after, so it can be undone even if the file changed since. A gesture
     (a drag has a hundred positions) is one step. A new version keeps unwritten placements, except of cameras whose
     settings changed in the file: the author wrote these, so they count, and Undo brings the placement back.
     """
 
-    def __init__(self) -> None:
-        self.in_file: dict[CameraKey, CameraSettings] = {}
-        """Settings of the loaded version."""
-        self.placed: dict[CameraKey, CameraSettings] = {}
-        """Settings of cameras that differ from the file; a direct change of this dict is no step of undo."""
-        self._done: list[PlacementChange] = []
-        self._undone: list[PlacementChange] = []
-
-    def copy(self) -> Placements:
-        """A copy of the placements and steps, independent of this object."""
-        other = Placements()
-        other.in_file, other.placed = dict(self.in_file), dict(self.placed)
-        other._done, other._undone = list(self._done), list(self._undone)
-        return other
+    in_file: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
+    """Settings of the loaded version."""
+    placed: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
+    """Settings of cameras that differ from the file."""
+    done: tuple[PlacementChange, ...] = ()
+    """Steps that can be undone, the newest last."""
+    undone: tuple[PlacementChange, ...] = ()
+    """Steps that can be redone, the next last."""
 
     def now(self, key: CameraKey) -> CameraSettings | None:
         """A camera's present settings; None if it is missing, or settings cannot describe its config."""
@@ -66,79 +61,81 @@ class Placements:
 
     @property
     def undo_label(self) -> str | None:
-        return self._done[-1].label if self._done else None
+        return self.done[-1].label if self.done else None
 
     @property
     def redo_label(self) -> str | None:
-        return self._undone[-1].label if self._undone else None
+        return self.undone[-1].label if self.undone else None
 
     def place(
         self,
         key: CameraKey,
         settings: CameraSettings,
+        at: float,
         control: object = None,
         pause: float = math.inf,
         label: str = "",
-    ) -> bool:
-        """Place a camera; `control` and `pause` as in `CameraStudio.place`. False if it is missing or nothing changes."""
-        before, now = self.now(key), time.monotonic()
+    ) -> Placements:
+        """Place a camera; nothing changes if it is missing.
+
+        Args:
+            at: when, in seconds of a monotonic clock.
+            control: id of the control; successive calls with the same one are one step of undo (a drag).
+            pause: seconds without a call after which a new step begins.
+        """
+        before = self.now(key)
         if before is None:
-            return False
-        last = self._done[-1] if self._done and self._done[-1].key == key else None
+            return self
+        last = self.done[-1] if self.done and self.done[-1].key == key else None
         if not differences(before, settings):
             # The distance of the target is no step of its own.
-            aimed = self.set_distance(key, settings.distance)
-            if last is not None:
-                self._done[-1] = replace(last, after=aimed)
-            return False
-        if last is not None and control is not None and last.control == control and now - last.at <= pause:
-            before = last.before
-            self._done.pop()
+            return self._with_distance(key, settings.distance)
+        others = self.done
+        if last is not None and control is not None and last.control == control and at - last.at <= pause:
+            before, others = last.before, self.done[:-1]
         label = label or _step_label(key, before, settings)
-        self._add_step(PlacementChange(key, before, settings, label, control, now))
-        self._put(key, settings)
-        return True
+        step = PlacementChange(key, before, settings, label, control, at)
+        return replace(self, done=others)._with_step(step)._put(key, settings)
 
-    def set_distance(self, key: CameraKey, distance: float | None) -> CameraSettings:
-        """Set the distance of a camera's target in metres; returns the new settings."""
-        held = self.placed if key in self.placed else self.in_file
-        held[key] = replace(held[key], distance=distance)
-        return held[key]
+    def _with_distance(self, key: CameraKey, distance: float | None) -> Placements:
+        """Another distance of a camera's target, in metres."""
+        held = "placed" if key in self.placed else "in_file"
+        settings = replace(getattr(self, held)[key], distance=distance)
+        done = self.done
+        if done and done[-1].key == key:
+            done = (*done[:-1], replace(done[-1], after=settings))
+        return replace(self, done=done, **{held: {**getattr(self, held), key: settings}})
 
-    def _add_step(self, step: PlacementChange) -> None:
-        self._done = [*self._done[-_MOST_STEPS + 1 :], step]
-        self._undone.clear()
+    def _with_step(self, step: PlacementChange) -> Placements:
+        return replace(self, done=(*self.done[-_MOST_STEPS + 1 :], step), undone=())
 
-    def undo(self) -> PlacementChange | None:
-        """Undo a step; returns it, or None if there is none."""
-        if not self._done:
-            return None
-        step = self._done.pop()
-        self._undone.append(step)
-        self._put(step.key, step.before)
-        return step
+    def undo(self) -> Placements:
+        """Undo the last step, if there is one."""
+        if not self.done:
+            return self
+        step = self.done[-1]
+        undone = (*self.undone, step)
+        return replace(self, done=self.done[:-1], undone=undone)._put(step.key, step.before)
 
-    def redo(self) -> PlacementChange | None:
-        """Redo a step; returns it, or None if there is none."""
-        if not self._undone:
-            return None
-        step = self._undone.pop()
-        self._done.append(replace(step, control=None))
-        self._put(step.key, step.after)
-        return step
+    def redo(self) -> Placements:
+        """Redo the step that was undone last, if there is one."""
+        if not self.undone:
+            return self
+        step = self.undone[-1]
+        done = (*self.done, replace(step, control=None))
+        return replace(self, done=done, undone=self.undone[:-1])._put(step.key, step.after)
 
-    def refused(self, key: CameraKey) -> None:
+    def refused(self, key: CameraKey) -> Placements:
         """The worker refused the camera's newest placement: restore the one before."""
-        last = self._done[-1] if self._done else None
-        if last is not None and last.key == key:
-            self._done.pop()
-            self._put(key, last.before)
-        else:
-            self.placed.pop(key, None)
+        if self.done and self.done[-1].key == key:
+            return replace(self, done=self.done[:-1])._put(key, self.done[-1].before)
+        return self.without(key)
 
-    def edit_undone(self, key: CameraKey, written: CameraSettings, in_file: CameraSettings) -> bool:
+    def edit_undone(
+        self, key: CameraKey, written: CameraSettings, in_file: CameraSettings
+    ) -> Placements | None:
         """A placement was written to the file and taken out again: use the file's settings, and let Undo bring the
-        placement back. False, without a change, if the camera was placed elsewhere since.
+        placement back. None if the camera was placed elsewhere since.
 
         Args:
             written: the settings that were taken out of the file.
@@ -146,24 +143,25 @@ class Placements:
         """
         placed = self.placed.get(key)
         if placed is not None and differences(placed, written):
-            return False
-        self.placed.pop(key, None)
-        if differences(written, in_file):
-            self._add_step(PlacementChange(key, written, in_file, f"reverted the change of {key[1]}"))
-        return True
+            return None
+        after = self.without(key)
+        if not differences(written, in_file):
+            return after
+        return after._with_step(PlacementChange(key, written, in_file, f"reverted the change of {key[1]}"))
 
-    def rename(self, key: CameraKey, new: CameraKey) -> None:
+    def rename(self, key: CameraKey, new: CameraKey) -> Placements:
         """Move a camera's placements and steps to another key."""
-        if key in self.placed:
-            self.placed[new] = self.placed.pop(key)
-        if key in self.in_file:
-            self.in_file[new] = self.in_file[key]
-        for steps in (self._done, self._undone):
-            steps[:] = [replace(s, key=new) if s.key == key else s for s in steps]
+        after = self.without(key).with_placed(new, self.placed[key]) if key in self.placed else self
+        in_file = {**self.in_file, new: self.in_file[key]} if key in self.in_file else self.in_file
+        done, undone = (
+            tuple(replace(step, key=new) if step.key == key else step for step in steps)
+            for steps in (self.done, self.undone)
+        )
+        return Placements(in_file, after.placed, done, undone)
 
     def loaded(
         self, in_file: Mapping[CameraKey, CameraSettings], own: frozenset[CameraKey] = frozenset()
-    ) -> tuple[CameraKey, ...]:
+    ) -> tuple[Placements, tuple[CameraKey, ...]]:
         """Take the cameras of a new version.
 
         Args:
@@ -171,33 +169,35 @@ class Placements:
             own: cameras that the studio itself changed in the file: their placements stay.
 
         Returns:
-            Cameras whose placement was dropped, since the file has new settings.
+            The placements, and the cameras whose placement was dropped, since the file has new settings.
         """
-        # A camera without a target in the file keeps its distance.
-        far = {key: now.distance for key in in_file if (now := self.now(key)) is not None}
-        in_file = {key: s if s.distance else replace(s, distance=far.get(key)) for key, s in in_file.items()}
-        before, self.in_file = self.in_file, dict(in_file)
+        before, kept, done = self.in_file, {}, self.done
         dropped: list[CameraKey] = []
-        for key, placed in list(self.placed.items()):
-            if key not in in_file:
-                del self.placed[key]
-            elif not differences(placed, in_file[key]):
-                del self.placed[key]
-            elif key not in own and key in before and differences(before[key], in_file[key]):
-                del self.placed[key]
+        for key, placed in self.placed.items():
+            if key not in in_file or not differences(placed, in_file[key]):
+                continue
+            if key not in own and key in before and differences(before[key], in_file[key]):
                 dropped.append(key)
                 label = f"reloaded {key[1]} from the file"
-                self._done.append(PlacementChange(key, placed, in_file[key], label))
-        for steps in (self._done, self._undone):
-            steps[:] = [step for step in steps if step.key in in_file]
-        return tuple(dropped)
+                done = (*done, PlacementChange(key, placed, in_file[key], label))
+            else:
+                kept[key] = placed
+        done, undone = (tuple(s for s in steps if s.key in in_file) for steps in (done, self.undone))
+        return Placements(in_file, kept, done, undone), tuple(dropped)
 
-    def _put(self, key: CameraKey, settings: CameraSettings) -> None:
+    def without(self, key: CameraKey) -> Placements:
+        """The camera is as in the file; no step of undo."""
+        return replace(self, placed={one: settings for one, settings in self.placed.items() if one != key})
+
+    def with_placed(self, key: CameraKey, settings: CameraSettings) -> Placements:
+        """The camera is placed so; no step of undo."""
+        return replace(self, placed={**self.placed, key: settings})
+
+    def _put(self, key: CameraKey, settings: CameraSettings) -> Placements:
         file = self.in_file.get(key)
         if file is not None and not differences(file, settings):
-            self.placed.pop(key, None)
-        else:
-            self.placed[key] = settings
+            return self.without(key)
+        return self.with_placed(key, settings)
 
 
 _STEP_LABELS = (
@@ -225,6 +225,12 @@ def usual_distance(pose: ArrayLike) -> float:
     return distance if NEAREST_TARGET <= distance <= FARTHEST_TARGET else USUAL
 
 
+def shown_step(run: Run) -> StepResult | None:
+    """The step of the shown moment; None before a task is loaded."""
+    shown = None if run.past is None else run.past.shown
+    return run.step if shown is None else shown.step
+
+
 @dataclass(frozen=True)
 class KeptPlacements:
     """Placements with their steps of undo, and the selected camera, for a later session of the same task."""
@@ -237,24 +243,27 @@ class StudioCameras:
     """The cameras, placements and selection that all parts of the studio share. Used on the loop.
 
     Args:
+        run: returns the present run.
         kept: of an earlier session of the task.
     """
 
-    def __init__(self, kept: KeptPlacements | None = None) -> None:
-        self.task: TaskDescription | None = None
+    def __init__(self, run: Callable[[], Run], kept: KeptPlacements | None = None) -> None:
+        self._run = run
         self.selected: CameraKey | None = None
         self.was_chosen = False
         """Whether a camera, or none, was chosen."""
-        self.placements = Placements() if kept is None else kept.placements.copy()
+        self.placements = Placements() if kept is None else kept.placements
         self._select_when_loaded = None if kept is None else kept.selected
         self.problem = ""
         """Message about the last failure."""
-        self.drawn: tuple[StepResult | None, int] = (None, 0)
-        """The step and the selected env that were shown last."""
+
+    @property
+    def task(self) -> TaskDescription | None:
+        return self._run().task
 
     def kept(self) -> KeptPlacements:
         """Placements, steps of undo and the selected camera, for a later session of this task."""
-        return KeptPlacements(self.placements.copy(), self.selected or self._select_when_loaded)
+        return KeptPlacements(self.placements, self.selected or self._select_when_loaded)
 
     def select_again(self) -> None:
         """Select again, after a load, the camera that was selected in the earlier session; none if the camera is gone."""
@@ -284,31 +293,46 @@ class StudioCameras:
         return None
 
     def mount_pose(self, info: CameraInfo) -> NDArray[np.float32] | None:
-        """(7,) pose of the camera's mount in the env's frame, at the moment shown last; None without one."""
-        step, env = self.drawn
-        if info.mount is None or self.task is None or step is None:
+        """(7,) pose of the camera's mount in the env's frame, at the shown moment; None without one."""
+        run = self._run()
+        step, env = shown_step(run), run.env
+        if info.mount is None or run.task is None or step is None:
             return None
-        names = self.task.geometry.body_names
+        names = run.task.geometry.body_names
         if info.mount not in names or step.poses.shape[1] != len(names) or env >= len(step.poses):
             return None  # the step is of another version
         return step.poses[env, names.index(info.mount)]
 
+    def in_file(self) -> dict[CameraKey, CameraSettings]:
+        """Settings of the loaded version. A camera without a target in the file keeps the distance of the one that it had, or
+        gets the default."""
+        return {
+            info.key: settings if settings.distance else replace(settings, distance=self._distance(info))
+            for info in (() if self.task is None else self.task.cameras)
+            if (settings := info.settings) is not None
+        }
+
+    def _distance(self, info: CameraInfo) -> float | None:
+        """Metres from a camera without a target in the file to its target; None if the pose of its mount is unknown."""
+        now, mount = self.placements.now(info.key), self.mount_pose(info)
+        if now is not None and now.distance is not None:
+            return now.distance
+        if info.settings is None or (mount is None) != (info.mount is None):
+            return None
+        return usual_distance(pose_in_env(info.settings, mount))
+
     def all_cameras(self) -> tuple[StudioCamera, ...]:
-        """All cameras, at the moment shown last."""
+        """All cameras, at the shown moment."""
         return () if self.task is None else tuple(self._studio_camera(info) for info in self.task.cameras)
 
     def _studio_camera(self, info: CameraInfo) -> StudioCamera:
-        key, mount = info.key, self.mount_pose(info)
-        now = self.placements.now(key)
-        if now is not None and now.distance is None and (mount is None) == (info.mount is None):
-            now = self.placements.set_distance(key, usual_distance(pose_in_env(now, mount)))
         return StudioCamera(
-            key=key,
+            key=info.key,
             info=info,
-            now=now,
-            moved=key in self.placements.placed,
-            mount_pose=mount,
-            refused=self.refusal(key) or "",
+            now=self.placements.now(info.key),
+            moved=info.key in self.placements.placed,
+            mount_pose=self.mount_pose(info),
+            refused=self.refusal(info.key) or "",
         )
 
     def to_export(self, key: CameraKey) -> calibration_files.CameraToExport:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,13 @@ from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription
 from workbench.session.cameras.file_edits import FileEdits
 from workbench.session.cameras.reports import CameraReports
-from workbench.session.cameras.selection import KeptPlacements, PlacementChange, StudioCameras
+from workbench.session.cameras.selection import (
+    KeptPlacements,
+    PlacementChange,
+    Placements,
+    StudioCameras,
+    shown_step,
+)
 from workbench.session.cameras.view import StudioView
 from workbench.session.loop import do, on_loop
 from workbench.session.process.askers import Asker, Background
@@ -61,7 +68,7 @@ class CameraStudio:
         """
         self._send, self._on_change = send, on_change
         self._run = run
-        self._cameras = StudioCameras(kept)
+        self._cameras = StudioCameras(run, kept)
         self._asker = asker
         self.file = FileEdits(self._cameras, self._notify, open_file, asker, run)
         self._serial = 0
@@ -96,32 +103,46 @@ class CameraStudio:
         """
         why_not = self._cameras.refusal(key) or why_no_camera(settings)
         self._cameras.problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
-        moved = not why_not and self._cameras.placements.place(key, settings, control, pause)
-        self.send_placements([key] if moved else [])
+        if not why_not:
+            self._place(key, settings, control, pause)
+        self._notify()
+
+    def _place(
+        self,
+        key: CameraKey,
+        settings: CameraSettings,
+        control: object = None,
+        pause: float = math.inf,
+        label: str = "",
+    ) -> None:
+        before = self._cameras.placements
+        self._cameras.placements = before.place(key, settings, time.monotonic(), control, pause, label)
+        if self._cameras.placements.placed.get(key) != before.placed.get(key):
+            self.send_placements([key])
 
     @on_loop
     def undo(self) -> None:
         """Undo the last step."""
-        self._step(self._cameras.placements.undo)
+        before = self._cameras.placements
+        self._step(before.done[-1:], before.undo())
 
     @on_loop
     def redo(self) -> None:
         """Redo the step that was undone last."""
-        self._step(self._cameras.placements.redo)
+        before = self._cameras.placements
+        self._step(before.undone[-1:], before.redo())
 
-    def _step(self, move: Callable[[], PlacementChange | None]) -> None:
-        step = move()
-        self._cameras.problem = ""
-        self.send_placements([] if step is None else [step.key])
+    def _step(self, steps: Sequence[PlacementChange], after: Placements) -> None:
+        self._cameras.placements, self._cameras.problem = after, ""
+        self.send_placements([step.key for step in steps])
 
     @on_loop
     def back_to_file(self, key: CameraKey) -> None:
         """Place a camera as in the file."""
         file = self._cameras.placements.in_file.get(key)
-        moved = file is not None and self._cameras.placements.place(
-            key, file, label=f"put {key[1]} back to the file"
-        )
-        self.send_placements([key] if moved else [])
+        if file is not None:
+            self._place(key, file, label=f"put {key[1]} back to the file")
+        self._notify()
 
     @on_loop
     def take_suggestion(self, index: int) -> None:
@@ -144,7 +165,8 @@ class CameraStudio:
     @on_loop
     def draw_preview(self) -> None:
         """Draw another preview, if something changed since the last and none is being drawn."""
-        key, (step, env) = self._cameras.selected, self._cameras.drawn
+        run, key = self._run(), self._cameras.selected
+        step, env = shown_step(run), run.env
         now = None if key is None else self._cameras.placements.now(key)
         if self._preview_scale == 1.0 or key is None or now is None or self._cameras.refusal(key):
             return
@@ -154,7 +176,7 @@ class CameraStudio:
             return
         self._previewed, self._preview_problem = (step, question), ""
 
-        question = replace(question, poses=self._run().shown_moment().of(env))
+        question = replace(question, poses=run.shown_moment().of(env))
 
         async def work(job: Job) -> None:
             self._preview = await self._asker.ask(question)
@@ -220,15 +242,9 @@ class CameraStudio:
 
     # --- reading ---------------------------------------------------------------------------------------
 
-    def view(self, step: StepResult | None, env: int) -> StudioView:
-        """The studio's part of `SessionView`.
-
-        Args:
-            step: of the shown moment.
-            env: the selected one.
-        """
+    def view(self) -> StudioView:
+        """The studio's part of `SessionView`, at the shown moment."""
         results, progress = self.reports.results, self.reports.progress
-        self._cameras.drawn = step, env
         preview = self._preview
         measured = None if results.report_of is None else self._cameras.placements.now(results.report_of)
         was = results.report_settings
@@ -240,7 +256,7 @@ class CameraStudio:
             report_stale=results.report is not None and (moved or results.outdated),
             preview_scale=self._preview_scale,
             preview=preview
-            if preview and (preview.key, preview.env) == (self._cameras.selected, env)
+            if preview and (preview.key, preview.env) == (self._cameras.selected, self._run().env)
             else None,
             progress=progress,
             selected=self._cameras.selected,
@@ -264,10 +280,9 @@ class CameraStudio:
         Returns:
             The cameras whose placement has to be sent to the worker, by `send_placements`.
         """
-        self._cameras.task = task
-        in_file = {c.key: c.settings for c in task.cameras if c.settings is not None}
         own = self.file.loaded(task)
-        dropped = self._cameras.placements.loaded(in_file, own)
+        in_file = self._cameras.in_file()
+        self._cameras.placements, dropped = self._cameras.placements.loaded(in_file, own)
         self.file.plan_in_copy(task)
         self._cameras.problem = ""
         if dropped:
@@ -309,19 +324,13 @@ class CameraStudio:
         """Placements, steps of undo and the selected camera, for a later session of this task."""
         return self._cameras.kept()
 
-    def placed(self, event: Placed, task: TaskDescription | None) -> None:
-        """The worker's answer to a placement.
-
-        Args:
-            task: with the camera's new info.
-        """
+    def placed(self, event: Placed) -> None:
+        """The worker's answer to a placement."""
         again = False
         if event.why_not:
             self._cameras.problem = f"{event.key[1]} could not be placed: {event.why_not}."
-            self._cameras.placements.refused(event.key)
+            self._cameras.placements = self._cameras.placements.refused(event.key)
             again = event.settings is not None
-        else:
-            self._cameras.task = task
         self.send_placements([event.key] if again else [])
 
     def close(self) -> None:

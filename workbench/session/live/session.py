@@ -264,7 +264,7 @@ class Session:
             solve=self.solver.view(env),
         )
         recording = replace(self._recorder.status(), saving=self.past_saver.status(_shown(self._run)))
-        return replace(view, recording=recording, studio=self.studio.view(view.step, env))
+        return replace(view, recording=recording, studio=self.studio.view())
 
     def env_rows(self) -> EnvRows | None:
         """See `Run.env_rows`."""
@@ -478,7 +478,7 @@ class Session:
             case _:
                 self._happen(event)
                 if isinstance(event, Placed):
-                    self.studio.placed(event, self._run.task)
+                    self.studio.placed(event)
                 if isinstance(event, LoadFailed) and not event.at_run:
                     self.studio.failed_to_load()
         return True
