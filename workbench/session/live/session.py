@@ -23,8 +23,9 @@ from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.policy import NoPolicy, PolicyFile, find_policy
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.machine.processes.watched_thread import listen, stop_listening
-from workbench.session.cameras.selection import KeptPlacements
-from workbench.session.cameras.studio import CameraStudio
+from workbench.session.cameras.state import KeptPlacements, first_studio, kept_placements, placed_cameras
+from workbench.session.cameras.state import view_of as studio_view_of
+from workbench.session.cameras.studio import StudioJobs
 from workbench.session.checks.checks import Checks
 from workbench.session.checks.profile import StepProfiler
 from workbench.session.checks.solve_seeds import SeedsSolver
@@ -42,7 +43,6 @@ from workbench.session.protocol.messages import (
     Event,
     Loaded,
     LoadFailed,
-    Placed,
     PlanDropped,
     PlanWanted,
     Progress,
@@ -135,7 +135,8 @@ class Session:
         settings = Settings()
         if kept is not None:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
-        self._state = State(first_run(task, options, history_bytes, settings))
+        studio = first_studio(None if kept is None else kept.cameras)
+        self._state = State(first_run(task, options, history_bytes, settings), studio)
         self._changes = ChangeCounter()
         self._notify = self._changes.notify
         self._enter_numbers = itertools.count(1)
@@ -170,16 +171,7 @@ class Session:
         self.seeds_solver = SeedsSolver(self._notify, recordings)
         """Solves the task from many seeds."""
         self._asker = Asker(self._send)
-        self.studio = CameraStudio(
-            self._send,
-            self._asker,
-            self._background,
-            self._notify,
-            lambda: self._run,
-            self.open_file,
-            None if kept is None else kept.cameras,
-        )
-        """The camera studio."""
+        self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
         listen(self._log)
         self._watcher.follow(watched_files(self._run))
         self._worker.start()
@@ -187,7 +179,7 @@ class Session:
     # --- what happens ------------------------------------------------------------------------------
 
     def do(self, command: Command, page: str = "") -> None:
-        """Carry out a command of `run.DOES`.
+        """Carry out a command of `state.DOES`.
 
         Args:
             page: name of the page that asks.
@@ -232,6 +224,8 @@ class Session:
                 return self._aside.begin(partial(self._watcher.follow, files, texts))
             case FollowPolicy(policy=policy, folder=folder):
                 return self._aside.begin(partial(self._policy_file.follow, policy, folder))
+            case _:
+                self._studio.perform(effect)
         return None
 
     def _send(self, request: Request) -> None:
@@ -264,7 +258,8 @@ class Session:
             solve=self.solver.view(env),
         )
         recording = replace(self._recorder.status(), saving=self.past_saver.status(_shown(self._run)))
-        return replace(view, recording=recording, studio=self.studio.view())
+        studio = studio_view_of(self._state.studio, self._run, self._studio.progress)
+        return replace(view, recording=recording, studio=studio)
 
     def env_rows(self) -> EnvRows | None:
         """See `Run.env_rows`."""
@@ -278,7 +273,7 @@ class Session:
     def kept_work(self) -> KeptWork:
         """What a person did in this session, for a later session of the same task."""
         run = self._run
-        return KeptWork(run.options, run.settings, run.seed, self.studio.kept_placements())
+        return KeptWork(run.options, run.settings, run.seed, kept_placements(self._state.studio))
 
     @property
     def task_folder(self) -> Path | None:
@@ -359,7 +354,7 @@ class Session:
         Args:
             before: record the episode before that one.
         """
-        what = request_of(self._run, env_idx, self.studio.placed_cameras(), before)
+        what = request_of(self._run, env_idx, placed_cameras(self._state.studio), before)
         if isinstance(what, str):
             self.past_saver.refuse(what, _shown(self._run))
         else:
@@ -408,7 +403,7 @@ class Session:
         self.profiler.close()
         self.solver.close()
         self.seeds_solver.close()
-        self.studio.close()
+        self._studio.close()
         self.past_saver.close()
         self._background.close()
         self._recorder.close()
@@ -445,7 +440,6 @@ class Session:
         if death.end is not End.HANDED_OVER:
             self._recorder.stop()
         self.solver.stop()
-        self.studio.interrupted()
         before = self._run.problem_serial
         self._happen(WorkerDied(death, self._printed.tail(20)))
         run = self._run
@@ -477,10 +471,6 @@ class Session:
                 self.solver.stop()
             case _:
                 self._happen(event)
-                if isinstance(event, Placed):
-                    self.studio.placed(event)
-                if isinstance(event, LoadFailed) and not event.at_run:
-                    self.studio.failed_to_load()
         return True
 
     def _on_loaded(self, event: Loaded, on_disk: bool) -> None:
@@ -504,7 +494,6 @@ class Session:
         run = self._run
         load = run.running_load()
         assert run.task is not None and load is not None
-        placed = self.studio.loaded(run.task, level)
         if rescored is not None:
             self.rescorer.rescore(load, rescored)
         elif what_to_do == "forget":
@@ -513,7 +502,6 @@ class Session:
         self.checks.loaded(load, before.task is not None and before.task.env_id == run.task.env_id)
         self.profiler.loaded()
         self.seeds_solver.loaded()
-        self.studio.send_placements(placed)
         if recording:
             put_back = past != "gone" or (event.reload is not None and bool(event.reload.carried))
             self._continue_recording(put_back, recording, one_each)
@@ -542,7 +530,6 @@ class Session:
         self.solver.stop()
         self.rescorer.stop(StoppedBy.SAVE)
         self.checks.stop(StoppedBy.SAVE)
-        self.studio.interrupted()
         self._happen(FileSaved())
 
     def _on_policy_saved(self) -> None:

@@ -22,7 +22,16 @@ from workbench.session.protocol.messages import (
     Tell,
     Told,
 )
-from workbench.session.run.asked import change_settings, do_command, draw_past, enter, reset, show, show_live
+from workbench.session.run.asked import (
+    DOES,
+    change_settings,
+    do_command,
+    draw_past,
+    enter,
+    reset,
+    show,
+    show_live,
+)
 from workbench.session.run.events import (
     ActionTold,
     EnvsReset,
@@ -38,7 +47,6 @@ from workbench.session.run.events import (
     PagesCounted,
     PastPicturesWanted,
     PolicySaved,
-    RunEvent,
     RunToEnter,
     Send,
     SettingsChanged,
@@ -59,7 +67,7 @@ from workbench.session.run.loading import (
 from workbench.session.run.run import Change, Run, at_rest, new_pictures, with_problem
 
 
-def apply(run: Run, event: RunEvent, now: Now) -> Change:
+def apply(run: Run, event: object, now: Now) -> Change:
     """The run after an event, and what has to be done.
 
     Only the history is written into in place (see `Past.history`): all else is in the value.
@@ -68,7 +76,7 @@ def apply(run: Run, event: RunEvent, now: Now) -> Change:
         Refused: the command makes no sense now; nothing has changed.
     """
     match event:
-        case Asked(command=command):
+        case Asked(command=command) if type(command) in DOES:
             return do_command(run, command)
         case VersionLoaded():
             return loaded(run, event.loaded, event.on_disk, now)

@@ -30,9 +30,10 @@ from workbench.commands.page import (
 from workbench.commands.recording import ToggleRecording, ToggleSavePast
 from workbench.commands.timeline import Seek
 from workbench.machine.kept_choices import close_hints
+from workbench.session.cameras.events import CameraChosen
+from workbench.session.live import state
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run import asked
 from workbench.session.run.events import PagesCounted
 from workbench.ui.app.marks import EPISODES, STUDIO, Marks
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
@@ -182,7 +183,7 @@ class Page:
         self._frustums = CameraFrustums(server)
         self._forces = ForceArrows(server)
         self._parts.add(TaskCommands(server, visitors))
-        kinds = DOES | asked.DOES | self._parts.does | also
+        kinds = DOES | state.DOES | self._parts.does | also
         register(server, visitors, kinds, "live page")
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", rows=key_rows(kinds)))
@@ -319,12 +320,12 @@ class Page:
             case ToggleSavePast():
                 self._record.save()
             case SelectCamera():
-                self._parts.do(command, visitor)
+                session.do(command, visitor.name)
                 self._open_tabs.open(visitor, STUDIO)
             case CloseDialog():
                 if self._opening is not None:
                     self._opening.close()
-            case _ if type(command) in asked.DOES:
+            case _ if type(command) in state.DOES:
                 session.do(command, visitor.name)
             case _ if isinstance(command, CamerasPanel.does):
                 self._cameras.do(command, visitor)
@@ -442,7 +443,7 @@ class Page:
             return
         ray = np.array(event.ray_origin), np.array(event.ray_direction)
         if (camera := self._frustums.under_ray(*ray)) is not None:
-            self._session.studio.select(camera)
+            self._session.happen(CameraChosen(camera))
             return
         if self._view_panel.only_selected:
             return

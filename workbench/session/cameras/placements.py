@@ -1,21 +1,16 @@
-"""Cameras of the running version, their placements with undo, and the selected one."""
+"""Placements of cameras, with undo and redo."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from workbench.authoring.camera_source import calibration_files
-from workbench.core.camera_data import NOT_ON_THE_GPU, CameraInfo, CameraKey, CameraSettings, differences
-from workbench.core.cameras.conventions import axes_of, pose_in_env
-from workbench.core.env.step_result import StepResult
-from workbench.jobs.task import TaskDescription
-from workbench.session.cameras.view import StudioCamera
-from workbench.session.run.run import Run
+from workbench.core.camera_data import CameraKey, CameraSettings, differences
+from workbench.core.cameras.conventions import axes_of
 
 _MOST_STEPS = 500
 NEAREST_TARGET, FARTHEST_TARGET, USUAL = 0.1, 3.0, 1.0
@@ -223,121 +218,3 @@ def usual_distance(pose: ArrayLike) -> float:
     forward = axes_of(p[3:])[0]
     distance = -float(p[2] / forward[2]) if abs(forward[2]) >= 1e-6 else USUAL
     return distance if NEAREST_TARGET <= distance <= FARTHEST_TARGET else USUAL
-
-
-def shown_step(run: Run) -> StepResult | None:
-    """The step of the shown moment; None before a task is loaded."""
-    shown = None if run.past is None else run.past.shown
-    return run.step if shown is None else shown.step
-
-
-@dataclass(frozen=True)
-class KeptPlacements:
-    """Placements with their steps of undo, and the selected camera, for a later session of the same task."""
-
-    placements: Placements
-    selected: CameraKey | None
-
-
-class StudioCameras:
-    """The cameras, placements and selection that all parts of the studio share. Used on the loop.
-
-    Args:
-        run: returns the present run.
-        kept: of an earlier session of the task.
-    """
-
-    def __init__(self, run: Callable[[], Run], kept: KeptPlacements | None = None) -> None:
-        self._run = run
-        self.selected: CameraKey | None = None
-        self.was_chosen = False
-        """Whether a camera, or none, was chosen."""
-        self.placements = Placements() if kept is None else kept.placements
-        self._select_when_loaded = None if kept is None else kept.selected
-        self.problem = ""
-        """Message about the last failure."""
-
-    @property
-    def task(self) -> TaskDescription | None:
-        return self._run().task
-
-    def kept(self) -> KeptPlacements:
-        """Placements, steps of undo and the selected camera, for a later session of this task."""
-        return KeptPlacements(self.placements, self.selected or self._select_when_loaded)
-
-    def select_again(self) -> None:
-        """Select again, after a load, the camera that was selected in the earlier session; none if the camera is gone."""
-        before, self._select_when_loaded = self._select_when_loaded, None
-        self.selected = self.selected or before
-        if self.selected is not None and self.info(self.selected) is None:
-            self.selected = None
-
-    def info(self, key: CameraKey) -> CameraInfo | None:
-        return None if self.task is None else self.task.camera(key)
-
-    def selected_camera(self) -> StudioCamera | None:
-        """The selected camera, if any, for a new request; clears `problem`."""
-        info = None if self.selected is None else self.info(self.selected)
-        self.problem = ""
-        return None if info is None else self._studio_camera(info)
-
-    def refusal(self, key: CameraKey) -> str | None:
-        """Why a camera cannot be placed; None if it can."""
-        info = self.info(key)
-        if info is None:
-            return f"there is no {key[0]} camera {key[1]}"
-        if self.task is not None and self.task.backend == "gpu":
-            return NOT_ON_THE_GPU
-        if info.settings is None:
-            return "its pose is invalid, or its lens differs between envs, so it cannot have one placement"
-        return None
-
-    def mount_pose(self, info: CameraInfo) -> NDArray[np.float32] | None:
-        """(7,) pose of the camera's mount in the env's frame, at the shown moment; None without one."""
-        run = self._run()
-        step, env = shown_step(run), run.env
-        if info.mount is None or run.task is None or step is None:
-            return None
-        names = run.task.geometry.body_names
-        if info.mount not in names or step.poses.shape[1] != len(names) or env >= len(step.poses):
-            return None  # the step is of another version
-        return step.poses[env, names.index(info.mount)]
-
-    def in_file(self) -> dict[CameraKey, CameraSettings]:
-        """Settings of the loaded version. A camera without a target in the file keeps the distance of the one that it had, or
-        gets the default."""
-        return {
-            info.key: settings if settings.distance else replace(settings, distance=self._distance(info))
-            for info in (() if self.task is None else self.task.cameras)
-            if (settings := info.settings) is not None
-        }
-
-    def _distance(self, info: CameraInfo) -> float | None:
-        """Metres from a camera without a target in the file to its target; None if the pose of its mount is unknown."""
-        now, mount = self.placements.now(info.key), self.mount_pose(info)
-        if now is not None and now.distance is not None:
-            return now.distance
-        if info.settings is None or (mount is None) != (info.mount is None):
-            return None
-        return usual_distance(pose_in_env(info.settings, mount))
-
-    def all_cameras(self) -> tuple[StudioCamera, ...]:
-        """All cameras, at the shown moment."""
-        return () if self.task is None else tuple(self._studio_camera(info) for info in self.task.cameras)
-
-    def _studio_camera(self, info: CameraInfo) -> StudioCamera:
-        return StudioCamera(
-            key=info.key,
-            info=info,
-            now=self.placements.now(info.key),
-            moved=info.key in self.placements.placed,
-            mount_pose=self.mount_pose(info),
-            refused=self.refusal(info.key) or "",
-        )
-
-    def to_export(self, key: CameraKey) -> calibration_files.CameraToExport:
-        """A camera as placed, for export. Raises ValueError if there is none, with a message for the reader."""
-        info, now = self.info(key), self.placements.now(key)
-        if info is None or now is None:
-            raise ValueError(f"there is no {key[0]} camera {key[1]} whose settings are known")
-        return calibration_files.CameraToExport(key, now, info.mount, self.mount_pose(info))
