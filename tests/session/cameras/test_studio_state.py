@@ -140,9 +140,8 @@ events: st.SearchStrategy[object] = st.one_of(
     st.builds(of.ComparisonWanted, settings),
     st.sampled_from([of.SheetWanted(), of.PreviewWanted(), of.Measuring(True), of.Measuring(False)]),
     st.builds(of.PreviewDrawn, pictures),
-    st.sampled_from(
-        [of.PreviewFailed, of.ReportFailed, of.NewCameraFailed, of.EditFailed, of.FileNotChanged]
-    ).flatmap(lambda kind: words.map(kind)),
+    st.sampled_from([of.EditFailed, of.FileNotChanged]).flatmap(lambda kind: words.map(kind)),
+    st.builds(of.WorkFailed, st.sampled_from(["live", "preview", "new camera"]), words),  # type: ignore[arg-type]
     st.builds(of.ReportMade, st.just(report), keys, settings, st.integers(0, 2), st.just(())),
     st.lists(settings, max_size=2).map(lambda all: of.SuggestionsFound(tuple(map(offered, all)), ("cube",))),
     st.builds(of.PicturesCompared, pictures, pictures),

@@ -25,6 +25,10 @@ Triple = tuple[float, float, float]
 Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]
 """What a camera is measured on: the env; the poses (B, 7) of its bodies, None for now; the moment of the history."""
 
+Lane = Literal["live", "background", "preview", "new camera"]
+"""Each has one job at a time; a new one replaces it. ``live`` measures by the worker that plays, ``background`` by the
+background process."""
+
 # --- what a page asks for, beside commands -------------------------------------------------------
 
 
@@ -103,11 +107,6 @@ class PreviewDrawn:
 
 
 @dataclass(frozen=True)
-class PreviewFailed:
-    why: str
-
-
-@dataclass(frozen=True)
 class ReportMade:
     """A report over the cases measured so far."""
 
@@ -150,9 +149,10 @@ class PixelPicked:
 
 
 @dataclass(frozen=True)
-class ReportFailed:
-    """A measurement, search or comparison failed."""
+class WorkFailed:
+    """The job of a lane failed."""
 
+    lane: Lane
     why: str
 
 
@@ -170,13 +170,6 @@ class NewCameraDrawn:
 
     request: EditRequest
     picture: Picture | None
-
-
-@dataclass(frozen=True)
-class NewCameraFailed:
-    """The preview of a camera that is to be added could not be drawn."""
-
-    why: str
 
 
 @dataclass(frozen=True)
@@ -220,17 +213,15 @@ StudioEvent = (
     | SheetWanted
     | EditWanted
     | PreviewDrawn
-    | PreviewFailed
     | ReportMade
     | Measuring
     | SuggestionsFound
     | PicturesCompared
     | SheetPictureDrawn
     | PixelPicked
-    | ReportFailed
+    | WorkFailed
     | PlanFound
     | NewCameraDrawn
-    | NewCameraFailed
     | FileChanged
     | FileNotChanged
     | TaskCopied
@@ -239,10 +230,6 @@ StudioEvent = (
 )
 
 # --- effects ---------------------------------------------------------------------------------------
-
-Lane = Literal["live", "background", "preview", "new camera"]
-"""Each has one job at a time; a new one replaces it. ``live`` measures by the worker that plays, ``background`` by the
-background process."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,6 @@ from workbench.session.cameras.events import (
     FileNotChanged,
     FindPlan,
     NewCameraDrawn,
-    NewCameraFailed,
     PlanFound,
     StopJobs,
     StudioClosed,
@@ -91,8 +90,6 @@ def apply_to_edits(studio: Studio, event: object, run: Run) -> Change:
         case NewCameraDrawn(request=request, picture=picture) if request == studio.edits.shown.request:
             shown = replace(studio.edits.shown, picture=picture, drawing=False)
             return with_edits(studio, shown=shown), []
-        case NewCameraFailed(why=why):
-            return replace(studio, problem=f"There is no picture of the new camera: {why}."), []
         case FileChanged():
             return _ended(studio, run)
         case FileNotChanged(reason=reason):

@@ -25,7 +25,6 @@ from workbench.session.cameras.events import (
     Pick,
     PicturesCompared,
     PixelPicked,
-    ReportFailed,
     ReportMade,
     SheetPictureDrawn,
     SheetWanted,
@@ -101,9 +100,6 @@ def apply_to_reports(studio: Studio, event: object, run: Run) -> Change:
             return with_results(studio, sheet=(*studio.results.sheet, picture)), []
         case PixelPicked(picked=picked):
             return with_results(studio, picked=picked), []
-        case ReportFailed(why=why):
-            problem = f"{why[:1].upper()}{why[1:]}" + ("" if why.endswith(".") else ".")
-            return with_results(studio, problem=problem), []
     return studio, []
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import get_args
 
 from workbench.commands.cameras import (
     CopyTask,
@@ -35,17 +36,15 @@ from workbench.session.cameras.events import (
     Lane,
     MeasureLive,
     MeasureSeeds,
-    NewCameraFailed,
     Pick,
     PreviewDrawn,
-    PreviewFailed,
     PreviewWanted,
-    ReportFailed,
     StopJobs,
     StopQuestion,
     StudioEffect,
     StudioEvent,
     Suggest,
+    WorkFailed,
 )
 from workbench.session.cameras.file_edits import (
     FileEdits,
@@ -63,6 +62,7 @@ from workbench.session.cameras.reports import (
     apply_to_reports,
     do_report,
     outdated,
+    with_results,
 )
 from workbench.session.cameras.state import (
     Change,
@@ -120,9 +120,8 @@ def apply(studio: Studio, event: object, run: Run, now: Now) -> Change:
             return _draw_preview(studio, run)
         case PreviewDrawn(picture=picture):
             return replace(studio, preview=picture, drawing=False), []
-        case PreviewFailed(why=why):
-            # The last preview stays; the next change draws again.
-            return replace(studio, preview_problem=f"The preview failed: {why}.", drawing=False), []
+        case WorkFailed(lane=lane, why=why):
+            return _failed(studio, lane, why), []
         case VersionLoaded():
             report = event.loaded.reload
             return _loaded(
@@ -279,6 +278,18 @@ def _placed(studio: Studio, event: Placed) -> Change:
     return (studio, []) if event.settings is None else _send(studio, event.key)
 
 
+def _failed(studio: Studio, lane: Lane, why: str) -> Studio:
+    match lane:
+        case "preview":
+            # The last preview stays; the next change draws again.
+            return replace(studio, preview_problem=f"The preview failed: {why}.", drawing=False)
+        case "new camera":
+            return replace(studio, problem=f"There is no picture of the new camera: {why}.")
+        case _:
+            problem = f"{why[:1].upper()}{why[1:]}" + ("" if why.endswith(".") else ".")
+            return with_results(studio, problem=problem)
+
+
 class StudioJobs:
     """Does the work of the studio. Used on the loop.
 
@@ -302,10 +313,8 @@ class StudioJobs:
         self._asker, self._happen = asker, happen
         self._file, self._reports = FileEdits(asker, happen), CameraReports(asker, background, happen)
         self._lanes: dict[Lane, Jobs] = {
-            "live": Jobs(on_change, lambda failure: happen(ReportFailed(str(failure)))),
-            "background": Jobs(on_change, lambda failure: happen(ReportFailed(str(failure)))),
-            "preview": Jobs(on_change, lambda failure: happen(PreviewFailed(str(failure)))),
-            "new camera": Jobs(on_change, lambda failure: happen(NewCameraFailed(str(failure)))),
+            lane: Jobs(on_change, lambda failure, lane=lane: happen(WorkFailed(lane, str(failure))))
+            for lane in get_args(Lane)
         }
 
     @property

@@ -23,7 +23,7 @@ class State:
     """One moment of a session. Parts that an event did not change are the same objects."""
 
     run: Run
-    studio: Studio = Studio()
+    studio: Studio
 
 
 def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
