@@ -39,7 +39,7 @@ from workbench.session.cameras.view import EditRequest, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.events import EnvsReset, MomentShown, PagesCounted
+from workbench.session.run.events import EnvsReset, FileOpened, MomentShown, PagesCounted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -98,7 +98,7 @@ def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
     task_file.write_text(text.replace("512", "64"))
     session.do(PutMovedCamerasBack())
     session.happen(PagesCounted(1))
-    session.open_file(task_file, "PushCubeEnv")
+    session.happen(FileOpened(task_file, "PushCubeEnv"))
     wait_until(session, lambda view: view.task.file == str(task_file), "the example")
     session.change(cameras=(CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")))
     return session

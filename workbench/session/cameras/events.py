@@ -103,6 +103,8 @@ class EditWanted:
 
 @dataclass(frozen=True)
 class PreviewDrawn:
+    """The preview that was asked for last."""
+
     picture: Picture
 
 
@@ -128,23 +130,31 @@ class Measuring:
 
 @dataclass(frozen=True)
 class SuggestionsFound:
+    """Placements that see these objects, best first."""
+
     found: tuple[OfferedPlacement, ...]
     objects: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class PicturesCompared:
+    """The shown env by a camera as placed, and with other settings."""
+
     now: Picture
     other: Picture
 
 
 @dataclass(frozen=True)
 class SheetPictureDrawn:
+    """The next picture of the sheet."""
+
     picture: Picture
 
 
 @dataclass(frozen=True)
 class PixelPicked:
+    """What a probed pixel shows."""
+
     picked: PickedPixel
 
 
@@ -246,6 +256,8 @@ class StopQuestion:
 
 @dataclass(frozen=True)
 class DrawPreview:
+    """Draw the selected camera in another size."""
+
     question: DrawCamera
 
 

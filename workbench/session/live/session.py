@@ -57,7 +57,6 @@ from workbench.session.rescore.background import StoppedBy
 from workbench.session.rescore.past import PastRescorer, RescoredPast, rescore_after_load
 from workbench.session.run.events import (
     EnvsReset,
-    FileOpened,
     FileSaved,
     Follow,
     FollowPolicy,
@@ -305,10 +304,6 @@ class Session:
     def change(self, **settings: Any) -> None:
         """Change fields of `Settings`."""
         self.happen(SettingsChanged(settings))
-
-    def open_file(self, file: Path, class_name: str) -> None:
-        """Open a task class of another file instead, and watch that file."""
-        self.happen(FileOpened(file, class_name))
 
     @on_loop
     def clear_printed(self) -> None:
