@@ -51,6 +51,7 @@ FILE = "/home/me/push.py"
 SETTINGS = CameraSettings((0.4, 0.0, 0.6), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")
 EDIT = SourceEdit(FILE, "old", "new", (), SETTINGS)
 NOTHING: CameraKey = ("sensor", "nothing")
+ODD: CameraKey = ("sensor", "odd")
 Happens = tuple[object, int, float]
 """An event, the run that it meets, and seconds since the event before."""
 
@@ -98,7 +99,7 @@ def requests(keys: st.SearchStrategy[CameraKey]) -> st.SearchStrategy[EditReques
     )
 
 
-keys = st.sampled_from([BASE, PEOPLE, ("sensor", "odd"), NOTHING])
+keys: st.SearchStrategy[CameraKey] = st.sampled_from([BASE, PEOPLE, ODD, NOTHING])
 heights = st.integers(0, 4).map(lambda height: replace(SETTINGS, position=(0.4, 0.0, height / 4)))
 settings = st.one_of(heights, st.sampled_from([replace(SETTINGS, near=math.nan), SETTINGS]))
 pictures = keys.map(lambda key: Picture(key[1], key[0], 0, np.zeros(7, np.float32)))
