@@ -28,6 +28,7 @@ from tests.benchmarks.reload import cold_restart
 from tests.drive.page import TASK
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
+from workbench.session.cameras.events import CameraPlaced
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
 from workbench.session.run.events import PagesCounted
@@ -78,7 +79,7 @@ def main(options: Options) -> None:
             for k in range(options.placements):
                 time.sleep(0.1)
                 began = time.perf_counter()
-                session.studio.place(BASE, at(start, k))
+                session.happen(CameraPlaced(BASE, at(start, k)))
                 wait(session, at(start, k))
                 single.append(time.perf_counter() - began)
             first = session.view().pictures_serial
@@ -86,7 +87,7 @@ def main(options: Options) -> None:
             began = time.perf_counter()
             for k in range(count):
                 time.sleep(max(0.0, began + k / RATE - time.perf_counter()))
-                session.studio.place(BASE, at(start, 100 + k), control=1)
+                session.happen(CameraPlaced(BASE, at(start, 100 + k), control=1))
             last = time.perf_counter()
             wait(session, at(start, 100 + count - 1))
             lag = time.perf_counter() - last

@@ -38,7 +38,7 @@ class _Asked:
 
 
 class HandedSession:
-    """Shows the view that it was handed, and notes what it is asked: ``Step()``, ``("studio.select", key)``."""
+    """Shows the view that it was handed, and notes what it is asked: ``Step()``, ``("stop_recording",)``."""
 
     def __init__(self) -> None:
         self.shown = EMPTY

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from workbench.commands.solve import SaveSolved
 from workbench.commands.timeline import StopRescoring
 from workbench.jobs.record.gather import Finished
 from workbench.jobs.task import TaskOptions
+from workbench.session.cameras.state import first_studio
 from workbench.session.events import Asked
 from workbench.session.live.solver import Episode, Solving
 from workbench.session.live.state import Effect, SessionEvent, State, apply
@@ -140,7 +140,7 @@ EVENTS = st.one_of(
 
 def first() -> State:
     run = first_run("push.py", TaskOptions(ENVS), 2**20, Settings())
-    return State(run, Recording(str(Path("recordings"))))
+    return State(run, Recording("recordings"), first_studio(None))
 
 
 Passed = tuple[State, SessionEvent, State, list[Effect]]

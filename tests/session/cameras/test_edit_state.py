@@ -13,9 +13,16 @@ import pytest
 
 from tests.drive.session import BASE, camera, in_studio, step, wait_until
 from workbench.authoring.camera_source.disk import SourceEdit
+from workbench.commands.cameras import (
+    DropCameraChange,
+    PutMovedCamerasBack,
+    RevertCameraChange,
+    SaveCameraChange,
+)
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
 from workbench.session.cameras import file_edits
+from workbench.session.cameras.events import CameraPlaced, EditWanted
 from workbench.session.cameras.view import EditRequest, EditState
 from workbench.session.live.session import Session
 
@@ -60,7 +67,7 @@ def planned(session: Session) -> EditState:
 
 def written(session: Session, stage: str = "checked") -> EditState:
     planned(session)
-    session.studio.file.write()
+    session.do(SaveCameraChange())
     ended = ("checked", "mismatch", "refused")
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ended), "the check")
     assert view.studio.edit_state.stage == stage, view.studio.edit_state.message
@@ -85,10 +92,10 @@ def test_while_the_disk_hangs_under_an_edit_the_session_answers(
         apply(edit)
 
     monkeypatch.setattr(file_edits, "apply", slowly)
-    session.studio.place(BASE, replace(there(session, BASE), fov=1.05))
-    session.studio.file.plan(EditRequest("edit", BASE))
+    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=1.05)))
+    session.happen(EditWanted(EditRequest("edit", BASE)))
     planned(session)
-    session.studio.file.write()
+    session.do(SaveCameraChange())
     try:
         assert hangs.wait(60)
         step(session)
@@ -97,7 +104,7 @@ def test_while_the_disk_hangs_under_an_edit_the_session_answers(
         goes_on.set()
     wait_until(session, in_studio(lambda s: s.edit_state.stage == "checked"), "the check")
     assert "1.05" in task_file.read_text()
-    session.studio.file.undo_write()
+    session.do(RevertCameraChange())
     wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
@@ -109,19 +116,19 @@ def test_while_the_disk_hangs_under_an_edit_the_session_answers(
 def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_between(
     session: Session, task_file: Path
 ) -> None:
-    studio, texts = session.studio, [task_file.read_text()]
+    texts = [task_file.read_text()]
     for fov in (0.9, 0.95):
-        studio.place(BASE, replace(there(session, BASE), fov=fov))
-        studio.file.plan(EditRequest("edit", BASE))
+        session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=fov)))
+        session.happen(EditWanted(EditRequest("edit", BASE)))
         written(session)
         texts.append(task_file.read_text())
-    studio.file.plan(EditRequest("remove", BASE))
+    session.happen(EditWanted(EditRequest("remove", BASE)))
     planned(session)
-    studio.file.drop_plan()
+    session.do(DropCameraChange())
     wait_until(
         session, in_studio(lambda s: s.edit_state.stage == "checked"), "the change that can be taken back"
     )
-    studio.file.undo_write()
+    session.do(RevertCameraChange())
     view = wait_until(
         session, in_studio(lambda s: "Before it: base_camera" in s.edit_state.message), "the change before it"
     )
@@ -129,31 +136,31 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
     assert view.studio.edit_state.stage == "checked"
     assert view.studio.edit_state.message.startswith(f"Edit reverted in {task_file.name}.")
     assert task_file.read_text() == texts[1]
-    studio.file.undo_write()
+    session.do(RevertCameraChange())
     wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
         "the file of before",
     )
     assert task_file.read_text() == texts[0]
-    studio.file.drop_plan()
+    session.do(DropCameraChange())
     wait_until(session, in_studio(lambda s: s.edit_state.stage == "none"), "nothing left")
-    studio.back_to_file(BASE)
+    session.do(PutMovedCamerasBack())
 
 
 @pytest.mark.slow
 def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session, task_file: Path) -> None:
-    studio, before = session.studio, task_file.read_text()
-    studio.place(BASE, replace(there(session, BASE), fov=0.9))
-    studio.file.plan(EditRequest("edit", BASE))
+    before = task_file.read_text()
+    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=0.9)))
+    session.happen(EditWanted(EditRequest("edit", BASE)))
     written(session)
     edited = task_file.read_text() + "# more\n"
     task_file.write_text(edited)
-    studio.file.undo_write()
+    session.do(RevertCameraChange())
     view = wait_until(session, in_studio(lambda s: s.edit_state.message.startswith("Not done")), "why not")
     assert "was edited since" in view.studio.edit_state.message and view.studio.edit_state.stage == "checked"
     assert task_file.read_text() == edited
-    studio.file.drop_plan()
+    session.do(DropCameraChange())
     task_file.write_text(before)
     wait_until(session, lambda v: v.studio.camera(BASE).info.settings.fov == 1.0, "the file of before")
 
@@ -161,24 +168,24 @@ def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session
 def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
     session: Session, task_file: Path
 ) -> None:
-    studio, before = session.studio, task_file.read_text()
-    studio.place(BASE, replace(there(session, BASE), fov=0.7))
-    studio.file.plan(EditRequest("edit", BASE))
+    before = task_file.read_text()
+    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=0.7)))
+    session.happen(EditWanted(EditRequest("edit", BASE)))
     message = written(session, "mismatch").message
     assert (
         "base_camera is not what was written (fov: 0.8, not 0.7)" in message
         and "Revert the change" in message
     )
     assert "fov=0.7" in task_file.read_text() and there(session, BASE).fov == 0.8
-    studio.file.undo_write()
+    session.do(RevertCameraChange())
     wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and not s.edit_state.loading),
         "the file of before",
     )
     assert task_file.read_text() == before
-    studio.back_to_file(BASE)
-    studio.file.drop_plan()
+    session.do(PutMovedCamerasBack())
+    session.do(DropCameraChange())
 
 
 @pytest.mark.parametrize(
@@ -188,28 +195,28 @@ def test_a_change_that_the_hook_itself_makes_another_of_is_refused_before_it_is_
     session: Session, task_file: Path, fov: float, why: str
 ) -> None:
     before = task_file.read_text()
-    session.studio.place(BASE, replace(there(session, BASE), fov=fov))
-    session.studio.file.plan(EditRequest("edit", BASE))
+    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=fov)))
+    session.happen(EditWanted(EditRequest("edit", BASE)))
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage == "refused"), "the refusal")
     assert why in view.studio.edit_state.message and f"fov={fov}" in view.studio.edit_state.snippet
     assert task_file.read_text() == before and there(session, BASE).fov == 1.0
-    session.studio.file.drop_plan()
-    session.studio.back_to_file(BASE)
+    session.do(DropCameraChange())
+    session.do(PutMovedCamerasBack())
 
 
 @pytest.mark.slow
 def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
     session: Session, task_file: Path
 ) -> None:
-    studio, before = session.studio, task_file.read_text()
-    studio.place(BASE, replace(there(session, BASE), fov=0.4))
-    studio.file.plan(EditRequest("edit", BASE))
+    before = task_file.read_text()
+    session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=0.4)))
+    session.happen(EditWanted(EditRequest("edit", BASE)))
     planned(session)
-    studio.file.write()
+    session.do(SaveCameraChange())
     view = wait_until(session, in_studio(lambda s: "does not load" in s.edit_state.message), "the failure")
     assert "revert it if that is the reason" in view.studio.edit_state.message
     assert view.problem is not None and "too narrow" in view.problem.message
     assert there(session, BASE).fov == 1.0, "the version before goes on"
-    studio.file.undo_write()
+    session.do(RevertCameraChange())
     wait_until(session, lambda v: v.problem is None and v.studio.edit_state.stage == "undone", "it back")
     assert task_file.read_text() == before

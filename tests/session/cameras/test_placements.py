@@ -8,19 +8,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests.drive.session import BASE, Told, camera, moved, told_session
 from tests.drive.waiting import until
 from tests.ui.scenes import camera as scene_camera
+from workbench.commands.cameras import PickPixel, PutMovedCamerasBack, RedoCamera, ScalePreview, UndoCamera
+from workbench.commands.command import Refused
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.conventions import LookAt, pose_from_look_at, target_of, with_pose
 from workbench.machine.processes.wire import Call
-from workbench.session.cameras import selection
+from workbench.session.cameras.events import CameraChosen, CameraPlaced, EditWanted, PreviewWanted
+from workbench.session.cameras.placements import Placements
 from workbench.session.cameras.view import EditRequest
 from workbench.session.protocol.messages import PlaceCamera, Placed
 from workbench.session.protocol.questions import RunCameras
@@ -49,7 +53,6 @@ def loaded(
     info = replace(scene_camera(), settings=settings, mount=mount)
     told.load(level, cameras=() if settings is None else (info,), source_hash=str(settings))
     told.reset()
-    told.view  # noqa: B018  (as a page draws it)
 
 
 @pytest.fixture
@@ -70,29 +73,21 @@ def looks_at(told: Told) -> object:
 
 
 def test_what_is_placed_is_asked_of_the_worker_and_what_stands_so_already_is_not(one: Told) -> None:
-    studio = one.session.studio
-    studio.place(BASE, MOVED)
-    studio.place(BASE, MOVED)
-    assert one.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)] == list(studio.placed_cameras())
+    session = one.session
+    session.happen(CameraPlaced(BASE, MOVED))
+    session.happen(CameraPlaced(BASE, MOVED))
+    assert one.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)]
     assert moved(one.view) == {BASE} and now(one) == MOVED
-    for do, settings in (
-        (studio.undo, None),
-        (studio.redo, MOVED),
-        (lambda: studio.back_to_file(BASE), None),
-    ):
-        do()
+    for command, settings in ((UndoCamera(), None), (RedoCamera(), MOVED), (PutMovedCamerasBack(), None)):
+        session.do(command)
         assert one.asked(PlaceCamera) == [PlaceCamera(BASE, settings)]
-    studio.place(NOTHING, MOVED)
+    session.happen(CameraPlaced(NOTHING, MOVED))
     assert one.asked(PlaceCamera) == [] and "there is no sensor camera nothing" in one.view.studio.problem
-    with pytest.raises(ValueError, match="nothing"):
-        studio.import_pose(NOTHING, "", None, None)
-    with pytest.raises(ValueError, match="nothing"):
-        studio.export([BASE, NOTHING], "json")
 
 
 def test_one_that_could_not_be_placed_is_asked_for_where_it_stood_once_each_time(one: Told) -> None:
     for height in (0.7, 0.8):
-        one.session.studio.place(BASE, at(height))
+        one.session.happen(CameraPlaced(BASE, at(height)))
         one.asked(object)
         one.tell(Placed(BASE, at(height), None, why_not="it is far away"))
         assert (
@@ -106,11 +101,11 @@ def test_one_that_could_not_be_placed_is_asked_for_where_it_stood_once_each_time
 def test_placements_are_sent_again_to_each_version_and_worker_until_the_file_says_otherwise(
     one: Told,
 ) -> None:
-    studio = one.session.studio
-    studio.select(BASE)
-    studio.place(NOTHING, MOVED)
+    session = one.session
+    session.happen(CameraChosen(BASE))
+    session.happen(CameraPlaced(NOTHING, MOVED))
     assert one.view.studio.problem
-    studio.place(BASE, MOVED)
+    session.happen(CameraPlaced(BASE, MOVED))
     for level in ("patched", "rebuilt", None):
         one.asked(object)
         loaded(one, level=level)
@@ -119,7 +114,7 @@ def test_placements_are_sent_again_to_each_version_and_worker_until_the_file_say
     loaded(one, at(0.9), "cameras")
     assert one.asked(PlaceCamera) == [PlaceCamera(BASE, None)] and now(one) == at(0.9)
     assert "base_camera" in one.view.studio.problem
-    studio.undo()
+    session.do(UndoCamera())
     assert now(one) == MOVED
     kept = one.session.kept_work()
     loaded(one, None, "cameras")
@@ -133,54 +128,98 @@ def test_placements_are_sent_again_to_each_version_and_worker_until_the_file_say
 # --- undo ------------------------------------------------------------------------------------------------
 
 DRAG = object()
-A_STEP_EACH = [0.62, 0.61, 0.6]
-"""Heights of `FILE`, and of the first two of three placements."""
-
-
-@pytest.mark.parametrize(
-    ("calls", "heights"),
-    [
-        ([("key", 0.0, 1.2), ("key", 1.1, 1.2), ("key", 2.3, 1.2)], [0.6]),
-        ([("key", 0.0, 1.2), ("key", 1.3, 1.2), ("key", 2.6, 1.2)], A_STEP_EACH),
-        ([("key", 0.0, 1.2), ("position", 0.1, 1.2), ("key", 0.2, 1.2)], A_STEP_EACH),
-        ([(DRAG, 0.0, math.inf), (DRAG, 90.0, math.inf), (object(), 90.1, math.inf)], [0.62, 0.6]),
-        ([(None, 0.0, math.inf), (None, 0.0, math.inf), (None, 0.0, math.inf)], A_STEP_EACH),
-    ],
-    ids=["followed at once", "after a pause", "by turns", "a drag that rests", "nobody's"],
+ONE_CAMERA = Placements({BASE: FILE})
+Placing = tuple[int, object, float, float]
+"""Millimetres above the ground, the control, seconds since the call before, and the pause of the control."""
+CALLS = st.lists(
+    st.tuples(
+        st.integers(500, 520),
+        st.sampled_from([None, "key", DRAG]),
+        st.sampled_from([0.0, 1.1, 1.3, 90.0]),
+        st.sampled_from([1.2, math.inf]),
+    ),
+    max_size=12,
 )
-def test_what_one_hand_does_without_a_pause_is_one_step_of_undo(
-    one: Told, calls: list[tuple[object, float, float]], heights: list[float], monkeypatch: pytest.MonkeyPatch
+
+
+def placed(calls: list[Placing], first: Placements = ONE_CAMERA) -> Placements:
+    seconds, placements = 0.0, first
+    for height, control, after, pause in calls:
+        seconds += after
+        placements = placements.place(BASE, at(height / 1000), seconds, control, pause)
+    return placements
+
+
+@given(CALLS)
+def test_what_one_control_does_without_a_pause_is_one_step_of_undo(calls: list[Placing]) -> None:
+    before: list[float] = []  # heights to which undo goes
+    seconds, was, last, last_control = 0.0, 0.6, -math.inf, None
+    for height, control, after, pause in calls:
+        seconds += after
+        if height / 1000 == was:
+            continue
+        if control is None or control != last_control or seconds - last > pause:
+            before.append(was)
+        was, last, last_control = height / 1000, seconds, control
+    placements, undone = placed(calls), []
+    while placements.done:
+        placements = placements.undo()
+        undone.append(placements.now(BASE))
+    assert undone == [at(height) for height in reversed(before)]
+
+
+@given(CALLS, st.integers(0, 12))
+def test_undone_and_redone_every_step_is_where_it_was(calls: list[Placing], steps: int) -> None:
+    last = placements = placed(calls)
+    for _ in range(steps):
+        placements = placements.undo()
+    for _ in range(steps):
+        placements = placements.redo()
+    assert (placements.placed, placements.undone) == (last.placed, ())
+    for _ in calls:
+        placements = placements.undo()
+    assert placements.placed == {} and placements.now(BASE) == FILE and placements.done == ()
+    assert last == placed(calls), "no value is written into"
+
+
+@given(CALLS, st.integers(500, 520), st.booleans())
+def test_a_placement_stays_over_a_load_unless_the_file_says_otherwise_and_is_never_lost(
+    calls: list[Placing], height: int, own: bool
 ) -> None:
-    studio = one.session.studio
-    for height, (hand, seconds, pause) in zip((0.61, 0.62, 0.63), calls, strict=True):
-        monkeypatch.setattr(selection, "time", SimpleNamespace(monotonic=lambda seconds=seconds: seconds))
-        studio.place(BASE, at(height), hand, pause)
-    undone = []
-    while one.view.studio.undo is not None:
-        studio.undo()
-        undone.append(now(one).position[2])
-    assert undone == heights
+    before, in_file = placed(calls), {BASE: at(height / 1000)}
+    after, dropped = before.loaded(in_file, frozenset({BASE} if own else ()))
+    was = before.placed.get(BASE)
+    changed = was is not None and in_file[BASE] not in (FILE, was)
+    assert dropped == ((BASE,) if changed and not own else ())
+    if dropped:
+        assert after.now(BASE) == in_file[BASE] and after.undo().now(BASE) == was
+    else:
+        assert after.now(BASE) == (in_file[BASE] if was is None else was)
+    gone, _ = before.loaded({})
+    assert (gone.placed, gone.done, gone.undone) == ({}, (), ())
 
 
 def test_what_was_taken_back_can_be_made_again_until_something_else_is_done(one: Told) -> None:
-    studio = one.session.studio
+    session = one.session
 
     def labels() -> tuple[str | None, str | None]:
         return one.view.studio.undo, one.view.studio.redo
 
-    studio.undo()
-    studio.redo()
+    for command in (UndoCamera(), RedoCamera()):
+        with pytest.raises(Refused):
+            session.do(command)
     assert labels() == (None, None)
-    studio.place(BASE, at(0.7), DRAG)
+    session.happen(CameraPlaced(BASE, at(0.7), DRAG))
     assert labels() == ("moved base_camera", None)
-    studio.undo()
+    session.do(UndoCamera())
     assert labels() == (None, "moved base_camera") and now(one) == FILE
-    studio.redo()
-    studio.place(BASE, at(0.8), DRAG)
-    studio.undo()
+    session.do(RedoCamera())
+    session.happen(CameraPlaced(BASE, at(0.8), DRAG))
+    session.do(UndoCamera())
     assert now(one) == at(0.7), "what was made again is whole: no drag goes on from it"
-    studio.place(BASE, at(0.9))
-    studio.redo()
+    session.happen(CameraPlaced(BASE, at(0.9)))
+    with pytest.raises(Refused):
+        session.do(RedoCamera())
     assert now(one) == at(0.9) and labels() == ("moved base_camera", None)
 
 
@@ -194,17 +233,17 @@ def test_the_target_is_the_one_that_the_file_gives_and_follows_it(one: Told) -> 
 
 
 def test_moved_it_looks_as_far_as_it_did_and_back_in_its_place_at_what_the_file_gives(one: Told) -> None:
-    studio = one.session.studio
-    studio.place(BASE, replace(FILE, distance=0.2))
+    session = one.session
+    session.happen(CameraPlaced(BASE, replace(FILE, distance=0.2)))
     assert now(one).distance == 0.2 and not moved(one.view) and one.view.studio.undo is None, "no placement"
-    studio.place(BASE, FILE)
-    studio.place(BASE, MOVED)
+    session.happen(CameraPlaced(BASE, FILE))
+    session.happen(CameraPlaced(BASE, MOVED))
     assert looks_at(one) == (0.08, 0.3, 0.2)
-    studio.place(BASE, replace(MOVED, distance=2.0))
+    session.happen(CameraPlaced(BASE, replace(MOVED, distance=2.0)))
     assert now(one).distance == 2.0
-    studio.undo()
+    session.do(UndoCamera())
     assert looks_at(one) == TARGET and not moved(one.view), "no step of its own"
-    studio.redo()
+    session.do(RedoCamera())
     assert now(one).distance == 2.0, "as it was set there"
 
 
@@ -213,7 +252,7 @@ def test_without_a_target_in_the_file_it_looks_at_the_ground_and_moved_it_goes_o
 ) -> None:
     loaded(told, BARE)
     assert looks_at(told) == (-0.105, 0, 0)
-    told.session.studio.place(BASE, replace(now(told), position=(0.45, 0.0, 0.9)))
+    told.session.happen(CameraPlaced(BASE, replace(now(told), position=(0.45, 0.0, 0.9))))
     assert looks_at(told) == (-0.105, 0, 0.3)
     loaded(told, replace(BARE, position=(0.45, 0.0, 0.9)), "cameras")
     assert looks_at(told) == (-0.105, 0, 0.3) and not moved(told.view), (
@@ -260,7 +299,7 @@ def with_file(tmp_path: Path) -> Iterator[tuple[Told, Path]]:
 
 def asks(told: Told) -> Call:
     """A plan, for which the worker is asked what comes of it, and which waits for the answer."""
-    told.session.studio.file.plan(EditRequest("add", ("human", "side"), FILE))
+    told.session.happen(EditWanted(EditRequest("add", ("human", "side"), FILE)))
     found: list[Any] = []
 
     def asked() -> bool:
@@ -276,14 +315,14 @@ def test_the_end_of_a_session_ends_what_waits_for_its_worker_and_begins_nothing_
 ) -> None:
     told, file = with_file
     asks(told)
-    told.session.studio.file.plan(EditRequest("edit", BASE, MOVED))  # behind it
+    told.session.happen(EditWanted(EditRequest("edit", BASE, MOVED)))  # behind it
     closing = threading.Thread(target=told.session.close)
     closing.start()
     closing.join(20)
     assert not closing.is_alive(), "it waits for an answer that nobody gives"
     state = told.view.studio.edit_state
     assert state.stage == "refused" and state.request is not None and state.request.what == "add"
-    told.session.studio.file.plan(EditRequest("edit", BASE, MOVED))
+    told.session.happen(EditWanted(EditRequest("edit", BASE, MOVED)))
     assert told.asked(Call) == [] and told.view.studio.edit_state == state
 
 
@@ -306,10 +345,10 @@ def test_no_thread_of_a_session_is_left_when_it_is_closed_whatever_waited(tmp_pa
     with opened(tmp_path) as (told, _):
         session = told.session
         asks(told)
-        session.studio.select(BASE)
-        session.studio.set_preview_scale(0.5)
-        session.studio.draw_preview()
-        session.studio.reports.pick(0.5, 0.5)
+        session.happen(CameraChosen(BASE))
+        session.do(ScalePreview(scale=0.5))
+        session.happen(PreviewWanted())
+        session.do(PickPixel(x=0.5, y=0.5))
         heard: list[Call] = []
         until(lambda: heard.extend(told.asked(Call)) or len(heard) == 2, "both questions")
         session.happen(RecordingWanted())

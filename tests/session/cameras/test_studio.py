@@ -11,15 +11,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import BASE, PEOPLE, camera, in_studio, moved, start_over, step, wait_until
+from tests.drive.session import BASE, camera, in_studio, moved, start_over, step, wait_until
+from workbench.commands.cameras import (
+    CopyTask,
+    DropCameraChange,
+    PickPixel,
+    PutMovedCamerasBack,
+    RevertCameraChange,
+    SaveCameraChange,
+    StopMeasuring,
+    UndoCamera,
+    UsePlacement,
+)
 from workbench.commands.run import PauseRun
 from workbench.core.camera_data import CameraKey, CameraSettings, differences
 from workbench.jobs.task import TaskOptions
+from workbench.session.cameras.events import (
+    CameraChosen,
+    CameraPlaced,
+    ComparisonWanted,
+    EditWanted,
+    MeasureWanted,
+    SheetWanted,
+    SuggestionsWanted,
+)
 from workbench.session.cameras.view import EditRequest, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.events import EnvsReset, MomentShown, PagesCounted
+from workbench.session.run.events import EnvsReset, FileOpened, MomentShown, PagesCounted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -52,18 +72,18 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, 
     try:
         wait_until(session, lambda view: view.task is not None, "the first load")
         there = replace(camera(session, BASE).now, position=(0.31, 0.02, 0.55))
-        session.studio.place(BASE, there)
-        session.studio.file.plan(EditRequest("edit", BASE))
+        session.happen(CameraPlaced(BASE, there))
+        session.happen(EditWanted(EditRequest("edit", BASE)))
         refused = wait_until(session, in_studio(lambda s: s.edit_state.stage == "refused"), "the refusal")
-        session.studio.file.copy_task()
+        session.do(CopyTask())
         planned = wait_until(
             session, in_studio(lambda s: s.edit_state.stage == "planned"), "the plan in the copy"
         )
-        session.studio.file.write()
+        session.do(SaveCameraChange())
         ended = wait_until(
             session, in_studio(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
         )
-        session.studio.file.drop_plan()
+        session.do(DropCameraChange())
         named = str(session.present_reference)
         yield session, Copied(folder, refused, planned, ended, named)
     finally:
@@ -76,9 +96,9 @@ def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
     text = task_file.read_text()
     # Small pictures: what is tested is where they are taken from.
     task_file.write_text(text.replace("512", "64"))
-    session.studio.back_to_file(BASE)
+    session.do(PutMovedCamerasBack())
     session.happen(PagesCounted(1))
-    session.open_file(task_file, "PushCubeEnv")
+    session.happen(FileOpened(task_file, "PushCubeEnv"))
     wait_until(session, lambda view: view.task.file == str(task_file), "the example")
     session.change(cameras=(CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")))
     return session
@@ -89,10 +109,9 @@ def session(studio_session: Session) -> Session:
     """At rest, and every camera as the file has it; one of them is worked on."""
     studio_session.do(PauseRun())
     studio_session.happen(MomentShown(None))
-    for one in studio_session.view().studio.cameras:
-        studio_session.studio.back_to_file(one.key)
+    studio_session.do(PutMovedCamerasBack())
     wait_until(studio_session, lambda v: not v.playing and not moved(v), "rest")
-    studio_session.studio.select(BASE)
+    studio_session.happen(CameraChosen(BASE))
     return studio_session
 
 
@@ -112,29 +131,29 @@ def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView
 
 def test_what_cannot_be_is_refused_in_words_and_changes_nothing(session: Session) -> None:
     start = camera(session, BASE).now
-    session.studio.place(BASE, replace(start, near=5.0, far=1.0))
+    session.happen(CameraPlaced(BASE, replace(start, near=5.0, far=1.0)))
     view = wait_until(session, in_studio(lambda s: "near must be" in s.problem), "the reason")
     assert not moved(view)
-    session.studio.place(BASE, replace(start, shader_pack="nonsense"))
+    session.happen(CameraPlaced(BASE, replace(start, shader_pack="nonsense")))
     view = wait_until(
         session, in_studio(lambda s: "there is no shader pack" in s.problem), "the worker's reason"
     )
     assert not moved(view)
-    session.studio.place(("sensor", "nobody"), start)
+    session.happen(CameraPlaced(("sensor", "nobody"), start))
     wait_until(session, in_studio(lambda s: "there is no sensor camera nobody" in s.problem), "the reason")
 
 
 def test_a_placement_is_written_compared_and_taken_back(session: Session, task_file: Path) -> None:
-    studio, saved = session.studio, task_file.read_bytes()
+    saved = task_file.read_bytes()
     before = saved.replace(b"\n", b"\r\n")  # as an editor on Windows saves it
     task_file.write_bytes(before)
     start = camera(session, BASE).now
-    studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
-    studio.file.plan(EditRequest("edit", BASE))
+    session.happen(CameraPlaced(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2)))
+    session.happen(EditWanted(EditRequest("edit", BASE)))
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
     assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
     assert task_file.read_bytes() == before and "+" in view.studio.edit_state.edit.diff
-    studio.file.write()
+    session.do(SaveCameraChange())
     view = wait_until(
         session, in_studio(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
     )
@@ -143,7 +162,7 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     now = camera(session, BASE)
     assert now.now == now.info.settings and not differences(now.now, view.studio.edit_state.edit.settings)
     assert task_file.read_bytes() == view.studio.edit_state.edit.new_text.encode()
-    studio.file.undo_write()
+    session.do(RevertCameraChange())
     view = wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
@@ -158,7 +177,7 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     )
     wait_until(session, seen_from(BASE, start), "the camera where the file has it")
     assert view.studio.undo == "reverted the change of base_camera"
-    session.studio.undo()
+    session.do(UndoCamera())
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert not differences(view.studio.camera(BASE).now, now.now)
 
@@ -166,15 +185,15 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
 def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     session: Session, task_file: Path
 ) -> None:
-    studio, before = session.studio, task_file.read_text()
+    before = task_file.read_text()
     there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
-    studio.place(BASE, there)
-    studio.file.plan(EditRequest("remove", BASE))
+    session.happen(CameraPlaced(BASE, there))
+    session.happen(EditWanted(EditRequest("remove", BASE)))
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
     assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
-    studio.file.write()
+    session.do(SaveCameraChange())
     wait_until(session, in_studio(lambda s: s.edit_state.stage == "checked"), "the version without it")
-    studio.file.undo_write()
+    session.do(RevertCameraChange())
     wait_until(
         session,
         in_studio(lambda s: s.edit_state.stage == "undone" and "loading it" not in s.edit_state.message),
@@ -183,7 +202,7 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     assert task_file.read_text() == before
     assert moved(session.view()) == {BASE} and camera(session, BASE).now == there
     wait_until(session, seen_from(BASE, there), "the camera where it was placed")
-    studio.file.drop_plan()
+    session.do(DropCameraChange())
 
 
 def settled(session: Session, reached: Callable[[StudioView], bool], what: str) -> StudioView:
@@ -196,25 +215,25 @@ def settled(session: Session, reached: Callable[[StudioView], bool], what: str) 
 
 
 def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
-    session.studio.reports.measure()
+    session.happen(MeasureWanted("envs"))
     report = settled(session, lambda s: s.results.report_of == BASE, "the judgement").results.report
     assert sorted(report.envs) == [0, 1] and not session.view().studio.report_stale
     (cube,) = report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
-    session.studio.reports.make_sheet()
+    session.happen(SheetWanted())
     sheet = settled(session, lambda s: len(s.results.sheet) == 2, "the pictures of all envs").results.sheet
     assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
     # Turned to the sky.
     start = camera(session, BASE).now
     away = replace(start, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
-    session.studio.place(BASE, away)
+    session.happen(CameraPlaced(BASE, away))
     assert session.view().studio.report_stale
-    session.studio.reports.measure()
+    session.happen(MeasureWanted("envs"))
     studio = settled(session, lambda s: s.results.report is not report, "the judgement of the placement")
     assert (
         studio.results.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
     )
-    session.studio.reports.compare(start)
+    session.happen(ComparisonWanted(start))
     pair = settled(session, lambda s: s.results.compared is not None, "the comparison").results.compared
     assert pair is not None
     here, there = pair
@@ -225,7 +244,7 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
 def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
     start_over(session, 0)
     step(session, 4)
-    session.studio.reports.measure_steps()
+    session.happen(MeasureWanted("steps"))
     studio = settled(session, lambda s: len(s.results.report_moments) == 5, "five moments")
     assert [moment.step for moment in studio.results.report_moments] == [0, 1, 2, 3, 4]
     assert {moment.env for moment in studio.results.report_moments} == {0} == set(studio.results.report.envs)
@@ -233,7 +252,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     assert cube.summary().seen == 1.0
     session.happen(MomentShown(studio.results.report_moments[2].serial))
     assert session.view().step.elapsed_steps[0] == 2
-    session.studio.reports.measure_steps(2)
+    session.happen(MeasureWanted("steps", 2))
     moments = settled(
         session, lambda s: len(s.results.report_moments) == 2, "its ends"
     ).results.report_moments
@@ -243,7 +262,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     session.happen(EnvsReset())
     wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
     session.happen(MomentShown(None))
-    session.studio.reports.measure_steps()
+    session.happen(MeasureWanted("steps"))
     settled(session, lambda s: len(s.results.report_moments) == 1, "the episode that has just begun")
 
 
@@ -253,8 +272,8 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
     # From the side that the robot does not stand on, level with the cube.
     x, y, z = (float(v) for v in cube[:3])
     beside = replace(camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0))
-    session.studio.place(BASE, beside)
-    session.studio.reports.pick(0.5, 0.5)
+    session.happen(CameraPlaced(BASE, beside))
+    session.do(PickPixel(x=0.5, y=0.5))
     picked = settled(session, lambda s: s.results.picked is not None, "the pixel").results.picked
     assert picked.body == "cube" and abs(picked.depth - 0.38) < 2e-3
     assert np.allclose(picked.point, [x + 0.02, y, z], atol=5e-3)
@@ -262,8 +281,7 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
 
 @pytest.mark.slow
 def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session: Session) -> None:
-    studio = session.studio
-    studio.reports.measure(3)
+    session.happen(MeasureWanted("resets", 3))
     assert session.view().studio.progress is not None
     found = settled(session, lambda s: s.results.report_seeds == 3, "three seeds")
     assert (
@@ -271,12 +289,12 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
         and found.results.report_of == BASE
         and not found.results.measuring
     )
-    studio.reports.suggest(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+    session.happen(SuggestionsWanted(("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2))
     offered = settled(session, lambda s: len(s.results.suggestions) > 0, "suggestions").results.suggestions
     assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
-    studio.take_suggestion(0)
+    session.do(UsePlacement(number=0))
     wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
-    studio.reports.measure(500)
+    session.happen(MeasureWanted("resets", 500))
     wait_until(
         session,
         in_studio(lambda s: s.results.measuring and s.results.report is not None),
@@ -285,29 +303,10 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     wait_until(
         session, in_studio(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
     )
-    studio.reports.stop()
+    session.do(StopMeasuring())
     wait_until(session, in_studio(lambda s: s.progress is None and not s.results.measuring), "its end")
-    studio.reports.suggest(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
+    session.happen(SuggestionsWanted(("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1))
     wait_until(session, in_studio(lambda s: "no object 'nothing'" in s.problem), "why not")
-
-
-def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
-    start = camera(session, BASE).now
-    text = session.studio.export([BASE, PEOPLE], "json")
-    session.studio.place(BASE, replace(start, position=(0.0, 0.0, 1.0)))
-    session.studio.import_pose(BASE, text, None, None)
-    assert not camera(session, BASE).moved
-    for form in ("opencv", "ros"):
-        assert session.studio.export([BASE, PEOPLE], form)
-    session.studio.import_pose(BASE, "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1", "camera_to_world", "maniskill")
-    assert camera(session, BASE).now.position == (5.0, 6.0, 7.0)
-    in_millimetres = "1 0 0 500\n0 1 0 -60\n0 0 1 700\n0 0 0 1"
-    session.studio.import_pose(BASE, in_millimetres, "camera_to_world", "opencv", 0.001)
-    assert camera(session, BASE).now.position == pytest.approx((0.5, -0.06, 0.7))
-    session.studio.import_pose(BASE, text, None, None, 0.001)
-    assert not camera(session, BASE).moved, "our own file is in metres whatever is chosen"
-    with pytest.raises(ValueError, match="no pose is in it"):
-        session.studio.import_pose(BASE, "{}", None, None)
 
 
 def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_copy(

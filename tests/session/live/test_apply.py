@@ -31,6 +31,7 @@ from workbench.commands.run import (
 )
 from workbench.commands.timeline import ContinueFromHere, GoToLast, NextEvent, Seek, StepBack, UndoReset
 from workbench.jobs.task import TaskOptions
+from workbench.session.cameras.state import first_studio
 from workbench.session.events import Asked
 from workbench.session.live.state import State, apply
 from workbench.session.live.view import view_of
@@ -128,7 +129,11 @@ def plain(value: object) -> Any:
 def after(events: list[Any]) -> tuple[State, list[object]]:
     run = first_run("push.py", TaskOptions(ENVS), 10**6, Settings())
     state, done = (
-        State(replace(run, own_file=Path("push.py"), own_folder=Path()), Recording("recordings")),
+        State(
+            replace(run, own_file=Path("push.py"), own_folder=Path()),
+            Recording("recordings"),
+            first_studio(None),
+        ),
         list[object](),
     )
     for at, event in enumerate(events):

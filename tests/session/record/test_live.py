@@ -15,6 +15,7 @@ import pytest
 
 from tests.drive.session import BASE, TASKS, camera, live_session, moved, step, wait_until
 from workbench.authoring.loading.load import load_task
+from workbench.commands.cameras import PutMovedCamerasBack
 from workbench.commands.recording import StopRecording
 from workbench.commands.run import Step
 from workbench.recording.episode.episode import Episode
@@ -22,6 +23,7 @@ from workbench.recording.lerobot.export import ExportOptions, export_lerobot
 from workbench.recording.lerobot.format import WORKBENCH_FILE
 from workbench.recording.maniskill.export import export_maniskill
 from workbench.recording.reader.read_episode import read_episode
+from workbench.session.cameras.events import CameraPlaced
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.record.recording import RecordingWanted
@@ -240,14 +242,14 @@ def test_what_is_recorded_says_where_a_moved_camera_was_and_where_the_file_has_i
     assert in_file is not None
     there = replace(in_file, position=(0.31, 0.02, 0.55))
     count = session.view().recording.episodes_written
-    session.studio.place(BASE, there)
+    session.happen(CameraPlaced(BASE, there))
     wait_until(session, lambda view: moved(view) == {BASE}, "the placement")
     session.happen(RecordingWanted((0,)))
     wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
     step(session, 2)
     session.happen(SaveWanted((0,)))
     past = written(session, count + 1)[-1]
-    session.studio.back_to_file(BASE)
+    session.do(PutMovedCamerasBack())
     wait_until(session, lambda view: not moved(view), "the file's placement")
     step(session, 2)
     view = wait_until(session, lambda view: view.recording.steps == 4, "the steps")

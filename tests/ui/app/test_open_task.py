@@ -10,13 +10,15 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.drive.scripted import scripted
-from tests.drive.session import wait_until
+from tests.drive.session import camera, moved, wait_until
 from tests.drive.waiting import until
 from tests.ui.scenes import camera as camera_info
 from workbench.authoring.loading.reference import TaskName
+from workbench.commands.cameras import UndoCamera
 from workbench.commands.run import PauseRun, PlayRun
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
+from workbench.session.cameras.events import CameraChosen, CameraPlaced
 from workbench.session.live.session import KeptWork, Session
 from workbench.session.tasks.catalogue import Entry, Section
 from workbench.session.tasks.recents import RecentTasks
@@ -114,25 +116,25 @@ def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
     first = desk.session_of("push.py")
     desk.place.pages.wait_for("live", 60)
     first.change(selected_env=1, speed=2.0)
-    now = next(one for one in first.studio.view(None, 0).cameras if one.key == CAMERA).now
+    now = camera(first, CAMERA).now
     assert now is not None
     placed = replace(now, position=(1.0, 2.0, 3.0))
-    first.studio.place(CAMERA, placed)
-    first.studio.select(CAMERA)
+    first.happen(CameraPlaced(CAMERA, placed))
+    first.happen(CameraChosen(CAMERA))
     desk.choose("pull.py")
     second = desk.session_of("pull.py")
-    assert second.studio.placed_cameras() == () and second.view().selected_env == 0
+    assert not moved(second.view()) and second.view().selected_env == 0
     until(lambda: first._changes._closing, "the end of the first session")
     desk.choose("push.py")
     again = desk.session_of("push.py")
     assert again is not first
-    (camera,) = again.studio.placed_cameras()
-    assert camera.key == CAMERA and camera.settings is not None
-    assert camera.settings.position == (1.0, 2.0, 3.0)
+    assert moved(again.view()) == {CAMERA}
+    now = camera(again, CAMERA).now
+    assert now is not None and now.position == (1.0, 2.0, 3.0)
     view = again.view()
     assert (view.selected_env, view.settings.speed, view.studio.selected) == (1, 2.0, CAMERA)
-    again.studio.undo()
-    assert again.studio.placed_cameras() == (), "the way back is kept too"
+    again.do(UndoCamera())
+    assert not moved(again.view()), "the way back is kept too"
 
 
 @pytest.mark.thorough

@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from tests.drive.live import HandedSession
 from tests.drive.panels import Panels
 from tests.ui.scenes import description, running, table_scene
-from workbench.commands.cameras import ReturnToKept, ToggleWantedObject
-from workbench.core.camera_data import CameraInfo, CameraSettings
+from workbench.commands.cameras import ReturnToKept, SaveCameraChange, ToggleWantedObject
+from workbench.commands.command import Command
+from workbench.core.camera_data import CameraInfo, CameraSettings, differences
+from workbench.core.cameras.conventions import axes_of, make_pose, with_pose
 from workbench.core.cameras.report import ObjectToSee
+from workbench.session.cameras.events import (
+    CameraPlaced,
+    ComparisonWanted,
+    EditWanted,
+    MeasureWanted,
+    SuggestionsWanted,
+)
 from workbench.session.cameras.view import EditRequest, EditState, StudioCamera, StudioView
 from workbench.session.live.view import SessionView
 from workbench.ui.cameras.compare import NAMES, CameraCompare, what_differs
-from workbench.ui.cameras.export import CameraExport, file_name
+from workbench.ui.cameras.export import CameraExport, calibrated_pose, calibration_text, file_name
 from workbench.ui.cameras.report import CameraReportPanel
 from workbench.ui.cameras.suggest import CameraSuggest, choices_of
 from workbench.ui.cameras.write_to_file import WriteToFile
+from workbench.ui.widgets.visitors import Visitor
 
 SETTINGS = CameraSettings(
     position=(0.3, 0.0, 0.6),
@@ -131,7 +144,7 @@ def test_a_placement_is_compared_with_that_of_the_file_before_it_was_saved(panel
     draw(replace(SETTINGS, far=50.0))
     draw(replace(SETTINGS, far=50.0))
     panels.press("Show side by side")
-    assert session.asked == [("studio.reports.compare", SETTINGS)]
+    assert session.asked == [ComparisonWanted(SETTINGS)]
 
 
 def test_a_placement_that_was_kept_is_what_it_is_then_compared_with_and_returns_to(panels: Panels) -> None:
@@ -148,7 +161,7 @@ def test_a_placement_that_was_kept_is_what_it_is_then_compared_with_and_returns_
     session.shown = looked_at(replace(SETTINGS, far=50.0))
     folder.draw(session.shown)
     panels.press("Return to A")
-    assert session.asked == [("studio.place", ("sensor", "base_camera"), SETTINGS)]
+    assert session.asked == [CameraPlaced(("sensor", "base_camera"), SETTINGS)]
 
 
 def test_a_box_around_the_eye_is_searched_until_one_is_written(panels: Panels) -> None:
@@ -168,7 +181,7 @@ def test_a_box_around_the_eye_is_searched_until_one_is_written(panels: Panels) -
     assert panels.field("Search box from").value == (0.0, -0.3, 2.0) and panels.field("Draw this box").value
     panels.set("Resets", 3)
     panels.press("Search")
-    asked = "studio.reports.suggest", ("cube",), (0.0, -0.3, 0.9), (0.6, 0.3, 2.0), 3
+    asked = SuggestionsWanted(("cube",), (0.0, -0.3, 0.9), (0.6, 0.3, 2.0), 3)
     assert session.asked == [asked], "between the corners, in whatever order they are"
     panels.ask(ToggleWantedObject(name="cube"))
     panels.press("Search")
@@ -181,9 +194,9 @@ def test_a_camera_is_measured_over_what_was_chosen(panels: Panels) -> None:
     panels.visitors.do = folder.do
     session.shown = looked_at()
     for over, fields, wanted in (
-        ("all envs now", (False, False), ("studio.reports.measure", 0)),
-        ("fresh resets", (False, True), ("studio.reports.measure", 32)),
-        ("this env's episode so far", (True, False), ("studio.reports.measure_steps", 50)),
+        ("all envs now", (False, False), MeasureWanted("envs", 32)),
+        ("fresh resets", (False, True), MeasureWanted("resets", 32)),
+        ("this env's episode so far", (True, False), MeasureWanted("steps", 50)),
     ):
         folder.draw(session.shown)
         panels.set("Over", over)
@@ -203,7 +216,13 @@ class Writing:
         self.panels, self.session = panels, HandedSession()
         above = panels.server.gui.add_folder(None)
         self.part = WriteToFile(panels.server, cast(Any, self.session), lambda _, lens: lens, above)
-        panels.visitors.do = self.part.do
+        panels.visitors.do = self.do
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        if type(command) in self.part.does:
+            self.part.do(command, visitor)
+        else:
+            self.session.do(command)
 
     def draw(self, view: SessionView) -> None:
         self.session.shown = view
@@ -217,14 +236,11 @@ def test_only_a_change_that_was_read_is_saved(panels: Panels) -> None:
     assert panels.button("Show the change").command is None and not panels.shows("Save")
     writing.draw(looked_at(edit_state=planned))
     assert not panels.shows("Show the change")
-    writing.session.shown = looked_at(moved, edit_state=planned)
-    panels.press("Save")
-    assert writing.session.asked == [] and "Show the change first" in panels.client.notices[-1]
-    writing.draw(writing.session.shown)
+    writing.draw(looked_at(moved, edit_state=planned))
     assert not panels.shows("Save") and panels.shows("Discard the change")
     writing.draw(looked_at(edit_state=planned))
     panels.press("Save")
-    assert writing.session.asked == [("studio.file.write",)]
+    assert writing.session.asked == [SaveCameraChange()]
 
 
 def test_a_camera_gets_the_name_that_was_typed_until_it_is_taken(panels: Panels) -> None:
@@ -241,13 +257,40 @@ def test_a_camera_gets_the_name_that_was_typed_until_it_is_taken(panels: Panels)
     panels.type("New name", "hand")
     panels.press("Duplicate")
     request = EditRequest("duplicate", key, name="hand")
-    assert writing.session.asked == [("studio.file.plan", request)]
+    assert writing.session.asked == [EditWanted(request)]
     writing.draw(looked_at(edit_state=EditState("planned", replace(request, settings=SETTINGS))))
     assert panels.typed("New name") == "hand"
     writing.draw(looked_at(edit_state=EditState("checked", request)))
     assert panels.typed("New name") == ""
     panels.press("Duplicate")
-    assert writing.session.asked[-1] == ("studio.file.plan", replace(request, name="base_camera_2"))
+    assert writing.session.asked[-1] == EditWanted(replace(request, name="base_camera_2"))
+
+
+@given(
+    st.lists(st.floats(-2, 2), min_size=7, max_size=7),
+    st.one_of(st.none(), st.lists(st.floats(-2, 2), min_size=7, max_size=7)),
+)
+def test_a_camera_goes_out_and_comes_in_where_it_was(pose: list[float], mount: list[float] | None) -> None:
+    """Also on a body that has moved since, where the file holds the pose in the frame of the env."""
+    assume(all(np.linalg.norm(one[3:]) > 0.1 for one in (pose, mount) if one is not None))
+    on = None if mount is None else make_pose(mount[:3], mount[3:]).astype(np.float32)
+    one = camera(on)
+    there = with_pose(SETTINGS, make_pose(pose[:3], pose[3:]))
+    text = calibration_text([replace(one, now=there)], "json")
+    for metres in (1.0, 0.001):
+        back = with_pose(SETTINGS, calibrated_pose(one, text, None, None, metres))
+        assert not differences(back, there, close=1e-5), "our own file is in metres whatever is chosen"
+    assert calibration_text([one], "opencv") and calibration_text([one, one], "ros").count("---") == 1
+    assert why_not(lambda: calibrated_pose(one, "{}", None, None))
+    assert why_not(lambda: calibration_text([replace(one, now=None)], "json"))
+    if mount is not None:
+        assert why_not(lambda: calibrated_pose(replace(one, mount_pose=None), text, None, None))
+
+
+def why_not(do: Callable[[], object]) -> str:
+    with pytest.raises(ValueError) as refused:
+        do()
+    return str(refused.value)
 
 
 def test_a_pasted_calibration_is_read_as_was_chosen(panels: Panels) -> None:
@@ -261,9 +304,12 @@ def test_a_pasted_calibration_is_read_as_was_chosen(panels: Panels) -> None:
     panels.set("Convention", "OpenGL, Blender")
     panels.set("Direction", "camera to world")
     panels.set("Units", "millimetres")
-    panels.type("Calibration", "1 0 0 0")
+    text = "1 0 0 500\n0 1 0 -60\n0 0 1 700\n0 0 0 1"
+    panels.type("Calibration", text)
     panels.press("Apply to the camera")
-    told = ("sensor", "base_camera"), "1 0 0 0", "camera_to_world", "opengl", 0.001
-    assert session.asked == [("studio.import_pose", *told)]
+    (placed,) = session.asked
+    assert placed.key == ("sensor", "base_camera")
+    assert placed.settings.position == pytest.approx((0.5, -0.06, 0.7))
+    assert np.allclose(axes_of(placed.settings.quaternion)[0], (0, 0, -1))
     folder.draw(session.shown)
-    assert panels.typed("Calibration") == "1 0 0 0" and "x right, y up" in panels.html()
+    assert panels.typed("Calibration") == text and "x right, y up" in panels.html()

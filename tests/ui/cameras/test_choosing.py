@@ -8,6 +8,7 @@ from tests.drive.live import Live
 from tests.ui.scenes import camera, running
 from workbench.commands.cameras import ChooseCamera, MoveCameraToView
 from workbench.core.camera_data import CameraKey
+from workbench.session.cameras.events import CameraChosen
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.view import SessionView
 from workbench.ui.cameras.studio import NO_CAMERA, TAB
@@ -29,11 +30,11 @@ def test_a_camera_or_none_is_chosen_from_the_list(live_page: Live) -> None:
     assert tab.field("Camera").value == NO_CAMERA
     assert list(tab.field("Camera").options) == [NO_CAMERA, BASE, PEOPLE]
     tab.set("Camera", PEOPLE)
-    assert live_page.asked[-1] == ("studio.select", ("human", "base_camera"))
+    assert live_page.asked[-1] == CameraChosen(("human", "base_camera"))
     live_page.show(studio(("human", "base_camera")))
     assert tab.field("Camera").value == PEOPLE
     tab.set("Camera", NO_CAMERA)
-    assert live_page.asked[-1] == ("studio.select", None)
+    assert live_page.asked[-1] == CameraChosen(None)
     live_page.do(ChooseCamera(name="gone · sensor"))
     assert live_page.client.notices == ["There is no camera gone · sensor."]
     live_page.do(MoveCameraToView())

@@ -24,6 +24,7 @@ from workbench.core.cameras.conventions import (
     target_of,
     with_pose,
 )
+from workbench.session.cameras.events import CameraChosen
 from workbench.session.live.session import Session
 from workbench.ui.cameras.fields import AXES, FOV, INTRINSIC, RPY, WXYZ, CameraNumbers
 from workbench.ui.cameras.pose_math import Placing
@@ -67,7 +68,7 @@ class Desk:
 def desk(scripted_session: Callable[..., Session], panels: Panels, request: pytest.FixtureRequest) -> Desk:
     info = replace(camera(), settings=request.param)
     session, two_handles = scripted_session(1, camera=info), [False]
-    session.studio.select(info.key)
+    session.happen(CameraChosen(info.key))
     numbers = CameraNumbers(panels.server, Placing(session), look_at=lambda: two_handles[0])
     panels.visitors.do = numbers.do
     desk = Desk(session, numbers, panels, two_handles)

@@ -73,7 +73,7 @@ def episode(env: int, largest: float = 0.25) -> Verdict[PastRun]:
 
 def studio(now: CameraSettings = LENS, mount: np.ndarray | None = None, **changes: Any) -> StudioView:
     one = StudioCamera(KEY, CAMERA, now, now != LENS, mount)
-    return StudioView(**{"cameras": (one,), "selected": KEY, "serial": 1, **changes})
+    return StudioView(**{"cameras": (one,), "selected": KEY, **changes})
 
 
 def picture(grey: int, env: int = 0) -> dict[Any, Picture]:
@@ -182,9 +182,9 @@ CHANGES: dict[str, Any] = {
     "a check that waits": lambda view: {"checks": replace(view.checks, state="loading", waits=True)},
     "a profile": lambda view: {"profile": replace(view.profile, serial=2, stale=True)},
     "seeds": lambda view: {"seeds": replace(view.seeds, serial=2, stale=True)},
-    "a moved camera": just(studio=studio(replace(LENS, position=(0.5, 0, 0.6)), serial=2)),
-    "no camera": just(studio=studio(selected=None, serial=2)),
-    "what studio can undo": just(studio=studio(undo="moved base_camera", serial=2)),
+    "a moved camera": just(studio=studio(replace(LENS, position=(0.5, 0, 0.6)))),
+    "no camera": just(studio=studio(selected=None)),
+    "what studio can undo": just(studio=studio(undo="moved base_camera")),
     "a moved mount": just(studio=studio(mount=np.array([0, 1, 0, 1, 0, 0, 0], np.float32))),
     "a picture": just(pictures=picture(200), pictures_serial=2),
     "a camera that fails": just(failed_cameras={KEY: "It cannot be drawn."}),

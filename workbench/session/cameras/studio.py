@@ -1,40 +1,297 @@
-"""The camera studio: places cameras, and holds their reports and file edits."""
+"""The camera studio: how each event changes it, and the work that follows."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Literal
+from typing import get_args
 
-from workbench.authoring.camera_source import calibration_files
-from workbench.core.camera_data import CameraKey, CameraSettings, Picture, differences, why_no_camera
-from workbench.core.cameras.conventions import Convention, Direction, relative_to, with_pose
-from workbench.core.env.step_result import StepResult
-from workbench.jobs.task import TaskDescription
-from workbench.session.cameras.file_edits import FileEdits
-from workbench.session.cameras.reports import CameraReports
-from workbench.session.cameras.selection import KeptPlacements, PlacementChange, StudioCameras
-from workbench.session.cameras.view import StudioView
-from workbench.session.loop import do, on_loop
+from workbench.commands.cameras import (
+    CopyTask,
+    DropCameraChange,
+    PickPixel,
+    PutMovedCamerasBack,
+    RedoCamera,
+    ResetCamera,
+    RevertCameraChange,
+    SaveCameraChange,
+    ScalePreview,
+    SelectCamera,
+    StopMeasuring,
+    UndoCamera,
+    UsePlacement,
+)
+from workbench.commands.command import Command, Refused
+from workbench.core.camera_data import CameraKey, why_no_camera
+from workbench.session.cameras.events import (
+    CameraChosen,
+    CameraPlaced,
+    ChangeFile,
+    Compare,
+    CopyToFolder,
+    DrawEnvs,
+    DrawNewCamera,
+    DrawPreview,
+    FindPlan,
+    Lane,
+    MeasureLive,
+    MeasureSeeds,
+    Pick,
+    PreviewDrawn,
+    PreviewWanted,
+    StopJobs,
+    StopQuestion,
+    StudioEffect,
+    StudioEvent,
+    Suggest,
+    WorkFailed,
+)
+from workbench.session.cameras.file_edits import (
+    FileEdits,
+    apply_to_edits,
+    do_edit,
+    edit_failed_to_load,
+    edit_loaded,
+    plan_in_copy,
+    with_edits,
+)
+from workbench.session.cameras.placements import Placements
+from workbench.session.cameras.reports import (
+    STOP_REPORTS,
+    CameraReports,
+    apply_to_reports,
+    do_report,
+    outdated,
+    with_results,
+)
+from workbench.session.cameras.state import (
+    Change,
+    Studio,
+    info_of,
+    refusal,
+    settings_in_file,
+    shown_step,
+)
+from workbench.session.events import Asked
+from workbench.session.loop import do
 from workbench.session.process.askers import Asker, Background
-from workbench.session.process.jobs import Job, JobFailed, Jobs
-from workbench.session.protocol.messages import PlaceCamera, Placed, ReloadLevel, Request
+from workbench.session.process.jobs import JobProgress, Jobs
+from workbench.session.protocol.messages import LoadFailed, PlaceCamera, Placed
 from workbench.session.protocol.questions import DrawCamera
+from workbench.session.run.events import FileOpened, FileSaved, Now, Send, VersionLoaded, WorkerDied
 from workbench.session.run.run import Run
 
 PREVIEW_MODALITIES = ("rgb", "depth", "segmentation")
-Previewed = tuple[StepResult | None, DrawCamera]
-"""A step and the question that draws it."""
+_OF_FILE = SaveCameraChange, RevertCameraChange, CopyTask, DropCameraChange
+_OF_REPORTS = StopMeasuring, PickPixel
+DOES: frozenset[type[Command]] = frozenset(
+    {
+        SelectCamera,
+        UndoCamera,
+        RedoCamera,
+        ResetCamera,
+        PutMovedCamerasBack,
+        UsePlacement,
+        ScalePreview,
+        *_OF_FILE,
+        *_OF_REPORTS,
+    }
+)
+"""Commands that `apply` takes."""
 
 
-class CameraStudio:
-    """Places cameras and previews them. All methods return at once and may be called on any thread; `view` has the results.
+def apply(studio: Studio, event: object, run: Run, now: Now) -> Change:
+    """The studio after an event, and what has to be done.
 
-    A placement is here (with undo), in the worker's live cameras, and at last in the author's file. This one is
-    authoritative: after each load it is sent to the worker again, so that neither a reload nor a crash moves a camera. If
-    the author changed the camera in the file, the file counts.
+    Args:
+        run: after the event.
+
+    Raises:
+        Refused: the command makes no sense now; nothing has changed.
+    """
+    match event:
+        case Asked(command=command) if type(command) in DOES:
+            return _do_command(studio, command, run, now)
+        case CameraChosen(key=key):
+            return _select(studio, key, run)
+        case CameraPlaced():
+            return _place(studio, event, run, now)
+        case PreviewWanted():
+            return _draw_preview(studio, run)
+        case PreviewDrawn(picture=picture):
+            return replace(studio, preview=picture, drawing=False), []
+        case WorkFailed(lane=lane, why=why):
+            return _failed(studio, lane, why), []
+        case VersionLoaded():
+            report = event.loaded.reload
+            return _loaded(
+                studio, run, scene_changed=report is None or report.level not in ("same", "cameras")
+            )
+        case LoadFailed(at_run=False):
+            return edit_failed_to_load(studio), []
+        case Placed():
+            return _placed(studio, event)
+        case FileSaved() | WorkerDied():
+            studio = replace(studio, previewed=None, drawing=False)
+            studio = with_edits(studio, shown=replace(studio.edits.shown, drawing=False))
+            return studio, [StopJobs(("live", "background", "preview", "new camera")), StopQuestion()]
+        case _:
+            studio, effects = apply_to_reports(studio, event, run)
+            studio, more = apply_to_edits(studio, event, run)
+            return studio, [*effects, *more]
+
+
+def _do_command(studio: Studio, command: Command, run: Run, now: Now) -> Change:
+    placements = studio.placements
+    match command:
+        case SelectCamera(kind=kind, name=name):
+            if info_of(run, (kind, name)) is None:
+                raise Refused(f"There is no {kind} camera {name}.")
+            return _select(studio, (kind, name), run)
+        case UndoCamera():
+            if not placements.done:
+                raise Refused("There is nothing to undo.")
+            return _send(replace(studio, placements=placements.undo(), problem=""), placements.done[-1].key)
+        case RedoCamera():
+            if not placements.undone:
+                raise Refused("There is nothing to redo.")
+            return _send(replace(studio, placements=placements.redo(), problem=""), placements.undone[-1].key)
+        case ResetCamera():
+            if studio.selected is None:
+                raise Refused("Choose the camera first.")
+            return _put_back(studio, (studio.selected,), now)
+        case PutMovedCamerasBack():
+            return _put_back(studio, tuple(placements.placed), now)
+        case UsePlacement(number=number):
+            return _take_suggestion(studio, number, run, now)
+        case ScalePreview(scale=scale):
+            return replace(studio, preview_scale=scale, preview=None, previewed=None), []
+        case _ if isinstance(command, _OF_REPORTS):
+            return do_report(studio, command, run)
+        case _:
+            return do_edit(studio, command, run)
+
+
+def _select(studio: Studio, key: CameraKey | None, run: Run) -> Change:
+    there = key is None or info_of(run, key) is not None
+    return replace(studio, was_chosen=True, selected=key if there else studio.selected), []
+
+
+def _place(studio: Studio, placed: CameraPlaced, run: Run, now: Now) -> Change:
+    key = placed.key
+    if why_not := refusal(run, key) or why_no_camera(placed.settings):
+        return replace(studio, problem=f"{key[1]} is left where it is: {why_not}."), []
+    after = studio.placements.place(key, placed.settings, now.monotonic, placed.control, placed.pause)
+    return _moved(replace(studio, problem=""), after, key)
+
+
+def _moved(studio: Studio, placements: Placements, key: CameraKey) -> Change:
+    """Send the placement of this camera, if it is another."""
+    before, studio = studio.placements.placed, replace(studio, placements=placements)
+    return (studio, []) if placements.placed.get(key) == before.get(key) else _send(studio, key)
+
+
+def _send(studio: Studio, *keys: CameraKey) -> Change:
+    """Send the present placements of these cameras to the worker."""
+    return studio, [Send(PlaceCamera(key, studio.placements.placed.get(key))) for key in keys]
+
+
+def _put_back(studio: Studio, keys: tuple[CameraKey, ...], now: Now) -> Change:
+    """Place cameras as in the file."""
+    effects: list[StudioEffect] = []
+    for key in keys:
+        if (file := studio.placements.in_file.get(key)) is not None:
+            label = f"put {key[1]} back to the file"
+            after = studio.placements.place(key, file, now.monotonic, label=label)
+            studio, sent = _moved(studio, after, key)
+            effects += sent
+    return studio, effects
+
+
+def _take_suggestion(studio: Studio, number: int, run: Run, now: Now) -> Change:
+    """Place the camera as in a suggestion."""
+    key, suggestions = studio.results.suggestions_of, studio.results.suggestions
+    settings = None if key is None else studio.placements.now(key)
+    if key is None or settings is None or not 0 <= number < len(suggestions):
+        raise Refused("There is no such suggestion.")
+    found = suggestions[number].settings
+    there = replace(settings, position=found.position, quaternion=found.quaternion)
+    return _place(studio, CameraPlaced(key, there), run, now)
+
+
+def _draw_preview(studio: Studio, run: Run) -> Change:
+    key, step = studio.selected, shown_step(run)
+    settings = None if key is None else studio.placements.now(key)
+    if studio.preview_scale == 1.0 or key is None or settings is None or refusal(run, key):
+        return studio, []
+    question = DrawCamera(key, settings, run.env, PREVIEW_MODALITIES, scale=studio.preview_scale)
+    seen = studio.previewed is not None and studio.previewed[0] is step and studio.previewed[1] == question
+    if seen or studio.drawing:
+        return studio, []
+    studio = replace(studio, previewed=(step, question), preview_problem="", drawing=True)
+    return studio, [DrawPreview(replace(question, poses=run.shown_moment().of(run.env)))]
+
+
+def _loaded(studio: Studio, run: Run, scene_changed: bool) -> Change:
+    """A version runs: update cameras and placements, and compare it with a written edit.
+
+    Args:
+        scene_changed: reports are of another version.
+    """
+    if run.task is None:
+        return studio, []
+    studio, own = edit_loaded(studio, run.task)
+    in_file = settings_in_file(studio.placements, run)
+    placements, dropped = studio.placements.loaded(in_file, own)
+    problem = ""
+    if dropped:
+        names = " and ".join(key[1] for key in dropped)
+        one = len(dropped) == 1
+        problem = (
+            f"{names} {'was' if one else 'were'} changed in the file and now {'follows' if one else 'follow'} "
+            "it; Undo restores your placement."
+        )
+    # Selected again is the camera that was selected in the earlier session; none if the camera is gone.
+    selected = studio.selected or studio.select_when_loaded
+    if selected is not None and info_of(run, selected) is None:
+        selected = None
+    studio = replace(
+        studio, placements=placements, problem=problem, selected=selected, select_when_loaded=None
+    )
+    stop: list[StudioEffect] = []
+    if scene_changed:
+        studio, stop = outdated(studio), [STOP_REPORTS]
+    # Dropped ones too: their placement may have been on its way during the load. And edited ones: after an edit
+    # was taken out again the version may count as the same, so the worker's camera would stay where it was.
+    to_send = dict.fromkeys((*placements.placed, *dropped, *sorted(own & in_file.keys())))
+    studio, sent = _send(studio, *to_send)
+    studio, planned = plan_in_copy(studio, run)
+    return studio, [*stop, *sent, *planned]
+
+
+def _placed(studio: Studio, event: Placed) -> Change:
+    """The worker's answer to a placement."""
+    if not event.why_not:
+        return studio, []
+    problem = f"{event.key[1]} could not be placed: {event.why_not}."
+    studio = replace(studio, problem=problem, placements=studio.placements.refused(event.key))
+    return (studio, []) if event.settings is None else _send(studio, event.key)
+
+
+def _failed(studio: Studio, lane: Lane, why: str) -> Studio:
+    match lane:
+        case "preview":
+            # The last preview stays; the next change draws again.
+            return replace(studio, preview_problem=f"The preview failed: {why}.", drawing=False)
+        case "new camera":
+            return replace(studio, problem=f"There is no picture of the new camera: {why}.")
+        case _:
+            problem = f"{why[:1].upper()}{why[1:]}" + ("" if why.endswith(".") else ".")
+            return with_results(studio, problem=problem)
+
+
+class StudioJobs:
+    """Does the work of the studio. Used on the loop.
 
     A preview is drawn by a temporary camera with the same lens (`core.cameras.temporary`): 1280 x 720 takes long without a
     GPU, 64 x 64 shows little, and another size of the env's camera would change the observation.
@@ -42,302 +299,63 @@ class CameraStudio:
 
     def __init__(
         self,
-        send: Callable[[Request], None],
         asker: Asker,
         background: Background,
         on_change: Callable[[], None],
-        run: Callable[[], Run],
-        open_file: Callable[[Path, str], None],
-        kept: KeptPlacements | None = None,
+        happen: Callable[[StudioEvent | FileOpened], object],
     ) -> None:
         """
         Args:
-            send, asker: send requests to, and ask the worker that plays.
-            background: asks the background process.
-            on_change: called, on any thread, when `view` has changed.
-            run: returns the present run.
-            open_file: opens a class of another file.
-            kept: placements of an earlier session of the task.
+            asker, background: ask the worker that plays, and the background process.
+            on_change: called when `progress` has changed.
+            happen: takes what the work comes to.
         """
-        self._send, self._on_change = send, on_change
-        self._run = run
-        self._cameras = StudioCameras(kept)
-        self._asker = asker
-        self.file = FileEdits(self._cameras, self._notify, open_file, asker, run)
-        self._serial = 0
-        self.reports = CameraReports(self._cameras, asker, background, self._notify, run)
-        self._previews = Jobs(self._notify, self._preview_failed)
-        self._preview_scale = 1.0
-        self._preview: Picture | None = None
-        self._preview_problem = ""
-        self._previewed: Previewed | None = None
-        """The last preview."""
+        self._asker, self._happen = asker, happen
+        self._file, self._reports = FileEdits(asker, happen), CameraReports(asker, background, happen)
+        self._lanes: dict[Lane, Jobs] = {
+            lane: Jobs(on_change, lambda failure, lane=lane: happen(WorkFailed(lane, str(failure))))
+            for lane in get_args(Lane)
+        }
 
-    # --- placing -------------------------------------------------------------------------------------
+    @property
+    def progress(self) -> JobProgress | None:
+        """Progress of a measurement, search or comparison; None while there is none."""
+        return self._lanes["background"].progress or self._lanes["live"].progress
 
-    @on_loop
-    def select(self, key: CameraKey | None) -> None:
-        """Select the camera that the page works on."""
-        self._cameras.was_chosen = True
-        self._cameras.selected = (
-            key if key is None or self._cameras.info(key) is not None else self._cameras.selected
-        )
-        self._notify()
+    def perform(self, effect: StudioEffect) -> None:
+        """Begin it."""
+        reports, lanes = self._reports, self._lanes
+        match effect:
+            case StopJobs(lanes=names):
+                for name in names:
+                    lanes[name].stop()
+            case StopQuestion():
+                self._file.stop_question()
+            case DrawPreview():
+                lanes["preview"].start("a preview", lambda job: self._draw_preview(effect.question))
+            case MeasureLive():
+                lanes["live"].start(effect.what, lambda job: reports.measure_live(job, effect))
+            case MeasureSeeds():
+                lanes["background"].start(effect.what, lambda job: reports.measure_seeds(job, effect))
+            case Suggest():
+                lanes["background"].start(effect.what, lambda job: reports.suggest(job, effect))
+            case Compare(key=(_, name)):
+                what = f"comparing two placements of {name}"
+                lanes["live"].start(what, lambda job: reports.compare(job, effect))
+            case DrawEnvs(key=(_, name)):
+                what = f"taking pictures of all envs with {name}"
+                lanes["live"].start(what, lambda job: reports.draw_envs(job, effect))
+            case Pick():
+                lanes["live"].start("refining", lambda job: reports.pick(job, effect))
+            case DrawNewCamera():
+                lanes["new camera"].start("a new camera", lambda job: self._file.draw(job, effect))
+            case FindPlan() | ChangeFile() | CopyToFolder():
+                self._file.begin(effect)
 
-    @on_loop
-    def place(
-        self, key: CameraKey, settings: CameraSettings, control: object = None, pause: float = math.inf
-    ) -> None:
-        """Place a camera, live. If placements come faster than the worker takes them, only the newest is made.
-
-        Args:
-            control: id of the control; successive calls with the same one are one step of undo (a drag).
-            pause: seconds without a call after which a new step begins.
-        """
-        why_not = self._cameras.refusal(key) or why_no_camera(settings)
-        self._cameras.problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
-        moved = not why_not and self._cameras.placements.place(key, settings, control, pause)
-        self.send_placements([key] if moved else [])
-
-    @on_loop
-    def undo(self) -> None:
-        """Undo the last step."""
-        self._step(self._cameras.placements.undo)
-
-    @on_loop
-    def redo(self) -> None:
-        """Redo the step that was undone last."""
-        self._step(self._cameras.placements.redo)
-
-    def _step(self, move: Callable[[], PlacementChange | None]) -> None:
-        step = move()
-        self._cameras.problem = ""
-        self.send_placements([] if step is None else [step.key])
-
-    @on_loop
-    def back_to_file(self, key: CameraKey) -> None:
-        """Place a camera as in the file."""
-        file = self._cameras.placements.in_file.get(key)
-        moved = file is not None and self._cameras.placements.place(
-            key, file, label=f"put {key[1]} back to the file"
-        )
-        self.send_placements([key] if moved else [])
-
-    @on_loop
-    def take_suggestion(self, index: int) -> None:
-        """Place the camera as in a suggestion."""
-        results = self.reports.results
-        key = results.suggestions_of
-        if key is None or not 0 <= index < len(results.suggestions):
-            return
-        found = results.suggestions[index].settings
-        now = self._cameras.placements.now(key)
-        if now is not None:
-            self.place(key, replace(now, position=found.position, quaternion=found.quaternion))
-
-    @on_loop
-    def set_preview_scale(self, scale: float) -> None:
-        """Show the selected camera at this factor of its own size; 1 for its own picture. Never written to the file."""
-        self._preview_scale, self._preview, self._previewed = scale, None, None
-        self._notify()
-
-    @on_loop
-    def draw_preview(self) -> None:
-        """Draw another preview, if something changed since the last and none is being drawn."""
-        key, (step, env) = self._cameras.selected, self._cameras.drawn
-        now = None if key is None else self._cameras.placements.now(key)
-        if self._preview_scale == 1.0 or key is None or now is None or self._cameras.refusal(key):
-            return
-        question = DrawCamera(key, now, env, PREVIEW_MODALITIES, scale=self._preview_scale)
-        seen = self._previewed is not None and self._previewed[0] is step and self._previewed[1] == question
-        if seen or self._previews.progress is not None:
-            return
-        self._previewed, self._preview_problem = (step, question), ""
-
-        question = replace(question, poses=self._run().shown_moment().of(env))
-
-        async def work(job: Job) -> None:
-            self._preview = await self._asker.ask(question)
-
-        self._previews.start("a preview", work)
-
-    def _preview_failed(self, failure: JobFailed) -> None:
-        """The last preview stays; the next change draws again."""
-        self._preview_problem = f"The preview failed: {failure}."
-
-    # --- calibration files -----------------------------------------------------------------------------
-
-    @on_loop
-    def export(self, keys: Sequence[CameraKey], form: Literal["json", "opencv", "ros"]) -> str:
-        """The text of a calibration file: cameras as placed, at the shown moment of the selected env.
-
-        ROS's format has one camera a file; several become YAML documents in one text.
-
-        Raises:
-            ValueError: a camera is missing or cannot be exported; the message is for the reader.
-        """
-        cameras = [self._cameras.to_export(key) for key in keys]
-        if form == "ros":
-            return "---\n".join(calibration_files.camera_as_ros_yaml(camera) for camera in cameras)
-        write = (
-            calibration_files.cameras_as_json if form == "json" else calibration_files.cameras_as_opencv_yaml
-        )
-        return write(cameras)
-
-    @on_loop
-    def import_pose(
-        self,
-        key: CameraKey,
-        text: str,
-        direction: Direction | None,
-        convention: Convention | None,
-        metres_per_unit: float = 1.0,
-    ) -> None:
-        """Place a camera by a calibration: a pose in the env's frame, or in its mount's if it is mounted.
-
-        Our own JSON contains direction and convention; for all else they are arguments.
-
-        Raises:
-            ValueError: with a message for the reader.
-        """
-        info, now = self._cameras.info(key), self._cameras.placements.now(key)
-        mount = None if info is None else self._cameras.mount_pose(info)
-        if now is None or info is None:
-            raise ValueError(f"there is no {key[0]} camera {key[1]} that can be placed")
-        found = calibration_files.find_poses(text)
-        chosen = [pose for pose in found if info.name in pose.label] or list(found)
-        if len(chosen) > 1:
-            labels = ", ".join(pose.label for pose in chosen)
-            raise ValueError(f"it holds several poses ({labels}): paste only the one you mean")
-        pose = calibration_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
-        if chosen[0].stated is not None and info.mount is not None:
-            if mount is None:
-                raise ValueError(
-                    f"the pose of {info.mount}, on which {info.name} is mounted, is not known yet"
-                )
-            pose = relative_to(mount, pose)  # ours is of the env's frame
-        self.place(key, with_pose(now, pose))
-
-    # --- reading ---------------------------------------------------------------------------------------
-
-    def view(self, step: StepResult | None, env: int) -> StudioView:
-        """The studio's part of `SessionView`.
-
-        Args:
-            step: of the shown moment.
-            env: the selected one.
-        """
-        results, progress = self.reports.results, self.reports.progress
-        self._cameras.drawn = step, env
-        preview = self._preview
-        measured = None if results.report_of is None else self._cameras.placements.now(results.report_of)
-        was = results.report_settings
-        # Rounding when it was written does not count.
-        moved = measured is None or was is None or bool(differences(measured, was, close=3e-4))
-        return StudioView(
-            cameras=self._cameras.all_cameras(),
-            results=results,
-            report_stale=results.report is not None and (moved or results.outdated),
-            preview_scale=self._preview_scale,
-            preview=preview
-            if preview and (preview.key, preview.env) == (self._cameras.selected, env)
-            else None,
-            progress=progress,
-            selected=self._cameras.selected,
-            was_chosen=self._cameras.was_chosen,
-            undo=self._cameras.placements.undo_label,
-            redo=self._cameras.placements.redo_label,
-            edit_state=self.file.view,
-            problem=self._cameras.problem or results.problem or self._preview_problem,
-            serial=self._serial,
-        )
-
-    # --- events, from the session ----------------------------------------------------------------------
-
-    def loaded(self, task: TaskDescription, level: ReloadLevel | None) -> tuple[CameraKey, ...]:
-        """A version runs: update cameras and placements, and compare it with a written edit. Sends
-        nothing.
-
-        Args:
-            level: of its reload; None for the first version.
-
-        Returns:
-            The cameras whose placement has to be sent to the worker, by `send_placements`.
-        """
-        self._cameras.task = task
-        in_file = {c.key: c.settings for c in task.cameras if c.settings is not None}
-        own = self.file.loaded(task)
-        dropped = self._cameras.placements.loaded(in_file, own)
-        self.file.plan_in_copy(task)
-        self._cameras.problem = ""
-        if dropped:
-            names = " and ".join(key[1] for key in dropped)
-            one = len(dropped) == 1
-            self._cameras.problem = (
-                f"{names} {'was' if one else 'were'} changed in the file and now {'follows' if one else 'follow'} "
-                "it; Undo restores your placement."
-            )
-        self._cameras.select_again()
-        self._serial += 1
-        if level not in ("same", "cameras"):
-            self.reports.mark_outdated()
-        # Dropped ones too: their placement may have been on its way during the load. And edited ones: after an edit
-        # was taken out again the version may count as the same, so the worker's camera would stay where it was.
-        to_send = (*self._cameras.placements.placed, *dropped, *(own & in_file.keys()))
-        return tuple(dict.fromkeys(to_send))
-
-    @on_loop
-    def interrupted(self) -> None:
-        """Cancel all jobs: the file was saved, or the worker is gone."""
-        self.reports.stop()
-        self._previews.stop()
-        self._previewed = None
-        self.file.stop()
-
-    def failed_to_load(self) -> None:
-        """A version failed to load; the one before continues."""
-        self.file.failed_to_load()
-        self._notify()
-
-    @on_loop
-    def placed_cameras(self) -> tuple[PlaceCamera, ...]:
-        """All placements, as requests to another worker."""
-        return tuple(PlaceCamera(key, settings) for key, settings in self._cameras.placements.placed.items())
-
-    @on_loop
-    def kept_placements(self) -> KeptPlacements:
-        """Placements, steps of undo and the selected camera, for a later session of this task."""
-        return self._cameras.kept()
-
-    def placed(self, event: Placed, task: TaskDescription | None) -> None:
-        """The worker's answer to a placement.
-
-        Args:
-            task: with the camera's new info.
-        """
-        again = False
-        if event.why_not:
-            self._cameras.problem = f"{event.key[1]} could not be placed: {event.why_not}."
-            self._cameras.placements.refused(event.key)
-            again = event.settings is not None
-        else:
-            self._cameras.task = task
-        self.send_placements([event.key] if again else [])
+    async def _draw_preview(self, question: DrawCamera) -> None:
+        self._happen(PreviewDrawn(await self._asker.ask(question)))
 
     def close(self) -> None:
         """Cancel all jobs, and wait for a running edit. Called on another thread than the loop."""
-        self.reports.close()
-        do(self._previews.close)
-        self.file.close()
-
-    # --- sending ---------------------------------------------------------------------------------------
-
-    def send_placements(self, keys: Sequence[CameraKey]) -> None:
-        """Send the present placements of these cameras to the worker."""
-        for key in keys:
-            self._send(PlaceCamera(key, self._cameras.placements.placed.get(key)))
-        self._notify()
-
-    def _notify(self) -> None:
-        self._serial += 1
-        self._on_change()
+        do(lambda: [lane.close() for lane in self._lanes.values()])
+        self._file.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -73,7 +74,7 @@ class EditState:
     message: str = ""
     """One sentence or two: what happened, and what to do next."""
     can_copy: bool = False
-    """Refused because the file must not be edited, while a copy could be: see `FileEdits.copy_task`."""
+    """Refused because the file must not be edited, while a copy could be: see `CopyTask`."""
     picture: Picture | None = None
     """Preview of a camera that is to be added, once it is drawn."""
     drawing: bool = False
@@ -118,7 +119,7 @@ class MeasuredMoment:
 
 @dataclass(frozen=True)
 class StudioResults:
-    """Results of `CameraReports` so far."""
+    """Results of reports so far."""
 
     report: CameraReport | None = None
     """The newest one."""
@@ -137,7 +138,7 @@ class StudioResults:
     """Best first."""
     suggestions_of: CameraKey | None = None
     compared: tuple[Picture, Picture] | None = None
-    """The camera as placed, and with the settings given to `CameraReports.compare`."""
+    """The camera as placed, and with the settings of `ComparisonWanted`."""
     picked: PickedPixel | None = None
     sheet: tuple[Picture, ...] = ()
     """The selected camera's picture in every env, worst first if there is a report over them."""
@@ -160,9 +161,11 @@ class StudioView:
     was_chosen: bool = False
     """Whether somebody has chosen a camera, or none."""
     undo: str | None = None
-    """What `CameraStudio.undo` would undo, as text (``moved base_camera``); None if there is nothing."""
+    """What `UndoCamera` would undo, as text (``moved base_camera``); None if there is nothing."""
     redo: str | None = None
     edit_state: EditState = EditState()
+    copies_to: Path = Path()
+    """Folder for a copy of the task."""
     results: StudioResults = StudioResults()
     """Reports, suggestions, pictures."""
     report_stale: bool = False
@@ -175,8 +178,6 @@ class StudioView:
     """Progress of the running job; None while no job runs."""
     problem: str = ""
     """The last failure, or a placement that was dropped, as a sentence."""
-    serial: int = 0
-    """Grows with every change of anything but `StudioCamera.mount_pose`."""
 
     def camera(self, key: CameraKey | None) -> StudioCamera | None:
         """The camera of that key; None if there is none."""

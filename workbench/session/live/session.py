@@ -24,8 +24,9 @@ from workbench.jobs.policy import NoPolicy, PolicyFile, find_policy
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.machine.kept_choices import keep_check_after_save
 from workbench.machine.processes.watched_thread import listen, stop_listening
-from workbench.session.cameras.selection import KeptPlacements
-from workbench.session.cameras.studio import CameraStudio
+from workbench.session.cameras.state import KeptPlacements, first_studio, kept_placements, placed_cameras
+from workbench.session.cameras.state import view_of as studio_view_of
+from workbench.session.cameras.studio import StudioJobs
 from workbench.session.checks.checks import (
     BeginCheck,
     CheckJobs,
@@ -50,7 +51,6 @@ from workbench.session.protocol.messages import (
     Event,
     Loaded,
     LoadFailed,
-    Placed,
     Progress,
     Request,
     Settings,
@@ -66,7 +66,6 @@ from workbench.session.rescore.rescoring import BeginRescoring, EndRescoring
 from workbench.session.run.events import (
     DrawSoon,
     EnvsReset,
-    FileOpened,
     FileSaved,
     Follow,
     FollowPolicy,
@@ -150,6 +149,7 @@ class Session:
         self._state = State(
             first_run(task, options, history_bytes, settings),
             Recording(str(recordings)),
+            first_studio(None if kept is None else kept.cameras),
             checks=Checks(ChecksView(after_each_save=check)),
         )
         self._changes = ChangeCounter()
@@ -179,16 +179,7 @@ class Session:
         self._plans = PlanJobs(self._happen)
         self._seeds = SeedsJobs(recordings, self._happen)
         self._asker = Asker(self._send)
-        self.studio = CameraStudio(
-            self._send,
-            self._asker,
-            self._background,
-            self._notify,
-            lambda: self._run,
-            self.open_file,
-            None if kept is None else kept.cameras,
-        )
-        """The camera studio."""
+        self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
         # Last: what it recovers happens at once.
         self._recorder = LiveRecorder(recordings, self._happen, on_notice)
         self._past_saver = PastSaver(recordings, self._recorder.finisher, self._background, self._happen)
@@ -264,13 +255,15 @@ class Session:
             case BeginEpisodes() | TakeStep() | EndEpisodes():
                 self._recorder.perform(effect)
             case BeginSaving():
-                self._past_saver.begin(effect, self.studio.placed_cameras())
+                self._past_saver.begin(effect, placed_cameras(self._state.studio))
             case EndSaving():
                 self._past_saver.end()
             case BeginRescoring() | EndRescoring():
                 self._past_rescorer.perform(effect)
             case EnvsReset():
                 self._happen(effect)
+            case _:
+                self._studio.perform(effect)
         return None
 
     def _send(self, request: Request) -> None:
@@ -303,7 +296,8 @@ class Session:
             seeds=self._state.seeds,
             solve=self._state.solving.view(env),
         )
-        return replace(view, studio=self.studio.view(view.step, env))
+        studio = studio_view_of(self._state.studio, self._run, self._studio.progress)
+        return replace(view, studio=studio)
 
     def env_rows(self) -> EnvRows | None:
         """See `Run.env_rows`."""
@@ -322,7 +316,7 @@ class Session:
     def kept_work(self) -> KeptWork:
         """What a person did in this session, for a later session of the same task."""
         run = self._run
-        return KeptWork(run.options, run.settings, run.seed, self.studio.kept_placements())
+        return KeptWork(run.options, run.settings, run.seed, kept_placements(self._state.studio))
 
     @property
     def task_folder(self) -> Path | None:
@@ -354,10 +348,6 @@ class Session:
     def change(self, **settings: Any) -> None:
         """Change fields of `Settings`."""
         self.happen(SettingsChanged(settings))
-
-    def open_file(self, file: Path, class_name: str) -> None:
-        """Open a task class of another file instead, and watch that file."""
-        self.happen(FileOpened(file, class_name))
 
     @on_loop
     def clear_printed(self) -> None:
@@ -391,7 +381,7 @@ class Session:
         self._profiles.close()
         self._plans.close()
         self._seeds.close()
-        self.studio.close()
+        self._studio.close()
         self._past_saver.close()
         self._background.close()
         self._recorder.close()
@@ -425,7 +415,6 @@ class Session:
 
     def _died(self, death: Death) -> tuple[Problem | None, bool]:
         """Returns the problem to show, if any, and whether there is a version to bring back."""
-        self.studio.interrupted()
         before = self._run.problem_serial
         self._happen(WorkerDied(death, self._printed.tail(20)))
         run = self._run
@@ -450,19 +439,11 @@ class Session:
                 self._notify()
             case _:
                 self._happen(event)
-                if isinstance(event, Placed):
-                    self.studio.placed(event, self._run.task)
-                if isinstance(event, LoadFailed) and not event.at_run:
-                    self.studio.failed_to_load()
         return True
 
     def _on_loaded(self, event: Loaded, on_disk: bool) -> None:
         self._worker.reset_deaths()
-        level = None if event.reload is None else event.reload.level
         self._happen(VersionLoaded(event, on_disk))
-        assert self._run.task is not None, "a version was loaded"
-        placed = self.studio.loaded(self._run.task, level)
-        self.studio.send_placements(placed)
         self._happen(LoadDone())
 
     # --- files and output ----------------------------------------------------------------------------
@@ -470,7 +451,6 @@ class Session:
     @on_loop
     def _on_files_changed(self, paths: set[Path]) -> None:
         """A watched file was saved."""
-        self.studio.interrupted()
         self._happen(FileSaved())
 
     def _on_policy_saved(self) -> None:

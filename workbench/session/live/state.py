@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 from workbench.commands.command import Command
+from workbench.session.cameras import studio as of_studio
+from workbench.session.cameras.events import StudioEffect, StudioEvent
+from workbench.session.cameras.state import Studio
 from workbench.session.checks import checks as of_checks
 from workbench.session.checks import profile as of_profile
 from workbench.session.checks import solve_seeds as of_seeds
@@ -29,6 +32,7 @@ SessionEvent = (
     | of_profile.ProfileEvent
     | of_seeds.SeedsEvent
     | of_solver.SolverEvent
+    | StudioEvent
 )
 Effect = (
     RunEffect
@@ -39,10 +43,17 @@ Effect = (
     | of_profile.ProfileEffect
     | of_seeds.SeedsEffect
     | of_solver.SolverEffect
+    | StudioEffect
     | Ask
 )
 DOES: frozenset[type[Command]] = (
-    asked.DOES | of_recording.DOES | of_rescoring.DOES | of_checks.DOES | of_profile.DOES | of_seeds.DOES
+    asked.DOES
+    | of_recording.DOES
+    | of_rescoring.DOES
+    | of_checks.DOES
+    | of_profile.DOES
+    | of_seeds.DOES
+    | of_studio.DOES
 )
 """Commands that `apply` takes."""
 
@@ -53,6 +64,7 @@ class State:
 
     run: Run
     recording: of_recording.Recording
+    studio: Studio
     rescoring: of_rescoring.PastRescoring = of_rescoring.PastRescoring()
     """The history rescored with the new code."""
     checks: of_checks.Checks = of_checks.Checks()
@@ -79,18 +91,10 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     profile, for_profile = of_profile.apply(state.profile, event, before, run)
     seeds, for_seeds = of_seeds.apply(state.seeds, event, before, run)
     solving, for_solver = of_solver.apply(state.solving, event, before, run)
-    new = replace(
-        state,
-        run=run,
-        recording=recording,
-        rescoring=rescoring,
-        checks=checks,
-        profile=profile,
-        seeds=seeds,
-        solving=solving,
-    )
+    studio, for_studio = of_studio.apply(state.studio, event, run, now)
+    new = State(run, recording, studio, rescoring, checks, profile, seeds, solving)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
-    # Rescoring begins before checks: the later of two jobs of one priority comes first. What the run has to do comes last:
-    # after a load a recording continues before a recorded run is entered.
+    # Rescoring begins before checks: the later of two jobs of one priority comes first. What the run has to do comes after
+    # them: when a load is done a recording continues before a recorded run is entered.
     for_jobs = [*for_recording, *for_rescoring, *for_checks, *for_profile, *for_seeds, *for_solver]
-    return state if same else new, [*for_jobs, *for_run]
+    return state if same else new, [*for_jobs, *for_run, *for_studio]

@@ -55,7 +55,7 @@ class Job:
 class Jobs:
     """One job at a time: a new one stops the one before, which changes nothing from then on. Used on the loop."""
 
-    def __init__(self, on_change: Callable[[], None], on_failure: Callable[[JobFailed], None]) -> None:
+    def __init__(self, on_change: Callable[[], None], on_failure: Callable[[JobFailed], object]) -> None:
         """
         Args:
             on_change: called when `progress` has changed.

@@ -29,6 +29,7 @@ from workbench.commands.page import (
 )
 from workbench.commands.timeline import Seek
 from workbench.machine.kept_choices import close_hints
+from workbench.session.cameras.events import CameraChosen
 from workbench.session.live import state
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -312,7 +313,7 @@ class Page:
                 self._hints.content = ""
                 close_hints()
             case SelectCamera():
-                self._parts.do(command, visitor)
+                session.do(command, visitor.name)
                 self._open_tabs.open(visitor, STUDIO)
             case CloseDialog():
                 if self._opening is not None:
@@ -435,7 +436,7 @@ class Page:
             return
         ray = np.array(event.ray_origin), np.array(event.ray_direction)
         if (camera := self._frustums.under_ray(*ray)) is not None:
-            self._session.studio.select(camera)
+            self._session.happen(CameraChosen(camera))
             return
         if self._view_panel.only_selected:
             return

@@ -15,6 +15,7 @@ from workbench.commands.envs import ShowFirstFlagged
 from workbench.commands.page import ShowTab
 from workbench.commands.recording import StopRecording
 from workbench.core.camera_data import CameraKey
+from workbench.session.cameras.events import CameraChosen, EditWanted
 from workbench.session.cameras.view import EditRequest
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.session import Session
@@ -43,7 +44,7 @@ class Marks(PagePart[SessionView]):
 
     every = 0.25
 
-    does = (PutMovedCamerasBack, ShowCameraChange, ShowChecks)
+    does = (ShowCameraChange, ShowChecks)
 
     def __init__(self, server: viser.ViserServer, session: Session, tabs: OpenTabs) -> None:
         self._session, self._tabs = session, tabs
@@ -51,8 +52,6 @@ class Marks(PagePart[SessionView]):
 
     def do(self, command: Command, visitor: Visitor) -> None:
         match command:
-            case PutMovedCamerasBack():
-                self._put_back()
             case ShowCameraChange():
                 self._show_change(visitor)
             case ShowChecks():
@@ -83,17 +82,13 @@ class Marks(PagePart[SessionView]):
             flagged=flagged and {"text": flagged[0], "hint": flagged[1], "press": ShowFirstFlagged()},
         )
 
-    def _put_back(self) -> None:
-        for key in moved_cameras(self._session.view()):
-            self._session.studio.back_to_file(key)
-
     def _show_change(self, visitor: Visitor) -> None:
         """Show how the file would change; nothing is written before that was read."""
         moved = moved_cameras(self._session.view())
         if not moved:
             return
-        self._session.studio.select(moved[0])
-        self._session.studio.file.plan(EditRequest("edit", moved[0]))
+        self._session.happen(CameraChosen(moved[0]))
+        self._session.happen(EditWanted(EditRequest("edit", moved[0])))
         self._tabs.open(visitor, STUDIO)
 
 

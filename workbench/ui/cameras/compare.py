@@ -12,6 +12,7 @@ from workbench.commands.cameras import ChooseCompared, ComparePlacements, KeepPl
 from workbench.commands.command import Command, Refused
 from workbench.core.camera_data import CameraKey, CameraSettings, Picture
 from workbench.core.cameras.conventions import angle_between
+from workbench.session.cameras.events import CameraPlaced, ComparisonWanted
 from workbench.session.cameras.view import StudioCamera
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -70,7 +71,7 @@ class CameraCompare(PagePart[SessionView]):
                 self._compare()
             case ReturnToKept():
                 camera, _ = chosen_camera(self._session)
-                self._session.studio.place(camera.key, self._kept_of(camera))
+                self._session.happen(CameraPlaced(camera.key, self._kept_of(camera)))
 
     def _kept_of(self, camera: StudioCamera) -> CameraSettings:
         if camera.key not in self._kept:
@@ -87,7 +88,7 @@ class CameraCompare(PagePart[SessionView]):
             raise Refused("The file has placed this camera in one way since the page was opened.")
         self._asked = (camera.key, now, other, NAMES[self._other])
         self._pair.asked(self._session.view().studio.results.compared)
-        self._session.studio.reports.compare(other)
+        self._session.happen(ComparisonWanted(other))
 
     def _note_file(self, cameras: tuple[StudioCamera, ...]) -> None:
         for camera in cameras:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.authoring.camera_source import calibration_files
 from workbench.commands.cameras import (
     ApplyCalibration,
     ChooseCameraFile,
@@ -22,6 +24,7 @@ from workbench.commands.cameras import (
 from workbench.commands.command import Command, Refused
 from workbench.core.cameras import conventions as frames
 from workbench.core.cameras.conventions import Convention, Direction
+from workbench.session.cameras.events import CameraPlaced
 from workbench.session.cameras.view import StudioCamera
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -147,23 +150,21 @@ class CameraExport(PagePart[SessionView]):
         camera, _ = chosen_camera(self._session)
         cameras = self._session.view().studio.cameras if self._every else (camera,)
         try:
-            text = self._session.studio.export(tuple(one.key for one in cameras), self._form)
+            text = calibration_text(cameras, self._form)
         except ValueError as reason:
             raise Refused(str(reason)) from None
         name = file_name("cameras" if self._every else camera.key[1], self._form)
         client.send_file_download(name, text.encode("utf-8"), save_immediately=True)
 
     def _place_by_text(self, client: viser.ClientHandle) -> None:
-        camera, _ = chosen_camera(self._session)
+        camera, now = chosen_camera(self._session)
         if not self._text.strip():
             raise Refused("Paste a calibration into the field first: a matrix, our JSON, or an OpenCV YAML.")
-        metres = UNITS[self._units]
         try:
-            self._session.studio.import_pose(
-                camera.key, self._text, self._direction, self._convention, metres
-            )
+            pose = calibrated_pose(camera, self._text, self._direction, self._convention, UNITS[self._units])
         except ValueError as reason:
             raise Refused(str(reason)) from None
+        self._session.happen(CameraPlaced(camera.key, frames.with_pose(now, pose)))
         client.add_notification(
             "Placed",
             "The pose was applied. The lens, if the text has one, was not: its matrix goes into Lens and image.",
@@ -188,6 +189,56 @@ class CameraExport(PagePart[SessionView]):
         if wanted != self._drawn:
             self._drawn = wanted
             self._html.content = matrices_html(camera, self._convention, self._direction)
+
+
+def calibration_text(cameras: Sequence[StudioCamera], form: Form) -> str:
+    """The text of a calibration file: cameras as placed, at the shown moment of the selected env.
+
+    ROS's format has one camera a file; several become YAML documents in one text.
+
+    Raises:
+        ValueError: a camera cannot be exported; the message is for the reader.
+    """
+    to_export = []
+    for camera in cameras:
+        kind, name = camera.key
+        if camera.now is None:
+            raise ValueError(f"there is no {kind} camera {name} whose settings are known")
+        to_export.append(
+            calibration_files.CameraToExport(camera.key, camera.now, camera.info.mount, camera.mount_pose)
+        )
+    if form == "ros":
+        return "---\n".join(calibration_files.camera_as_ros_yaml(one) for one in to_export)
+    write = calibration_files.cameras_as_json if form == "json" else calibration_files.cameras_as_opencv_yaml
+    return write(to_export)
+
+
+def calibrated_pose(
+    camera: StudioCamera,
+    text: str,
+    direction: Direction | None,
+    convention: Convention | None,
+    metres_per_unit: float = 1.0,
+) -> frames.Floats:
+    """(7,) pose by a calibration, in the frame of the camera's mount, or the env's if it has none.
+
+    Our own JSON contains direction and convention; for all else they are arguments.
+
+    Raises:
+        ValueError: with a message for the reader.
+    """
+    info = camera.info
+    found = calibration_files.find_poses(text)
+    chosen = [pose for pose in found if info.name in pose.label] or list(found)
+    if len(chosen) > 1:
+        labels = ", ".join(pose.label for pose in chosen)
+        raise ValueError(f"it holds several poses ({labels}): paste only the one you mean")
+    pose = calibration_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
+    if chosen[0].stated is None or info.mount is None:
+        return pose
+    if camera.mount_pose is None:
+        raise ValueError(f"the pose of {info.mount}, on which {info.name} is mounted, is not known yet")
+    return frames.relative_to(camera.mount_pose, pose)  # ours is of the env's frame
 
 
 def file_name(name: str, form: Form) -> str:

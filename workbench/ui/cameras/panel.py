@@ -15,6 +15,7 @@ from workbench.commands.cameras import PickPixel, ShowFrustums, ShowPictures
 from workbench.commands.command import Command, Refused
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
 from workbench.machine.text import listed
+from workbench.session.cameras.events import PreviewWanted
 from workbench.session.cameras.studio import PREVIEW_MODALITIES
 from workbench.session.cameras.view import PickedPixel, StudioCamera
 from workbench.session.live.session import Session
@@ -343,7 +344,7 @@ class StudioPicture:
         picture = None if key is None else view.pictures.get(key)
         if preview:
             picture = studio.preview
-            self._session.studio.draw_preview()
+            self._session.happen(PreviewWanted())
         self._picture.settle()
         failed = "" if key is None else view.failed_cameras.get(key, "")
         if failed:

@@ -29,6 +29,7 @@ from workbench.core.cameras.conventions import (
     triple,
     with_pose,
 )
+from workbench.session.cameras.events import CameraPlaced
 from workbench.session.cameras.view import StudioCamera
 from workbench.session.live.session import Session
 
@@ -215,14 +216,14 @@ class Placing:
         return Frame(camera.mount_pose, self.offset)
 
     def place(self, key: CameraKey, settings: CameraSettings, control: object, pause: float = PAUSE) -> None:
-        """Place it live; `control` and `pause` as in `CameraStudio.place`.
+        """Place it live; `control` and `pause` as in `CameraPlaced`.
 
         Raises:
             Refused: it is too far away for any task.
         """
         if not all(abs(x) <= FARTHEST for x in settings.position):
             raise Refused(f"A camera must be within {FARTHEST:g} m of the origin.")
-        self._session.studio.place(key, settings, control, pause)
+        self._session.happen(CameraPlaced(key, settings, control, pause))
 
     def change(self, control: object, change: Callable[[CameraSettings, Frame], CameraSettings]) -> None:
         """Apply `change` to the chosen camera; `control` as in `place`.

@@ -17,13 +17,13 @@ from workbench.commands.cameras import (
     MeasureChosenCamera,
     Measured,
     ShowMeasuredMoment,
-    StopMeasuring,
     UseSuggestedPlane,
 )
 from workbench.commands.command import Command, Refused
 from workbench.commands.envs import SelectEnv
 from workbench.core.camera_data import Picture
 from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, size_text
+from workbench.session.cameras.events import CameraPlaced, MeasureWanted, SheetWanted
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -61,7 +61,6 @@ class CameraReportPanel(PagePart[SessionView]):
         ChooseMeasuredResets,
         MeasureChosenCamera,
         DrawSheet,
-        StopMeasuring,
         ShowMeasuredMoment,
         UseSuggestedPlane,
     )
@@ -92,7 +91,7 @@ class CameraReportPanel(PagePart[SessionView]):
     # --- requests ------------------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        studio, reports = self._session.view().studio, self._session.studio.reports
+        studio = self._session.view().studio
         match command:
             case ChooseMeasured(over=over):
                 self._over = over
@@ -104,15 +103,11 @@ class CameraReportPanel(PagePart[SessionView]):
                 raise Refused("Choose the camera first.")
             case MeasureChosenCamera():
                 self._report.asked(studio.results.report)
-                if self._over == "steps":
-                    reports.measure_steps(self._steps)
-                else:
-                    reports.measure(self._resets if self._over == "resets" else 0)
+                most = self._steps if self._over == "steps" else self._resets
+                self._session.happen(MeasureWanted(self._over, most))
             case DrawSheet():
                 self._pictures.asked(studio.results.sheet)
-                reports.make_sheet()
-            case StopMeasuring():
-                reports.stop()
+                self._session.happen(SheetWanted())
             case ShowMeasuredMoment(number=number):
                 self._show_moment(number)
             case UseSuggestedPlane(plane=plane):
@@ -131,7 +126,7 @@ class CameraReportPanel(PagePart[SessionView]):
         near = report.depth.suggested_near if plane == "near" else camera.now.near
         far = report.depth.suggested_far if plane == "far" else camera.now.far
         if near is not None and far is not None and near < far:
-            self._session.studio.place(camera.key, replace(camera.now, near=near, far=far))
+            self._session.happen(CameraPlaced(camera.key, replace(camera.now, near=near, far=far)))
 
     # --- drawing -------------------------------------------------------------------------------------
 

@@ -23,11 +23,9 @@ from workbench.commands.cameras import (
     MoveCameraRight,
     MoveCameraToView,
     MoveCameraUp,
-    PickPixel,
     RedoCamera,
     ResetCamera,
     ScalePreview,
-    SelectCamera,
     ShowModality,
     ShowOneEnv,
     ToggleLookThrough,
@@ -41,6 +39,7 @@ from workbench.commands.command import Command, Refused
 from workbench.commands.page import TellUnfolded
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.core.cameras.conventions import target_of
+from workbench.session.cameras.events import CameraChosen
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -108,22 +107,16 @@ class StudioPanel(PagePart[SessionView]):
     """
 
     does = (
-        SelectCamera,
         ChooseCamera,
-        UndoCamera,
-        RedoCamera,
         *MOVES,
         *TURNS,
         ToggleLookThrough,
         MoveCameraToView,
-        ResetCamera,
         ChooseHandles,
         ChooseAxes,
         ChooseSnap,
         ShowOneEnv,
         ShowModality,
-        ScalePreview,
-        PickPixel,
         *CameraNumbers.does,
     )
 
@@ -181,7 +174,7 @@ class StudioPanel(PagePart[SessionView]):
             return
         cameras = sorted(view.task.cameras, key=lambda camera: camera.kind != "sensor")
         if cameras and view.studio.selected is None:
-            self._session.studio.select(cameras[0].key)
+            self._session.happen(CameraChosen(cameras[0].key))
 
     @property
     def shows(self) -> str:
@@ -369,23 +362,13 @@ class StudioPanel(PagePart[SessionView]):
     # --- what a person does ------------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        studio = self._session.studio
         match command:
-            case SelectCamera(kind=kind, name=name):
-                studio.select((kind, name))
             case ChooseCamera(name=name):
-                studio.select(self._key_of(name))
-            case UndoCamera():
-                studio.undo()
-            case RedoCamera():
-                studio.redo()
+                self._session.happen(CameraChosen(self._key_of(name)))
             case ToggleLookThrough():
                 self._look.toggle(visitor.client)
             case MoveCameraToView():
                 self._placing.change(None, partial(self._look.settings_from, visitor.client))
-            case ResetCamera():
-                if (key := self._session.view().studio.selected) is not None:
-                    studio.back_to_file(key)
             case ChooseHandles(look_at=look_at):
                 self._look_at = look_at
             case ChooseAxes(own=own):
@@ -398,10 +381,6 @@ class StudioPanel(PagePart[SessionView]):
                 self._view_panel.show_only_selected(one)
             case ShowModality(kind=kind):
                 self._picture.show_kind(kind)
-            case ScalePreview(scale=scale):
-                studio.set_preview_scale(scale)
-            case PickPixel(x=x, y=y):
-                studio.reports.pick(x, y)
             case _ if isinstance(command, CameraNumbers.does):
                 self._numbers.do(command, visitor)
             case _ if type(command) in self._inner.does:

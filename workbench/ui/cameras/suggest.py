@@ -22,6 +22,7 @@ from workbench.core.camera_data import CameraKey, CameraKind, CameraSettings
 from workbench.core.cameras.conventions import rotation_matrix, triple
 from workbench.core.cameras.report import OfferedPlacement
 from workbench.jobs.task import TaskDescription
+from workbench.session.cameras.events import SuggestionsWanted
 from workbench.session.cameras.view import StudioCamera
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -80,7 +81,6 @@ class CameraSuggest(PagePart[SessionView]):
         ShowSearchBox,
         ChooseSearchResets,
         SearchPlacements,
-        UsePlacement,
     )
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
@@ -142,8 +142,6 @@ class CameraSuggest(PagePart[SessionView]):
                 self._resets = resets
             case SearchPlacements():
                 self._search_placements()
-            case UsePlacement(number=number):
-                self._session.studio.take_suggestion(number)
 
     def _search_placements(self) -> None:
         view = self._session.view()
@@ -155,7 +153,7 @@ class CameraSuggest(PagePart[SessionView]):
             raise Refused("Choose at least one object that must be visible.")
         self._offers.asked(view.studio.results.suggestions)
         low, high = ordered(self._box_of(camera, now))
-        self._session.studio.reports.suggest(wanted, low, high, self._resets)
+        self._session.happen(SuggestionsWanted(wanted, low, high, self._resets))
 
     def _wanted_of(self, key: CameraKey | None, choices: tuple[VisibleObject, ...]) -> frozenset[str]:
         by_default = frozenset(choice.name for choice in choices if choice.first)

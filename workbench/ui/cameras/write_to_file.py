@@ -29,6 +29,7 @@ from workbench.commands.cameras import (
 from workbench.commands.command import Command, Refused
 from workbench.core.camera_data import CameraKind, CameraSettings
 from workbench.core.cameras.conventions import axes_of, intrinsic_of, pose_of, vertical_fov
+from workbench.session.cameras.events import EditWanted
 from workbench.session.cameras.file_edits import IN_FILE
 from workbench.session.cameras.view import EditRequest, EditState, StudioView
 from workbench.session.live.session import Session
@@ -181,10 +182,6 @@ class WriteToFile(PagePart[SessionView]):
 
     does = (
         PlanCameraChange,
-        SaveCameraChange,
-        RevertCameraChange,
-        CopyTask,
-        DropCameraChange,
         NameCamera,
         AddCamera,
         DuplicateCamera,
@@ -200,7 +197,7 @@ class WriteToFile(PagePart[SessionView]):
         above: viser.GuiFolderHandle,
     ) -> None:
         self._session, self._from_viewer = session, from_viewer
-        gui, folder = server.gui, session.studio.file.folder
+        gui, folder = server.gui, session.view().studio.copies_to
         self._name = ""
         self._named: EditState | None = None
         """Last change after which the field for a name was emptied."""
@@ -218,18 +215,8 @@ class WriteToFile(PagePart[SessionView]):
     # --- requests --------------------------------------------------------------------------------------
 
     def do(self, command: Command, visitor: Visitor) -> None:
-        studio, file = self._session.view().studio, self._session.studio.file
+        studio = self._session.view().studio
         match command:
-            case SaveCameraChange():
-                if studio.edit_state.stage != "planned" or is_stale(studio):
-                    raise Refused("Show the change first: only what you have read is saved.")
-                file.write()
-            case RevertCameraChange():
-                file.undo_write()
-            case CopyTask():
-                file.copy_task()
-            case DropCameraChange():
-                file.drop_plan()
             case NameCamera(name=name):
                 self._name = name
             case AddCamera(kind=kind):
@@ -254,7 +241,7 @@ class WriteToFile(PagePart[SessionView]):
         """Ask for a plan. Notes the place first: the answer may come at once."""
         change = self._change if request.what == "edit" else self._member_change
         change.arrival.asked(self._session.view().studio.edit_state)
-        self._session.studio.file.plan(request)
+        self._session.happen(EditWanted(request))
 
     def _add(self, kind: CameraKind, client: viser.ClientHandle) -> None:
         view = self._session.view()
