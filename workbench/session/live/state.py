@@ -17,7 +17,6 @@ from workbench.session.record import recording as of_recording
 from workbench.session.record.saving import SaveEvent, SaveWanted
 from workbench.session.rescore import rescoring as of_rescoring
 from workbench.session.run import apply as of_run
-from workbench.session.run import asked
 from workbench.session.run.events import Now, RunEffect, RunEvent
 from workbench.session.run.run import Run
 
@@ -47,7 +46,7 @@ Effect = (
     | Ask
 )
 DOES: frozenset[type[Command]] = (
-    asked.DOES
+    of_run.DOES
     | of_recording.DOES
     | of_rescoring.DOES
     | of_checks.DOES

@@ -1,14 +1,67 @@
-"""How each event changes the run."""
+"""How each event changes the run, commands among them."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+import msgspec
+
+from workbench.authoring.loading.reference import (
+    reference_to_class,
+)
+from workbench.commands.cameras import ChoosePictures
+from workbench.commands.command import Command, Refused
+from workbench.commands.envs import NextEnv, PreviousEnv, SelectEnv
+from workbench.commands.run import (
+    ChooseActions,
+    ChooseClass,
+    ChooseEpisodeEnd,
+    Interrupt,
+    PauseRun,
+    PlayRun,
+    RebuildScene,
+    ReloadCameras,
+    ReloadCode,
+    ReloadFile,
+    ResetAll,
+    ResetSelected,
+    RestartWorker,
+    SetPolicy,
+    SetSeed,
+    SetSpeed,
+    Step,
+    TogglePlay,
+    UseControlMode,
+)
+from workbench.commands.solve import (
+    ChooseMethod,
+    ChoosePlannedEnvs,
+    FollowBody,
+    SetHorizon,
+    SetNoise,
+    SetPlanEvery,
+    SetRollouts,
+    SetTemperature,
+)
+from workbench.commands.timeline import (
+    ContinueFromHere,
+    GoToLast,
+    NextEvent,
+    PreviousEvent,
+    Seek,
+    StepBack,
+    StepForward,
+    UndoReset,
+)
 from workbench.core.capture.inspection import Inspection
 from workbench.jobs.task import Stepped
 from workbench.session.events import Asked
 from workbench.session.protocol.messages import (
     CameraFailed,
+    EnterRecording,
     Inspect,
     LoadFailed,
     Loading,
@@ -16,21 +69,14 @@ from workbench.session.protocol.messages import (
     PastPictures,
     Pictures,
     Placed,
+    Play,
     ReadPolicyAgain,
+    Reset,
     RulesBroken,
+    SingleStep,
     Status,
     Tell,
     Told,
-)
-from workbench.session.run.asked import (
-    DOES,
-    change_settings,
-    do_command,
-    draw_past,
-    enter,
-    reset,
-    show,
-    show_live,
 )
 from workbench.session.run.events import (
     ActionTold,
@@ -39,7 +85,9 @@ from workbench.session.run.events import (
     EpisodeStepShown,
     FileOpened,
     FileSaved,
+    FollowPolicy,
     InspectionWanted,
+    InterruptWorker,
     LoadDone,
     LoadGaveWay,
     MomentShown,
@@ -48,6 +96,8 @@ from workbench.session.run.events import (
     PagesCounted,
     PastPicturesWanted,
     PolicySaved,
+    ReplaceWorker,
+    RunEffect,
     RunToEnter,
     Send,
     SettingsChanged,
@@ -65,7 +115,49 @@ from workbench.session.run.loading import (
     reload_file,
     try_next,
 )
-from workbench.session.run.run import Change, Run, at_rest, new_pictures, with_problem
+from workbench.session.run.past import Past
+from workbench.session.run.run import Change, Run, at_rest, movable_bodies, new_pictures, with_problem
+
+_NEW_PLAN = ChooseMethod, SetRollouts, SetHorizon, SetNoise, SetTemperature, SetPlanEvery
+DOES: frozenset[type[Command]] = frozenset(
+    {
+        TogglePlay,
+        PlayRun,
+        PauseRun,
+        Step,
+        ResetAll,
+        ResetSelected,
+        SelectEnv,
+        NextEnv,
+        PreviousEnv,
+        SetSeed,
+        SetSpeed,
+        ChooseEpisodeEnd,
+        ChooseActions,
+        SetPolicy,
+        ChoosePlannedEnvs,
+        FollowBody,
+        *_NEW_PLAN,
+        ChoosePictures,
+        ReloadFile,
+        RebuildScene,
+        ReloadCode,
+        ReloadCameras,
+        ChooseClass,
+        UseControlMode,
+        RestartWorker,
+        Interrupt,
+        StepBack,
+        StepForward,
+        PreviousEvent,
+        NextEvent,
+        Seek,
+        GoToLast,
+        UndoReset,
+        ContinueFromHere,
+    }
+)
+"""Commands that `apply` takes."""
 
 
 def apply(run: Run, event: object, now: Now) -> Change:
@@ -86,7 +178,7 @@ def apply(run: Run, event: object, now: Now) -> Change:
 def _apply(run: Run, event: object, now: Now) -> Change:
     match event:
         case Asked(command=command) if type(command) in DOES:
-            return do_command(run, command)
+            return _do_command(run, command)
         case VersionLoaded():
             return loaded(run, event.loaded, event.on_disk, now)
         case Stepped():
@@ -101,7 +193,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
         case LoadFailed():
             return load_failed(run, event, now)
         case LoadDone() if run.to_enter is not None:
-            return enter(replace(run, to_enter=None), run.to_enter)
+            return _enter(replace(run, to_enter=None), run.to_enter)
         case LoadGaveWay():
             return try_next(run, event.failed)
         case NewProcessNeeded():
@@ -130,7 +222,7 @@ def _apply(run: Run, event: object, now: Now) -> Change:
             changes = (count == 0) != (run.pages == 0)
             return counted, [Send(counted.for_worker())] if changes else []
         case SettingsChanged(values=values):
-            return change_settings(run, **values)
+            return _change_settings(run, **values)
         case OptionsApplied(options=options):
             return apply_options(run, options)
         case FileOpened():
@@ -140,28 +232,209 @@ def _apply(run: Run, event: object, now: Now) -> Change:
             )
             return reload_file(opened, "auto", follow(opened, ()))
         case MomentShown(serial=serial, env=env):
-            run, effects = (run, []) if env is None else change_settings(run, selected_env=env)
-            return show(run, None if run.past is None else run.past.seek(serial)), effects
+            run, effects = (run, []) if env is None else _change_settings(run, selected_env=env)
+            return _show(run, None if run.past is None else run.past.seek(serial)), effects
         case EpisodeStepShown(env=env, step=step):
-            run, effects = change_settings(run, selected_env=env)
-            return show(run, None if run.kept is None else run.kept.seek_step(env, step)), effects
+            run, effects = _change_settings(run, selected_env=env)
+            return _show(run, None if run.kept is None else run.kept.seek_step(env, step)), effects
         case PastPicturesWanted(at=at):
-            return draw_past(run) if at in (None, run.stands_at) else (run, [])
+            return _draw_past(run) if at in (None, run.stands_at) else (run, [])
         case ActionTold():
             if run.task is None:
                 return run, []
             envs = tuple(range(run.num_envs)) if event.env_idx is None else event.env_idx
-            return show_live(run), [Send(Tell(envs, event.dimensions, event.values))]
+            return _show_live(run), [Send(Tell(envs, event.dimensions, event.values))]
         case InspectionWanted(sections=sections):
             return run, [Send(Inspect(run.env, sections))]
         case EnvsReset(env_idx=env_idx):
-            return reset(run, env_idx)
+            return _reset(run, env_idx)
         case RunToEnter():
-            return enter(run, event)
+            return _enter(run, event)
     return run, []
 
 
-# --- what the worker says ---------------------------------------------------------------------------
+# --- what a person asks ------------------------------------------------------------------------------
+
+
+def _do_command(run: Run, command: Command) -> Change:
+    match command:
+        case TogglePlay():
+            return _play(run, not run.playing)
+        case PlayRun():
+            return _play(run, True)
+        case PauseRun():
+            return _play(run, False)
+        case Step():
+            return _set_playing(_show_live(run), False), [Send(SingleStep())]
+        case ResetAll():
+            return _reset(run, None)
+        case ResetSelected():
+            return _reset(run, (run.env,))
+        case SetSeed(seed=seed):
+            return _reset(replace(run, seed=seed), None)
+        case SelectEnv(env=env):
+            if not 0 <= env < run.num_envs:
+                raise Refused(f"There is no env {env}: they are 0 to {run.num_envs - 1}.")
+            return _change_settings(run, selected_env=env)
+        case NextEnv():
+            return _change_settings(run, selected_env=(run.env + 1) % run.num_envs)
+        case PreviousEnv():
+            return _change_settings(run, selected_env=(run.env - 1) % run.num_envs)
+        case SetSpeed(speed=speed):
+            return _change_settings(run, speed=math.inf if speed is None else speed)
+        case ChooseEpisodeEnd(rule=rule):
+            return _change_settings(run, episode_end=rule)
+        case ChooseActions(source=source):
+            # Without a name a policy is a source too: the next step reports what is missing.
+            policy = run.named_policy if source == "policy" else None
+            return _change_settings(run, action_source=source, policy=policy)
+        case SetPolicy(policy=policy):
+            policy = policy.strip()
+            if policy and ":" not in policy:
+                raise Refused("A policy is written module:function or file.py:function.")
+            return _change_settings(run, action_source="policy", policy=policy or None)
+        case ChoosePlannedEnvs(envs=envs):
+            return _change_settings(run, solve_all=envs == "all")
+        case FollowBody(body=body):
+            if body and body not in movable_bodies(run.task):
+                raise Refused("There is no such body that moves.")
+            return _change_settings(run, traced=body)
+        case ChoosePictures(pictures=pictures):
+            return _change_settings(run, pictures=pictures)
+        case _ if isinstance(command, _NEW_PLAN):
+            plan = replace(run.settings.plan, **msgspec.structs.asdict(command))
+            return _change_settings(run, plan=plan)
+        case ReloadFile():
+            return reload_file(run)
+        case RebuildScene():
+            return reload_file(run, "rebuilt")
+        case ReloadCode():
+            return reload_file(run, "patched")
+        case ReloadCameras():
+            return reload_file(run, "cameras")
+        case ChooseClass(name=name):
+            return _choose_class(run, name)
+        case UseControlMode(mode=mode):
+            if run.task is None or run.task.control_mode == mode:
+                return run, []
+            env_kwargs = {**run.options.env_kwargs, "control_mode": mode}
+            return apply_options(run, replace(run.options, env_kwargs=env_kwargs))
+        case RestartWorker():
+            return replace(run, recovery=run.recovery.restart_requested()), [ReplaceWorker()]
+        case Interrupt():
+            return run, [InterruptWorker()]
+        case _:
+            return _travel(run, command)
+
+
+def _travel(run: Run, command: Command) -> Change:
+    """Commands of the timeline."""
+    past, env = run.kept, run.env
+    if past is None:
+        raise Refused("There is no step yet.")
+    match command:
+        case StepBack():
+            return _show(run, past.seek_by(env, -1)), []
+        case StepForward():
+            return _show(run, past.seek_by(env, 1)), []
+        case PreviousEvent():
+            return _show(run, past.seek_event(env, -1)), []
+        case NextEvent():
+            return _show(run, past.seek_event(env, 1)), []
+        case Seek(step=step, episode_only=episode_only):
+            return _show(run, past.seek_tick(step, env if episode_only else None)), []
+        case GoToLast():
+            return _show_live(run), []
+        case UndoReset():
+            run, effects = _play(run, False, live=False)
+            restore = past.undo(env)
+        case ContinueFromHere(scope=scope):
+            effects = []
+            restore = past.continue_from_shown(env, scope)
+        case _:
+            raise AssertionError(f"{command} is not in DOES")
+    if restore is None:
+        return new_pictures(run), effects
+    return new_pictures(replace(run, past=past.seek(None))), [*effects, Send(restore)]
+
+
+def _set_playing(run: Run, playing: bool) -> Run:
+    return replace(run, playing=playing, wants_play=playing)
+
+
+def _play(run: Run, playing: bool, live: bool = True) -> Change:
+    run = _show_live(run) if playing and live else run
+    return _set_playing(run, playing), [Send(Play(playing))]
+
+
+def _reset(run: Run, env_idx: tuple[int, ...] | None) -> Change:
+    return _show_live(run), [Send(Reset(env_idx, run.seed if env_idx is None else None))]
+
+
+def _show_live(run: Run) -> Run:
+    """The newest moment is shown."""
+    return _show(run, None if run.past is None else run.past.seek(None))
+
+
+def _show(run: Run, past: Past | None) -> Run:
+    """`past` shows another moment, or the same."""
+    if past is None or run.past is None or past.shown is run.past.shown:
+        return run
+    return new_pictures(replace(run, past=past))
+
+
+def _draw_past(run: Run) -> Change:
+    if run.past is None:
+        return run, []
+    past, request = run.past.draw(run.env, run.settings.cameras, run.settings.pictures)
+    return replace(run, past=past), [] if request is None else [Send(request)]
+
+
+def _change_settings(run: Run, **values: Any) -> Change:
+    """Change fields of `Settings`; the selected env is clipped to the batch, once there is one."""
+    before = run.settings
+    new = replace(before, **values)
+    selected = max(int(new.selected_env), 0)
+    new = replace(new, selected_env=selected if run.task is None else min(selected, run.task.num_envs - 1))
+    if new.action_source == "policy" and ("policy" in values or new.policy):
+        run = replace(run, named_policy=new.policy)
+    if new == before:
+        return run, []
+    policy = run.policy
+    run = replace(run, settings=new)
+    if new.cameras != before.cameras:
+        # One that is asked for again is tried again.
+        kept = {camera.key for camera in before.cameras} & {camera.key for camera in new.cameras}
+        run = replace(
+            run, failed_cameras={key: why for key, why in run.failed_cameras.items() if key in kept}
+        )
+    if new.selected_env != before.selected_env:
+        # Without this the other env's picture would stay until a new one comes.
+        run = new_pictures(replace(run, pictures={}))
+    effects: list[RunEffect] = [Send(run.for_worker())]
+    if run.policy != policy:
+        effects.append(FollowPolicy(run.policy, run.folder))
+    return run, effects
+
+
+def _choose_class(run: Run, name: str) -> Change:
+    if run.own_file is None or name not in run.choices:
+        raise Refused("The file has no such task.")
+    file = run.own_file if run.task is None or run.task.file is None else Path(run.task.file)
+    choices = (name, *(other for other in run.choices if other != name))
+    return reload_file(replace(run, reference=reference_to_class(run.reference, file, name), choices=choices))
+
+
+def _enter(run: Run, wanted: RunToEnter) -> Change:
+    run, effects = _play(_show_live(run), False)
+    if run.task is None:
+        return replace(run, to_enter=wanted), effects
+    env_idx = tuple(range(run.num_envs)) if wanted.everywhere else (run.env,)
+    request = EnterRecording(wanted.run, env_idx, wanted.source_file, dict(wanted.source), wanted.number)
+    return run, [*effects, Send(request)]
+
+
+# --- what the worker says ----------------------------------------------------------------------------
 
 
 def _stepped(run: Run, event: Stepped) -> Run:
