@@ -81,10 +81,10 @@ ENVS = 3
 NOW = Now(5.0, 1e9)
 
 
-def loaded(level: Any = None, hash: str = "a") -> VersionLoaded:
+def loaded(level: Any = None, hash: str = "a", envs: int = ENVS) -> VersionLoaded:
     """The worker has loaded a version; without a level the first."""
-    geometry, poses = table_scene(ENVS)
-    first = step_of(poses, success=np.zeros(ENVS, bool))
+    geometry, poses = table_scene(envs)
+    first = step_of(poses, success=np.zeros(envs, bool))
     task = replace(description(geometry, (camera(),)), source_hash=hash)
     report = None if level is None else Report(level, "")
     return VersionLoaded(Loaded(task, first, {}, report, None), True)
@@ -214,6 +214,15 @@ def test_an_episode_that_a_load_ends_is_followed_by_the_next_one_of_each_env() -
     assert state.recording.env_idx == (0,) and effects == []
 
 
+def test_envs_that_a_smaller_version_lacks_are_recorded_no_more() -> None:
+    all_envs = Asked(ChooseRecordedEnvs(envs="all")), Asked(ToggleRecording())
+    state, effects = after(loaded(), *all_envs, RESET, loaded("rebuilt", "b", envs=2), LoadDone())
+    assert state.recording.env_idx == (0, 1) and EnvsReset((0, 1)) in effects
+    last = RecordingWanted((2,))
+    state, effects = after(loaded(), last, RESET, loaded("rebuilt", "b", envs=2), LoadDone())
+    assert not state.recording.env_idx and effects == []
+
+
 def test_what_dies_is_not_recorded_again_and_what_is_handed_over_is() -> None:
     for end in End:
         died = WorkerDied(replace(DEATH, end=end), "")
@@ -231,7 +240,11 @@ def test_envs_are_reset_after_their_capture_was_asked_for() -> None:
 def test_steps_that_wait_for_the_disk_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(of_recording, "MOST_WAITING_BYTES", 1)
     state, effects = after(loaded(), Asked(ToggleRecording()), RESET)
-    assert effects == [EndEpisodes()] and state.recording.problem and not state.recording.env_idx
+    assert (
+        effects == [EndEpisodes(), Send(SetCapture(()))]
+        and state.recording.problem
+        and not state.recording.env_idx
+    )
 
 
 def test_what_an_older_recording_or_job_says_changes_nothing_but_the_bytes_that_wait() -> None:

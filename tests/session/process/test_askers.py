@@ -237,6 +237,27 @@ def test_the_job_that_was_begun_last_comes_first_and_what_gave_way_is_done_again
     assert len(pids) == 1, "what was left gave its answer in time, and its process goes on"
 
 
+def test_two_that_are_stopped_at_once_leave_the_process_to_the_next(background: Background) -> None:
+    async def for_ever() -> None:
+        await asyncio.Event().wait()
+
+    async def at_once() -> str:
+        return "done"
+
+    tasks = do(lambda: [loop.begin(background.in_turns(Job(name), for_ever)) for name in ("one", "other")])
+    do(lambda: None)  # one has the process, the other waits for it
+
+    def stop() -> None:
+        # As a save stops two jobs: neither has left before the other is stopped.
+        for task in tasks:
+            task.cancel()
+
+    do(stop)
+    until(lambda: all(task.done() for task in tasks), "their end")
+    assert all(task.cancelled() for task in tasks)
+    assert in_turns(background, Job("next"), at_once).result(PATIENCE) == "done"
+
+
 @pytest.mark.slow
 def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes_on_with_another(
     background: Background, tmp_path: Path

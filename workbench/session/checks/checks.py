@@ -238,7 +238,7 @@ def _take(checks: Checks, event: object) -> Checks:
         case CheckWaits(waits=waits) if waits != view.waits:
             return _changed(checks, waits=waits)
         case GroupBegan():
-            return _changed(checks, state="checking")
+            return _changed(checks, state="checking", waits=False)
         case RuleChecked(result=result, seconds=seconds, total=total):
             results = tuple(by_rule((*view.results, result)).values())
             before = tuple(finding for finding in view.before if finding.rule != result.rule)

@@ -182,10 +182,12 @@ class Background(Asker):
             return
         if self._idle is not None:
             self._idle.cancel()
-        if not self._waiting:
+        # Of two jobs that are stopped at once one may not have left yet.
+        waiting = [rank for rank, granted in self._waiting.items() if not granted.done()]
+        if not waiting:
             self._idle = loop.later(IDLE_SECONDS, self.end)
             return
-        self._turn = max(self._waiting)
+        self._turn = max(waiting)
         self._waiting.pop(self._turn).set_result(None)
 
     def _end_turn(self) -> None:

@@ -277,7 +277,11 @@ def _apply(
         case VersionLoaded(loaded=loaded) if recording.env_idx:
             return _loaded(recording, loaded, before)
         case LoadDone() if (continues := recording.continues) is not None:
-            env_idx, one_each = continues.env_idx, continues.one_each
+            one_each = continues.one_each
+            # The version may have fewer envs.
+            env_idx = tuple(env for env in continues.env_idx if env < run.num_envs)
+            if not env_idx:
+                return replace(recording, continues=None), []
             reset = not (continues.put_back or one_each)
             return _start(recording, run, env_idx, one_each=one_each, reset=reset)
     return recording, []
@@ -316,7 +320,7 @@ def _take(recording: Recording, stepped: Stepped) -> Change:
     size = _size(stepped)
     waiting = recording.waiting_bytes + size
     if waiting > MOST_WAITING_BYTES:
-        return _ended(recording, TOO_SLOW), [EndEpisodes()]
+        return _ended(recording, TOO_SLOW), [EndEpisodes(), Send(SetCapture(()))]
     return replace(recording, waiting_bytes=waiting), [TakeStep(stepped, size)]
 
 
@@ -325,7 +329,7 @@ def _recorded(recording: Recording, event: StepRecorded) -> Change:
     if event.number != recording.number or not recording.env_idx:
         return recording, []  # another recording has begun, or none
     if event.problem is not None:
-        return _ended(recording, event.problem), [EndEpisodes(), Send(SetCapture((), from_reset=True))]
+        return _ended(recording, event.problem), [EndEpisodes(), Send(SetCapture(()))]
     left = tuple(env for env in recording.env_idx if env in event.env_idx)
     recorded = replace(recording, env_idx=left, under_way=event.under_way)
     if left == recording.env_idx:
