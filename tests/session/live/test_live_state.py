@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from workbench.session.process.supervisor import End
 from workbench.session.protocol.messages import (
     CameraFailed,
     CameraRequest,
+    Inspect,
     Load,
     LoadFailed,
     Loading,
@@ -38,7 +40,8 @@ from workbench.session.protocol.messages import (
 )
 from workbench.session.protocol.messages import Told as ToldRobots
 from workbench.session.rescore.rescoring import CodeLoads, MomentsRescored, RescoringDone
-from workbench.session.run.events import MomentShown, OptionsApplied, PagesCounted
+from workbench.session.run.events import MomentShown, OptionsApplied, PagesCounted, ReadingChosen
+from workbench.session.run.reading import READ_EVERY
 from workbench.session.run.run import Run
 
 EYE = CameraRequest("eye", "sensor")
@@ -358,6 +361,36 @@ def test_files_of_the_task_are_known_and_no_others(tmp_path: Path) -> None:
         assert not knows(str(task.parent / "gone.py"))
         told.session.change(action_source="policy", policy=f"{outside}:act")
         assert knows(str(outside)), "its policy"
+
+
+# --- readings of an env ----------------------------------------------------------------------------------
+
+
+def test_what_is_looked_at_is_read_once_for_each_step_and_again_when_the_answer_has_come(told: Told) -> None:
+    told.play(2)
+    told.session.happen(ReadingChosen(("joints",)))
+    told.step()
+    assert told.asked(Inspect) == [], "no page is open"
+    told.session.happen(PagesCounted(1))
+    (asked,) = until(lambda: told.asked(Inspect), "a reading")
+    assert (asked.env, asked.sections) == (0, ("joints",))
+    told.step(5)
+    time.sleep(2 * READ_EVERY)
+    assert told.asked(Inspect) == [], "a busy worker gets no queue of questions"
+    told.tell(Inspection(0, 3))
+    assert len(until(lambda: told.asked(Inspect), "the reading of the newest step")) == 1
+    told.tell(Inspection(0, 8))
+    time.sleep(2 * READ_EVERY)
+    assert told.asked(Inspect) == [], "nothing is new"
+    told.session.change(selected_env=1)
+    (asked,) = until(lambda: told.asked(Inspect), "another env")
+    told.load("rebuilt")
+    assert len(until(lambda: told.asked(Inspect), "another scene, although the last was not answered")) == 1
+    told.session.happen(ReadingChosen(()))
+    told.tell(Inspection(1, 0))
+    told.step()
+    time.sleep(2 * READ_EVERY)
+    assert told.asked(Inspect) == []
 
 
 # --- options of the envs -----------------------------------------------------------------------------------

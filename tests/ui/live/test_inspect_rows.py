@@ -9,7 +9,6 @@ import pytest
 from tests.drive.live import Live
 from tests.ui.scenes import running
 from workbench.core.capture.inspection import Inspection, JointReadings, Leaf, Touching
-from workbench.session.run.events import InspectionWanted
 from workbench.ui.live.inspect_panel import (
     CHOICES,
     LONGEST,
@@ -136,18 +135,17 @@ def test_what_changed_since_the_reading_before_is_marked_of_the_same_env_alone(l
 
 
 def test_only_what_is_chosen_is_read_and_contacts_for_the_arrows(live_page: Live) -> None:
-    def read() -> list[object]:
-        live_page.show(running(2, step_serial=len(asked)))
-        asked.extend(live_page.asked_by_drawing)
-        return [call.sections for call in live_page.asked_by_drawing if isinstance(call, InspectionWanted)]
+    def chosen() -> tuple[str, ...]:
+        return live_page.asked[-1].sections
 
-    asked: list[object] = []
+    live_page.show(running(2))
     inspect = live_page.part("Inspect")
-    assert read() == [], "no page has opened the tab"
+    assert not live_page.asked, "no page has opened the tab"
     inspect.set("Force arrows", True)
-    assert read() == [("contacts",)]
+    assert chosen() == ("contacts",)
     inspect.set("Show", "state")
-    assert read() == [("state", "contacts")] and inspect.field("Force arrows").value is True
+    live_page.again()
+    assert chosen() == ("state", "contacts") and inspect.field("Force arrows").value is True
     inspect.set("Force arrows", False)
     inspect.set("Show", "nothing")
-    assert read() == []
+    assert chosen() == ()

@@ -75,6 +75,8 @@ from workbench.session.run.events import (
     Now,
     PastPicturesWanted,
     PolicySaved,
+    ReadingDue,
+    ReadSoon,
     ReplaceWorker,
     RunToEnter,
     Send,
@@ -240,6 +242,8 @@ class Session:
                 if self._to_draw is not None:
                     self._to_draw.cancel()
                 self._to_draw = later(STANDS_STILL, lambda: self._happen(PastPicturesWanted(at)))
+            case ReadSoon(seconds=seconds):
+                later(seconds, lambda: self._happen(ReadingDue()))
             case BeginCheck() | EndCheck():
                 self._checks.perform(effect)
             case KeepCheckAfterSave(wanted=wanted):

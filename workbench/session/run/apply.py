@@ -96,6 +96,8 @@ from workbench.session.run.events import (
     PagesCounted,
     PastPicturesWanted,
     PolicySaved,
+    ReadingChosen,
+    ReadingDue,
     ReplaceWorker,
     RunEffect,
     RunToEnter,
@@ -116,6 +118,7 @@ from workbench.session.run.loading import (
     try_next,
 )
 from workbench.session.run.past import Past
+from workbench.session.run.reading import read, schedule
 from workbench.session.run.run import Change, Run, at_rest, movable_bodies, new_pictures, with_problem
 
 _NEW_PLAN = ChooseMethod, SetRollouts, SetHorizon, SetNoise, SetTemperature, SetPlanEvery
@@ -172,7 +175,8 @@ def apply(run: Run, event: object, now: Now) -> Change:
     stands_at = new.stands_at
     if new.pages and stands_at is not None and (stands_at != run.stands_at or isinstance(event, Placed)):
         effects = [*effects, DrawSoon(stands_at)]
-    return new, effects
+    new, for_reading = schedule(new, event, now)
+    return new, [*effects, *for_reading]
 
 
 def _apply(run: Run, event: object, now: Now) -> Change:
@@ -246,6 +250,10 @@ def _apply(run: Run, event: object, now: Now) -> Change:
             return _show_live(run), [Send(Tell(envs, event.dimensions, event.values))]
         case InspectionWanted(sections=sections):
             return run, [Send(Inspect(run.env, sections))]
+        case ReadingChosen(sections=sections):
+            return replace(run, read_sections=sections), []
+        case ReadingDue():
+            return read(run, now)
         case EnvsReset(env_idx=env_idx):
             return _reset(run, env_idx)
         case RunToEnter():

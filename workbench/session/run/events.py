@@ -163,6 +163,18 @@ class InspectionWanted:
 
 
 @dataclass(frozen=True)
+class ReadingChosen:
+    """Read these sections of the selected env from now on, while pages are open; without any, nothing."""
+
+    sections: tuple[Section, ...]
+
+
+@dataclass(frozen=True)
+class ReadingDue:
+    """The time of a reading that was scheduled has come."""
+
+
+@dataclass(frozen=True)
 class EnvsReset:
     """Reset these envs with fresh seeds; all, with the session's seed, if None."""
 
@@ -188,6 +200,8 @@ RunEvent = (
     | PastPicturesWanted
     | ActionTold
     | InspectionWanted
+    | ReadingChosen
+    | ReadingDue
     | EnvsReset
     | RunToEnter
 )
@@ -237,4 +251,11 @@ class DrawSoon:
     at: object
 
 
-RunEffect = Send | ReplaceWorker | InterruptWorker | Follow | FollowPolicy | DrawSoon
+@dataclass(frozen=True)
+class ReadSoon:
+    """Let `ReadingDue` happen after these seconds."""
+
+    seconds: float
+
+
+RunEffect = Send | ReplaceWorker | InterruptWorker | Follow | FollowPolicy | DrawSoon | ReadSoon

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from workbench.authoring.loading.reference import (
 )
 from workbench.authoring.problem import Problem
 from workbench.core.camera_data import CameraKey, Picture
-from workbench.core.capture.inspection import Inspection
+from workbench.core.capture.inspection import Inspection, Section
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription, TaskOptions
 from workbench.session.history.env_table import EnvRows
@@ -148,7 +149,14 @@ class Run:
     """Rules of GPU simulation that the running version has broken; None for none."""
     rules_serial: int = 0
     inspection: Inspection | None = None
-    """The newest answer to `InspectionWanted`, of the env that was selected then."""
+    """The newest reading, of the env that was selected then."""
+    read_sections: tuple[Section, ...] = ()
+    """What is read of the selected env while steps go on."""
+    reading: Literal["none", "soon", "asked"] = "none"
+    read_at: object = None
+    """What was shown when the last reading was asked for."""
+    read_when: float = -math.inf
+    """When that was, in seconds of `Now.monotonic`."""
 
     # --- reading -----------------------------------------------------------------------------------
 

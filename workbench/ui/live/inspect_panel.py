@@ -19,7 +19,8 @@ from workbench.core.capture.inspection import SECTIONS, Inspection, JointReading
 from workbench.machine.text import number_text
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.run.events import InspectionWanted
+from workbench.session.run.events import ReadingChosen
+from workbench.session.run.reading import READ_EVERY
 from workbench.ui.scene.env_grid import InView
 from workbench.ui.widgets.fields import choice, tick
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart
@@ -134,10 +135,6 @@ def _code(values: NDArray[np.float32]) -> str:
     return "[" + ", ".join(f"{float(value):.6f}".rstrip("0").rstrip(".") or "0" for value in values) + "]"
 
 
-READ_EVERY = 0.2
-"""Seconds between two readings."""
-PATIENCE = 2.0
-"""Timeout in seconds of a reading, after which the question is sent again: the worker may have been replaced."""
 NOTHING, JOINTS, POSES = "nothing", "joints", "poses"
 CHOICES: dict[str, Section | None] = {
     NOTHING: None,
@@ -152,14 +149,13 @@ CHOICES: dict[str, Section | None] = {
 class InspectPanel(PagePart[SessionView]):
     """Reads what is chosen, of the selected env, from the worker.
 
-    Nothing is read until a page has opened the tab: reading takes the worker's time. The next reading is asked for when
-    the last has come, at most five times a second: a busy worker gets no queue of questions.
+    Nothing is read until a page has opened the tab: reading takes the worker's time.
     """
 
     does = (ChooseInspected, ShowForces)
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
-        self._session, self._clock = session, clock
+        self._session = session
         self._chosen, self._shows_forces = JOINTS, False
         self._show = choice(
             server,
@@ -181,9 +177,6 @@ class InspectPanel(PagePart[SessionView]):
         self._handle = server.gui.add_html("")
         self._opened = False
         server.gui.add_html(render("tell", command=TellUnfolded(panel=TAB)))
-        self._asked: tuple[object, ...] | None = None
-        self._asked_at = -math.inf
-        self._had: Inspection | None = None
         self._now: Inspection | None = None
         self._before: Inspection | None = None
         self._due = DrawDue(READ_EVERY, clock)
@@ -192,7 +185,6 @@ class InspectPanel(PagePart[SessionView]):
         chosen = self._chosen
         self._show.show(chosen)
         self._forces.show(self._shows_forces)
-        self._ask(view, chosen)
         self._take(view)
         no_step = self._no_step_yet(view)
         wanted = (chosen, view.task_serial, view.selected_env, id(self._now), no_step)
@@ -209,6 +201,7 @@ class InspectPanel(PagePart[SessionView]):
                 self.unfold()
             case ShowForces(on=on):
                 self._shows_forces = on
+                self._choose()
 
     def forces(self, view: SessionView) -> Inspection | None:
         """The reading whose contacts the 3-D view shows; None while the past is shown: contacts are read live only."""
@@ -220,6 +213,7 @@ class InspectPanel(PagePart[SessionView]):
     def unfold(self) -> None:
         """Start reading, because a page has opened the tab."""
         self._opened = True
+        self._choose()
 
     def _no_step_yet(self, view: SessionView) -> bool:
         """Whether the selected env has made no step since it was built, reset or put back. PhysX finds contacts while
@@ -229,20 +223,13 @@ class InspectPanel(PagePart[SessionView]):
         lived = self._session.look(lambda run: run.segment()) if view.timeline.shown is None else None
         return lived is not None and lived[0] == lived[1]
 
-    def _ask(self, view: SessionView, chosen: str) -> None:
-        needed: tuple[Section | None, ...] = (
-            CHOICES[chosen] if self._opened else None,
+    def _choose(self) -> None:
+        """Tell the session what is looked at."""
+        needed = {
+            CHOICES[self._chosen] if self._opened else None,
             "contacts" if self._shows_forces else None,
-        )
-        sections: tuple[Section, ...] = tuple(section for section in SECTIONS if section in needed)
-        wanted = (view.task_serial, view.step_serial, view.selected_env, sections)
-        if not sections or view.task is None or wanted == self._asked:
-            return
-        waited = self._clock() - self._asked_at
-        answered = self._asked is None or view.inspection is not self._had
-        if waited >= (READ_EVERY if answered else PATIENCE):
-            self._asked, self._asked_at, self._had = wanted, self._clock(), view.inspection
-            self._session.happen(InspectionWanted(sections))
+        }
+        self._session.happen(ReadingChosen(tuple(section for section in SECTIONS if section in needed)))
 
     def _take(self, view: SessionView) -> None:
         new = view.inspection
