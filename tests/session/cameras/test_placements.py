@@ -23,12 +23,13 @@ from workbench.commands.command import Refused
 from workbench.core.camera_data import CameraSettings
 from workbench.core.cameras.conventions import LookAt, pose_from_look_at, target_of, with_pose
 from workbench.machine.processes.wire import Call
-from workbench.session.cameras.events import CameraChosen, CameraPlaced, EditWanted, PreviewWanted
+from workbench.session.cameras.events import CameraChosen, CameraPlaced, EditWanted
 from workbench.session.cameras.placements import Placements
 from workbench.session.cameras.view import EditRequest
 from workbench.session.protocol.messages import PlaceCamera, Placed
 from workbench.session.protocol.questions import RunCameras
 from workbench.session.record.recording import RecordingWanted
+from workbench.session.run.events import PagesCounted
 
 pytestmark = pytest.mark.thorough
 
@@ -345,9 +346,9 @@ def test_no_thread_of_a_session_is_left_when_it_is_closed_whatever_waited(tmp_pa
     with opened(tmp_path) as (told, _):
         session = told.session
         asks(told)
+        session.happen(PagesCounted(1))
         session.happen(CameraChosen(BASE))
         session.do(ScalePreview(scale=0.5))
-        session.happen(PreviewWanted())
         session.do(PickPixel(x=0.5, y=0.5))
         heard: list[Call] = []
         until(lambda: heard.extend(told.asked(Call)) or len(heard) == 2, "both questions")

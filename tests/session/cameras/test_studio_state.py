@@ -139,7 +139,7 @@ events: st.SearchStrategy[object] = st.one_of(
     ),
     st.builds(of.SuggestionsWanted, st.just(("cube",)), corners, corners, st.integers(0, 3)),
     st.builds(of.ComparisonWanted, settings),
-    st.sampled_from([of.SheetWanted(), of.PreviewWanted(), of.Measuring(True), of.Measuring(False)]),
+    st.sampled_from([of.SheetWanted(), of.StudioOpened(), of.Measuring(True), of.Measuring(False)]),
     st.builds(of.PreviewDrawn, pictures),
     st.sampled_from([of.EditFailed, of.FileNotChanged]).flatmap(lambda kind: words.map(kind)),
     st.builds(of.WorkFailed, st.sampled_from(["live", "preview", "new camera"]), words),  # type: ignore[arg-type]

@@ -52,8 +52,8 @@ class CameraPlaced:
 
 
 @dataclass(frozen=True)
-class PreviewWanted:
-    """Draw another preview, if something changed since the last and none is being drawn."""
+class StudioOpened:
+    """A page has opened the studio."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ class StudioClosed:
 StudioEvent = (
     CameraChosen
     | CameraPlaced
-    | PreviewWanted
+    | StudioOpened
     | MeasureWanted
     | SuggestionsWanted
     | ComparisonWanted

@@ -72,6 +72,8 @@ class Studio:
     selected: CameraKey | None = None
     was_chosen: bool = False
     """Whether somebody has chosen a camera, or none."""
+    is_open: bool = False
+    """Whether a page has opened the studio: a camera is then chosen."""
     select_when_loaded: CameraKey | None = None
     """The camera that was selected in an earlier session."""
     problem: str = ""

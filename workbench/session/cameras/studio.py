@@ -38,11 +38,11 @@ from workbench.session.cameras.events import (
     MeasureSeeds,
     Pick,
     PreviewDrawn,
-    PreviewWanted,
     StopJobs,
     StopQuestion,
     StudioEffect,
     StudioEvent,
+    StudioOpened,
     Suggest,
     WorkFailed,
 )
@@ -109,15 +109,28 @@ def apply(studio: Studio, event: object, run: Run, now: Now) -> Change:
     Raises:
         Refused: the command makes no sense now; nothing has changed.
     """
+    studio, effects = _apply(studio, event, run, now)
+    if studio.is_open and not studio.was_chosen and studio.selected is None and run.task is not None:
+        # The first sensor camera. A person may then choose none.
+        cameras = sorted(run.task.cameras, key=lambda camera: camera.kind != "sensor")
+        if cameras:
+            studio, _ = _select(studio, cameras[0].key, run)
+    if not run.pages or run.state not in ("running", "paused"):
+        return studio, effects
+    studio, preview = _draw_preview(studio, run)
+    return studio, [*effects, *preview]
+
+
+def _apply(studio: Studio, event: object, run: Run, now: Now) -> Change:
     match event:
         case Asked(command=command) if type(command) in DOES:
             return _do_command(studio, command, run, now)
+        case StudioOpened():
+            return replace(studio, is_open=True), []
         case CameraChosen(key=key):
             return _select(studio, key, run)
         case CameraPlaced():
             return _place(studio, event, run, now)
-        case PreviewWanted():
-            return _draw_preview(studio, run)
         case PreviewDrawn(picture=picture):
             return replace(studio, preview=picture, drawing=False), []
         case WorkFailed(lane=lane, why=why):
@@ -220,6 +233,7 @@ def _take_suggestion(studio: Studio, number: int, run: Run, now: Now) -> Change:
 
 
 def _draw_preview(studio: Studio, run: Run) -> Change:
+    """Draw a preview, if one is wanted and something has changed since the last."""
     key, step = studio.selected, shown_step(run)
     settings = None if key is None else studio.placements.now(key)
     if studio.preview_scale == 1.0 or key is None or settings is None or refusal(run, key):

@@ -15,7 +15,6 @@ from workbench.commands.cameras import PickPixel, ShowFrustums, ShowPictures
 from workbench.commands.command import Command, Refused
 from workbench.core.camera_data import CameraInfo, CameraKey, CameraKind, Picture
 from workbench.machine.text import listed
-from workbench.session.cameras.events import PreviewWanted
 from workbench.session.cameras.studio import PREVIEW_MODALITIES
 from workbench.session.cameras.view import PickedPixel, StudioCamera
 from workbench.session.live.session import Session
@@ -309,8 +308,8 @@ class StudioPicture:
     Depth and segmentation too: a far plane that is too near, or a gripper that hides the cube, is seen there first.
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
-        self._server, self._session = server, session
+    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
+        self._server = server
         self._drawn: tuple[CameraKey, Picture, str] | None = None
         self._clock, self._drawn_at = clock, -math.inf
         self._span: DepthRange | None = None
@@ -344,7 +343,6 @@ class StudioPicture:
         picture = None if key is None else view.pictures.get(key)
         if preview:
             picture = studio.preview
-            self._session.happen(PreviewWanted())
         self._picture.settle()
         failed = "" if key is None else view.failed_cameras.get(key, "")
         if failed:

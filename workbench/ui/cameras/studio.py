@@ -39,7 +39,7 @@ from workbench.commands.command import Command, Refused
 from workbench.commands.page import TellUnfolded
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.core.cameras.conventions import target_of
-from workbench.session.cameras.events import CameraChosen
+from workbench.session.cameras.events import CameraChosen, StudioOpened
 from workbench.session.cameras.view import StudioCamera, StudioView
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
@@ -143,7 +143,7 @@ class StudioPanel(PagePart[SessionView]):
         above = gui.add_folder(None)
         self._choice = choice(server, "Camera", ChooseCamera, "name", (NO_CAMERA,), NO_CAMERA)
         self._note = gui.add_html(render("note", text="Cameras appear when the task has loaded."))
-        self._picture = StudioPicture(server, session, clock)
+        self._picture = StudioPicture(server, clock)
         self._facts = gui.add_html("", visible=False)
         self._tools = gui.add_html("", visible=False)
         self._look = LookThrough(server, self._placing)
@@ -156,7 +156,6 @@ class StudioPanel(PagePart[SessionView]):
         self._inner: Parts[SessionView] = Parts((self._writing, *self._folders))
         self.does = (*StudioPanel.does, *self._inner.does)
         gui.add_html(render("tell", command=TellUnfolded(panel=TAB)))
-        self._was_opened = False
         with self._picture.folder:
             self._pick = CameraPick(server, session)
         self._gizmos: dict[int, CameraGizmo] = {}
@@ -165,16 +164,7 @@ class StudioPanel(PagePart[SessionView]):
 
     def unfold(self) -> None:
         """The tab was opened, perhaps before the task was loaded."""
-        self._was_opened = True
-        self._choose_first(self._session.view())
-
-    def _choose_first(self, view: SessionView) -> None:
-        """Choose the first sensor camera once the tab was opened. A person may then choose none."""
-        if view.studio.was_chosen or not self._was_opened or view.task is None:
-            return
-        cameras = sorted(view.task.cameras, key=lambda camera: camera.kind != "sensor")
-        if cameras and view.studio.selected is None:
-            self._session.happen(CameraChosen(cameras[0].key))
+        self._session.happen(StudioOpened())
 
     @property
     def shows(self) -> str:
@@ -238,7 +228,6 @@ class StudioPanel(PagePart[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         studio = view.studio
-        self._choose_first(view)
         self._draw_choice(view)
         self._writing.draw(view)
         chosen, camera = studio.chosen, studio.placeable
