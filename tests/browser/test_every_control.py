@@ -74,7 +74,7 @@ class Board:
         """Whether the server was asked for something, or a text was copied."""
         before = self.page.evaluate("asked")
         # Playwright's own would wait for a picture to be stable, which is drawn anew while it waits.
-        part.evaluate("p => p.scrollIntoView({block: 'nearest'})")
+        part.evaluate("p => p.scrollIntoView({block: 'center'})")
         box = part.bounding_box()
         if box is None:
             return False
