@@ -446,14 +446,13 @@ def _enter(run: Run, wanted: RunToEnter) -> Change:
 
 
 def _stepped(run: Run, event: Stepped) -> Run:
-    if event.step.action is not None:
-        run = replace(run, recovery=run.recovery.stepped())
-    if run.past is None:
-        run = replace(run, step=event.step)
-    else:
-        past, moment = run.past.added(event)
-        run = replace(run, past=past, step=moment.step, step_serial=moment.serial)
-    first, run = run.first_step_due, replace(run, first_step_due=False)
+    recovery = run.recovery if event.step.action is None else run.recovery.stepped()
+    past, step, serial = run.past, event.step, run.step_serial
+    if past is not None:
+        past, moment = past.added(event)
+        step, serial = moment.step, moment.serial
+    first = run.first_step_due
+    run = replace(run, recovery=recovery, past=past, step=step, step_serial=serial, first_step_due=False)
     if run.problem is not None and run.problem_at_run and not first:
         # It runs again after a problem at run time: the task was reset, or the policy changed.
         run = at_rest(with_problem(run, None))
