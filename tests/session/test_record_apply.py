@@ -288,6 +288,11 @@ def test_a_rescoring_that_a_save_stopped_begins_again_if_the_version_stays_the_s
         apply_of_these(state, Asked(StopRescoring()))
 
 
+def test_an_episode_that_was_saved_of_the_past_is_none_of_the_recording() -> None:
+    state, _ = after(loaded(), Asked(ToggleRecording()), EpisodeEnded(live=True), EpisodeEnded(live=False))
+    assert (state.recording.episodes, state.recording.being_written) == (1, 2)
+
+
 def test_every_command_of_these_features_is_taken() -> None:
     taken = of_recording.DOES | of_rescoring.DOES
     assert {type(command) for command in COMMANDS} == taken

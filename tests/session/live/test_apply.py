@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,7 +15,7 @@ from tests.drive.session import DEATH, moment
 from tests.ui.scenes import camera, description, step_of, table_scene
 from workbench.authoring.problem import Problem
 from workbench.commands.command import Refused
-from workbench.commands.envs import NextEnv, SelectEnv
+from workbench.commands.envs import NextEnv, PreviousEnv, SelectEnv
 from workbench.commands.run import (
     ChooseActions,
     PauseRun,
@@ -30,7 +31,8 @@ from workbench.commands.run import (
     UseControlMode,
 )
 from workbench.commands.timeline import ContinueFromHere, GoToLast, NextEvent, Seek, StepBack, UndoReset
-from workbench.jobs.task import TaskOptions
+from workbench.core.capture.inspection import Inspection
+from workbench.jobs.task import Stepped, TaskOptions
 from workbench.session.cameras.state import first_studio
 from workbench.session.events import Asked
 from workbench.session.live.state import State, apply
@@ -54,10 +56,14 @@ from workbench.session.run.events import (
     PagesCounted,
     PastPicturesWanted,
     PolicySaved,
+    ReadingChosen,
+    ReadingDue,
+    ReadSoon,
     Send,
     VersionLoaded,
     WorkerDied,
 )
+from workbench.session.run.reading import READ_EVERY
 from workbench.session.run.run import first_run
 
 ENVS = 3
@@ -73,7 +79,7 @@ def loaded(level: str | None, text: str, envs: int = ENVS) -> VersionLoaded:
     return VersionLoaded(Loaded(task, step_of(poses), {"import": 1.0}, report), on_disk=True)
 
 
-def stepped(number: int, jumped: tuple[int, ...]) -> object:
+def stepped(number: int, jumped: tuple[int, ...]) -> Stepped:
     elapsed = np.full(ENVS, number)
     elapsed[list(jumped)] = 0
     return moment(elapsed, jumped, number=number)
@@ -170,3 +176,38 @@ def test_loads_of_the_file_are_numbered_in_the_order_in_which_they_are_asked_for
     ]
     numbers = [load.number for load in loads if load.source is None]
     assert numbers == sorted(numbers)
+
+
+def state_after(*events: Any) -> State:
+    return after(list(events))[0]
+
+
+def test_what_takes_long_ends_in_a_pause_or_goes_on_playing() -> None:
+    busy = Status(False, 0.0, 0.0, activity="building the scene")
+    for playing, state in ((False, "paused"), (True, "running")):
+        assert state_after(loaded(None, "one"), busy).run.state == "loading"
+        assert state_after(loaded(None, "one"), busy, Status(playing, 1.0, 1.0)).run.state == state
+    stopped = WorkerDied(replace(DEATH, gives_up=True), "")
+    assert state_after(loaded(None, "one"), stopped, Status(True, 1.0, 1.0)).run.state == "stopped"
+
+
+def test_before_the_first_env_comes_the_last_and_after_the_last_the_first() -> None:
+    there = loaded(None, "one")
+    assert state_after(there, Asked(PreviousEnv())).run.env == ENVS - 1
+    assert state_after(there, Asked(PreviousEnv()), Asked(NextEnv())).run.env == 0
+
+
+def test_a_file_that_was_saved_stays_unloaded_although_the_version_before_fails_meanwhile() -> None:
+    fails = LoadFailed(PROBLEM, kept=True, at_run=True)
+    assert not state_after(loaded(None, "one"), fails).run.stale
+    assert state_after(loaded(None, "one"), FileSaved(), fails).run.stale
+
+
+def test_a_reading_comes_at_once_and_the_next_after_a_while() -> None:
+    state = state_after(loaded(None, "one"), PagesCounted(1), stepped(0, (0, 1, 2)))
+    state, (soon,) = apply(state, ReadingChosen(("joints",)), Now(100.0, 0.0))
+    assert soon == ReadSoon(0.0)
+    state, _ = apply(state, ReadingDue(), Now(100.0, 0.0))
+    state, _ = apply(state, stepped(1, ()), Now(100.05, 0.0))
+    state, (soon,) = apply(state, Inspection(0, 0), Now(100.1, 0.0))
+    assert isinstance(soon, ReadSoon) and soon.seconds == pytest.approx(READ_EVERY - 0.1)
