@@ -256,7 +256,7 @@ def _apply(
             return _start(_new(recording, now), run, chosen, one_each=True, reset=False)
         case Asked(command=ChooseRecordedEnvs(envs=envs)):
             return replace(recording, chosen=envs), []
-        case RecordingWanted(env_idx=env_idx, next_episode=next_episode):
+        case RecordingWanted(env_idx=env_idx, next_episode=next_episode) if env_idx != ():
             return _start(_new(recording, now), run, env_idx, one_each=next_episode, reset=not next_episode)
         case Stepped() if recording.env_idx:
             return _take(recording, event)
