@@ -178,7 +178,8 @@ def apply(solving: Solving, event: object, before: Run, run: Run) -> Change:
     match event:
         case PlanWanted() if (load := run.running_load()) is not None:
             if event.why_not:
-                return _refuse(solving, event.why_not, None)
+                refused, asks = _refuse(solving, event.why_not, None)
+                return refused, [EndPlan(), *asks] if runs else asks
             # One env of the task is enough to make the rollouts' envs like it, and its seed decides nothing.
             alone = replace(load, options=replace(load.options, num_envs=1, seed=0))
             settings = run.settings
