@@ -139,7 +139,7 @@ def _solve(view: SeedsView, run: Run) -> Change:
     if not isinstance(load.task, str):
         # Only the texts of a recording's task were cleared, not the file that bears its name.
         why = "this task comes from a recording: open its file to solve it"
-        return _changed(view, state="failed", why=why), []
+        return _changed(view, state="failed", why=why), [EndSeeds()] if view.state in RUNNING else []
     begun = SeedsView("starting", view.serial + 1, total=view.chosen, chosen=view.chosen)
     return begun, [BeginSeeds(load.task, load.options, view.chosen, run.settings.plan)]
 
