@@ -36,7 +36,7 @@ from workbench.authoring.problem import Problem
 from workbench.cli.terminal.output import SafeConsole, print_line, print_problem, print_text, refuse, warn
 from workbench.machine.text import guard_terminal
 from workbench.recording.library.library import Library
-from workbench.session.process.captured_output import PrintedLine, Run
+from workbench.session.process.captured_output import PrintedLine, StyledText
 from workbench.ui.library.rows import cells
 
 TITLE = "\x1b]0;owned\x07"
@@ -197,7 +197,7 @@ def test_all_that_the_commands_say_is_text() -> None:
         refuse(f"there is no file {EVIL}")
         warn(EVIL)
         print_problem(Problem("import", EVIL, f"/{EVIL}.py", 3, EVIL, f"Traceback\n  {EVIL}\n"))
-        print_line(PrintedLine("stdout", "plain", (Run("plain", Style(color="color(1)")),)))
+        print_line(PrintedLine("stdout", "plain", (StyledText("plain", Style(color="color(1)")),)))
     said = streams.getvalue()
     assert harmful(said) == set() and "\\x1b]0;owned\\x07" in said
     assert "  | plain\n" in said, "no colours where there is no terminal"

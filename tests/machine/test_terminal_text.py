@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rich.style import Style
 
 from workbench.machine.text import only_colours, plain_text
-from workbench.session.process.captured_output import PLAIN, Run, coloured_runs, for_terminal
+from workbench.session.process.captured_output import PLAIN, StyledText, coloured_runs, for_terminal
 
 COLOURS = re.compile("\x1b\\[[0-9;:]*m")
 DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
@@ -115,14 +115,14 @@ def test_controls_are_shown_as_python_writes_them(text: str, shown: str) -> None
 )
 def test_colours_are_read_as_terminals_do(numbers: str, style: Style) -> None:
     runs, _ = coloured_runs(f"\x1b[{numbers}mx")
-    assert runs == [Run("x", style)]
+    assert runs == [StyledText("x", style)]
 
 
 def test_a_style_goes_on_over_lines_and_text_that_is_hidden_is_not_hidden() -> None:
     first, style = coloured_runs("\x1b[31mone")
     second, _ = coloured_runs("two\x1b[0m three", style)
-    assert first == [Run("one", Style(color="color(1)"))]
-    assert second == [Run("two", Style(color="color(1)")), Run(" three", PLAIN)]
+    assert first == [StyledText("one", Style(color="color(1)"))]
+    assert second == [StyledText("two", Style(color="color(1)")), StyledText(" three", PLAIN)]
     assert only_colours("\x1b[31;8msecret\x1b[0m") == "\\x1b[31;8msecret\x1b[0m"
 
 

@@ -16,7 +16,7 @@ from workbench.session.process.captured_output import (
     Printed,
     PrintedLine,
     PrintedLog,
-    Run,
+    StyledText,
 )
 from workbench.ui.live.log_panel import (
     DARK_PAGE,
@@ -131,7 +131,7 @@ def test_the_sixteen_colours_of_the_page_can_be_read(scheme: str, page: tuple[in
     )
 )
 def test_text_can_be_seen_on_any_background(style: Style) -> None:
-    ((span,),) = spans_of_lines([("x", (Run("x", style),))])
+    ((span,),) = spans_of_lines([("x", (StyledText("x", style),))])
     colours = re.fullmatch(r"color:#(\w{6});background:#(\w{6})", span.css)
     assert colours is not None
     text, behind = (tuple(bytes.fromhex(colour)) for colour in colours.groups())

@@ -39,16 +39,16 @@ from workbench.recording.episode.row import LibraryRow
 from workbench.recording.library.library import LibraryView
 from workbench.session.events import Asked
 from workbench.session.review.state import (
-    Event,
     FilesChecked,
     FileStamp,
     Listed,
-    NotRead,
     Open,
     OpenFirst,
     ProblemFound,
-    Read,
     ReadingEnded,
+    RecordingNotRead,
+    RecordingRead,
+    ReviewEvent,
     ReviewState,
     SceneTold,
     apply,
@@ -81,7 +81,7 @@ ROWS = {
     )
     for number, id in enumerate(EPISODES)
 }
-Happens = Callable[[ReviewState], Event]
+Happens = Callable[[ReviewState], ReviewEvent]
 """An event as it can come in a state."""
 
 
@@ -89,7 +89,7 @@ def read(id: str, late: int, scene: bool) -> Happens:
     episode = (EPISODES if scene else WITHOUT_SCENE)[id]
     opened = Opened(id, f"{id}.rrd", episode, find_events(episode))
     files = {Path(f"{id}.rrd"): FileStamp(id, (1, 1))}
-    return lambda state: Read(state.opening.number - late, opened, files)
+    return lambda state: RecordingRead(state.opening.number - late, opened, files)
 
 
 def scene(id: str, late: int, there: bool) -> Happens:
@@ -100,7 +100,7 @@ def scene(id: str, late: int, there: bool) -> Happens:
 def read_next(late: int, scene: bool) -> Happens:
     """The row of an opening that comes next is read."""
 
-    def event(state: ReviewState) -> Event:
+    def event(state: ReviewState) -> ReviewEvent:
         rows = state.opening.rows[state.opening.done :]
         return read(rows[0].id, late, scene)(state) if rows else ReadingEnded(state.opening.number - late)
 
@@ -126,7 +126,7 @@ happenings: st.SearchStrategy[Happens] = st.one_of(
     st.builds(read_next, late, st.booleans()),
     st.builds(read, ids, late, st.booleans()),
     st.builds(
-        lambda id, late: lambda state: NotRead(state.opening.number - late, id, f"{id} is cut off."),
+        lambda id, late: lambda state: RecordingNotRead(state.opening.number - late, id, f"{id} is cut off."),
         ids,
         late,
     ),

@@ -28,7 +28,7 @@ _KEPT_OF_PIECE = 16_384
 """Bytes at the end of a piece that are split into lines during a flood."""
 
 
-class Run(NamedTuple):
+class StyledText(NamedTuple):
     """Characters of one style, without control characters."""
 
     text: str
@@ -41,7 +41,7 @@ class PrintedLine:
     """``stdout`` or ``stderr``."""
     text: str
     """The text without colours, control characters escaped."""
-    runs: tuple[Run, ...] = ()
+    runs: tuple[StyledText, ...] = ()
     """The text as coloured runs; empty if it has no colour."""
 
 
@@ -179,13 +179,13 @@ def _read(stream: str, raw: bytes, style: Style) -> tuple[PrintedLine, Style]:
     return PrintedLine(stream, text, tuple(runs) if any(run.style != PLAIN for run in runs) else ()), after
 
 
-def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[Run], Style]:
+def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[StyledText], Style]:
     """One line as runs, and the style in which the next line begins.
 
     Args:
         style: at the end of the previous line.
     """
-    runs: list[Run] = []
+    runs: list[StyledText] = []
     end = 0
     for found in COLOURS.finditer(text):
         _add(runs, text[end : found.start()], style)
@@ -195,18 +195,18 @@ def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[Run], Style]:
     return runs, style
 
 
-def for_terminal(runs: Iterable[Run]) -> str:
+def for_terminal(runs: Iterable[StyledText]) -> str:
     """Escape codes for these runs; the terminal's style is plain after them."""
     return "".join(run.style.render(run.text) for run in runs)
 
 
-def _add(runs: list[Run], text: str, style: Style) -> None:
+def _add(runs: list[StyledText], text: str, style: Style) -> None:
     if not text:
         return
     text = plain_text(text, "\t")
     if runs and runs[-1].style == style:
         text = runs.pop().text + text
-    runs.append(Run(text, style))
+    runs.append(StyledText(text, style))
 
 
 @lru_cache(4096)

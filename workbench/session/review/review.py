@@ -25,17 +25,17 @@ from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.process.memory_limit import format_size, total_memory
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
 from workbench.session.review.state import (
-    Event,
     FilesChecked,
     FileStamp,
     First,
     Listed,
-    NotRead,
     Open,
     OpenFirst,
     ProblemFound,
-    Read,
     ReadingEnded,
+    RecordingNotRead,
+    RecordingRead,
+    ReviewEvent,
     ReviewState,
     SceneTold,
     advanced,
@@ -153,7 +153,7 @@ class Review:
 
     # --- on the loop ---------------------------------------------------------------------------------
 
-    def _happened(self, event: Event) -> None:
+    def _happened(self, event: ReviewEvent) -> None:
         state, effects = apply(self._state, event, self._clock())
         self._set(state)
         for reading in effects:
@@ -209,15 +209,15 @@ class Review:
             try:
                 one, files = await aside.run(partial(self._read_row, row, shapes, job))
             except (OSError, UnreadableRecording) as error:
-                self._happened(NotRead(number, row.id, f"{row.name} was not opened. {error}"))
+                self._happened(RecordingNotRead(number, row.id, f"{row.name} was not opened. {error}"))
             except Exception as error:
                 # The file may hold anything. Without this the page would stay on "opening" without a reason.
                 log.exception("%s could not be opened.", row.name)
                 why = f"{row.name} could not be opened ({type(error).__name__}: {error})."
-                self._happened(NotRead(number, row.id, why))
+                self._happened(RecordingNotRead(number, row.id, why))
             else:
                 opened.append(one)
-                self._happened(Read(number, one, files))
+                self._happened(RecordingRead(number, one, files))
         self._happened(ReadingEnded(number, problem))
         return opened
 

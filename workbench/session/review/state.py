@@ -38,7 +38,7 @@ class FileStamp:
 
 
 @dataclass(frozen=True)
-class Opening:
+class OpeningState:
     """The recordings that are being opened, or were opened last."""
 
     number: int = 0
@@ -67,7 +67,7 @@ class ReviewState:
     library: LibraryView = LibraryView()
     first: First | None = None
     """What to open by itself once the library lists it."""
-    opening: Opening = Opening()
+    opening: OpeningState = OpeningState()
     files: Mapping[Path, FileStamp] = field(default_factory=dict)
     """Files of the open recordings."""
     problems: tuple[str, ...] = ()
@@ -103,7 +103,7 @@ class Listed:
 
 
 @dataclass(frozen=True)
-class Read:
+class RecordingRead:
     """A recording was read."""
 
     opening: int
@@ -112,7 +112,7 @@ class Read:
 
 
 @dataclass(frozen=True)
-class NotRead:
+class RecordingNotRead:
     """A recording could not be read."""
 
     opening: int
@@ -157,13 +157,13 @@ class ProblemFound:
     sentence: str
 
 
-Event = (
+ReviewEvent = (
     Asked
     | Open
     | OpenFirst
     | Listed
-    | Read
-    | NotRead
+    | RecordingRead
+    | RecordingNotRead
     | ReadingEnded
     | SceneTold
     | FilesChecked
@@ -182,20 +182,23 @@ class BeginReading:
     rows: tuple[LibraryRow, ...]
 
 
-Result = tuple[ReviewState, list[BeginReading]]
+Change = tuple[ReviewState, list[BeginReading]]
 
 
 # --- changes -----------------------------------------------------------------------------------------
 
 
-def apply(state: ReviewState, event: Event, now: float) -> Result:
+def apply(state: ReviewState, event: ReviewEvent, now: float) -> Change:
     """The state after an event at clock time `now` in seconds, and what has to be done.
 
     Raises `Refused` if a command is not possible; the state is then as it was.
     """
     state = advanced(state, now)
     opening = state.opening
-    if isinstance(event, Read | NotRead | ReadingEnded | SceneTold) and event.opening != opening.number:
+    if (
+        isinstance(event, RecordingRead | RecordingNotRead | ReadingEnded | SceneTold)
+        and event.opening != opening.number
+    ):
         return state, []
     match event:
         case Asked(command=review.OpenAgain()):
@@ -209,13 +212,13 @@ def apply(state: ReviewState, event: Event, now: float) -> Result:
             return _open_first(replace(state, first=what), now)
         case Listed(library=library):
             return _open_first(replace(state, library=library), now)
-        case Read(opened=one, files=files):
+        case RecordingRead(opened=one, files=files):
             opening = replace(opening, read=(*opening.read, one), files={**opening.files, **files})
             state = _told(
                 replace(state, opening=opening), *(file.sentence for file in one.episode.broken_files)
             )
             return _row_done(state, now), []
-        case NotRead(id=id, problem=problem):
+        case RecordingNotRead(id=id, problem=problem):
             state = _with(_told(state, problem), not_opened=(*state.view.not_opened, id))
             return _row_done(state, now), []
         case ReadingEnded(problem=problem):
@@ -386,7 +389,7 @@ def _swap_with_first(state: ReviewState, index: int, now: float) -> ReviewState:
 # --- what is open ------------------------------------------------------------------------------------
 
 
-def _open_ids(state: ReviewState, asked: Open, now: float) -> Result:
+def _open_ids(state: ReviewState, asked: Open, now: float) -> Change:
     rows, ids = {row.id: row for row in state.library.rows}, dict.fromkeys(asked.ids)
     wanted = [rows[id] for id in ids if id in rows]
     problems = []
@@ -403,7 +406,7 @@ def _open_ids(state: ReviewState, asked: Open, now: float) -> Result:
     return _open(state, wanted[:MOST_OPEN], problems, asked.state, now, asked.library_stays)
 
 
-def _open_first(state: ReviewState, now: float) -> Result:
+def _open_first(state: ReviewState, now: float) -> Change:
     first, library = state.first, state.library
     if first is None:
         return state, []
@@ -425,11 +428,11 @@ def _open(
     at: int | None,
     now: float,
     library_stays: bool,
-) -> Result:
+) -> Change:
     # The library lists the newest first, but a comparison asks what became of the oldest. It is also read first: the
     # recording that is shown first stays selected when others arrive.
     rows = tuple(sorted(rows, key=lambda row: (row.date is None, row.date or _NEVER)))
-    opening = Opening(state.opening.number + 1, rows, at, show_at=now + FIRST_SHOWN, pause=FIRST_SHOWN)
+    opening = OpeningState(state.opening.number + 1, rows, at, show_at=now + FIRST_SHOWN, pause=FIRST_SHOWN)
     state = replace(state, first=None, opening=opening, problems=tuple(problems))
     state = _with(
         state, loading=_loading(opening), problems=state.problems, not_opened=(), library_stays=library_stays
@@ -437,7 +440,7 @@ def _open(
     return state, [BeginReading(opening.number, rows)]
 
 
-def _loading(opening: Opening) -> str:
+def _loading(opening: OpeningState) -> str:
     """What is being opened, with a count if there are several."""
     rows, done = opening.rows, opening.done
     if done >= len(rows):

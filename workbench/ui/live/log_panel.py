@@ -15,7 +15,7 @@ from rich.terminal_theme import TerminalTheme
 from workbench.commands.command import Command
 from workbench.commands.run import ClearLog, FilterLog, PauseLog
 from workbench.session.live.view import SessionView
-from workbench.session.process.captured_output import PLAIN, SWITCHES, Printed, Run
+from workbench.session.process.captured_output import PLAIN, SWITCHES, Printed, StyledText
 from workbench.session.process.memory_limit import format_size
 from workbench.session.process.supervisor import Vitals
 from workbench.ui.widgets.fields import Field, tick
@@ -50,7 +50,7 @@ class Span:
     css: str = ""
 
 
-def spans_of_lines(lines: Sequence[tuple[str, tuple[Run, ...]]]) -> list[list[Span]]:
+def spans_of_lines(lines: Sequence[tuple[str, tuple[StyledText, ...]]]) -> list[list[Span]]:
     """The spans of each line (its text and its runs), at most `MOST_SPANS` in all."""
     left = MOST_SPANS
     found: list[list[Span]] = []
@@ -60,7 +60,7 @@ def spans_of_lines(lines: Sequence[tuple[str, tuple[Run, ...]]]) -> list[list[Sp
     return found[::-1]
 
 
-def _span(run: Run) -> Span:
+def _span(run: StyledText) -> Span:
     return Span(run.text) if run.style == PLAIN else Span(run.text, *_look(run.style))
 
 
