@@ -31,11 +31,11 @@ from workbench.session.history.history import History, Moment
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.process.supervisor import Death, End, Supervisor, Vitals, WorkerOptions
-from workbench.session.protocol.messages import Event, Loaded, ReloadReport, Request, Status
+from workbench.session.protocol.messages import Event, Inspect, Loaded, ReloadReport, Request, Status
 from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.recordings import Rescorer
 from workbench.session.rescore.rescoring import BeginRescoring, RescoreEffect
-from workbench.session.run.events import MomentShown
+from workbench.session.run.events import MomentShown, PastPicturesWanted
 
 TASKS = Path(__file__).parents[2] / "tasks"
 BASE: CameraKey = ("sensor", "base_camera")
@@ -330,6 +330,18 @@ def seek_by(session: Session, steps: int) -> None:
     """Press the right arrow so often, or the left one."""
     for _ in range(abs(steps)):
         session.do(StepForward() if steps > 0 else StepBack())
+
+
+def heard(session: Session) -> SessionView:
+    """The view once the worker has answered a question, after all that it was sent before."""
+    before = session.view().inspection
+    session._worker.send(Inspect(0, ("joints",)))
+    return wait_until(session, lambda view: view.inspection is not before, "an answer of the worker")
+
+
+def draw_past(session: Session) -> None:
+    """Draw at once what the shown moment lacks, as it is drawn when a slider stands still."""
+    session.happen(PastPicturesWanted(session.look(lambda run: run.stands_at)))
 
 
 def stop_watching(session: Session) -> None:

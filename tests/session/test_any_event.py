@@ -104,6 +104,11 @@ class Feature:
     """The effect that ends the job, and what the job tells last."""
 
 
+def without_before(apply: Callable[[Any, object, Run], Any]) -> Callable[[Any, object, Run, Run], Any]:
+    """This `apply`, which asks for the run after the event only, called with the run before it too."""
+    return lambda value, event, before, run: apply(value, event, run)
+
+
 FEATURES = {
     "checks": Feature(
         checks.Checks(),
@@ -115,7 +120,7 @@ FEATURES = {
     ),
     "profile": Feature(
         profile.ProfileView(),
-        profile.apply,
+        without_before(profile.apply),
         lambda value: value,
         ("running",),
         profile.BeginProfile,
@@ -123,7 +128,7 @@ FEATURES = {
     ),
     "seeds": Feature(
         solve_seeds.SeedsView(),
-        solve_seeds.apply,
+        without_before(solve_seeds.apply),
         lambda value: value,
         solve_seeds.RUNNING,
         solve_seeds.BeginSeeds,
@@ -131,7 +136,7 @@ FEATURES = {
     ),
     "plans": Feature(
         solver.Solving(),
-        solver.apply,
+        without_before(solver.apply),
         lambda value: value.view(0),
         ("starting", "planning"),
         solver.BeginPlan,

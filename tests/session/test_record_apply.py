@@ -26,8 +26,8 @@ from workbench.commands.timeline import StopRescoring
 from workbench.jobs.record.gather import Finished
 from workbench.jobs.task import TaskOptions
 from workbench.session.cameras.state import first_studio
-from workbench.session.events import Asked
-from workbench.session.live.solver import Episode, Solving
+from workbench.session.events import Asked, Then
+from workbench.session.live.solver import PlannedEpisode, Solving
 from workbench.session.live.state import Effect, SessionEvent, State, apply
 from workbench.session.process.jobs import JobProgress
 from workbench.session.process.supervisor import End
@@ -40,8 +40,8 @@ from workbench.session.record.recording import (
     EpisodeEnded,
     EpisodesRecovered,
     EpisodeWritten,
+    LiveRecording,
     RecordEffect,
-    Recording,
     RecordingWanted,
     StepRecorded,
     TakeStep,
@@ -140,7 +140,7 @@ EVENTS = st.one_of(
 
 def first() -> State:
     run = first_run("push.py", TaskOptions(ENVS), 2**20, Settings())
-    return State(run, Recording("recordings"), first_studio(None))
+    return State(run, LiveRecording("recordings"), first_studio(None))
 
 
 Passed = tuple[State, SessionEvent, State, list[Effect]]
@@ -209,7 +209,7 @@ def test_an_episode_that_a_load_ends_is_followed_by_the_next_one_of_each_env() -
     assert capture == Send(SetCapture((0,), from_reset=True)), "no reset, which would lose the moment"
     assert again.recording.since == NOW.wall and again.recording.env_idx == (0,)
     state, effects = after(*begun, loaded("rebuilt", "b"), LoadDone())
-    assert effects[1:] == [Send(SetCapture((0,), from_reset=True)), EnvsReset((0,))]
+    assert effects[1:] == [Send(SetCapture((0,), from_reset=True)), Then(EnvsReset((0,)))]
     state, effects = after(*begun, loaded("same"), LoadDone())
     assert state.recording.env_idx == (0,) and effects == []
 
@@ -217,7 +217,7 @@ def test_an_episode_that_a_load_ends_is_followed_by_the_next_one_of_each_env() -
 def test_envs_that_a_smaller_version_lacks_are_recorded_no_more() -> None:
     all_envs = Asked(ChooseRecordedEnvs(envs="all")), Asked(ToggleRecording())
     state, effects = after(loaded(), *all_envs, RESET, loaded("rebuilt", "b", envs=2), LoadDone())
-    assert state.recording.env_idx == (0, 1) and EnvsReset((0, 1)) in effects
+    assert state.recording.env_idx == (0, 1) and Then(EnvsReset((0, 1))) in effects
     last = RecordingWanted((2,))
     state, effects = after(loaded(), last, RESET, loaded("rebuilt", "b", envs=2), LoadDone())
     assert not state.recording.env_idx and effects == []
@@ -232,7 +232,7 @@ def test_what_dies_is_not_recorded_again_and_what_is_handed_over_is() -> None:
 
 def test_envs_are_reset_after_their_capture_was_asked_for() -> None:
     state, effects = after(loaded(), Asked(ChooseRecordedEnvs(envs="all")), Asked(ToggleRecording()))
-    assert effects[1:] == [Send(SetCapture((0, 1, 2), from_reset=True)), EnvsReset()]
+    assert effects[1:] == [Send(SetCapture((0, 1, 2), from_reset=True)), Then(EnvsReset())]
     _, effects = apply_of_these(state, EnvsReset())
     assert effects == [Send(Reset(None, state.run.seed))]
 
@@ -264,7 +264,7 @@ def test_episodes_are_saved_once_they_are_solved_and_one_job_at_a_time() -> None
     state, _ = after(loaded(), RESET, STEP)
     with pytest.raises(Refused):
         apply_of_these(state, Asked(SaveSolved()))
-    solved = Solving(episodes={env: Episode(solved_at=1) for env in (0, 2)})
+    solved = Solving(episodes={env: PlannedEpisode(solved_at=1) for env in (0, 2)})
     state, (begin,) = apply_of_these(replace(state, solving=solved), Asked(SaveSolved()))
     assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [0, 2]
     with pytest.raises(Refused):

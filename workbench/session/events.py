@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from workbench.commands.command import Command
 
@@ -17,7 +18,15 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Ask:
-    """Effect: the session asks itself for a command."""
+class Then:
+    """Effect: let this event happen next."""
 
-    command: Command
+    event: Any
+
+
+@dataclass(frozen=True)
+class Later:
+    """Effect: let this event happen after some seconds. `apply` ignores it if it has lost its sense by then."""
+
+    seconds: float
+    event: Any

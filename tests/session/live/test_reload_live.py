@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import runs, save, wait_until
+from tests.drive.session import heard, runs, save, wait_until
 from workbench.commands.command import Refused
 from workbench.commands.recording import StopRecording
 from workbench.commands.run import ChooseClass, PauseRun, PlayRun, RebuildScene, ReloadFile, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.record.recording import RecordingWanted
-from workbench.session.run.events import EnvsReset, InspectionWanted
+from workbench.session.run.events import EnvsReset
 
 DRAWS = True
 
@@ -58,9 +58,7 @@ def played(session: Session, steps: int) -> SessionView:
     session.do(PauseRun())
     wait_until(session, lambda v: not v.playing and v.state == "paused", "the pause")
     # What the worker sends after it has paused comes before its answer.
-    before = session.view().inspection
-    session.happen(InspectionWanted(("joints",)))
-    return wait_until(session, lambda v: v.inspection is not before, "rest")
+    return heard(session)
 
 
 def test_a_patch_keeps_moment_past_and_selection_and_shows_new_numbers_while_paused(

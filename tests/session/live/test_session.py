@@ -13,12 +13,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from tests.drive.session import Told, live_session, start_over, step, wait_until
+from tests.drive.session import Told, heard, live_session, start_over, step, wait_until
 from workbench.commands.run import PauseRun, PlayRun, Step
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest, EnterRecording
-from workbench.session.run.events import ActionTold, EnvsReset, InspectionWanted, PagesCounted
+from workbench.session.run.events import ActionTold, EnvsReset, PagesCounted
 
 pytestmark = pytest.mark.thorough
 
@@ -53,10 +53,7 @@ def test_a_single_step_ends_playing(session: Session) -> None:
     session.do(Step())
     serials = []
     for _ in range(20):  # a worker that played on would take some ten steps meanwhile
-        before = session.view().inspection
-        session.happen(InspectionWanted(("joints",)))
-        wait_until(session, lambda v, before=before: v.inspection is not before, "an answer")
-        serials.append(session.view().step_serial)
+        serials.append(heard(session).step_serial)
     session.change(speed=1.0)
     assert len(set(serials)) == 1 and session.view().state == "paused"
 

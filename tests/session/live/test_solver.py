@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.session import TASKS, Told, live_session, start_over, step, wait_until
+from tests.drive.session import TASKS, Told, heard, live_session, start_over, step, wait_until
 from workbench.commands.run import Interrupt, PauseRun, PlayRun, Step
 from workbench.planning.options import PlanOptions
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import PlanDropped, PlanWanted, Play
 from workbench.session.record.saving import SaveWanted
-from workbench.session.run.events import InspectionWanted
 
 FEW = PlanOptions(rollouts=16, horizon=0.3, noise=0.8)
 """Enough for a cube that is pushed."""
@@ -102,8 +101,7 @@ def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(ses
     session.do(PauseRun())
     view = wait_until(session, lambda view: not view.playing and view.solve.state == "none", "the pause")
     serial = session.view().step_serial
-    session.happen(InspectionWanted(("joints",)))
-    view = wait_until(session, lambda v: v.inspection is not None, "an answer of the worker")
+    view = heard(session)
     assert view.step_serial - serial <= 1 and view.solve.state == "none"
 
 

@@ -10,14 +10,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tests.drive.session import jump, live_session, moment_at, start_over, step, wait_until
+from tests.drive.session import draw_past, jump, live_session, moment_at, start_over, step, wait_until
 from workbench.commands.recording import StopRecording
 from workbench.commands.run import PauseRun, RestartWorker
 from workbench.commands.timeline import ContinueFromHere, UndoReset
 from workbench.session.live.session import Session
 from workbench.session.protocol.messages import CameraRequest
 from workbench.session.record.recording import RecordingWanted
-from workbench.session.run.events import ActionTold, EnvsReset, MomentShown, PagesCounted, PastPicturesWanted
+from workbench.session.run.events import ActionTold, EnvsReset, MomentShown, PagesCounted
 
 N = 3
 
@@ -156,7 +156,7 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     now = wait_until(session, lambda v: key in v.pictures, "the live picture").pictures[key]
     session.happen(MomentShown(start))
     assert session.view().pictures == {} and session.view().timeline.wants_pictures
-    session.happen(PastPicturesWanted())
+    draw_past(session)
     then = wait_until(session, lambda v: key in v.pictures, "the picture of the past").pictures[key]
     assert not session.view().timeline.wants_pictures
     live = session.view().timeline.last

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.session import live_session, wait_until
+from tests.drive.session import draw_past, live_session, wait_until
 from workbench.commands.run import Step
 from workbench.commands.timeline import ContinueFromHere
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.events import MomentShown, PagesCounted, PastPicturesWanted
+from workbench.session.run.events import MomentShown, PagesCounted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -68,7 +68,7 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
         session.change(selected_env=1)
         past = session.view().timeline.first
         session.happen(MomentShown(past))
-        session.happen(PastPicturesWanted())
+        draw_past(session)
         view = wait_until(session, lambda v: v.timeline.shown == past and drawn(v, 1), "a picture of then")
         assert not shows_cube(view)
         last = view.timeline.last

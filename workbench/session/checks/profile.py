@@ -76,12 +76,11 @@ ProfileEvent = StepTimed | ProfileFailed
 ProfileEffect = BeginProfile | EndProfile
 
 
-def apply(view: ProfileView, event: object, before: Run, run: Run) -> tuple[ProfileView, list[ProfileEffect]]:
+def apply(view: ProfileView, event: object, run: Run) -> tuple[ProfileView, list[ProfileEffect]]:
     """The profile after an event, and what has to be done.
 
     Args:
-        before: the run before the event.
-        run: the run after it.
+        run: the run after the event.
 
     Raises:
         Refused: the command makes no sense now.

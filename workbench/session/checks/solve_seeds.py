@@ -104,12 +104,11 @@ Change = tuple[SeedsView, list[SeedsEffect]]
 """The results after an event, and what has to be done."""
 
 
-def apply(view: SeedsView, event: object, before: Run, run: Run) -> Change:
+def apply(view: SeedsView, event: object, run: Run) -> Change:
     """The results after an event, and what has to be done.
 
     Args:
-        before: the run before the event.
-        run: the run after it.
+        run: the run after the event.
 
     Raises:
         Refused: the command makes no sense now.

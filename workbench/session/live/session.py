@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import time
-from asyncio import TimerHandle
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
@@ -37,7 +36,7 @@ from workbench.session.checks.checks import (
 )
 from workbench.session.checks.profile import BeginProfile, EndProfile, ProfileJobs
 from workbench.session.checks.solve_seeds import BeginSeeds, EndSeeds, SeedsJobs
-from workbench.session.events import Ask, Asked
+from workbench.session.events import Asked, Later, Then
 from workbench.session.history.env_table import EnvRows
 from workbench.session.live.solver import BeginPlan, EndPlan, PlanJobs
 from workbench.session.live.state import Effect, SessionEvent, State, apply
@@ -57,15 +56,13 @@ from workbench.session.protocol.messages import (
     WarmUp,
 )
 from workbench.session.record.live import LiveRecorder
-from workbench.session.record.recording import BeginEpisodes, EndEpisodes, Recording, TakeStep
+from workbench.session.record.recording import BeginEpisodes, EndEpisodes, LiveRecording, TakeStep
 from workbench.session.record.save_past import PastSaver
 from workbench.session.record.saving import BeginSaving, EndSaving
 from workbench.session.rescore.past import RescoredCurve
 from workbench.session.rescore.past_rescorer import PastRescorer
 from workbench.session.rescore.rescoring import BeginRescoring, EndRescoring
 from workbench.session.run.events import (
-    DrawSoon,
-    EnvsReset,
     FileSaved,
     Follow,
     FollowPolicy,
@@ -73,10 +70,7 @@ from workbench.session.run.events import (
     LoadDone,
     LoadGaveWay,
     Now,
-    PastPicturesWanted,
     PolicySaved,
-    ReadingDue,
-    ReadSoon,
     ReplaceWorker,
     RunToEnter,
     Send,
@@ -91,8 +85,6 @@ from workbench.session.run.run import Run, first_run
 Value = TypeVar("Value")
 HISTORY_BYTES = 256 * 1024**2
 """Default memory limit of the history."""
-STANDS_STILL = 0.35
-"""Seconds at one moment of the past before its pictures are drawn; with less, every drag would draw some."""
 
 
 @dataclass(frozen=True)
@@ -150,15 +142,13 @@ class Session:
             options, settings = replace(kept.options, seed=kept.seed), replace(kept.settings, cameras=())
         self._state = State(
             first_run(task, options, history_bytes, settings),
-            Recording(str(recordings)),
+            LiveRecording(str(recordings)),
             first_studio(None if kept is None else kept.cameras),
             checks=Checks(ChecksView(after_each_save=check)),
         )
         self._changes = ChangeCounter()
         self._notify = self._changes.notify
         self._enter_numbers = itertools.count(1)
-        self._to_draw: TimerHandle | None = None
-        """Draws pictures of the past soon."""
         self._printed = PrintedLog(self._on_lines)
         self._aside = Aside("follow")
         """Begins to watch files, for which they are read."""
@@ -238,12 +228,10 @@ class Session:
                 return self._aside.begin(partial(self._watcher.follow, files, texts))
             case FollowPolicy(policy=policy, folder=folder):
                 return self._aside.begin(partial(self._policy_file.follow, policy, folder))
-            case DrawSoon(at=at):
-                if self._to_draw is not None:
-                    self._to_draw.cancel()
-                self._to_draw = later(STANDS_STILL, lambda: self._happen(PastPicturesWanted(at)))
-            case ReadSoon(seconds=seconds):
-                later(seconds, lambda: self._happen(ReadingDue()))
+            case Then(event=event):
+                self._happen(event)
+            case Later(seconds=seconds, event=event):
+                later(seconds, lambda: self._happen(event))
             case BeginCheck() | EndCheck():
                 self._checks.perform(effect)
             case KeepCheckAfterSave(wanted=wanted):
@@ -252,8 +240,6 @@ class Session:
                 self._profiles.perform(effect)
             case BeginPlan() | EndPlan():
                 self._plans.perform(effect)
-            case Ask(command=command):
-                self._happen(Asked(command))
             case BeginSeeds() | EndSeeds():
                 self._seeds.perform(effect)
             case BeginEpisodes() | TakeStep() | EndEpisodes():
@@ -264,8 +250,6 @@ class Session:
                 self._past_saver.end()
             case BeginRescoring() | EndRescoring():
                 self._past_rescorer.perform(effect)
-            case EnvsReset():
-                self._happen(effect)
             case _:
                 self._studio.perform(effect)
         return None
@@ -374,7 +358,6 @@ class Session:
     def close(self) -> None:
         """End all processes and threads; waits for episodes that are being written. Called on another thread than the loop."""
         stop_listening(self._log)
-        do(lambda: self._to_draw and self._to_draw.cancel())
         self._changes.close()
         self._worker.stop()
         self._watcher.stop()
@@ -462,7 +445,6 @@ class Session:
         # A policy in the task's folder is also watched as a module of the task, for which a save reports "nothing changed".
         self._log("the policy's file was saved: it is read again")
         self.happen(PolicySaved())
-        self._notify()
 
     def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:
         self._notify()

@@ -16,7 +16,7 @@ from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import Stepped
 from workbench.planning.options import PlanOptions
 from workbench.session.checks.checks import load_version
-from workbench.session.events import Ask
+from workbench.session.events import Asked, Then
 from workbench.session.loop import do
 from workbench.session.process.askers import Background
 from workbench.session.process.jobs import Job, JobFailed, Jobs
@@ -64,7 +64,7 @@ class SolveView:
 
 
 @dataclass(frozen=True)
-class Episode:
+class PlannedEpisode:
     """What is known of the running episode of an env."""
 
     begins: int = 0
@@ -85,7 +85,7 @@ class Solving:
 
     shared: SolveView = SolveView()
     """The view without the fields of a single env."""
-    episodes: Mapping[int, Episode] = field(default_factory=dict)
+    episodes: Mapping[int, PlannedEpisode] = field(default_factory=dict)
     """By env."""
 
     @property
@@ -95,7 +95,7 @@ class Solving:
 
     def view(self, env: int) -> SolveView:
         """The view of this env."""
-        episode = self.episodes.get(env, Episode())
+        episode = self.episodes.get(env, PlannedEpisode())
         predicted, achieved = _curves(episode)
         return replace(
             self.shared,
@@ -162,16 +162,15 @@ class EndPlan:
 
 SolverEvent = RolloutsStart | PlanActivity | PlanMade | PlanFailed
 SolverEffect = BeginPlan | EndPlan
-Change = tuple[Solving, list[SolverEffect | Ask | Send]]
+Change = tuple[Solving, list[SolverEffect | Then | Send]]
 """The plans after an event, and what has to be done."""
 
 
-def apply(solving: Solving, event: object, before: Run, run: Run) -> Change:
+def apply(solving: Solving, event: object, run: Run) -> Change:
     """The plans after an event, and what has to be done. The last plan stays visible when planning ends.
 
     Args:
-        before: the run before the event.
-        run: the run after it.
+        run: the run after the event.
     """
     state = solving.shared.state
     runs = state in ("starting", "planning")
@@ -203,13 +202,13 @@ def apply(solving: Solving, event: object, before: Run, run: Run) -> Change:
 
 def _refuse(solving: Solving, why: str, problem: Problem | None) -> Change:
     """There is no plan to follow: the worker that plays is paused."""
-    return _changed(solving, state="failed", activity="", why=why, problem=problem), [Ask(PauseRun())]
+    return _changed(solving, state="failed", activity="", why=why, problem=problem), [Then(Asked(PauseRun()))]
 
 
 def _planned(solving: Solving, made: PlanMade) -> Solving:
     episodes = dict(solving.episodes)
     for one in made.envs:
-        episode = episodes.get(one.env, Episode())
+        episode = episodes.get(one.env, PlannedEpisode())
         place = len(episode.rewards)
         episodes[one.env] = replace(
             episode,
@@ -230,17 +229,17 @@ def _stepped(solving: Solving, event: Stepped, planned: bool) -> Solving:
     """
     if not planned and not solving.episodes:
         return solving
-    episodes: dict[int, Episode] = {}
+    episodes: dict[int, PlannedEpisode] = {}
     for env, jumped in enumerate(event.reset_mask if planned else ()):
         known = None if jumped else solving.episodes.get(env)
         episodes[env] = _noted(known, env, event.step)
     return _changed(replace(solving, episodes=episodes))
 
 
-def _noted(episode: Episode | None, env: int, step: StepResult) -> Episode:
+def _noted(episode: PlannedEpisode | None, env: int, step: StepResult) -> PlannedEpisode:
     elapsed = int(step.elapsed_steps[env])
     if episode is None:
-        return Episode(elapsed)
+        return PlannedEpisode(elapsed)
     solved_at, success = episode.solved_at, step.evaluate.get("success")
     if success is not None and bool(np.all(success[env])) and not solved_at:
         solved_at = elapsed
@@ -303,7 +302,7 @@ class PlanJobs:
         self._happen(PlanFailed(str(failure), failure.problem))
 
 
-def _curves(episode: Episode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _curves(episode: PlannedEpisode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Predicted and achieved reward a step, from each step of the episode on."""
     rewards = np.array(episode.rewards, np.float32)
     count = max(len(rewards), max(episode.predicted, default=-1) + 1)

@@ -11,7 +11,7 @@ from workbench.session.cameras.state import Studio
 from workbench.session.checks import checks as of_checks
 from workbench.session.checks import profile as of_profile
 from workbench.session.checks import solve_seeds as of_seeds
-from workbench.session.events import Ask
+from workbench.session.events import Then
 from workbench.session.live import solver as of_solver
 from workbench.session.record import recording as of_recording
 from workbench.session.record.saving import SaveEvent, SaveWanted
@@ -43,7 +43,7 @@ Effect = (
     | of_seeds.SeedsEffect
     | of_solver.SolverEffect
     | StudioEffect
-    | Ask
+    | Then
 )
 DOES: frozenset[type[Command]] = (
     of_run.DOES
@@ -62,7 +62,7 @@ class State:
     """One moment of a session. Parts that an event did not change are the same objects."""
 
     run: Run
-    recording: of_recording.Recording
+    recording: of_recording.LiveRecording
     studio: Studio
     rescoring: of_rescoring.PastRescoring = of_rescoring.PastRescoring()
     """The history rescored with the new code."""
@@ -84,12 +84,12 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     """
     before, solved = state.run, state.solving.solved
     run, for_run = of_run.apply(before, event, now)
-    recording, for_recording = of_recording.apply(state.recording, event, before, run, now, solved)
+    recording, for_recording = of_recording.apply(state.recording, event, run, now, solved)
     rescoring, for_rescoring = of_rescoring.apply(state.rescoring, event, before, run)
     checks, for_checks = of_checks.apply(state.checks, event, before, run)
-    profile, for_profile = of_profile.apply(state.profile, event, before, run)
-    seeds, for_seeds = of_seeds.apply(state.seeds, event, before, run)
-    solving, for_solver = of_solver.apply(state.solving, event, before, run)
+    profile, for_profile = of_profile.apply(state.profile, event, run)
+    seeds, for_seeds = of_seeds.apply(state.seeds, event, run)
+    solving, for_solver = of_solver.apply(state.solving, event, run)
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
     new = State(run, recording, studio, rescoring, checks, profile, seeds, solving)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))

@@ -28,7 +28,7 @@ from workbench.session.protocol.messages import ReloadReport, RulesBroken, Setti
 from workbench.session.record.recording import RecordingStatus
 from workbench.session.rescore.background import RescoreView
 from workbench.session.run.past import TimelineView
-from workbench.session.run.run import PastLoad, Run, State
+from workbench.session.run.run import PastLoad, Run, RunState
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class ShownCameras:
 class SessionView:
     """Immutable; its serials tell the redraw loop cheaply which parts are new, so that nothing is drawn twice."""
 
-    state: State = "starting"
+    state: RunState = "starting"
     activity: str = ""
     """Current step of starting or loading, else empty."""
     stale: bool = False
@@ -191,6 +191,7 @@ def view_of(run: Run, **known: Any) -> SessionView:
     view = replace(
         now,
         curves=past.history.steps.curves(run.env),
+        timeline_cleared=run.after_load == "gone",
         timeline=past.view(run.env, run.settings.cameras, run.settings.pictures),
         odd=past.history.findings,
     )

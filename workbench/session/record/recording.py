@@ -14,13 +14,12 @@ from workbench.commands.recording import (
 )
 from workbench.jobs.record.gather import Finished
 from workbench.jobs.task import Stepped, TaskDescription
-from workbench.session.events import Asked
+from workbench.session.events import Asked, Then
 from workbench.session.process.supervisor import End
 from workbench.session.protocol.messages import Loaded, SetCapture
 from workbench.session.record import saving as of_saving
 from workbench.session.record.saving import SaveEffect, SaveStatus, Saving, without_message
 from workbench.session.run.events import EnvsReset, LoadDone, Now, Send, VersionLoaded, WorkerDied
-from workbench.session.run.loading import past_after
 from workbench.session.run.run import Run
 
 DOES: frozenset[type[Command]] = of_saving.DOES | {
@@ -78,7 +77,7 @@ class UnderWay:
 
 
 @dataclass(frozen=True)
-class Recording:
+class LiveRecording:
     """The recording that runs, and what was recorded before. It takes each env's steps from the next reset on."""
 
     folder: str
@@ -211,15 +210,15 @@ class EndEpisodes:
     """End the running episodes and write what they have."""
 
 
-RecordEffect = BeginEpisodes | TakeStep | EndEpisodes | SaveEffect | Send | EnvsReset
-Change = tuple[Recording, list[RecordEffect]]
+RecordEffect = BeginEpisodes | TakeStep | EndEpisodes | SaveEffect | Send | Then
+Change = tuple[LiveRecording, list[RecordEffect]]
 
 
 # --- apply ------------------------------------------------------------------------------------------
 
 
 def apply(
-    recording: Recording, event: object, before: Run, run: Run, now: Now, solved: tuple[int, ...] = ()
+    recording: LiveRecording, event: object, run: Run, now: Now, solved: tuple[int, ...] = ()
 ) -> Change:
     """The recording after an event, and what has to be done.
 
@@ -227,8 +226,7 @@ def apply(
     memory.
 
     Args:
-        before: the run before the event.
-        run: the run after it.
+        run: the run after the event.
         solved: envs whose episode is solved.
 
     Raises:
@@ -238,12 +236,12 @@ def apply(
     saving, effects = of_saving.apply(recording.saving, event, run, chosen, solved)
     if saving is not recording.saving:
         recording = replace(recording, saving=saving)
-    recording, more = _apply(recording, event, before, run, now, chosen)
+    recording, more = _apply(recording, event, run, now, chosen)
     return recording, [*effects, *more]
 
 
 def _apply(
-    recording: Recording, event: object, before: Run, run: Run, now: Now, chosen: tuple[int, ...] | None
+    recording: LiveRecording, event: object, run: Run, now: Now, chosen: tuple[int, ...] | None
 ) -> Change:
     match event:
         case Asked(command=ToggleRecording()) if not recording.env_idx:
@@ -275,7 +273,7 @@ def _apply(
         case WorkerDied(death=death) if recording.env_idx and death.end is not End.HANDED_OVER:
             return _ended(recording), [EndEpisodes()]
         case VersionLoaded(loaded=loaded) if recording.env_idx:
-            return _loaded(recording, loaded, before)
+            return _loaded(recording, loaded, run)
         case LoadDone() if (continues := recording.continues) is not None:
             one_each = continues.one_each
             # The version may have fewer envs.
@@ -287,12 +285,12 @@ def _apply(
     return recording, []
 
 
-def _new(recording: Recording, now: Now) -> Recording:
+def _new(recording: LiveRecording, now: Now) -> LiveRecording:
     return replace(recording, since=now.wall, episodes=0)
 
 
 def _start(
-    recording: Recording, run: Run, env_idx: tuple[int, ...] | None, *, one_each: bool, reset: bool
+    recording: LiveRecording, run: Run, env_idx: tuple[int, ...] | None, *, one_each: bool, reset: bool
 ) -> Change:
     if run.task is None:
         raise Refused("No task is loaded yet.")
@@ -307,16 +305,16 @@ def _start(
     )
     begin = BeginEpisodes(begun.number, run.task, envs, one_each)
     effects: list[RecordEffect] = [begin, Send(SetCapture(envs, from_reset=True))]
-    return begun, [*effects, EnvsReset(None if env_idx is None else envs)] if reset else effects
+    return begun, [*effects, Then(EnvsReset(None if env_idx is None else envs))] if reset else effects
 
 
-def _ended(recording: Recording, problem: str | None = None) -> Recording:
+def _ended(recording: LiveRecording, problem: str | None = None) -> LiveRecording:
     return replace(
         recording, env_idx=(), under_way=UnderWay(), problem=problem or recording.problem, continues=None
     )
 
 
-def _take(recording: Recording, stepped: Stepped) -> Change:
+def _take(recording: LiveRecording, stepped: Stepped) -> Change:
     size = _size(stepped)
     waiting = recording.waiting_bytes + size
     if waiting > MOST_WAITING_BYTES:
@@ -324,7 +322,7 @@ def _take(recording: Recording, stepped: Stepped) -> Change:
     return replace(recording, waiting_bytes=waiting), [TakeStep(stepped, size)]
 
 
-def _recorded(recording: Recording, event: StepRecorded) -> Change:
+def _recorded(recording: LiveRecording, event: StepRecorded) -> Change:
     recording = replace(recording, waiting_bytes=recording.waiting_bytes - event.bytes)
     if event.number != recording.number or not recording.env_idx:
         return recording, []  # another recording has begun, or none
@@ -338,13 +336,12 @@ def _recorded(recording: Recording, event: StepRecorded) -> Change:
     return (recorded, [capture]) if left else (_ended(recorded), [capture, EndEpisodes()])
 
 
-def _loaded(recording: Recording, loaded: Loaded, before: Run) -> Change:
+def _loaded(recording: LiveRecording, loaded: Loaded, run: Run) -> Change:
     """An episode must not mix steps of two versions, nor of two processes."""
     report = loaded.reload
     if report is not None and report.level == "same":
         return recording, []
-    past = past_after(before.task, loaded, before.recovery.restoring)
-    put_back = past != "gone" or (report is not None and bool(report.carried))
+    put_back = run.after_load != "gone" or (report is not None and bool(report.carried))
     continues = Continues(recording.env_idx, recording.one_each, put_back)
     return replace(_ended(recording), continues=continues), [EndEpisodes()]
 

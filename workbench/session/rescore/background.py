@@ -18,8 +18,6 @@ class StoppedBy(Enum):
 
     HAND = "stopped by hand"
     SAVE = "the file was saved again"
-    LOAD = "another version was loaded"
-    LOSS = "the episodes are gone"
     CLOSING = "closing"
 
 

@@ -14,8 +14,7 @@ from workbench.session.protocol.messages import Load
 from workbench.session.rescore.background import RUNNING, RescoreView, StoppedBy
 from workbench.session.rescore.past import PastRun, RescoredCurve, RescoredPast
 from workbench.session.run.events import FileSaved, VersionLoaded
-from workbench.session.run.loading import PastAfterLoad, past_after
-from workbench.session.run.run import Run
+from workbench.session.run.run import PastAfterLoad, Run
 
 DOES: frozenset[type[Command]] = frozenset({StopRescoring})
 """Commands that `apply` takes."""
@@ -128,9 +127,8 @@ def apply(rescoring: PastRescoring, event: object, before: Run, run: Run) -> Cha
             return _stop(rescoring, StoppedBy.HAND)
         case FileSaved() if runs:
             return _stop(rescoring, StoppedBy.SAVE)
-        case VersionLoaded(loaded=loaded):
-            past = past_after(before.task, loaded, before.recovery.restoring)
-            what_to_do = rescore_after_load(past, view)
+        case VersionLoaded():
+            what_to_do = rescore_after_load(run.after_load, view)
             if what_to_do == "forget" and rescoring.past is not None:
                 return PastRescoring(RescoreView(serial=view.serial + 1), None, rescoring.job), [
                     EndRescoring()

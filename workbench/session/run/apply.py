@@ -58,11 +58,10 @@ from workbench.commands.timeline import (
 )
 from workbench.core.capture.inspection import Inspection
 from workbench.jobs.task import Stepped
-from workbench.session.events import Asked
+from workbench.session.events import Asked, Later
 from workbench.session.protocol.messages import (
     CameraFailed,
     EnterRecording,
-    Inspect,
     LoadFailed,
     Loading,
     NewProcessNeeded,
@@ -80,13 +79,11 @@ from workbench.session.protocol.messages import (
 )
 from workbench.session.run.events import (
     ActionTold,
-    DrawSoon,
     EnvsReset,
     EpisodeStepShown,
     FileOpened,
     FileSaved,
     FollowPolicy,
-    InspectionWanted,
     InterruptWorker,
     LoadDone,
     LoadGaveWay,
@@ -161,6 +158,8 @@ DOES: frozenset[type[Command]] = frozenset(
     }
 )
 """Commands that `apply` takes."""
+STANDS_STILL = 0.35
+"""Seconds at one moment of the past before its pictures are drawn; with less, every drag would draw some."""
 
 
 def apply(run: Run, event: object, now: Now) -> Change:
@@ -174,7 +173,7 @@ def apply(run: Run, event: object, now: Now) -> Change:
     new, effects = _apply(run, event, now)
     stands_at = new.stands_at
     if new.pages and stands_at is not None and (stands_at != run.stands_at or isinstance(event, Placed)):
-        effects = [*effects, DrawSoon(stands_at)]
+        effects = [*effects, Later(STANDS_STILL, PastPicturesWanted(stands_at))]
     new, for_reading = schedule(new, event, now)
     return new, [*effects, *for_reading]
 
@@ -242,14 +241,12 @@ def _apply(run: Run, event: object, now: Now) -> Change:
             run, effects = _change_settings(run, selected_env=env)
             return _show(run, None if run.kept is None else run.kept.seek_step(env, step)), effects
         case PastPicturesWanted(at=at):
-            return _draw_past(run) if at in (None, run.stands_at) else (run, [])
+            return _draw_past(run) if at == run.stands_at else (run, [])
         case ActionTold():
             if run.task is None:
                 return run, []
             envs = tuple(range(run.num_envs)) if event.env_idx is None else event.env_idx
             return _show_live(run), [Send(Tell(envs, event.dimensions, event.values))]
-        case InspectionWanted(sections=sections):
-            return run, [Send(Inspect(run.env, sections))]
         case ReadingChosen(sections=sections):
             return replace(run, read_sections=sections), []
         case ReadingDue():
@@ -354,15 +351,15 @@ def _travel(run: Run, command: Command) -> Change:
         case GoToLast():
             return _show_live(run), []
         case UndoReset():
-            run, effects = _play(run, False, live=False)
-            restore = past.undo(env)
+            if (restore := past.undo(env)) is None:
+                raise Refused("There is nothing to undo.")
+            run, effects = _play(run, False)
         case ContinueFromHere(scope=scope):
+            if (restore := past.continue_from_shown(env, scope)) is None:
+                raise Refused("Show an earlier moment first: the run continues from there.")
             effects = []
-            restore = past.continue_from_shown(env, scope)
         case _:
             raise AssertionError(f"{command} is not in DOES")
-    if restore is None:
-        return new_pictures(run), effects
     return new_pictures(replace(run, past=past.seek(None))), [*effects, Send(restore)]
 
 
@@ -370,8 +367,8 @@ def _set_playing(run: Run, playing: bool) -> Run:
     return replace(run, playing=playing, wants_play=playing)
 
 
-def _play(run: Run, playing: bool, live: bool = True) -> Change:
-    run = _show_live(run) if playing and live else run
+def _play(run: Run, playing: bool) -> Change:
+    run = _show_live(run) if playing else run
     return _set_playing(run, playing), [Send(Play(playing))]
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from workbench.core.capture.inspection import Section
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.task import TaskOptions
-from workbench.session.events import Asked
+from workbench.session.events import Asked, Later
 from workbench.session.process.heartbeat import Busy
 from workbench.session.process.supervisor import Death
 from workbench.session.protocol.messages import (
@@ -140,10 +140,10 @@ class EpisodeStepShown:
 
 @dataclass(frozen=True)
 class PastPicturesWanted:
-    """Draw the pictures that the shown moment lacks."""
+    """Draw the pictures that the shown moment lacks, if it is still the same."""
 
-    at: object = None
-    """`Run.stands_at` when this was asked for: where it has changed since, nothing is drawn. None for whatever is shown."""
+    at: object
+    """`Run.stands_at` when this was asked for."""
 
 
 @dataclass(frozen=True)
@@ -153,13 +153,6 @@ class ActionTold:
     dimensions: tuple[int, ...]
     values: tuple[float, ...]
     env_idx: tuple[int, ...] | None = None
-
-
-@dataclass(frozen=True)
-class InspectionWanted:
-    """Inspect the selected env once."""
-
-    sections: tuple[Section, ...]
 
 
 @dataclass(frozen=True)
@@ -199,7 +192,6 @@ RunEvent = (
     | EpisodeStepShown
     | PastPicturesWanted
     | ActionTold
-    | InspectionWanted
     | ReadingChosen
     | ReadingDue
     | EnvsReset
@@ -244,18 +236,4 @@ class FollowPolicy:
     folder: Path | None
 
 
-@dataclass(frozen=True)
-class DrawSoon:
-    """Let `PastPicturesWanted` happen after a moment, instead of what was to be drawn before: a drag draws none."""
-
-    at: object
-
-
-@dataclass(frozen=True)
-class ReadSoon:
-    """Let `ReadingDue` happen after these seconds."""
-
-    seconds: float
-
-
-RunEffect = Send | ReplaceWorker | InterruptWorker | Follow | FollowPolicy | DrawSoon | ReadSoon
+RunEffect = Send | ReplaceWorker | InterruptWorker | Follow | FollowPolicy | Later

@@ -6,20 +6,18 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
 
 from workbench.authoring.loading.reference import (
     RecordedTask,
     reference_to_class,
 )
-from workbench.authoring.problem import Problem
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskDescription, TaskOptions, changed_options
 from workbench.machine.processes.wire import pack
 from workbench.session.history.env_table import EnvTable
 from workbench.session.history.history import History
 from workbench.session.process.heartbeat import death_problem
-from workbench.session.process.supervisor import Death, End
+from workbench.session.process.supervisor import End
 from workbench.session.protocol.messages import (
     SCENE_KEPT,
     Loaded,
@@ -31,10 +29,17 @@ from workbench.session.protocol.messages import (
 )
 from workbench.session.run.events import Follow, Now, ReplaceWorker, RunEffect, Send, WorkerDied
 from workbench.session.run.past import Past
-from workbench.session.run.run import Change, PastLoad, Run, at_rest, load_of, new_pictures, with_problem
+from workbench.session.run.run import (
+    Change,
+    PastAfterLoad,
+    PastLoad,
+    Run,
+    at_rest,
+    load_of,
+    new_pictures,
+    with_problem,
+)
 
-PastAfterLoad = Literal["same", "patched", "gone"]
-"""What a load means for the history: it continues unchanged, it continues with other code, or another history begins."""
 _MOST_LOADS = 20
 
 
@@ -104,7 +109,7 @@ def apply_options(run: Run, options: TaskOptions) -> Change:
     return reload_file(replace(run, tried_options=tried, options_refused=None))
 
 
-def past_after(before: TaskDescription | None, event: Loaded, restored: bool) -> PastAfterLoad:
+def _past_after(before: TaskDescription | None, event: Loaded, restored: bool) -> PastAfterLoad:
     """What a load means for the history.
 
     Args:
@@ -132,7 +137,7 @@ def loaded(run: Run, event: Loaded, on_disk: bool, now: Now) -> Change:
     run = replace(run, recovery=run.recovery.loaded(task, now.monotonic))
     run = _take_options(run, event.options)
     kept = report is not None and report.level in SCENE_KEPT
-    past = past_after(before, event, restored)
+    past = _past_after(before, event, restored)
     drawn = kept or (past != "gone" and before is not None and pack(before.geometry) == pack(task.geometry))
     if drawn and before is not None:
         # The same object, so that the page sees that it need not build the scene again.
@@ -146,7 +151,7 @@ def loaded(run: Run, event: Loaded, on_disk: bool, now: Now) -> Change:
         step=event.first,
         load_milliseconds=milliseconds,
         reload=report,
-        timeline_cleared=past == "gone",
+        after_load=past,
         activity="",
         stale=stale,
         failed_cameras=run.failed_cameras if restored else {},
@@ -262,8 +267,8 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
     )
     if while_loading:
         run, _ = _refuse_options(run, run.tried_options)
-    problem = death_to_show(run, death, event.printed, texts)
-    if problem is not None:
+    if death.end is not End.HANDED_OVER and (death.end is not End.ASKED or death.stack):
+        problem = death_problem(death.why, death.doing, death.stack, run.own_files, event.printed, texts)
         run = with_problem(run, problem, at_run=not while_loading)
     if death.doing == "drawing" and death.end is not End.ASKED:
         # The next worker would die of the same picture.
@@ -280,13 +285,6 @@ def died(run: Run, event: WorkerDied, now: Now) -> Run:
         state="stopped" if death.gives_up else "starting",
         activity="" if death.gives_up else "starting a new worker",
     )
-
-
-def death_to_show(run: Run, death: Death, printed: str, texts: Mapping[str, str]) -> Problem | None:
-    """The problem of a death; None if the end was requested."""
-    if death.end is End.HANDED_OVER or (death.end is End.ASKED and not death.stack):
-        return None
-    return death_problem(death.why, death.doing, death.stack, run.own_files, printed, texts)
 
 
 def _texts(run: Run) -> Mapping[str, str]:

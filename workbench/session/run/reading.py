@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from workbench.core.capture.inspection import Inspection
+from workbench.session.events import Later
 from workbench.session.protocol.messages import Inspect, LoadFailed
-from workbench.session.run.events import Now, ReadSoon, Send, VersionLoaded, WorkerDied
+from workbench.session.run.events import Now, ReadingDue, Send, VersionLoaded, WorkerDied
 from workbench.session.run.run import Change, Run
 
 READ_EVERY = 0.2
@@ -21,7 +22,8 @@ def schedule(run: Run, event: object, now: Now) -> Change:
         return run, []
     if run.read_at == _now(run):
         return run, []
-    return replace(run, reading="soon"), [ReadSoon(max(0.0, run.read_when + READ_EVERY - now.monotonic))]
+    wait = max(0.0, run.read_when + READ_EVERY - now.monotonic)
+    return replace(run, reading="soon"), [Later(wait, ReadingDue())]
 
 
 def read(run: Run, now: Now) -> Change:

@@ -37,9 +37,13 @@ from workbench.session.run.events import RunEffect, RunToEnter
 from workbench.session.run.past import Past, Strip
 from workbench.session.run.recovery import LoadInputs, Recovery
 
-State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
+RunState = Literal["starting", "loading", "running", "paused", "error", "stopped"]
 """``starting`` the worker process; ``loading``: a task is being imported or built; ``error``: no version is loaded,
 see `Run.problem`; ``stopped``: there is no worker."""
+
+
+PastAfterLoad = Literal["same", "patched", "gone"]
+"""What a load means for the history: it continues unchanged, it continues with other code, or another history begins."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +98,7 @@ class Run:
     named_policy: str | None = None
     """The policy that was named last, for when policies act again."""
 
-    state: State = "starting"
+    state: RunState = "starting"
     activity: str = "a worker process"
     """Current step of starting or loading, else empty."""
     stale: bool = False
@@ -109,8 +113,8 @@ class Run:
     load_milliseconds: float = 0.0
     reload: ReloadReport | None = None
     """How the running version came in; None for the first."""
-    timeline_cleared: bool = False
-    """Whether the running version began another history."""
+    after_load: PastAfterLoad = "same"
+    """What the last load meant for the history."""
     loads: tuple[PastLoad, ...] = ()
     """The last loads, newest first."""
     choices: tuple[str, ...] = ()
