@@ -79,8 +79,11 @@ class Board:
         if box is None:
             return False
         self.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + min(box["height"] / 2, 10))
-        self.page.wait_for_timeout(60)
-        return self.page.evaluate("asked") > before or part.inner_text() == "copied"
+        for _ in range(10):
+            self.page.wait_for_timeout(50)
+            if self.page.evaluate("asked") > before or part.inner_text() == "copied":
+                return True
+        return False
 
     def press_all(self, where: str) -> list[str]:
         """What was pressed and did nothing, as text."""
