@@ -33,6 +33,7 @@ from workbench.session.cameras.events import CameraChosen
 from workbench.session.live import state
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.loop import Aside, post
 from workbench.session.run.events import PagesCounted
 from workbench.ui.app.marks import EPISODES, STUDIO, Marks
 from workbench.ui.app.pages import draw_apart
@@ -142,6 +143,8 @@ class Page:
         self._link = partial(editor_link, editor, known=session.knows_file)
         self._on_review, self._on_look = on_review, on_look
         self._visitors_counted = -1
+        self._choices = Aside("choices")
+        """Keeps what a person chose for later runs."""
         self._panels_due = DrawDue(PANELS_EVERY, clock)
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
@@ -184,7 +187,8 @@ class Page:
         register(server, visitors, kinds, "live page")
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", rows=key_rows(kinds)))
-        server.scene.on_click()(self._on_scene_click)
+        # viser awaits coroutines, although its types do not say so.
+        server.scene.on_click()(self._on_scene_click)  # type: ignore[arg-type]
 
     def _is_own(self, file: str) -> bool:
         return isinstance(self._session.reference, str) and self._session.knows_file(file)
@@ -277,6 +281,7 @@ class Page:
     def close(self) -> None:
         """It is shown no more. The session may live on under another page, and must not render for this one."""
         self.counted(0)
+        self._choices.end()
 
     def redraw(self) -> None:
         """Draw the present state of the session; where only steps advance, the panels are drawn less often than
@@ -316,7 +321,7 @@ class Page:
                 self._view_panel.toggle_only_selected()
             case CloseHints():
                 self._hints.content = ""
-                close_hints()
+                self._choices.begin(close_hints)
             case SelectCamera():
                 session.do(command, visitor.name)
                 self._open_tabs.open(visitor, STUDIO)
@@ -431,7 +436,10 @@ class Page:
             return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height, fovy, acting)
         return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
 
-    def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
+    async def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
+        post(lambda: self._clicked(event))
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
         layout, view = self._layout, self._session.view()
         if layout is None or view.task is None:
             return
