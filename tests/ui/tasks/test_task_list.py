@@ -47,7 +47,7 @@ class Chosen:
     def choose(self, number: int) -> None:
         self.numbers.append(number)
 
-    def create(self, name: str, template: TemplateName) -> None:
+    async def create(self, name: str, template: TemplateName) -> None:
         if name == "taken":
             raise ValueError("There is a file taken.py already.")
         self.created.append((name, template))

@@ -29,7 +29,7 @@ from workbench.ui.widgets.fields import Field, choice
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render, sentence
 from workbench.ui.widgets.tools import tool, tools_html
-from workbench.ui.widgets.visitors import Visitor
+from workbench.ui.widgets.visitors import Done, Visitor
 
 PICTURES = "/task_pictures/"
 """Prefix of the route of the pictures of registered tasks."""
@@ -51,7 +51,7 @@ class Chooser(Protocol):
         """Open this row of the list; returns at once. A number that is not listed is refused."""
         ...
 
-    def create(self, name: str, template: TemplateName) -> None:
+    async def create(self, name: str, template: TemplateName) -> None:
         """Write a new task into the folder of the list, and open it.
 
         Raises:
@@ -149,7 +149,7 @@ class TaskList:
         except NotAPath as error:
             return None, sentence(str(error))
 
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         match command:
             case OpenListedTask(number=number):
                 if self._chooser.catalogue.entry(number) is None:
@@ -172,11 +172,15 @@ class TaskList:
             case ChooseTemplate(template=template):
                 self._template = template
             case CreateTask():
-                try:
-                    self._chooser.create(self._name.strip(), self._template)
-                except ValueError as why:
-                    raise Refused(str(why)) from None
-                self._on_chosen()
+                return self._create(self._name.strip(), self._template)
+        return None
+
+    async def _create(self, name: str, template: TemplateName) -> None:
+        try:
+            await self._chooser.create(name, template)
+        except ValueError as why:
+            raise Refused(str(why)) from None
+        self._on_chosen()
 
     def _choose(self, number: int) -> None:
         self._chooser.choose(number)
@@ -304,7 +308,7 @@ class OpenDialog(PagePart[object]):
         self._lock = threading.RLock()
         self._shown: tuple[Dialog, TaskList] | None = None
 
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         match command:
             case OpenTaskList():
                 self.open()
@@ -312,7 +316,8 @@ class OpenDialog(PagePart[object]):
                 with self._lock:
                     if self._shown is None:
                         raise Refused("The list of tasks is closed.")
-                    self._shown[1].do(command, visitor)
+                    return self._shown[1].do(command, visitor)
+        return None
 
     def add_button(self) -> None:
         """Add the button that opens it to the present container."""
