@@ -254,7 +254,9 @@ class ReviewPage:
     def stop(self) -> None:
         """Stop redrawing; returns when the loop has ended."""
         self._loop.stop()
-        self._library.close()
+        self._library.end()
+        if self._sweep is not None:
+            self._sweep.end()
 
     @property
     def dark(self) -> bool:

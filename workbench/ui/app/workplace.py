@@ -136,7 +136,7 @@ class Workplace:
             else:
                 library = Library(self._recordings)
                 review = Review(library, make_scene=SceneProcess(self._tasks, self._imports))
-                library.on_change = review.library_changed
+                library.on_change.add(review.library_changed)
                 review.open_first(first)
                 library.watch()
                 self._shelf = Shelf(library, review)
