@@ -407,6 +407,19 @@ def test_only_the_first_answer_counts(table: Table, library: Library) -> None:
     assert not table.panels.presses(UndoDelete())
 
 
+def test_an_edit_that_is_not_possible_any_more_says_why(
+    table: Table, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = table.panels.client
+    monkeypatch.setattr(table.panels.server, "get_clients", lambda: {client.client_id: client})
+    gone = newest(0, 1)[0]
+    table.press_row(gone)
+    table.ask(NoteSelected())
+    library.delete([gone])
+    table.panels.ask(AnswerDialog())
+    until(lambda: "not in the library any more" in " ".join(client.notices), "the reason")
+
+
 def test_a_table_that_has_not_changed_is_not_sent_again(table: Table, library: Library) -> None:
     table.press_row(newest(0, 1)[0])
     library.refresh()

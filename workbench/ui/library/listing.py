@@ -5,25 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from workbench.commands import library as commands
 from workbench.commands.command import Command
-from workbench.commands.library import (
-    AlsoNextRow,
-    AlsoPreviousRow,
-    ClearRowFilter,
-    FilterRows,
-    FilterTask,
-    LookForRows,
-    NextRow,
-    NextRows,
-    OpenRow,
-    PressRow,
-    PreviousRow,
-    PreviousRows,
-    SelectAllRows,
-    SelectNoRows,
-    SortRows,
-    ToggleRow,
-)
 from workbench.recording.episode.row import LibraryRow
 from workbench.ui.library.rows import Column, Outcome, begins_descending, chosen, ordered
 from workbench.ui.widgets.paged import Paged
@@ -32,6 +15,25 @@ MOST_ROWS = 50
 """Rows of one page of the table."""
 LONGEST_WORDS = 200
 _FIRST_PAGE = Paged(MOST_ROWS)
+DOES: tuple[type[Command], ...] = (
+    commands.PressRow,
+    commands.OpenRow,
+    commands.NextRow,
+    commands.PreviousRow,
+    commands.AlsoNextRow,
+    commands.AlsoPreviousRow,
+    commands.NextRows,
+    commands.PreviousRows,
+    commands.ToggleRow,
+    commands.SelectAllRows,
+    commands.SelectNoRows,
+    commands.SortRows,
+    commands.FilterRows,
+    commands.FilterTask,
+    commands.LookForRows,
+    commands.ClearRowFilter,
+)
+"""Commands that `apply` takes; any other only drops what is not there."""
 
 
 @dataclass(frozen=True)
@@ -124,42 +126,42 @@ def make_listing(
 
 
 def apply(listing: Listing, command: Command) -> LibraryList:
-    """The list after a command; other commands than those of the list only drop what is not there."""
+    """The list after a command."""
     listed, rows = listing.list, listing.rows
     arranged = listed.arrangement
     match command:
-        case PressRow(id=id, held=held):
+        case commands.PressRow(id=id, held=held):
             return _press(listing, id, "ctrl" in held, "shift" in held)
-        case OpenRow(id=id):
+        case commands.OpenRow(id=id):
             return _press(listing, id)
-        case ToggleRow() if listed.cursor is not None:
+        case commands.ToggleRow() if listed.cursor is not None:
             return _press(listing, listed.cursor, toggle=True)
-        case NextRow():
+        case commands.NextRow():
             return _move(listing, 1)
-        case PreviousRow():
+        case commands.PreviousRow():
             return _move(listing, -1)
-        case AlsoNextRow():
+        case commands.AlsoNextRow():
             return _move(listing, 1, to_anchor=True)
-        case AlsoPreviousRow():
+        case commands.AlsoPreviousRow():
             return _move(listing, -1, to_anchor=True)
-        case NextRows():
+        case commands.NextRows():
             return replace(listed, pages=listed.pages.turned(1, len(rows)))
-        case PreviousRows():
+        case commands.PreviousRows():
             return replace(listed, pages=listed.pages.turned(-1, len(rows)))
-        case SelectAllRows():
+        case commands.SelectAllRows():
             return replace(listed, selected=frozenset(row.id for row in rows))
-        case SelectNoRows():
+        case commands.SelectNoRows():
             return replace(listed, selected=frozenset())
-        case SortRows(column=column):
+        case commands.SortRows(column=column):
             down = not arranged.descending if column == arranged.column else begins_descending(column)
             return _arrange(listed, replace(arranged, column=column, descending=down))
-        case FilterRows(outcome=outcome):
+        case commands.FilterRows(outcome=outcome):
             return _arrange(listed, replace(arranged, outcome=outcome))
-        case LookForRows(words=words) if words[:LONGEST_WORDS] != arranged.words:
+        case commands.LookForRows(words=words) if words[:LONGEST_WORDS] != arranged.words:
             return _arrange(listed, replace(arranged, words=words[:LONGEST_WORDS]))
-        case FilterTask(task=task) if task != arranged.task:
+        case commands.FilterTask(task=task) if task != arranged.task:
             return _arrange(listed, replace(arranged, task=task))
-        case ClearRowFilter():
+        case commands.ClearRowFilter():
             return _arrange(listed, replace(arranged, outcome="all", words="", task=None))
         case _:
             return listed

@@ -13,27 +13,22 @@ import viser
 
 from workbench.commands.command import Command
 from workbench.commands.library import (
-    AlsoNextRow,
-    AlsoPreviousRow,
     ClearRowFilter,
     DeleteSelected,
     EmptyTrash,
     FilterRows,
     FilterTask,
     LookForRows,
-    NextRow,
     NextRows,
     NoteSelected,
     OpenRow,
     OpenSelected,
     PressRow,
-    PreviousRow,
     PreviousRows,
     SelectAllRows,
     SelectNoRows,
     SortRows,
     TagSelected,
-    ToggleRow,
     UndoDelete,
 )
 from workbench.commands.page import AnswerDialog, TypeAnswer
@@ -41,7 +36,7 @@ from workbench.recording.episode.row import LibraryRow
 from workbench.recording.library.library import Library, LibraryView
 from workbench.session.loop import Aside, begin, on_loop, post
 from workbench.ui.library.dialogs import LibraryEdits
-from workbench.ui.library.listing import Action, Arrangement, LibraryList, Listing, apply, make_listing
+from workbench.ui.library.listing import DOES, Action, Arrangement, LibraryList, Listing, apply, make_listing
 from workbench.ui.library.rows import (
     COLUMNS,
     HINTS,
@@ -68,28 +63,7 @@ MOST_JOBS = 6
 MOST_OPEN = 4
 """Maximum number of recordings that a review shows at once."""
 ALL_TASKS = "all tasks"
-LIST = (
-    PressRow,
-    OpenRow,
-    NextRow,
-    PreviousRow,
-    AlsoNextRow,
-    AlsoPreviousRow,
-    NextRows,
-    PreviousRows,
-    ToggleRow,
-    SelectAllRows,
-    SelectNoRows,
-    UndoDelete,
-    EmptyTrash,
-    SortRows,
-    FilterRows,
-    FilterTask,
-    LookForRows,
-    ClearRowFilter,
-    TypeAnswer,
-    AnswerDialog,
-)
+LIST = (*DOES, UndoDelete, EmptyTrash, TypeAnswer, AnswerDialog)
 """Commands that the list itself carries out."""
 
 
