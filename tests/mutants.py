@@ -121,7 +121,7 @@ PROTECTED = {
     "ui/cameras/fields": "ui/cameras/test_fields.py",
     "ui/app/review_page": "ui/app/test_review_page.py -k 'strip or timeline or opened'",
     "ui/app/go_live": "ui/app/test_go_live.py",
-    "ui/library/listing": "ui/library/test_panel.py",
+    "ui/library/listing": "ui/library/test_listing.py ui/library/test_panel.py",
     "ui/server/gated_server": "ui/server/test_gated_server.py ui/server/test_socket_and_renewal.py ui/server/test_strangers.py::test_a_page_that_has_shown_the_token_is_not_hurried"
     " ui/server/test_strangers.py::test_what_is_turned_away_is_counted_and_told_once_of_each_kind"
     " ui/server/test_strangers.py::test_what_was_not_told_yet_is_told_at_the_end_with_the_total"

@@ -42,6 +42,8 @@ class Reviewed(Panels):
 
     def all_drawn(self) -> dict[str, object]:
         """All that can be seen once every part was drawn, whatever its key says."""
+        unread = 'class="wb-library-picture"></td>'
+        until(lambda: self.draw() or unread not in self.html(unread), "the pictures of the library")
         forget_what_was_drawn(self.page._parts)
         self.draw()
         return self.everything()

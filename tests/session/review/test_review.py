@@ -276,7 +276,7 @@ def filled(child_process: None, tmp_path: Path) -> Iterator[Library]:
 
 def test_the_newest_is_opened_library_stays_once_it_is_listed_and_only_once(filled: Library) -> None:
     review = Review(filled)
-    filled.on_change = review.library_changed
+    filled.on_change.add(review.library_changed)
     review.open_first("newest")
     review.add_problem("A killed program left half an episode.")
     assert not review.view().loading
@@ -294,7 +294,7 @@ def test_the_newest_is_opened_library_stays_once_it_is_listed_and_only_once(fill
 def test_a_file_is_opened_library_stays_once_it_is_listed(filled: Library) -> None:
     filled.refresh()
     review = Review(filled)
-    filled.on_change = review.library_changed
+    filled.on_change.add(review.library_changed)
     review.open_first("newest")
     later = write(filled.folder, made(3, seed=4, written_at="2026-11-22T10:00:00+00:00"), pictures=False)
     review.open_first(later.with_suffix(".rrd"))
@@ -311,7 +311,7 @@ def test_nothing_is_opened_library_stays_after_a_person_has_opened_a_recording(
     elsewhere = write(tmp_path_factory.mktemp("other"), made(3, seed=4), pictures=False)
     filled.refresh()
     review = Review(filled)
-    filled.on_change = review.library_changed
+    filled.on_change.add(review.library_changed)
     review.open_first(filled.folder / elsewhere.name)
     (row,) = (row for row in filled.view().rows if row.seed == 1)
     view = opened(review, row.id)

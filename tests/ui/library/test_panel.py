@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -114,12 +115,16 @@ class Table:
         marks = re.findall(r'data-row="(\d+)"\] \.wb-tick i \{', self.panels.html("<style"))
         return [ids[int(number)] for number in marks]
 
+    def pictures(self) -> int:
+        """How many rows show one."""
+        return self.panels.html("wb-library").count("<img")
+
     def selected(self) -> tuple[str, ...]:
         return self.panel.selected()
 
 
 @pytest.fixture
-def table(panels: Panels, library: Library, told: Told, clock: Clock) -> Table:
+def table(panels: Panels, library: Library, told: Told, clock: Clock) -> Iterator[Table]:
     panel = LibraryPanel(panels.server, library, told.opened.append)
 
     def do(command: Command, visitor: Visitor) -> None:
@@ -129,8 +134,10 @@ def table(panels: Panels, library: Library, told: Told, clock: Clock) -> Table:
             panel.do(command, visitor)
 
     panels.visitors.do = do
-    panel.draw()
-    return Table(panel, panels, clock)
+    table = Table(panel, panels, clock)
+    until(lambda: table.draw() or table.pictures() == MOST_ROWS, "the pictures")
+    yield table
+    panel.end()
 
 
 def newest(first: int, last: int) -> list[str]:
@@ -329,26 +336,88 @@ def test_tags_note_and_deletion_are_asked_for_and_done(
     table.ask(TagSelected())
     table.panels.type("", "good, new <b>")
     table.panels.ask(AnswerDialog())
-    assert [library.row(id).tags for id in (first, second)] == [  # type: ignore[union-attr]
-        ("mine", "good", "new <b>"),
-        ("good", "new <b>"),
-    ]
+    tags = [("mine", "good", "new <b>"), ("good", "new <b>")]
+    until(lambda: [library.row(id).tags for id in (first, second)] == tags, "the tags")  # type: ignore[union-attr]
     table.draw()
     assert "new &lt;b&gt;" in table.panels.html("wb-library") and "<b>" not in table.panels.html("wb-library")
     table.ask(NoteSelected())
     table.panels.type("", "look again")
     table.panels.ask(AnswerDialog())
+    until(lambda: library.row(second).note == "look again", "the note")  # type: ignore[union-attr]
     assert json.loads((tmp_path / f"r{second[2:]}.json").read_text())["workbench"]["note"] == "look again"
+    table.draw()
     table.ask(DeleteSelected())
     table.panels.press("Cancel")
     assert len(library.view().rows) == COUNT
     table.ask(DeleteSelected())
     table.panels.ask(AnswerDialog())
+    until(lambda: len(library.view().rows) == COUNT - 2, "two rows fewer")
     table.draw()
-    assert len(library.view().rows) == COUNT - 2 and table.selected() == ()
+    assert table.selected() == ()
     assert "In the trash: 6 files" in table.panels.html()
     table.ask(UndoDelete())
-    assert len(library.view().rows) == COUNT and "In the trash" not in table.panels.html()
+    until(lambda: len(library.view().rows) == COUNT, "the rows again")
+    table.draw()
+    assert "In the trash" not in table.panels.html()
+
+
+def test_a_disk_that_hangs_holds_neither_the_table_nor_what_is_pressed_in_it(
+    table: Table, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes_on, read, set_note = threading.Event(), library.thumbnails, library.set_note
+    begun: list[str] = []
+
+    def thumbnails(ids: Sequence[str]) -> dict[str, bytes]:
+        goes_on.wait(60)
+        return read(ids)
+
+    def note(ids: Sequence[str], text: str) -> None:
+        begun.append(text)
+        goes_on.wait(60)
+        set_note(ids, text)
+
+    monkeypatch.setattr(library, "thumbnails", thumbnails)
+    monkeypatch.setattr(library, "set_note", note)
+    table.ask(SortRows(column="seed"))
+    assert table.shown()[:3] == ["id00", "id01", "id02"]
+    assert table.pictures() == COUNT - 10, "those that were shown before"
+    assert "no picture" not in table.panels.html("wb-library")
+    for id, text in (("id00", "first"), ("id01", "second")):
+        table.press_row(id)
+        table.ask(NoteSelected())
+        table.panels.type("", text)
+        table.panels.ask(AnswerDialog())
+    assert table.selected() == ("id01",) and not table.panels.shows("", "field")
+    until(lambda: begun == ["first"], "the first note")
+    goes_on.set()
+    until(lambda: [library.row(f"id0{k}").note for k in (0, 1)] == ["first", "second"], "the notes")  # type: ignore[union-attr]
+    until(lambda: table.draw() or table.pictures() == MOST_ROWS, "the pictures")
+
+
+def test_only_the_first_answer_counts(table: Table, library: Library) -> None:
+    table.press_row(newest(0, 1)[0])
+    table.ask(DeleteSelected())
+    for _ in range(3):
+        table.panels.do(AnswerDialog())
+    until(lambda: len(library.view().rows) == COUNT - 1, "one row fewer")
+    table.draw()
+    table.ask(UndoDelete())
+    until(lambda: len(library.view().rows) == COUNT, "the row again")
+    table.draw()
+    assert not table.panels.presses(UndoDelete())
+
+
+def test_an_edit_that_is_not_possible_any_more_says_why(
+    table: Table, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = table.panels.client
+    monkeypatch.setattr(table.panels.server, "get_clients", lambda: {client.client_id: client})
+    gone = newest(0, 1)[0]
+    table.press_row(gone)
+    table.ask(NoteSelected())
+    library.delete([gone])
+    table.panels.ask(AnswerDialog())
+    until(lambda: "not in the library any more" in " ".join(client.notices), "the reason")
 
 
 def test_a_table_that_has_not_changed_is_not_sent_again(table: Table, library: Library) -> None:

@@ -113,6 +113,7 @@ def test_a_value_of_an_axis_leaves_the_other_points_out(tab: Tab) -> None:
     assert len(tab.points()) == 6
     tab.ask(ClearSweepFilter())
     assert len(tab.points()) == 9
+    assert "robot_uids = panda" in tab.panels.html("wb-sweep-point"), "what was shown before"
 
 
 def test_another_order_and_other_values_begin_on_the_first_page(

@@ -12,21 +12,19 @@ def turn(by: int) -> TurnEnvs:
 
 def test_a_long_list_is_shown_a_page_at_a_time_whatever_its_length_becomes() -> None:
     pages = Paged(10)
-    assert pages.places(10) == range(10) and pages.shown(turn) is None
+    assert pages.places(10) == range(10) and pages.shown(10, turn) is None
     assert pages.places(0) == range(0)
     assert pages.places(23) == range(10)
-    assert pages.shown(turn) == {"first": 1, "last": 10, "of": 23, "back": turn(-1), "on": turn(1)}
-    pages.turn(1)
-    assert pages.places(23) == range(10, 20)
-    pages.turn(-1)
-    pages.turn(-1)
-    assert pages.places(23) == range(10), "nothing is before the first"
-    pages.turn(5)
-    assert pages.places(23) == range(20, 23), "nothing is behind the last"
-    shown = pages.shown(turn)
+    assert pages.shown(23, turn) == {"first": 1, "last": 10, "of": 23, "back": turn(-1), "on": turn(1)}
+    second = pages.turned(1, 23)
+    assert second.places(23) == range(10, 20)
+    assert second.turned(-1, 23).turned(-1, 23).places(23) == range(10), "nothing is before the first"
+    last = second.turned(5, 23)
+    assert last.places(23) == range(20, 23), "nothing is behind the last"
+    shown = last.shown(23, turn)
     assert shown is not None and (shown["first"], shown["last"]) == (21, 23)
-    assert pages.places(20) == range(10, 20), "its page is gone"
-    pages.go_to(9)
-    assert pages.first == 0
-    pages.go_to(10)
-    assert pages.places(11) == range(10, 11)
+    assert last.places(20) == range(10, 20), "its page is gone"
+    assert last.turned(-1, 20).places(20) == range(10), "the one before what is shown"
+    assert last.places(0) == range(0)
+    assert last.at(9).places(11) == range(10)
+    assert last.at(10).places(11) == range(10, 11)

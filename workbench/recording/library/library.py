@@ -93,7 +93,7 @@ class Library:
         """Held while `_kept` is changed, but not while files are read."""
         self._changed = threading.Lock()
         self._view = LibraryView(reading=(0, 0), sweep=self._sweep())
-        self.on_change: Callable[[], None] = lambda: None
+        self.on_change: set[Callable[[], None]] = set()
         """Called when the view has changed, on the thread that changed it."""
         self._by_id: dict[str, LibraryRow] = {}
         self._scan = Scan(fresh=True)
@@ -257,7 +257,8 @@ class Library:
             if replace(view, serial=0) == replace(self._view, serial=0) and self._view.serial > 0:
                 return
             self._view = replace(view, serial=self._view.serial + 1)
-        self.on_change()
+        for changed in tuple(self.on_change):
+            changed()
 
     def _sweep(self) -> tuple[int, int] | None:
         try:
@@ -329,9 +330,8 @@ class Library:
             return batch
 
     def check_delete(self, ids: Iterable[str]) -> None:
-        """Raises LibraryError if `delete` would refuse these recordings."""
-        with self._changing:
-            self._keys_to_delete(ids)
+        """Raises LibraryError if `delete` would refuse these recordings. Waits for nothing."""
+        self._keys_to_delete(ids)
 
     def _keys_to_delete(self, ids: Iterable[str]) -> set[str]:
         selected = set(ids)

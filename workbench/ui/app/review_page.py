@@ -259,7 +259,9 @@ class ReviewPage:
 
     def close(self) -> None:
         """It is shown no more."""
-        self._library.close()
+        self._library.end()
+        if self._sweep is not None:
+            self._sweep.end()
 
     def redraw(self) -> None:
         """Draw the present state of the review."""

@@ -129,7 +129,7 @@ class Workplace:
     def _make_shelf(self) -> Shelf:
         library = Library(self._recordings)
         review = Review(library, make_scene=SceneProcess(self._tasks, self._imports))
-        library.on_change = review.library_changed
+        library.on_change.add(review.library_changed)
         review.open_first(self._first)
         library.watch()
         shelf = Shelf(library, review)

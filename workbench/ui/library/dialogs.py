@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import viser
 
 from workbench.commands.page import AnswerDialog, CloseDialog, TypeAnswer
+from workbench.machine.processes.watched_thread import report_failure
 from workbench.recording.episode.row import LONGEST_NOTE, LibraryRow, clean_tags
 from workbench.recording.library.library import Library, LibraryError
+from workbench.session.loop import Aside, begin
 from workbench.ui.library.rows import in_words
 from workbench.ui.widgets.fields import Field
 from workbench.ui.widgets.notices import tell_all
@@ -26,14 +28,12 @@ class Dialog:
         self.modal = server.gui.add_modal(title)
         with self.modal:
             server.gui.add_html(render("context", context="dialog"))
-        self._lock = threading.Lock()
 
     def close(self) -> bool:
         """Close it; False if it was closed already: only the first answer counts."""
-        with self._lock:
-            if self.modal.closed:
-                return False
-            self.modal.close()
+        if self.modal.closed:
+            return False
+        self.modal.close()
         return True
 
 
@@ -41,8 +41,18 @@ MOST_KNOWN = 12
 """Maximum number of tags in use that are listed."""
 
 
+@dataclass(frozen=True)
+class _Question:
+    """A question in a dialog, and what was typed so far."""
+
+    dialog: Dialog
+    answered: Callable[[str], object]
+    """Does what is asked, given the typed text; blocks. Raises LibraryError."""
+    typed: str
+
+
 class LibraryEdits:
-    """Asks for tags, a note or a deletion and does it; one dialog at a time.
+    """Asks for tags, a note or a deletion and does it; one dialog at a time. Used on the loop.
 
     A dialog over the page, since a form in the scrolled table would be out of sight. It acts on the recordings that it
     was opened for, not on those selected by the time of the answer.
@@ -50,15 +60,17 @@ class LibraryEdits:
 
     def __init__(self, server: viser.ViserServer, library: Library) -> None:
         self._server, self._library = server, library
-        self._lock = threading.RLock()
-        self._question: Dialog | None = None
-        self._typed = ""
-        self._answered: Callable[[str], object] = lambda typed: None
+        self._question: _Question | None = None
+        self._disk = Aside("library-edits")
 
     def close(self) -> bool:
         """Close the dialog; False if there is none."""
-        with self._lock:
-            return self._question is not None and self._question.close()
+        return self._question is not None and self._question.dialog.close()
+
+    def end(self) -> None:
+        """Close the dialog, and end the thread when the edits that were asked for are done."""
+        self.close()
+        self._disk.end()
 
     def ask_tags(self, ids: tuple[str, ...]) -> None:
         rows = self._rows(ids)
@@ -69,7 +81,7 @@ class LibraryEdits:
         def answered(typed: str) -> None:
             tags = clean_tags(typed.split(","))
             removed = [tag for tag in shared if tag not in tags]
-            self._do(lambda: self._library.set_tags(ids, [tag for tag in tags if tag not in shared], removed))
+            self._library.set_tags(ids, [tag for tag in tags if tag not in shared], removed)
 
         known = sorted({tag for row in self._library.view().rows for tag in row.tags})
         explained = "Words, separated by commas."
@@ -87,13 +99,18 @@ class LibraryEdits:
         explained = "" if len(notes) == 1 else "They have different notes; this one replaces them."
 
         def answered(typed: str) -> None:
-            self._do(lambda: self._library.set_note(ids, typed[:LONGEST_NOTE]))
+            self._library.set_note(ids, typed[:LONGEST_NOTE])
 
         self._ask("Note", "", rows, explained, "Save", answered, notes.pop() if len(notes) == 1 else "")
 
     def ask_delete(self, ids: tuple[str, ...]) -> None:
         rows = self._rows(ids)
-        if not rows or not self._do(lambda: self._library.check_delete(ids)):
+        if not rows:
+            return
+        try:
+            self._library.check_delete(ids)
+        except LibraryError as error:
+            self._tell(error)
             return
         self._ask(
             "Delete recordings",
@@ -101,7 +118,7 @@ class LibraryEdits:
             rows,
             "All their files move to the folder .trash in the library and can be restored from there.",
             "Delete",
-            lambda _: self._do(lambda: self._library.delete(ids)),
+            lambda _: self._library.delete(ids),
         )
 
     def ask_empty(self) -> None:
@@ -112,11 +129,11 @@ class LibraryEdits:
             [],
             "This cannot be undone.",
             "Delete for good",
-            lambda _: self._do(self._library.empty_trash),
+            lambda _: self._library.empty_trash(),
         )
 
     def undo_delete(self) -> None:
-        self._do(self._library.undo_delete)
+        begin(self._do(self._library.undo_delete))
 
     def _ask(
         self,
@@ -132,16 +149,15 @@ class LibraryEdits:
 
         Args:
             do: label of the button that accepts.
-            answered: gets the typed text, as the page sent it, on any thread.
+            answered: as in `_Question`; the text is as the page sent it.
             value: text of the input line, in which Enter accepts too. None: no input, and the accept button is red.
         """
         gui, names = self._server.gui, [row.name for row in rows]
         shown = names if len(names) <= MOST_NAMES else names[: MOST_NAMES - 1]
-        with self._lock:
-            self.close()
-            self._question = question = Dialog(self._server, title)
-        self._typed, self._answered = value or "", answered
-        with question.modal:
+        self.close()
+        dialog = Dialog(self._server, title)
+        self._question = _Question(dialog, answered, value or "")
+        with dialog.modal:
             more = len(names) - len(shown)
             gui.add_html(render("library_question", question=asked, names=shown, more=more, answer=explained))
             if value is not None:
@@ -160,24 +176,28 @@ class LibraryEdits:
 
     def type(self, text: str) -> None:
         """Store the text that is typed into the question so far."""
-        self._typed = text
+        if self._question is not None:
+            self._question = replace(self._question, typed=text)
 
     def answer(self) -> None:
         """Do what the question asks; only the first answer counts."""
-        with self._lock:
-            typed, answered = self._typed, self._answered
-        if self.close():
-            answered(typed)
+        question = self._question
+        if question is not None and self.close():
+            begin(self._do(lambda: question.answered(question.typed)))
 
     def _rows(self, ids: Sequence[str]) -> list[LibraryRow]:
         rows = (self._library.row(id) for id in ids)
         return [row for row in rows if row is not None]
 
-    def _do(self, work: Callable[[], object]) -> bool:
-        """Do the work; returns whether it succeeded. A LibraryError is shown on every page."""
+    async def _do(self, work: Callable[[], object]) -> None:
+        """Do the work after the one before. A LibraryError is shown on every page."""
         try:
-            work()
+            await self._disk.run(work)
         except LibraryError as error:
-            tell_all(self._server, "Not possible", str(error), seconds=8.0)
-            return False
-        return True
+            self._tell(error)
+        except Exception as error:
+            report_failure("An edit of the library failed", error)
+            tell_all(self._server, "Failed", "It failed; the reason is in the terminal.", "red")
+
+    def _tell(self, error: LibraryError) -> None:
+        tell_all(self._server, "Not possible", str(error), seconds=8.0)

@@ -2,44 +2,41 @@
 
 from __future__ import annotations
 
+import asyncio
 import datetime
 import os
-import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 
 import viser
 
 from workbench.commands.command import Command
 from workbench.commands.library import (
-    AlsoNextRow,
-    AlsoPreviousRow,
     ClearRowFilter,
     DeleteSelected,
     EmptyTrash,
     FilterRows,
     FilterTask,
     LookForRows,
-    NextRow,
     NextRows,
     NoteSelected,
     OpenRow,
     OpenSelected,
     PressRow,
-    PreviousRow,
     PreviousRows,
     SelectAllRows,
     SelectNoRows,
     SortRows,
     TagSelected,
-    ToggleRow,
     UndoDelete,
 )
 from workbench.commands.page import AnswerDialog, TypeAnswer
 from workbench.recording.episode.row import LibraryRow
 from workbench.recording.library.library import Library, LibraryView
+from workbench.session.loop import Aside, begin, on_loop, post
 from workbench.ui.library.dialogs import LibraryEdits
-from workbench.ui.library.listing import RANGE, TOGGLE, Action, LibraryList
+from workbench.ui.library.listing import DOES, Action, Arrangement, LibraryList, Listing, apply, make_listing
 from workbench.ui.library.rows import (
     COLUMNS,
     HINTS,
@@ -66,29 +63,7 @@ MOST_JOBS = 6
 MOST_OPEN = 4
 """Maximum number of recordings that a review shows at once."""
 ALL_TASKS = "all tasks"
-HELD = {"": 0, "ctrl": TOGGLE, "shift": RANGE, "ctrl+shift": TOGGLE | RANGE}
-LIST = (
-    PressRow,
-    OpenRow,
-    NextRow,
-    PreviousRow,
-    AlsoNextRow,
-    AlsoPreviousRow,
-    NextRows,
-    PreviousRows,
-    ToggleRow,
-    SelectAllRows,
-    SelectNoRows,
-    UndoDelete,
-    EmptyTrash,
-    SortRows,
-    FilterRows,
-    FilterTask,
-    LookForRows,
-    ClearRowFilter,
-    TypeAnswer,
-    AnswerDialog,
-)
+LIST = (*DOES, UndoDelete, EmptyTrash, TypeAnswer, AnswerDialog)
 """Commands that the list itself carries out."""
 
 
@@ -99,9 +74,11 @@ class LibraryPanel(PagePart[object]):
     sheet of its own that marks rows by their numbers, and only that is sent. A row keeps its number for as long as the
     page lives: a press selects the pressed row even if the table has moved meanwhile.
 
+    Thumbnails are read on a thread of their own when the rows of the shown page change; rows are shown before theirs come.
+
     Args:
         on_open: gets the ids of one to `MOST_OPEN` recordings, in the order of the table.
-            Called on any thread, and must not block.
+            Called on the loop, and must not block.
     """
 
     def __init__(
@@ -113,10 +90,11 @@ class LibraryPanel(PagePart[object]):
     ) -> None:
         self._server, self._library, self._running = server, library, running
         self._folder = os.fsencode(library.folder).decode(errors="replace")
-        self._list = LibraryList(library)
+        self._list = LibraryList()
+        self._listed: Listing | None = None
+        """The latest listing; only saves computing it again."""
         self._edits = LibraryEdits(server, library)
-        self._lock = threading.RLock()
-        self._actions = [
+        self._actions: tuple[Action, ...] = (
             Action(
                 "Open",
                 OpenSelected(),
@@ -134,7 +112,7 @@ class LibraryPanel(PagePart[object]):
                 self._edits.ask_delete,
                 reads=False,
             ),
-        ]
+        )
         server.gui.add_html(render("context", context="library"))
         self._jobs = server.gui.add_html("", visible=False)
         self._filters = server.gui.add_html("")
@@ -153,6 +131,15 @@ class LibraryPanel(PagePart[object]):
         self._table = server.gui.add_html("")
         self._trash = server.gui.add_html("")
 
+        self._disk = Aside("thumbnails")
+        self._reading: asyncio.Task[None] | None = None
+        self._pictured: tuple[LibraryRow, ...] = ()
+        """Rows whose thumbnails are read, or were read last."""
+        self._thumbnails: Mapping[str, bytes | None] = {}
+        """JPEGs by ids of rows; None for a recording without one. A row that is not here has not been read yet."""
+        library.on_change.add(self._library_changed)
+        self._library_changed()
+
         self._number_of: dict[str, int] = {}
         """Number of each recording's row, from 1 on, in the order of arrival."""
         self._drawn: object = None
@@ -165,92 +152,99 @@ class LibraryPanel(PagePart[object]):
 
     def selected(self) -> tuple[str, ...]:
         """Ids of the selected recordings, in the order of the table."""
-        return self._list.selected_ids()
+        return self._listing(self._library.view()).selected
 
+    @on_loop
     def select(self, ids: Iterable[str]) -> None:
         """Select those of these recordings that are listed."""
-        self._list.select(ids)
+        self._list = replace(self._list, selected=frozenset(ids))
 
     def add_action(self, action: Action) -> None:
-        """Add a button for the selected recordings; it runs on any thread and must not block."""
-        with self._lock:
-            self._actions.append(action)
+        """Add a button for the selected recordings; it runs on the loop and must not block."""
+        self._actions = (*self._actions, action)
 
     @property
     def does(self) -> tuple[type[Command], ...]:  # type: ignore[override]
         """Commands that the panel carries out; the actions are those added so far."""
         return (*LIST, *(type(action.command) for action in self._actions))
 
+    @on_loop
     def close(self) -> None:
-        """Close the dialog, if there is one. Called when the page goes."""
+        """Close the dialog, if there is one."""
         self._edits.close()
 
+    @on_loop
+    def end(self) -> None:
+        """Close the dialog and stop following the library: the page goes."""
+        self._library.on_change.discard(self._library_changed)
+        if self._reading is not None:
+            self._reading.cancel()
+        self._disk.end()
+        self._edits.end()
+
+    @on_loop
     def do(self, command: Command, visitor: Visitor) -> None:
-        listed = self._list
+        before = self._listing(self._library.view())
+        self._list = apply(before, command)
+        self._read_thumbnails()
         match command:
-            case PressRow(id=id, held=held):
-                listed.press(id, HELD[held])
             case OpenRow(id=id):
-                if listed.press(id):
+                if any(row.id == id for row in before.rows):
                     self._run(self._actions[0])
-            case NextRow():
-                listed.move(1)
-            case PreviousRow():
-                listed.move(-1)
-            case AlsoNextRow():
-                listed.move(1, RANGE)
-            case AlsoPreviousRow():
-                listed.move(-1, RANGE)
-            case NextRows():
-                listed.pages.turn(1)
-            case PreviousRows():
-                listed.pages.turn(-1)
-            case ToggleRow():
-                listed.toggle_cursor()
-            case SelectAllRows():
-                listed.select_all()
-            case SelectNoRows():
-                self.select(())
             case UndoDelete():
                 self._edits.undo_delete()
             case EmptyTrash():
                 self._edits.ask_empty()
-            case SortRows(column=column):
-                listed.sort_by(column)
-            case FilterRows(outcome=outcome):
-                listed.choose(outcome)
-            case LookForRows(words=words):
-                listed.look_for(words, listed.task)
             case TypeAnswer(text=text):
                 self._edits.type(text)
             case AnswerDialog():
                 self._edits.answer()
-            case FilterTask(task=task):
-                listed.look_for(listed.words, task)
-            case ClearRowFilter():
-                listed.choose("all")
-                listed.look_for("", None)
             case _:
-                self._run(next(action for action in self._actions if type(action.command) is type(command)))
+                for action in self._actions:
+                    if type(action.command) is type(command):
+                        self._run(action)
+
+    # --- what is listed --------------------------------------------------------------------------------
+
+    def _listing(self, view: LibraryView) -> Listing:
+        listing = make_listing(self._list, view.rows, self._listed)
+        self._listed = listing
+        return listing
+
+    def _library_changed(self) -> None:
+        post(self._read_thumbnails)
+
+    def _read_thumbnails(self) -> None:
+        """Read the thumbnails of the shown rows if they are others than before; on the loop."""
+        rows = self._listing(self._library.view()).page
+        if rows == self._pictured:
+            return
+        self._pictured = rows
+        if self._reading is not None:
+            self._reading.cancel()
+        self._reading = begin(self._read([row.id for row in rows]))
+
+    async def _read(self, ids: list[str]) -> None:
+        jpegs = await self._disk.run(lambda: self._library.thumbnails(ids))
+        self._thumbnails = {id: jpegs.get(id) for id in ids}
 
     # --- drawing ---------------------------------------------------------------------------------------
 
     def draw(self, view: object = None) -> None:
         """Draw what has changed; the page's own `view` is not used."""
-        view = self._library.view()
-        with self._lock, self._list.lock:
-            self._find.show(self._list.words)
-            self._draw_jobs(view)
-            wanted = (view.serial, self._list.state(), len(self._actions), self._running())
-            if wanted == self._drawn:
-                return
-            self._drawn = wanted
-            page = self._list.page(view)
-            self._draw_filters(view)
-            self._draw_table(view, page)
-            self._draw_tools(view)
-            self._draw_marks(page)
-            self._trash.content = render("library_trash", trash=view.trash, empty=EmptyTrash())
+        view, thumbnails, running = self._library.view(), self._thumbnails, self._running()
+        listing = self._listing(view)
+        self._find.show(listing.list.arrangement.words)
+        self._draw_jobs(view)
+        wanted = (view, listing, thumbnails, running, self._actions)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
+        self._draw_filters(view, listing)
+        self._draw_table(view, listing, thumbnails, running)
+        self._draw_tools(view, listing)
+        self._draw_marks(listing)
+        self._trash.content = render("library_trash", trash=view.trash, empty=EmptyTrash())
 
     def _draw_jobs(self, view: LibraryView) -> None:
         """Draw the progress of the jobs that record into the folder, each with its failures."""
@@ -266,14 +260,13 @@ class LibraryPanel(PagePart[object]):
         self._jobs.content = render("library_jobs", jobs=shown)
         self._jobs.visible = bool(shown)
 
-    def _draw_filters(self, view: LibraryView) -> None:
-        listed = self._list
-        wanted = (view.serial, listed.words, listed.task, listed.outcome)
+    def _draw_filters(self, view: LibraryView, listing: Listing) -> None:
+        listed = listing.list.arrangement
+        wanted = (view, listed.words, listed.task, listed.outcome)
         if wanted == self._filters_drawn:
             return
         self._filters_drawn = wanted
         tasks = sorted({row.task for row in view.rows if row.task})
-        listed.look_for(listed.words, listed.task)  # its task may have gone
         self._tasks.show(listed.task, options={ALL_TASKS: None, **{task: task for task in tasks}})
         self._tasks.visible = len(tasks) > 1
         self._find.visible = bool(view.rows)
@@ -302,46 +295,55 @@ class LibraryPanel(PagePart[object]):
             else [],
         )
 
-    def _draw_table(self, view: LibraryView, page: Sequence[LibraryRow]) -> None:
+    def _draw_table(
+        self,
+        view: LibraryView,
+        listing: Listing,
+        thumbnails: Mapping[str, bytes | None],
+        running: OpenVersion | None,
+    ) -> None:
         now = datetime.datetime.now().astimezone()
-        running = self._running()
+        page, arranged = listing.page, listing.list.arrangement
+        none_so = self._none_so(view, arranged)
+        jpegs = [thumbnails.get(row.id, b"") for row in page]  # empty until it is read
         wanted = (
             page,
+            jpegs,
             running,
             bool(view.rows),
-            self._none_so(view),
-            self._list.column,
-            self._list.descending,
+            none_so,
+            arranged.column,
+            arranged.descending,
             now.date(),
         )
         if wanted == self._table_drawn:
             return
         self._table_drawn = wanted
-        pictures = self._library.thumbnails([row.id for row in page])
         self._table.content = render(
             "library",
             some=bool(view.rows),
-            none_so=self._none_so(view),
+            none_so=none_so,
             clear=ClearRowFilter(),
             press_row=lambda id: PressRow(id=id),
             also=lambda id: PressRow(id=id, held="ctrl"),
             open_row=lambda id: OpenRow(id=id),
-            head=[self._head(column) for column in COLUMNS],
-            second=[self._head(column) for column in SECOND_LINE],
+            head=[_head(column, arranged) for column in COLUMNS],
+            second=[_head(column, arranged) for column in SECOND_LINE],
             rows=[
                 {
                     "number": self._number(row.id),
                     "of": row,
                     "cells": cells(row, running, now),
-                    "picture": address_of_jpeg(pictures[row.id]) if row.id in pictures else "",
+                    "picture": address_of_jpeg(jpeg) if jpeg else "",
+                    "unread": jpeg == b"",
                 }
-                for row in page
+                for row, jpeg in zip(page, jpegs, strict=True)
             ],
         )
 
-    def _none_so(self, view: LibraryView) -> str:
+    def _none_so(self, view: LibraryView, arranged: Arrangement) -> str:
         if view.rows:
-            return none_like_that(self._list.words, self._list.outcome, self._list.task)
+            return none_like_that(arranged.words, arranged.outcome, arranged.task)
         if view.problem is not None or view.reading is not None:
             return ""
         return (
@@ -349,18 +351,8 @@ class LibraryPanel(PagePart[object]):
             "a task or with workbench record, appear here."
         )
 
-    def _head(self, column: Column) -> dict[str, object]:
-        listed = self._list
-        arrow = "" if column != listed.column else " ↓" if listed.descending else " ↑"
-        return {
-            "name": column,
-            "arrow": arrow,
-            "press": SortRows(column=column),
-            "hint": f"{HINTS[column]}. Click to sort",
-        }
-
-    def _draw_tools(self, view: LibraryView) -> None:
-        listed, rows = self._list, self._list.rows(view)
+    def _draw_tools(self, view: LibraryView, listing: Listing) -> None:
+        listed, rows = listing.list, listing.rows
         count = len(listed.selected)
         if not view.rows and not view.trash.files:
             self._tools.content = ""
@@ -382,12 +374,12 @@ class LibraryPanel(PagePart[object]):
             select_all=SelectAllRows() if count < len(rows) else None,
             select_none=SelectNoRows() if count else None,
             undo=UndoDelete() if view.trash.files else None,
-            pages=listed.pages.shown(lambda by: NextRows() if by > 0 else PreviousRows()),
+            pages=listed.pages.shown(len(rows), lambda by: NextRows() if by > 0 else PreviousRows()),
         )
 
-    def _draw_marks(self, page: Sequence[LibraryRow]) -> None:
-        listed = self._list
-        selected = [self._number(row.id) for row in page if row.id in listed.selected]
+    def _draw_marks(self, listing: Listing) -> None:
+        listed = listing.list
+        selected = [self._number(row.id) for row in listing.page if row.id in listed.selected]
         cursor = None if listed.cursor is None else self._number(listed.cursor)
         self._marks.content = render("library_marks", selected=selected, cursor=cursor, follow=listed.follow)
 
@@ -426,3 +418,13 @@ class LibraryPanel(PagePart[object]):
         return (
             f"{broken[0].problem} Copy it again from where it was recorded, or open it to see what is left."
         )
+
+
+def _head(column: Column, arranged: Arrangement) -> dict[str, object]:
+    arrow = "" if column != arranged.column else " ↓" if arranged.descending else " ↑"
+    return {
+        "name": column,
+        "arrow": arrow,
+        "press": SortRows(column=column),
+        "hint": f"{HINTS[column]}. Click to sort",
+    }

@@ -299,16 +299,18 @@ class EnvPanel(MomentPart):
             case SortEnvs(column=column):
                 self._descending = not self._descending if column == self._column else False
                 self._column = column
-                self._pages.go_to(0)
+                self._pages = self._pages.at(0)
             case FilterEnvs(which=which):
                 self._filter = which
-                self._pages.go_to(0)
+                self._pages = self._pages.at(0)
             case ToggleEnvEntries():
                 self._choosing = not self._choosing
             case ToggleEnvEntry(name=name):
                 self._toggle_entry(name)
             case TurnEnvs(by=by):
-                self._pages.turn(by)
+                rows = self._session.env_rows()
+                count = 0 if rows is None else int(np.count_nonzero(mask(rows, self._filter)))
+                self._pages = self._pages.turned(by, count)
         self._pressed += 1
 
     def unfold(self) -> None:
@@ -365,7 +367,7 @@ class EnvPanel(MomentPart):
             choose=ToggleEnvEntries() if rows.first_true else None,
             entries=self._entries(rows) if self._choosing else (),
             choosing=self._choosing,
-            pages=self._pages.shown(lambda by: TurnEnvs(by=by)),
+            pages=self._pages.shown(len(envs), lambda by: TurnEnvs(by=by)),
             head=self._head(rows),
             levels=levels(self._measure(rows, shown)),
             rows=[

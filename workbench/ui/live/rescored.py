@@ -63,7 +63,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
         rescored = view.rescored
         self._shown, self._first = (view.selected_env, view.timeline.shown), view.timeline.first
         if rescored.state == "none":
-            self._pages.go_to(0)
+            self._pages = self._pages.at(0)
         self._draw_status(rescored, TITLE)
         if rescored.verdicts is not self._verdicts:
             self._verdicts = rescored.verdicts
@@ -127,7 +127,7 @@ class PastRescorePanel(RescoredPanel[SessionView, PastRun]):
         shown = view.selected_env, view.timeline.shown
         here = next((k for k, one in enumerate(listed) if _place(one) == shown), -1 if by > 0 else 0)
         place = (here + by) % len(listed)
-        self._pages.go_to(place)
+        self._pages = self._pages.at(place)
         self._show(listed[place])
 
 

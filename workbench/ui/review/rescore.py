@@ -174,7 +174,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
         """Start rescoring these recordings of the library."""
         files = episode_files(self._library, ids)
         self._selected = None
-        self._pages.go_to(0)
+        self._pages = self._pages.at(0)
         code = self._chosen()
         self._rescorer.start(
             files,

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
-import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import viser
@@ -21,18 +19,17 @@ from workbench.commands.review import (
     SortSweep,
     TurnSweep,
 )
-from workbench.machine.processes.watched_thread import watched_thread
-from workbench.recording.episode.row import UnreadableRecording
+from workbench.machine.processes.watched_thread import report_failure
+from workbench.recording.episode.row import LibraryRow, UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import read_sweep
 from workbench.recording.sweeps import RESULTS, PointSummary, SweepEpisode, SweepResults, value_text
+from workbench.session.loop import Aside, begin, on_loop, post
 from workbench.session.review.view import ReviewView
 from workbench.ui.widgets.paged import Paged
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render, short_text
 from workbench.ui.widgets.visitors import Visitor
-
-log = logging.getLogger(__name__)
 
 ROWS = 12
 """Number of rows of a page of the table."""
@@ -154,7 +151,7 @@ def best_first(rows: Sequence[SweepEpisode]) -> list[SweepEpisode]:
     return sorted((row for row in rows if row.steps is not None), key=goodness)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Shown:
     """Choices of a person; the same on all open pages."""
 
@@ -163,8 +160,44 @@ class Shown:
     chosen: int | None = None
     """Index of the chosen point. None until a person chooses: then the point of the open episode is shown, else
     the best one."""
-    only: dict[str, set[str]] = field(default_factory=dict)
-    """Values of the shown points, by name of the setting; all values if a name is missing."""
+    only: frozenset[tuple[str, str]] = frozenset()
+    """Names of settings and values of the shown points; all values of a setting that is not here."""
+    pages: Paged = field(default_factory=lambda: Paged(ROWS))
+
+    def keeps(self, one: PointSummary) -> bool:
+        """Whether it has the values of `only`."""
+        return all((name, one.values.get(name)) in self.only for name in {name for name, _ in self.only})
+
+
+def apply(shown: Shown, command: Command, summaries: Sequence[PointSummary]) -> Shown:
+    """The choices after a command."""
+    first = shown.pages.at(0)
+    match command:
+        case ShowSweepPoint(index=index):
+            return replace(shown, chosen=index)
+        case SortSweep(column=column):
+            down = not shown.descending if column == shown.column else not column.startswith("set ")
+            return replace(shown, column=column, descending=down, pages=first)
+        case FilterSweep(name=name, value=value):
+            return replace(shown, only=shown.only ^ {(name, value)}, pages=first)
+        case ClearSweepFilter():
+            return replace(shown, only=frozenset(), pages=first)
+        case TurnSweep(by=by):
+            return replace(shown, pages=shown.pages.turned(by, sum(map(shown.keeps, summaries))))
+        case _:
+            return shown
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """What was read of the file."""
+
+    results: SweepResults | None = None
+    problem: str = ""
+    summaries: Sequence[PointSummary] = ()
+    """The best first."""
+    point_of: Mapping[str, int] = field(default_factory=dict)
+    """Index of the point of each recording, by path of the recording."""
 
 
 class SweepPanel(PagePart[ReviewView]):
@@ -184,190 +217,75 @@ class SweepPanel(PagePart[ReviewView]):
         on_open: Callable[[tuple[str, ...]], None],
     ) -> None:
         self._library, self._on_open = library, on_open
-        self._file = library.folder / RESULTS
         self._note = server.gui.add_html("")
         self._plot = server.gui.add_html("")
         self._table = server.gui.add_html("")
         self._episodes = server.gui.add_html("")
-        self._lock = threading.RLock()
-        self._results: SweepResults | None = None
-        self._summaries: list[PointSummary] = []
-        self._point_of: dict[str, int] = {}
-        """Index of the point of each recording, by path of the recording."""
-        self._problem = ""
+        self._disk = Aside("sweep-results")
         self._seen: tuple[int, int] | None = None
-        self._serial = 0
-        """Counter that grows with every change of what is shown."""
-        self.shown = Shown()
-        self._chosen: int | None = None
-        """The point whose episodes are listed."""
-        self._pages = Paged(ROWS)
+        """Size and time of the file that was read last."""
+        self._read = Read()
+        self._shown = Shown()
+        library.on_change.add(self._library_changed)
+        self._library_changed()
 
     # --- the file --------------------------------------------------------------------------------------
 
+    def _library_changed(self) -> None:
+        post(self._look)
+
     def _look(self) -> None:
-        """Read the file when it has changed, on a thread of its own."""
+        """Read the file if it has changed; on the loop."""
         seen = self._library.view().sweep
         if seen != self._seen:
             self._seen = seen
-            watched_thread("sweep results", self._read).start()
+            begin(self._read_again())
 
-    def _read(self) -> None:
-        results, problem = None, ""
+    async def _read_again(self) -> None:
         try:
-            results = read_sweep(self._file)
+            self._read = await self._disk.run(self._read_file)
         except (UnreadableRecording, OSError) as error:
-            problem = str(error)
-        with self._lock:
-            self._results, self._problem = results, problem
-            self._summaries = [] if results is None else results.summaries()
-            rows = () if results is None else results.episodes
-            self._point_of = {
-                str(self._library.folder / row.recording): row.point for row in rows if row.recording
-            }
-            if self.shown.chosen is not None and self.shown.chosen >= len(self._summaries):
-                self.shown.chosen = None
-            self._serial += 1
+            self._read = Read(problem=str(error))
+        except Exception as error:
+            report_failure("The results of a sweep could not be read", error)
+            self._read = Read(problem="The results could not be read. The reason is in the terminal.")
+
+    def _read_file(self) -> Read:
+        folder = self._library.folder
+        results = read_sweep(folder / RESULTS)
+        point_of = {str(folder / row.recording): row.point for row in results.episodes if row.recording}
+        return Read(results, "", results.summaries(), point_of)
+
+    @on_loop
+    def end(self) -> None:
+        """Stop following the file: the page goes."""
+        self._library.on_change.discard(self._library_changed)
+        self._disk.end()
 
     # --- drawing ---------------------------------------------------------------------------------------
 
     def key(self, view: ReviewView) -> object:
-        self._look()
         opened = tuple(one.id for one in view.opened)
-        return self._serial, opened, self._library.view().serial
+        return self._read, self._shown, opened, self._library.view()
 
     def draw(self, view: ReviewView) -> None:
-        with self._lock:
-            results, shown = self._results, self.shown
-            self._note.content = self._note_html()
-            if results is None:
-                self._plot.content = self._table.content = self._episodes.content = ""
-                return
-            self._chosen = self._first(view) if shown.chosen is None else shown.chosen
-            kept = [one for one in self._summaries if self._is_kept(one)]
-            self._plot.content = self._plot_html(results)
-            self._table.content = self._table_html(results, kept)
-            chosen = next((one for one in self._summaries if one.index == self._chosen), None)
-            self._episodes.content = "" if chosen is None else self._episodes_html(results, chosen, view)
-
-    def _first(self, view: ReviewView) -> int | None:
-        """The point of the episode that is open, else the best one."""
-        opened = {one.id for one in view.opened}
-        paths = (str(path) for row in self._library.view().rows if row.id in opened for path in row.paths)
-        of_opened = (self._point_of[path] for path in paths if path in self._point_of)
-        return next(of_opened, next((one.index for one in self._summaries), None))
-
-    def _note_html(self) -> str:
-        if self._problem:
-            return render("note", text=self._problem)
-        results = self._results
-        if results is None:
-            return render("note", text=f"Reading {RESULTS}.")
-        actions = results.actions.rpartition("/")[2]
-        failed, lines = sum(one.failed for one in self._summaries), len(self._summaries) <= MOST_PRESSED
-        return render("sweep_head", results=results, actions=actions, failed=failed, lines=lines)
-
-    def _is_kept(self, one: PointSummary) -> bool:
-        return all(one.values.get(name) in texts for name, texts in self.shown.only.items() if texts)
-
-    def _plot_html(self, results: SweepResults) -> str:
-        axes = axes_of(results, self._summaries)
-        lines = []
-        by_return = [one.mean_return for one in self._summaries if one.mean_return is not None]
-        low, high = min(by_return, default=0.0), max(by_return, default=0.0)
-        tell_apart = len({one.rate for one in self._summaries if one.rate is not None}) > 1
-        for k, one in enumerate(self._summaries):
-            points = [(axis.x, axis.heights[k]) for axis in axes]
-            known = [f"{x:.1f},{y:.1f}" for x, y in points if y is not None]
-            kept = self._is_kept(one)
-            rate = one.rate if tell_apart else None
-            if rate is None and one.mean_return is not None and high > low:
-                rate = (one.mean_return - low) / (high - low)
-            lines.append(
-                {
-                    "points": " ".join(known),
-                    "kept": kept,
-                    "part": round(100 * (rate or 0.0)),
-                    "chosen": one.index == self._chosen,
-                    "failed": not one.episodes,
-                    "press": ShowSweepPoint(index=one.index)
-                    if kept and len(self._summaries) <= MOST_PRESSED
-                    else None,
-                    "about": _about(one),
-                }
-            )
-        # The chosen one over the others, and those that are left out below.
-        lines.sort(key=lambda line: (line["chosen"], line["kept"]))
-        return render(
-            "sweep_plot",
-            axes=[
-                {
-                    "name": axis.name,
-                    "x": axis.x,
-                    "ticks": [
-                        {
-                            "label": label,
-                            "y": y,
-                            "press": FilterSweep(name=axis.name, value=text) if text else None,
-                            "on": text in self.shown.only.get(axis.name, ()) and bool(text),
-                        }
-                        for label, y, text in axis.ticks
-                    ],
-                }
-                for axis in axes
-            ],
-            lines=lines,
-            faint=len(lines) > MOST_PRESSED,
-            width=WIDTH,
-            top=TOP,
-            bottom=BOTTOM,
-            clear=ClearSweepFilter() if any(self.shown.only.values()) else None,
+        read, shown = self._read, self._shown
+        self._note.content = _note_html(read)
+        if read.results is None:
+            self._plot.content = self._table.content = self._episodes.content = ""
+            return
+        library = self._library.view().rows
+        point = _shown_point(read, shown, view, library)
+        self._plot.content = _plot_html(read.results, read.summaries, shown, point)
+        self._table.content = _table_html(read.results, read.summaries, shown, point)
+        self._episodes.content = (
+            "" if point is None else self._episodes_html(read.results, point, view, library)
         )
 
-    def _table_html(self, results: SweepResults, kept: Sequence[PointSummary]) -> str:
-        terms = terms_of(self._summaries)
-        columns: dict[str, tuple[Callable[[PointSummary], Any], str]] = {}
-        for name in results.names:
-            columns[f"set {name}"] = (lambda one, name=name: _in_order(one.values[name])), name
-        columns["success"] = lambda one: _rate_order(one), "success"
-        columns["at the end"] = lambda one: _part(one.solved_at_end, one.episodes), "at the end"
-        columns["return"] = lambda one: _least(one.mean_return), "return"
-        for name in terms:
-            columns[f"mean {name}"] = (
-                (lambda one, name=name: _least(one.means.get(name))),
-                name.removeprefix(_TERMS),
-            )
-        columns["episodes"] = lambda one: one.episodes, "episodes"
-        order, _ = columns.get(self.shown.column, columns["success"])
-        ordered = sorted(kept, key=order, reverse=self.shown.descending)
-        places = self._pages.places(len(ordered))
-        rows = []
-        for one in [ordered[k] for k in places]:
-            rows.append(
-                {
-                    "press": ShowSweepPoint(index=one.index),
-                    "chosen": one.index == self._chosen,
-                    "values": [value_text(one.values[name]) for name in results.names],
-                    "cells": [*_result_cells(one), *(_shown(one.means.get(name)) for name in terms)],
-                    "episodes": one.episodes,
-                    "failed": one.failed,
-                }
-            )
-        head = [
-            {
-                "name": title,
-                "arrow": "" if column != self.shown.column else " ↓" if self.shown.descending else " ↑",
-                "press": SortSweep(column=column),
-                "set": column.startswith("set "),
-            }
-            for column, (_, title) in columns.items()
-        ]
-        return render(
-            "sweep_table", head=head, rows=rows, pages=self._pages.shown(lambda by: TurnSweep(by=by))
-        )
-
-    def _episodes_html(self, results: SweepResults, chosen: PointSummary, view: ReviewView) -> str:
-        rows = [row for row in results.episodes if row.point == chosen.index]
+    def _episodes_html(
+        self, results: SweepResults, point: PointSummary, view: ReviewView, library: Sequence[LibraryRow]
+    ) -> str:
+        rows = [row for row in results.episodes if row.point == point.index]
         ordered = best_first(rows)
         if len(ordered) > 2 * MOST_SHOWN:
             lists = [
@@ -376,13 +294,13 @@ class SweepPanel(PagePart[ReviewView]):
             ]
         else:
             lists = [("Episodes, the best first", ordered)] if ordered else []
-        ids = {str(path): row.id for row in self._library.view().rows for path in row.paths}
+        ids = {str(path): row.id for row in library for path in row.paths}
         opened = {one.id for one in view.opened}
         return render(
             "sweep_episodes",
-            point=_point_text(chosen),
-            failure=chosen.failure,
-            failed=chosen.failed,
+            point=_point_text(point),
+            failure=point.failure,
+            failed=point.failed,
             lists=[
                 {"title": title, "rows": [self._episode(row, ids, opened) for row in some]}
                 for title, some in lists
@@ -403,37 +321,141 @@ class SweepPanel(PagePart[ReviewView]):
 
     # --- presses ---------------------------------------------------------------------------------------
 
+    @on_loop
     def do(self, command: Command, visitor: Visitor) -> None:
-        with self._lock:
-            match command:
-                case ShowSweepPoint(index=index):
-                    self.shown.chosen = index
-                case SortSweep(column=column):
-                    self._sort(column)
-                case FilterSweep(name=name, value=value):
-                    self._filter(name, value)
-                case ClearSweepFilter():
-                    self.shown.only.clear()
-                    self._pages.go_to(0)
-                case TurnSweep(by=by):
-                    self._pages.turn(by)
-                case OpenSweepEpisode(id=id):
-                    self._on_open((id,))
-            self._serial += 1
+        self._shown = apply(self._shown, command, self._read.summaries)
+        if isinstance(command, OpenSweepEpisode):
+            self._on_open((command.id,))
 
-    def _sort(self, column: str) -> None:
-        same = column == self.shown.column
-        self.shown.descending = not self.shown.descending if same else not column.startswith("set ")
-        self.shown.column = column
-        self._pages.go_to(0)
 
-    def _filter(self, name: str, text: str) -> None:
-        self.shown.only.setdefault(name, set()).symmetric_difference_update({text})
-        self._pages.go_to(0)
-        kept = [one.index for one in self._summaries if self._is_kept(one)]
-        if kept and self._chosen not in kept:
-            # They are the best first.
-            self.shown.chosen = kept[0]
+def _note_html(read: Read) -> str:
+    if read.problem:
+        return render("note", text=read.problem)
+    results = read.results
+    if results is None:
+        return render("note", text=f"Reading {RESULTS}.")
+    actions = results.actions.rpartition("/")[2]
+    failed, lines = sum(one.failed for one in read.summaries), len(read.summaries) <= MOST_PRESSED
+    return render("sweep_head", results=results, actions=actions, failed=failed, lines=lines)
+
+
+def _shown_point(
+    read: Read, shown: Shown, view: ReviewView, library: Sequence[LibraryRow]
+) -> PointSummary | None:
+    """The point whose episodes are listed: the chosen one, else that of the open episode, else the best one. If it is left
+    out, the best one that is not."""
+    by_index: dict[int | None, PointSummary] = {one.index: one for one in read.summaries}
+    opened = {one.id for one in view.opened}
+    paths = (str(path) for row in library if row.id in opened for path in row.paths)
+    of_opened = (read.point_of[path] for path in paths if path in read.point_of)
+    index = shown.chosen if shown.chosen in by_index else next(of_opened, None)
+    point = by_index.get(index, next(iter(read.summaries), None))
+    if point is None or shown.keeps(point):
+        return point
+    return next(filter(shown.keeps, read.summaries), point)
+
+
+def _plot_html(
+    results: SweepResults, summaries: Sequence[PointSummary], shown: Shown, point: PointSummary | None
+) -> str:
+    axes = axes_of(results, summaries)
+    lines = []
+    by_return = [one.mean_return for one in summaries if one.mean_return is not None]
+    low, high = min(by_return, default=0.0), max(by_return, default=0.0)
+    tell_apart = len({one.rate for one in summaries if one.rate is not None}) > 1
+    for k, one in enumerate(summaries):
+        points = [(axis.x, axis.heights[k]) for axis in axes]
+        known = [f"{x:.1f},{y:.1f}" for x, y in points if y is not None]
+        kept = shown.keeps(one)
+        rate = one.rate if tell_apart else None
+        if rate is None and one.mean_return is not None and high > low:
+            rate = (one.mean_return - low) / (high - low)
+        lines.append(
+            {
+                "points": " ".join(known),
+                "kept": kept,
+                "part": round(100 * (rate or 0.0)),
+                "chosen": one is point,
+                "failed": not one.episodes,
+                "press": ShowSweepPoint(index=one.index) if kept and len(summaries) <= MOST_PRESSED else None,
+                "about": _about(one),
+            }
+        )
+    # The chosen one over the others, and those that are left out below.
+    lines.sort(key=lambda line: (line["chosen"], line["kept"]))
+    return render(
+        "sweep_plot",
+        axes=[
+            {
+                "name": axis.name,
+                "x": axis.x,
+                "ticks": [
+                    {
+                        "label": label,
+                        "y": y,
+                        "press": FilterSweep(name=axis.name, value=text) if text else None,
+                        "on": (axis.name, text) in shown.only and bool(text),
+                    }
+                    for label, y, text in axis.ticks
+                ],
+            }
+            for axis in axes
+        ],
+        lines=lines,
+        faint=len(lines) > MOST_PRESSED,
+        width=WIDTH,
+        top=TOP,
+        bottom=BOTTOM,
+        clear=ClearSweepFilter() if shown.only else None,
+    )
+
+
+def _table_html(
+    results: SweepResults, summaries: Sequence[PointSummary], shown: Shown, point: PointSummary | None
+) -> str:
+    terms = terms_of(summaries)
+    columns: dict[str, tuple[Callable[[PointSummary], Any], str]] = {}
+    for name in results.names:
+        columns[f"set {name}"] = (lambda one, name=name: _in_order(one.values[name])), name
+    columns["success"] = lambda one: _rate_order(one), "success"
+    columns["at the end"] = lambda one: _part(one.solved_at_end, one.episodes), "at the end"
+    columns["return"] = lambda one: _least(one.mean_return), "return"
+    for name in terms:
+        columns[f"mean {name}"] = (
+            (lambda one, name=name: _least(one.means.get(name))),
+            name.removeprefix(_TERMS),
+        )
+    columns["episodes"] = lambda one: one.episodes, "episodes"
+    order, _ = columns.get(shown.column, columns["success"])
+    ordered = sorted(filter(shown.keeps, summaries), key=order, reverse=shown.descending)
+    places = shown.pages.places(len(ordered))
+    rows = []
+    for one in [ordered[k] for k in places]:
+        rows.append(
+            {
+                "press": ShowSweepPoint(index=one.index),
+                "chosen": one is point,
+                "values": [value_text(one.values[name]) for name in results.names],
+                "cells": [*_result_cells(one), *(_shown(one.means.get(name)) for name in terms)],
+                "episodes": one.episodes,
+                "failed": one.failed,
+            }
+        )
+    head = [
+        {
+            "name": title,
+            "arrow": "" if column != shown.column else " ↓" if shown.descending else " ↑",
+            "press": SortSweep(column=column),
+            "set": column.startswith("set "),
+        }
+        for column, (_, title) in columns.items()
+    ]
+    return render(
+        "sweep_table",
+        head=head,
+        rows=rows,
+        pages=shown.pages.shown(len(ordered), lambda by: TurnSweep(by=by)),
+    )
 
 
 def _part(count: int | None, total: int) -> float:

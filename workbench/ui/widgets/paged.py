@@ -3,38 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from workbench.commands.command import Command
 
 
+@dataclass(frozen=True)
 class Paged:
-    """A part of a list, `most` rows at a time."""
+    """A part of a list, `most` rows at a time. It is clamped to the list's length, which may change."""
 
-    def __init__(self, most: int) -> None:
-        self._most, self.first, self._count = most, 0, 0
+    most: int
+    first: int = 0
+    """Row that the page begins with."""
 
-    def go_to(self, place: int) -> None:
-        """Show the page that holds this row; `places` clamps it to the list."""
-        self.first = max(place, 0) // self._most * self._most
+    def at(self, place: int) -> Paged:
+        """The page that holds this row."""
+        return replace(self, first=max(place, 0) // self.most * self.most)
 
-    def turn(self, by: int) -> None:
-        """Move by this many pages."""
-        self.go_to(self.first + by * self._most)
+    def turned(self, by: int, count: int) -> Paged:
+        """The page that is so many pages further in a list of this length."""
+        return self.at(self.places(count).start + by * self.most)
 
     def places(self, count: int) -> range:
         """The rows to show of a list of this length."""
-        self._count = count
-        if self.first >= count:
-            self.go_to(count - 1)
-        return range(self.first, min(self.first + self._most, count))
+        first = min(self.first, self.at(count - 1).first)
+        return range(first, min(first + self.most, count))
 
-    def shown(self, turn: Callable[[int], Command]) -> dict[str, object] | None:
+    def shown(self, count: int, turn: Callable[[int], Command]) -> dict[str, object] | None:
         """For a template: first, last, count, and the commands that turn the page; None where one page holds all rows.
 
         Args:
             turn: the command that moves by so many pages.
         """
-        if self._count <= self._most:
+        if count <= self.most:
             return None
-        last = min(self.first + self._most, self._count)
-        return {"first": self.first + 1, "last": last, "of": self._count, "back": turn(-1), "on": turn(1)}
+        places = self.places(count)
+        return {"first": places.start + 1, "last": places.stop, "of": count, "back": turn(-1), "on": turn(1)}

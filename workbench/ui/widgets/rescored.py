@@ -69,7 +69,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
         self._list.visible = bool(listed)
         if listed:
             rows = [self._row(place) for place in self._pages.places(len(listed))]
-            pages = self._pages.shown(lambda by: TurnRescored(by=by))
+            pages = self._pages.shown(len(listed), lambda by: TurnRescored(by=by))
             self._list.content = render("rescored_list", rows=rows, more=pages, column=self._column)
 
     def _draw_chart(
@@ -99,7 +99,7 @@ class RescoredPanel(PagePart[View], Generic[View, Of]):
                         self._show(verdict)
                         break
             case TurnRescored(by=by):
-                self._pages.turn(by)
+                self._pages = self._pages.turned(by, len(self._listed))
 
     def _key_of(self, verdict: Verdict[Of]) -> str:
         """Key that distinguishes its run from the others."""

@@ -1,0 +1,119 @@
+"""The library's list as a value: what each command makes of it, over rows that come and go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from workbench.commands.command import Command
+from workbench.commands.library import (
+    AlsoNextRow,
+    AlsoPreviousRow,
+    ClearRowFilter,
+    FilterRows,
+    FilterTask,
+    LookForRows,
+    NextRow,
+    NextRows,
+    OpenRow,
+    PressRow,
+    PreviousRow,
+    PreviousRows,
+    SelectAllRows,
+    SelectNoRows,
+    SortRows,
+    ToggleRow,
+    UndoDelete,
+)
+from workbench.recording.episode.row import LibraryRow
+from workbench.ui.library.listing import MOST_ROWS, LibraryList, Listing, apply, make_listing
+
+Rows = tuple[LibraryRow, ...]
+ROWS: Rows = tuple(
+    LibraryRow(
+        kind="workbench",
+        id=f"r{k}",
+        name=f"r{k}",
+        place=(f"r{k}", 0),
+        paths=(Path(f"r{k}.json"),),
+        size=1,
+        written=float(-k),
+        seed=k,
+        task="push" if k % 3 else "pick",
+        success=k % 2 == 0,
+    )
+    for k in range(MOST_ROWS + 3)
+)
+
+
+def after(commands: Iterable[Command], rows: Rows = ROWS) -> Listing:
+    """The list after these."""
+    listed = LibraryList()
+    for command in commands:
+        listed = apply(make_listing(listed, rows), command)
+    return make_listing(listed, rows)
+
+
+def without(*ids: str) -> Rows:
+    return tuple(row for row in ROWS if row.id not in ids)
+
+
+def test_the_cursor_goes_on_from_the_place_of_a_row_that_is_gone() -> None:
+    listed = after([PressRow(id="r4")])
+    there = make_listing(listed.list, without("r4"))
+    assert there.selected == () and there.list.cursor is None
+    assert make_listing(apply(there, NextRow()), there.library).selected == ("r5",)
+
+
+def test_an_arrow_without_a_cursor_begins_on_the_page_that_is_shown() -> None:
+    assert after([NextRows(), NextRow()]).selected == (f"r{MOST_ROWS}",)
+    assert after([NextRows(), NextRows(), PreviousRows(), NextRow()]).selected == ("r0",)
+
+
+def test_what_a_filter_hid_is_not_selected_when_it_is_shown_again() -> None:
+    chosen = [SelectAllRows(), FilterRows(outcome="no success")]
+    assert len(after(chosen).selected) == len(after(chosen).rows) == len(ROWS) // 2
+    shown = after([*chosen, ClearRowFilter()])
+    assert len(shown.rows) == len(ROWS) and len(shown.selected) == len(ROWS) // 2
+
+
+def test_the_filter_of_a_task_goes_with_its_last_recording() -> None:
+    listed = after([FilterTask(task="pick")])
+    assert {row.task for row in listed.rows} == {"pick"}
+    rest = tuple(row for row in ROWS if row.task != "pick")
+    there = make_listing(listed.list, rest)
+    assert there.rows == rest and there.list.arrangement.task is None
+    assert make_listing(apply(there, UndoDelete()), ROWS).rows == ROWS
+
+
+ids = st.sampled_from([*(row.id for row in ROWS[:9]), "gone"])
+commands: st.SearchStrategy[Command] = st.one_of(
+    st.builds(PressRow, id=ids, held=st.sampled_from(["", "ctrl", "shift", "ctrl+shift"])),
+    st.builds(OpenRow, id=ids),
+    st.sampled_from([NextRow(), PreviousRow(), AlsoNextRow(), AlsoPreviousRow(), NextRows(), PreviousRows()]),
+    st.sampled_from([ToggleRow(), SelectAllRows(), SelectNoRows(), ClearRowFilter(), UndoDelete()]),
+    st.builds(SortRows, column=st.sampled_from(["seed", "task", "date"])),
+    st.builds(FilterRows, outcome=st.sampled_from(["all", "success", "no success", "broken"])),
+    st.builds(LookForRows, words=st.sampled_from(["", "r1", "nothing has this"])),
+    st.builds(FilterTask, task=st.sampled_from([None, "push", "pick", "none"])),
+)
+libraries = st.sampled_from([ROWS, without("r1", "r2"), tuple(row for row in ROWS if row.task == "push"), ()])
+
+
+@given(st.lists(st.tuples(commands, libraries), max_size=30))
+def test_whatever_is_pressed_only_what_is_listed_is_selected(happened: list[tuple[Command, Rows]]) -> None:
+    listed, before = LibraryList(), None
+    for command, rows in happened:
+        before = make_listing(listed, rows, before)
+        listed = apply(before, command)
+        there = make_listing(listed, rows, before)
+        again = make_listing(listed, rows)
+        assert (there.rows, there.list) == (again.rows, again.list), "nothing of an older moment"
+        shown = {row.id for row in there.rows}
+        assert there.list.selected == set(there.selected) <= shown
+        assert there.list.cursor is None or there.list.cursor in shown
+        assert bool(there.page) == bool(there.rows) and set(there.page) <= set(there.rows)
+        before = there
