@@ -158,7 +158,7 @@ class Downloads:
             kind: Its content type.
             download: The browser saves it instead of showing it.
         """
-        path = Path(path).resolve()
+        path = Path(path).absolute()
         reply = FileReply(path, kind, download_as=path.name if download else None)
         with self._lock:
             key = self._ids.setdefault(reply, secrets.token_urlsafe(16))
