@@ -178,7 +178,7 @@ class ReviewPage:
         self._add_library(library)
         with share_tab:
             sharing = place.sharing
-            share = sharing.part(server, library, self._library, self._make_way)
+            self._share = sharing.part(server, library, self._library, self._make_way)
         with review_tab:
             going = GoLivePart(server, go_live)
             self._view_panel = ViewPanel(server, dark, place.stage.choice)
@@ -187,7 +187,7 @@ class ReviewPage:
             curves,
             compare,
             self._library,
-            share,
+            self._share,
             going,
             self._view_panel,
             self._rescore,
@@ -255,6 +255,7 @@ class ReviewPage:
         """Stop redrawing; returns when the loop has ended."""
         self._loop.stop()
         self._library.close()
+        self._share.close()
 
     @property
     def dark(self) -> bool:

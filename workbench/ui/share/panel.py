@@ -343,6 +343,10 @@ class SharePart(PagePart[ReviewView]):
         owner = self._rerun if isinstance(command, RerunView.does) else self._share
         owner.do(command, visitor)
 
+    def close(self) -> None:
+        """Called when the page goes."""
+        self._rerun.end()
+
     def draw(self, view: ReviewView) -> None:
         opened = {one.id: one.episode for one in view.opened}
         ids = self._table.selected()

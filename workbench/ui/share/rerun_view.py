@@ -197,8 +197,7 @@ class RerunView:
         request for the panel's content tells that it is there.
         """
         if self._panel is not None:
-            with suppress(RuntimeError):  # it went with its page
-                self._panel.set_width(self._width)
+            self._panel.set_width(self._width)
 
     @on_loop
     def open(self) -> None:
@@ -244,3 +243,9 @@ class RerunView:
         panel, self._panel = self._panel, None
         if panel is not None:
             panel.remove()
+
+    @on_loop
+    def end(self) -> None:
+        """Open nothing any more, because the page goes, and the panel with it."""
+        self._jobs.close()
+        self._panel = None
