@@ -49,7 +49,7 @@ class InSoftware:
         self.all_pages = False
         """Whether all open pages draw in software."""
         self._drawn: Scene | None = None
-        """The scene that is drawn, if it has many triangles."""
+        """The scene that is drawn, if it is drawn of simplified shapes."""
         self._made: tuple[SceneGeometry, float] | None = None
         """Scene and tolerance for which the simplified shapes are ready."""
         self._simplifying: asyncio.Task[None] | None = None
@@ -110,12 +110,12 @@ class InSoftware:
             layout: The grid of the envs.
             alone: One env is shown, at the origin.
         """
-        few = looks.triangles > Looks().triangles or _triangles(geometry, alone) <= FEW
-        self._drawn = None if few else (geometry, layout, alone)
-        made = self._made
-        if few or not self.all_pages or made is None or made[0] is not geometry:
+        usual = not self.all_pages or looks.triangles > Looks().triangles
+        if usual or _triangles(geometry, alone) <= FEW:
+            self._drawn = None
             return looks
-        return replace(looks, error=made[1])
+        self._drawn, made = (geometry, layout, alone), self._made
+        return replace(looks, error=made[1] if made is not None and made[0] is geometry else 0.0)
 
     async def _simplify(self) -> None:
         """Simplify the shapes that are drawn, as long as all pages draw in software."""
