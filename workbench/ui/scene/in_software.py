@@ -66,19 +66,15 @@ class InSoftware:
         post(partial(self._know, visitor.client.client_id, True))
 
     async def _came(self, client: viser.ClientHandle) -> None:
-        post(partial(self._wait_for, client.client_id))
+        post(partial(self._expect, client.client_id))
 
     async def _left(self, client: viser.ClientHandle) -> None:
         post(partial(self._forget, client.client_id))
 
-    def _wait_for(self, page: int) -> None:
+    def _expect(self, page: int) -> None:
         self._pages[page] = None
-        later(PATIENCE, partial(self._give_up, page))
         self._decide()
-
-    def _give_up(self, page: int) -> None:
-        if self._pages.get(page, True) is None:
-            self._know(page, False)
+        later(PATIENCE, lambda: self._know(page, self._pages.get(page) or False))
 
     def _know(self, page: int, in_software: bool) -> None:
         if page in self._pages:
