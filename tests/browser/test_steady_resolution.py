@@ -16,7 +16,7 @@ from tests.ui.scenes import table_scene
 from workbench.core.scene.shapes import Mesh
 from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.scene.in_software import PATIENCE, InSoftware
+from workbench.ui.scene.in_software import InSoftware
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.widgets.visitors import PATH, Visitors
 
@@ -121,8 +121,7 @@ def test_the_notice_of_it_goes_by_itself_and_is_not_shown_again(
 def test_shapes_are_simpler_only_while_every_page_draws_in_software(
     gated_server: GatedServer, show: Show
 ) -> None:
-    now = 0.0
-    in_software = InSoftware(gated_server.server, clock=lambda: now)
+    in_software = InSoftware(gated_server.server)
     visitors = Visitors(gated_server.server)
     visitors.do = lambda command, visitor: in_software.told_by(visitor)
     gated_server.add_channel(PATH, visitors.serve)
@@ -142,8 +141,7 @@ def test_shapes_are_simpler_only_while_every_page_draws_in_software(
     other = show(A_CARD)
     until(lambda: len(gated_server.server.get_clients()) == 2, "the other page")
     assert in_software.all_pages
-    now = PATIENCE
-    assert not in_software.all_pages
+    until(lambda: not in_software.all_pages, "the other page has said nothing for long enough")
     assert in_software.looks(Looks(), geometry, layout, alone=False) == Looks()
     other.close()
     until(lambda: in_software.all_pages, "the other page is gone")

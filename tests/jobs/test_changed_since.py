@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tests.drive.episodes import made
-from workbench.jobs.from_recording import ChangesOnDisk, changed_on_disk, changed_since
+from workbench.jobs.from_recording import changed_on_disk, changed_since
 
 THEN = "import numpy as np\n\nSIZE = 1\n\n\nclass Push:\n    def evaluate(self):\n        return {}\n"
 NOW = THEN.replace("SIZE = 1", "SIZE = 2  # larger").replace("return {}", "return {'success': 1}")
@@ -31,9 +31,8 @@ def test_the_file_that_a_recording_names_is_read_with_those_beside_it(tmp_path: 
     beside.write_text("WIDTH = 1\n")
     source = {"push.py": THEN, "helpers/shapes.py": "WIDTH = 1\n"}
     info = replace(made(1).info, source_file=str(file), source=source)
-    look = ChangesOnDisk(look_every=0.0)
-    assert look.of(info) == changed_on_disk(info) == ""
+    assert changed_on_disk(info) == ""
     beside.write_text("WIDTH = 2\n")
-    assert look.of(info) == "WIDTH of shapes.py"
+    assert changed_on_disk(info) == "WIDTH of shapes.py"
     file.unlink()
-    assert look.of(info) == ""
+    assert changed_on_disk(info) == ""

@@ -6,7 +6,6 @@ import ast
 import os
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -65,8 +64,6 @@ def recorded_version(info: EpisodeInfo) -> str:
 
 
 MOST_NAMED = 4
-SCAN_SECONDS = 2.0
-"""Seconds between two reads of the files."""
 
 
 def changed_since(
@@ -118,20 +115,6 @@ def changed_on_disk(info: EpisodeInfo) -> str:
             except (OSError, SyntaxError):
                 return ""
     return changed_since(info.source_file, info.source, str(file), now)
-
-
-class ChangesOnDisk:
-    """`changed_on_disk`, cached for callers that ask many times a second."""
-
-    def __init__(self, look_every: float = SCAN_SECONDS) -> None:
-        self._look_every = look_every
-        self._known: tuple[str, float, str] | None = None
-
-    def of(self, info: EpisodeInfo) -> str:
-        now = time.monotonic()
-        if self._known is None or self._known[0] != info.id or now - self._known[1] > self._look_every:
-            self._known = info.id, now, changed_on_disk(info)
-        return self._known[2]
 
 
 def _symbol_text(path: str, name: str, main: str) -> str:

@@ -265,6 +265,31 @@ def test_files_that_change_or_go_are_said_and_stay_open(
     assert len(review.view().opened) == 1
 
 
+def test_what_changed_of_the_selected_recordings_task_is_told_at_once_and_again_after_a_save(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.session.review.review.CHECK_SECONDS", 0.01)
+    task = tmp_path / "push.py"
+    task.write_text("SIZE = 2\nMASS = 1\n")
+
+    def recorded_with(source: str) -> Episode:
+        episode = made(3)
+        return replace(episode, info=replace(episode.info, source_file=str(task), source={str(task): source}))
+
+    review, _ = review_of(a=recorded_with("SIZE = 1\nMASS = 1\n"), b=recorded_with("SIZE = 2\nMASS = 2\n"))
+    opened(review, "a", "b")
+    reach(review, lambda view: view.changed_symbols == "SIZE", "what changed since the first")
+    select(review, 1)
+    reach(review, lambda view: view.changed_symbols == "MASS", "what changed since the second")
+    task.write_text("SIZE = 3\nMASS = 2\n")
+    reach(review, lambda view: view.changed_symbols == "SIZE", "what was saved")
+    close_one(review, 1)
+    close_one(review, 0)
+    opened(review, "b")
+    reach(review, lambda view: view.changed_symbols == "SIZE", "the same of one that is opened again")
+    review.close()
+
+
 @pytest.fixture
 def filled(child_process: None, tmp_path: Path) -> Iterator[Library]:
     for seed, minute in ((1, 10), (2, 20), (3, 15)):
@@ -362,21 +387,21 @@ def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.M
     monkeypatch.setattr("workbench.session.review.state.FIRST_SHOWN", 0.0)
     shelf = Shelf({"a": made(10), "b": made(20), "c": made(30)})
     reached, go_on = threading.Event(), threading.Event()
+    readers: list[threading.Thread] = []
 
     def read(row: Row, *_: object) -> Episode:
+        readers.append(threading.current_thread())
         if row.id == "b":
             reached.set()
             assert go_on.wait(60)
         return shelf.read(row)
 
     review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
-    before = set(threading.enumerate())
     review.open("ab")
     assert reached.wait(60)
-    (first,) = set(threading.enumerate()) - before
     opened(review, "c")
     go_on.set()
-    first.join(60)
+    readers[0].join(60)
     assert [o.id for o in review.view().opened] == ["c"] and not review.view().loading
 
 

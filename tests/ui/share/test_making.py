@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -91,6 +93,37 @@ def test_an_archive_unpacked_is_the_recording_again(recordings: Path, tmp_path: 
     (again,) = find_all_sources([tmp_path / "elsewhere"])
     before, after = read_recording(source), read_recording(again)
     assert after.info.id == before.info.id and after.length == before.length and not after.broken_files
+
+
+@pytest.mark.slow
+def test_downloads_of_one_name_are_kept_apart_until_the_end(recordings: Path, tmp_path: Path) -> None:
+    told = Told()
+    wanted = MakeRequest("zip", find_all_sources([recordings]), tmp_path)
+    assert told.making.start(wanted, download=True) and not told.making.start(wanted), "one at a time"
+    told.wait(lambda view: not view.running)
+    told.making.start(wanted, download=True)
+    view = told.wait(lambda view: len(view.made) == 2)
+    (second,), (first,) = (made.paths for made in view.made)
+    assert first.name == second.name and first != second and not list(tmp_path.iterdir())
+    assert view.made[0].sizes == (second.stat().st_size,) and first.exists()
+    told.making.close()
+    assert not first.exists() and not second.exists()
+
+
+def test_the_end_waits_for_work_that_was_begun_and_does_not_wait_for_ever(
+    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.ui.share.make.END_SECONDS", 0.1)
+    told, go_on = Told(), threading.Event()
+    monkeypatch.setattr(
+        "workbench.ui.share.make.Processes", lambda count: SimpleNamespace(run=lambda *work: go_on.wait(60))
+    )
+    told.making.start(MakeRequest("zip", find_all_sources([recordings]), tmp_path))
+    told.making.close()
+    assert told.making.view().running, "it hangs"
+    go_on.set()
+    view = told.wait(lambda view: not view.running)
+    assert (view.problem, view.made) == ("", ())
 
 
 def test_an_archive_of_several_has_each_file_once_and_nothing_that_a_link_names(

@@ -13,18 +13,21 @@ from pathlib import Path
 
 from workbench.commands.command import Command
 from workbench.core.scene.shapes import SharedShapes
+from workbench.jobs.from_recording import changed_on_disk
 from workbench.machine.processes.family import allocated_memory
 from workbench.machine.processes.watched_thread import report_failure
-from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.episode import Episode, EpisodeInfo
 from workbench.recording.episode.row import LibraryRow, UnreadableRecording
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import read_recording
 from workbench.session.events import Asked
-from workbench.session.loop import Aside, ChangeCounter, begin, do, later, on_loop, post
+from workbench.session.loop import Aside, ChangeCounter, do, on_loop, post
 from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.process.memory_limit import format_size, total_memory
 from workbench.session.review.recorded_scene import SceneError, SceneProcess
 from workbench.session.review.state import (
+    BeginReading,
+    CheckFiles,
     FilesChecked,
     FileStamp,
     First,
@@ -92,7 +95,7 @@ class Review:
         self._changes = ChangeCounter()
         self._state = ReviewState()
         self._reading = Jobs(lambda: None, self._failed)
-        self._next_check: asyncio.TimerHandle | None = None
+        self._checks = Jobs(lambda: None, lambda failure: self._happened(ProblemFound(f"{failure}.")))
         self._file_checks = Aside("review-files")
 
     @on_loop
@@ -147,19 +150,20 @@ class Review:
     def close(self) -> None:
         """Stop opening, and checking files."""
         self._reading.close()
+        self._checks.close()
         self._file_checks.end()
-        if self._next_check is not None:
-            self._next_check.cancel()
 
     # --- on the loop ---------------------------------------------------------------------------------
 
     def _happened(self, event: ReviewEvent) -> None:
         state, effects = apply(self._state, event, self._clock())
         self._set(state)
-        for reading in effects:
-            self._reading.start("opening", partial(self._open, reading.opening, reading.rows))
-        if state.files and self._next_check is None:
-            self._next_check = later(CHECK_SECONDS, lambda: begin(self._check(self._state.files)))
+        for effect in effects:
+            match effect:
+                case BeginReading(opening=opening, rows=rows):
+                    self._reading.start("opening", partial(self._open, opening, rows))
+                case CheckFiles():
+                    self._checks.start("checking files", self._check)
 
     def _set(self, state: ReviewState) -> None:
         before, self._state = self._state, state
@@ -177,10 +181,12 @@ class Review:
     def _failed(self, failure: JobFailed) -> None:
         self._happened(ReadingEnded(self._state.opening.number, f"{failure}."))
 
-    async def _check(self, files: Mapping[Path, FileStamp]) -> None:
-        changed = await self._file_checks.run(partial(_changed_files, files))
-        self._next_check = None
-        self._happened(FilesChecked(files, tuple(changed)))
+    async def _check(self, job: Job) -> None:
+        while True:
+            chosen = self._state.view.chosen
+            info = None if chosen is None else chosen.episode.info
+            self._happened(await self._file_checks.run(partial(_check_files, self._state.files, info)))
+            await asyncio.sleep(CHECK_SECONDS)
 
     async def _open(self, number: int, rows: tuple[LibraryRow, ...], job: Job) -> None:
         # Each opening has one of its own: a disk that hangs must not keep the next.
@@ -273,6 +279,11 @@ class Review:
 def _shared(episode: Episode, shapes: SharedShapes) -> Episode:
     """The recording, sharing equal shapes with other recordings."""
     return episode if episode.geometry is None else replace(episode, geometry=shapes.share(episode.geometry))
+
+
+def _check_files(files: Mapping[Path, FileStamp], info: EpisodeInfo | None) -> FilesChecked:
+    symbols = "" if info is None else changed_on_disk(info)
+    return FilesChecked(files, tuple(_changed_files(files)), info, symbols)
 
 
 def _changed_files(files: Mapping[Path, FileStamp]) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Literal
 
 from workbench.commands import review, run, timeline
 from workbench.commands.command import Command, Refused
-from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.episode import Episode, EpisodeInfo
 from workbench.recording.episode.row import LibraryRow
 from workbench.recording.library.library import LibraryView
 from workbench.session.events import Asked
@@ -148,6 +148,10 @@ class FilesChecked:
     """The files that were checked."""
     changed: tuple[str, ...]
     """A sentence for each file that was deleted or changed."""
+    task_of: EpisodeInfo | None = None
+    """Info of the recording whose task was checked."""
+    changed_symbols: str = ""
+    """Symbols of that task that changed since the recording."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +186,13 @@ class BeginReading:
     rows: tuple[LibraryRow, ...]
 
 
-Change = tuple[ReviewState, list[BeginReading]]
+@dataclass(frozen=True)
+class CheckFiles:
+    """Check the files of the open recordings, and the selected one's task, now and from time to time."""
+
+
+ReviewEffect = BeginReading | CheckFiles
+Change = tuple[ReviewState, list[ReviewEffect]]
 
 
 # --- changes -----------------------------------------------------------------------------------------
@@ -193,7 +203,15 @@ def apply(state: ReviewState, event: ReviewEvent, now: float) -> Change:
 
     Raises `Refused` if a command is not possible; the state is then as it was.
     """
-    state = advanced(state, now)
+    before = state.view.chosen
+    state, effects = _applied(advanced(state, now), event, now)
+    chosen = state.view.chosen
+    if chosen is None or (before is not None and before.episode.info is chosen.episode.info):
+        return state, effects
+    return _with(state, changed_symbols=""), [*effects, CheckFiles()]
+
+
+def _applied(state: ReviewState, event: ReviewEvent, now: float) -> Change:
     opening = state.opening
     if (
         isinstance(event, RecordingRead | RecordingNotRead | ReadingEnded | SceneTold)
@@ -228,7 +246,14 @@ def apply(state: ReviewState, event: ReviewEvent, now: float) -> Change:
             return replace(state, opening=replace(state.opening, read=())), []
         case SceneTold():
             return _scene_told(state, event), []
-        case FilesChecked(files=files, changed=changed):
+        case FilesChecked(files=files, changed=changed, task_of=task_of, changed_symbols=symbols):
+            chosen = state.view.chosen
+            if (
+                chosen is not None
+                and chosen.episode.info is task_of
+                and symbols != state.view.changed_symbols
+            ):
+                state = _with(state, changed_symbols=symbols)
             problems = tuple(dict.fromkeys((*state.problems, *changed)))
             if files is state.files and not state.view.loading and problems != state.view.problems:
                 state = _with(state, problems=problems)

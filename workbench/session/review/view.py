@@ -107,6 +107,8 @@ class ReviewView:
     """What is being opened."""
     problems: tuple[str, ...] = ()
     """Recordings that could not be opened, and files that changed since; a sentence each."""
+    changed_symbols: str = ""
+    """Symbols of the selected recording's task that changed since the recording."""
     not_opened: tuple[str, ...] = ()
     """Ids of the recordings that the last opening could not read."""
     library_stays: bool = False

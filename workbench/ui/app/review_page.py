@@ -176,7 +176,7 @@ class ReviewPage:
         self._add_library(library)
         with share_tab:
             sharing = place.sharing
-            share = sharing.part(server, library, self._library, self._make_way)
+            self._share = sharing.part(server, library, self._library, self._make_way)
         with review_tab:
             going = GoLivePart(server, go_live)
             self._view_panel = ViewPanel(server, dark, place.stage.choice)
@@ -185,7 +185,7 @@ class ReviewPage:
             curves,
             compare,
             self._library,
-            share,
+            self._share,
             going,
             self._view_panel,
             self._rescore,
@@ -260,6 +260,7 @@ class ReviewPage:
     def close(self) -> None:
         """It is shown no more."""
         self._library.end()
+        self._share.close()
         if self._sweep is not None:
             self._sweep.end()
 

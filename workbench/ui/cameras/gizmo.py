@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +15,7 @@ import viser
 from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.core.cameras.conventions import axes_of, intrinsic_of, target_of, vertical_fov
 from workbench.session.cameras.view import StudioCamera
+from workbench.session.loop import post
 from workbench.ui.cameras.pose_math import (
     Floats,
     Frame,
@@ -85,7 +86,6 @@ class CameraGizmo:
         self._line = line_set(page, "/studio/line of sight", SIGHT_COLOUR, 2.0)
         self._held_at = -1e9
         self._start: _Taken | None = None
-        # Async: callbacks in viser's pool of threads would come in any order.
         self._camera.on_update(self._on_camera)
         self._eye.on_update(self._on_point)
         self._target.on_update(self._on_point)
@@ -106,7 +106,6 @@ class CameraGizmo:
             if camera is not None:
                 self._draw_line(camera)
             return
-        self._start = None
         two = camera is not None and self._look_at()
         for handle, shown in (
             (self._camera, camera is not None and not two),
@@ -145,39 +144,46 @@ class CameraGizmo:
 
     def _went_on(self, phase: str) -> _Taken | None:
         """State of the camera when the gizmo was taken, for an update of a drag; else None."""
-        self._held_at = time.monotonic()
-        if (phase == "start" or self._start is None) and not self._take():
+        taken, self._held_at = self.held, time.monotonic()
+        if (phase == "start" or not taken) and not self._take():
             return None
         start = self._start
         if phase == "end":
             self._start = None
         return start if phase == "update" else None
 
+    # Async: callbacks in viser's pool of threads would come in any order.
     async def _on_camera(self, event: viser.TransformControlsEvent) -> None:
-        start = self._went_on(event.phase)
-        if start is None:
-            return
-        pose, frame = start.pose, start.frame
-        position, wxyz = event.target.position, event.target.wxyz
-        with refusals_told(event.client, then=self._let_go):
-            if self._own_axes():
-                moved = np.concatenate([position, wxyz])
-            else:
-                moved = turned_in_world(pose, position, wxyz)
-            moved = snapped(pose, moved, self._snap(), self._own_axes(), frame.offset)
-            self._place(start, moved, start.target - pose[:3])
+        pose = np.concatenate([event.target.position, event.target.wxyz])
+        post(partial(self._drag_camera, event.client, event.phase, pose))
 
     async def _on_point(self, event: viser.TransformControlsEvent) -> None:
+        point = np.array(event.target.position)
+        post(partial(self._drag_point, event.client, event.phase, point, event.target is self._eye))
+
+    def _drag_camera(self, client: viser.ClientHandle | None, phase: str, there: Floats) -> None:
+        start = self._went_on(phase)
+        if start is None:
+            return
+        pose, own = start.pose, self._own_axes()
+        with refusals_told(client, then=self._let_go):
+            moved = there if own else turned_in_world(pose, there[:3], there[3:])
+            moved = snapped(pose, moved, self._snap(), own, start.frame.offset)
+            self._place(start, moved, start.target - pose[:3])
+
+    def _drag_point(
+        self, client: viser.ClientHandle | None, phase: str, point: Floats, moves_eye: bool
+    ) -> None:
         """Move the eye or the target."""
-        moves_eye, start = event.target is self._eye, self._went_on(event.phase)
+        start = self._went_on(phase)
         if start is None:
             return
         pose, target = start.pose, start.target
         before = pose[:3] if moves_eye else target
-        at = np.concatenate([before, UNTURNED]), np.concatenate([event.target.position, UNTURNED])
+        at = np.concatenate([before, UNTURNED]), np.concatenate([point, UNTURNED])
         there = snapped(*at, Snap(metres=self._snap().metres), False, start.frame.offset)[:3]
         eye, target = (there, target) if moves_eye else (pose[:3], there)
-        with refusals_told(event.client, then=self._let_go):
+        with refusals_told(client, then=self._let_go):
             self._place(start, looking_at(pose, eye, target), target - eye)
 
     def _place(self, start: _Taken, pose: Floats, sight: Floats) -> None:
@@ -225,7 +231,8 @@ class LookThrough:
 
     def __init__(self, server: viser.ViserServer, placing: Placing) -> None:
         self._server, self._placing = server, placing
-        self._lock = threading.Lock()
+        self._asked: deque[int] = deque()
+        """Pages that asked to look through the camera, or to go back, since the last drawing."""
         self._looking: dict[int, _Looking] = {}
         self._border = line_set(server, "/studio/border", BORDER_COLOUR, 2.0)
 
@@ -235,33 +242,34 @@ class LookThrough:
         return bool(self._looking)
 
     def toggle(self, client: viser.ClientHandle | None) -> None:
-        """Look through the chosen camera, or go back."""
-        camera = self._placing.camera
-        if client is None:
-            return
-        with self._lock:
-            if client.client_id in self._looking:
-                self._back(client)
-            elif camera is not None:
-                eye = client.camera
-                self._looking[client.client_id] = _Looking(
-                    camera.key, eye.position.copy(), eye.look_at.copy(), eye.up_direction.copy(), eye.fov
-                )
-                self._show(client, camera)
+        """Look through the chosen camera, or go back, with the next drawing."""
+        if client is not None:
+            self._asked.append(client.client_id)
 
     def draw(self, camera: StudioCamera | None) -> None:
         """Follow the camera; go back if it is no longer the chosen one."""
-        with self._lock:
-            clients = self._server.get_clients()
-            for number in list(self._looking):
-                client = clients.get(number)
-                if client is None:
-                    del self._looking[number]
-                elif camera is None or camera.key != self._looking[number].key:
-                    self._back(client)
-                else:
-                    self._show(client, camera)
+        clients = self._server.get_clients()
+        while self._asked:
+            if (client := clients.get(self._asked.popleft())) is not None:
+                self._turn(client, camera)
+        for number in list(self._looking):
+            client = clients.get(number)
+            if client is None:
+                del self._looking[number]
+            elif camera is None or camera.key != self._looking[number].key:
+                self._back(client)
+            else:
+                self._show(client, camera)
         self._draw_border(camera if self._looking else None)
+
+    def _turn(self, client: viser.ClientHandle, camera: StudioCamera | None) -> None:
+        if client.client_id in self._looking:
+            self._back(client)
+        elif camera is not None:
+            eye = client.camera
+            self._looking[client.client_id] = _Looking(
+                camera.key, eye.position.copy(), eye.look_at.copy(), eye.up_direction.copy(), eye.fov
+            )
 
     def _draw_border(self, camera: StudioCamera | None) -> None:
         """Draw the border of the picture, since the page's view is wider."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import viser
@@ -12,6 +13,7 @@ from workbench.authoring.templates.new_task import CannotBegin, fill_blank_file,
 from workbench.commands.command import Command, Refused
 from workbench.commands.run import FillEmptyFile, Interrupt, RebuildScene, ReloadFile, RestartWorker
 from workbench.session.live.view import SessionView
+from workbench.session.loop import Aside, begin, post
 from workbench.session.process.heartbeat import Busy
 from workbench.ui.live.timeline import GAP, step_in_words
 from workbench.ui.widgets.editor import LinkTo, no_links
@@ -89,6 +91,7 @@ class Banner(PagePart[SessionView]):
         self._link, self._is_own = link, is_own
         self._blank: Path | None = None
         """File that is offered to be filled."""
+        self._disk = Aside("fill-file")
         self._panel = server.gui.add_panel(visible=False, order=-10.0)
         with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
             self._html = server.gui.add_html("")
@@ -130,10 +133,14 @@ class Banner(PagePart[SessionView]):
     def do(self, command: Command, visitor: Visitor) -> None:
         if self._blank is None:
             raise Refused("No empty file is open.")
+        filled = self._fill(self._blank, visitor)
+        post(lambda: begin(filled))
+
+    async def _fill(self, file: Path, visitor: Visitor) -> None:
         try:
-            fill_blank_file(self._blank)
+            await self._disk.run(partial(fill_blank_file, file))
         except CannotBegin as error:
-            raise Refused(str(error)) from None
+            visitor.tell(str(error))
 
 
 def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) -> str:

@@ -24,7 +24,7 @@ from workbench.commands.review import (
 )
 from workbench.commands.run import TogglePlay
 from workbench.core.camera_data import moved_cameras_text
-from workbench.jobs.from_recording import ChangesOnDisk, recorded_version
+from workbench.jobs.from_recording import recorded_version
 from workbench.recording.episode.episode import acted_by_text
 from workbench.session.review.review import SPEEDS, Review
 from workbench.session.review.state import MOST_COMPARED
@@ -93,7 +93,6 @@ class ReviewPanel(PagePart[ReviewView]):
         self._align = choice(server, "Align at", AlignRecordings, "at", ("start",), "start")
         self._unaligned_note = gui.add_html("")
         self._facts = gui.add_html("")
-        self._changes = ChangesOnDisk()
         self._listed: object = None
         """Key of the data that the list was drawn for."""
         self._facts_of: tuple[Opened, str] | None = None
@@ -147,7 +146,7 @@ class ReviewPanel(PagePart[ReviewView]):
         self._align.show(view.align, options=by_name(view.alignments))
         unaligned = unaligned_text(view)
         self._unaligned_note.content = render("note", text=unaligned) if unaligned else ""
-        facts_of = view.chosen and (view.chosen, self._changes.of(view.chosen.episode.info))
+        facts_of = view.chosen and (view.chosen, view.changed_symbols)
         if self._facts_of != facts_of:
             self._facts_of = facts_of
             self._facts.content = facts_html(*facts_of) if facts_of else ""

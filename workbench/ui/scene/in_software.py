@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Hashable
+import asyncio
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import viser
@@ -14,10 +13,10 @@ from workbench.commands.page import TellDrawnInSoftware
 from workbench.core.scene.mesh_levels import from_afar
 from workbench.core.scene.shapes import SceneGeometry
 from workbench.machine.processes.watched_thread import report_failure
+from workbench.session.loop import Aside, begin, later, post
 from workbench.ui.scene.bodies import Looks
 from workbench.ui.scene.env_grid import EnvLayout
 from workbench.ui.scene.pixels import NEAREST, Eye, eyes_of
-from workbench.ui.widgets.parts import Clock
 from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.visitors import Visitor
 
@@ -33,6 +32,8 @@ AT_REST = 0.4
 PATIENCE = 3.0
 """Timeout in seconds within which a page says that it draws in software. Until then nothing changes: a reloaded
 page would be sent fine shapes and then simple ones."""
+Scene = tuple[SceneGeometry, EnvLayout, bool]
+"""A drawn scene, the grid of its envs, and whether one env alone is shown."""
 
 
 class InSoftware:
@@ -41,19 +42,20 @@ class InSoftware:
     All pages of a server are sent the same shapes: simplified ones only while every open page draws in software.
     """
 
-    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
-        self._server, self._clock = server, clock
-        self._told: set[int] = set()
-        self._came: dict[int, float] = {}
-        """Time when each page was seen first, by page."""
-        self._all = False
-        self._eyes: tuple[Hashable, ...] = ()
-        self._since = clock()
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._pages: dict[int, bool | None] = {}
+        """Whether each open page draws in software; None if that is not known yet."""
+        self.all_pages = False
+        """Whether all open pages draw in software."""
+        self._drawn: Scene | None = None
+        """The scene that is drawn, if it is drawn of simplified shapes."""
         self._made: tuple[SceneGeometry, float] | None = None
         """Scene and tolerance for which the simplified shapes are ready."""
-        self._unfit: SceneGeometry | None = None
-        """The scene whose shapes cannot be simplified."""
-        self._making: threading.Thread | None = None
+        self._simplifying: asyncio.Task[None] | None = None
+        self._aside = Aside("simplify")
+        server.on_client_connect(self._came)
+        server.on_client_disconnect(self._left)
 
     def ask(self) -> None:
         """Let the pages tell (``browser.js``). Call it in the main panel of each new page."""
@@ -61,26 +63,42 @@ class InSoftware:
 
     def told_by(self, visitor: Visitor) -> None:
         """Handle that a page draws its view in software."""
-        self._told.add(visitor.client.client_id)
+        post(partial(self._know, visitor.client.client_id, True))
 
-    @property
-    def all_pages(self) -> bool:
-        """Whether all open pages draw in software."""
-        clients, now = self._server.get_clients().keys(), self._clock()
-        self._came = {page: self._came.get(page, now) for page in clients}
-        self._told &= clients
-        untold = clients - self._told
-        if any(now - self._came[page] >= PATIENCE for page in untold):
-            self._all = False
-        elif clients and not untold:
-            self._all = True
-        return self._all
+    async def _came(self, client: viser.ClientHandle) -> None:
+        post(partial(self._expect, client.client_id))
+
+    async def _left(self, client: viser.ClientHandle) -> None:
+        post(partial(self._forget, client.client_id))
+
+    def _expect(self, page: int) -> None:
+        self._pages[page] = None
+        self._decide()
+        later(PATIENCE, lambda: self._know(page, self._pages.get(page) or False))
+
+    def _know(self, page: int, in_software: bool) -> None:
+        if page in self._pages:
+            self._pages[page] = in_software
+            self._decide()
+
+    def _forget(self, page: int) -> None:
+        self._pages.pop(page, None)
+        self._decide()
+
+    def _decide(self) -> None:
+        known = self._pages.values()
+        if False in known:
+            self.all_pages = False
+        elif known and None not in known:
+            self.all_pages = True
+        if self._simplifying is None and self.all_pages and known:
+            self._simplifying = begin(self._simplify())
 
     def looks(self, looks: Looks, geometry: SceneGeometry, layout: EnvLayout, alone: bool) -> Looks:
         """These looks, or cheaper ones that differ by about a pixel in the pages that are open.
 
-        Shapes are simplified in a thread, and drawn so when they are ready. Who asks for finer ones than usual has them, and
-        so has who looks at few.
+        Shapes are simplified in the background, and drawn so when they are ready. Who asks for finer ones than usual has
+        them, and so has who looks at few.
 
         Args:
             looks: As the person has chosen.
@@ -88,41 +106,50 @@ class InSoftware:
             layout: The grid of the envs.
             alone: One env is shown, at the origin.
         """
-        if not self.all_pages or geometry is self._unfit:
+        usual = not self.all_pages or looks.triangles > Looks().triangles
+        if usual or _triangles(geometry, alone) <= FEW:
+            self._drawn = None
             return looks
-        if looks.triangles > Looks().triangles or _triangles(geometry, alone) <= FEW:
-            return looks
-        eyes = eyes_of(self._server)
-        known = self._made is not None and self._made[0] is geometry
-        now = self._made[1] if known and self._made is not None else 0.0
-        if not eyes or (known and not self._rest(eyes)):
-            return replace(looks, error=now)
-        wanted = 2.0 ** (round(2 * np.log2(TOLERANCE * pixel_of(eyes, layout, alone))) / 2)
-        if not known or not 1 / STEADY < wanted / now < STEADY:
-            self._begin_to_make(geometry, wanted)
-        return replace(looks, error=now)
+        self._drawn, made = (geometry, layout, alone), self._made
+        return replace(looks, error=made[1] if made is not None and made[0] is geometry else 0.0)
 
-    def _rest(self, eyes: tuple[Eye, ...]) -> bool:
-        seen = tuple((eye.position.tobytes(), eye.pixel) for eye in eyes)
-        if seen != self._eyes:
-            self._eyes, self._since = seen, self._clock()
-        return self._clock() - self._since >= AT_REST
-
-    def _begin_to_make(self, geometry: SceneGeometry, error: float) -> None:
-        if self._making is None or not self._making.is_alive():
-            self._making = threading.Thread(target=self._make, args=(geometry, error), daemon=True)
-            self._making.start()
-
-    def _make(self, geometry: SceneGeometry, error: float) -> None:
+    async def _simplify(self) -> None:
+        """Simplify the shapes that are drawn, as long as all pages draw in software."""
+        seen: object = None
+        unfit: SceneGeometry | None = None
         try:
-            for visual in geometry.visuals:
-                from_afar(visual.mesh, error)
-        except Exception as why:
-            # Else it would be tried again at each step.
-            self._unfit = geometry
-            report_failure("Shapes cannot be simplified for pages that draw in software", why)
-        else:
-            self._made = geometry, error
+            while self.all_pages and self._pages:
+                await asyncio.sleep(AT_REST)
+                eyes, before = eyes_of(self._server), seen
+                seen = [(eye.position.tobytes(), eye.pixel) for eye in eyes]
+                wanted = self._wanted(eyes, seen == before)
+                if wanted is None or wanted[0] is unfit:
+                    continue
+                try:
+                    await self._aside.run(partial(_simplify_shapes, *wanted))
+                except Exception as why:
+                    unfit = wanted[0]  # else it would be tried again and again
+                    report_failure("Shapes cannot be simplified for pages that draw in software", why)
+                else:
+                    self._made = wanted
+        finally:
+            self._simplifying = None
+
+    def _wanted(self, eyes: tuple[Eye, ...], at_rest: bool) -> tuple[SceneGeometry, float] | None:
+        """The scene to simplify, and its tolerance; None if what was made is good enough."""
+        if not eyes or self._drawn is None:
+            return None
+        geometry, layout, alone = self._drawn
+        error = 2.0 ** (round(2 * np.log2(TOLERANCE * pixel_of(eyes, layout, alone))) / 2)
+        if self._made is not None and self._made[0] is geometry:
+            if not at_rest or 1 / STEADY < error / self._made[1] < STEADY:
+                return None
+        return geometry, error
+
+
+def _simplify_shapes(geometry: SceneGeometry, error: float) -> None:
+    for visual in geometry.visuals:
+        from_afar(visual.mesh, error)
 
 
 def _triangles(geometry: SceneGeometry, alone: bool) -> int:

@@ -262,7 +262,7 @@ class Stage:
         server.initial_camera.far = 300.0
         self.scene = SceneView(server, clock)
         self.framing = Framing(server)
-        self.in_software = InSoftware(server, clock)
+        self.in_software = InSoftware(server)
         self.choice = ViewChoice()
 
     def clear(self) -> None:

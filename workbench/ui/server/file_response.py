@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import gzip
+import hashlib
 import os
 import secrets
-import threading
 import urllib.parse
 import zlib
 from collections.abc import Callable, Mapping
@@ -146,9 +146,9 @@ class Downloads:
     """
 
     def __init__(self, gated_server: GatedServer) -> None:
-        self._lock = threading.Lock()
+        self._secret = secrets.token_bytes(32)
         self._files: dict[str, FileReply] = {}
-        self._ids: dict[FileReply, str] = {}
+        """Files by the random part of their address; requests read it on other threads."""
         gated_server.add_route(PREFIX, self._answer, headers=_POLICY)
 
     def address(self, path: Path, kind: str = "application/octet-stream", download: bool = False) -> str:
@@ -158,16 +158,15 @@ class Downloads:
             kind: Its content type.
             download: The browser saves it instead of showing it.
         """
-        path = Path(path).resolve()
+        path = Path(path).absolute()
         reply = FileReply(path, kind, download_as=path.name if download else None)
-        with self._lock:
-            key = self._ids.setdefault(reply, secrets.token_urlsafe(16))
-            self._files[key] = reply
+        # The same for the same file, and unknown to others.
+        key = hashlib.blake2b(repr(reply).encode(), key=self._secret, digest_size=16).hexdigest()
+        self._files[key] = reply
         return f"{PREFIX}{key}/{_quoted(path.name)}"
 
     def _answer(self, asked: str) -> tuple[int, str, bytes] | FileReply:
-        with self._lock:
-            reply = self._files.get(asked.partition("/")[0])
+        reply = self._files.get(asked.partition("/")[0])
         if reply is None:
             return 404, "text/plain; charset=utf-8", b"There is no such file."
         return reply

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import shutil
 import signal
 import tempfile
-import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -43,6 +43,7 @@ from workbench.recording.lerobot.export import ExportOptions, export_lerobot
 from workbench.recording.maniskill.export import export_maniskill
 from workbench.recording.reader.reading import read_recording
 from workbench.recording.reader.scan import SUFFIXES
+from workbench.session.loop import Aside, begin, on_loop, post, result_of
 from workbench.ui.share.scene_html import seconds_a_step, write_scene_html
 from workbench.ui.widgets.templates import counted, sentence
 
@@ -86,6 +87,8 @@ class Made:
     """A sentence for each damaged file of a recording of which the rest was used."""
     incomplete: tuple[str, ...] = ()
     """A sentence for each recording that lacks something of what was made."""
+    sizes: tuple[int, ...] = ()
+    """Bytes of each file, for downloads."""
 
     @property
     def said(self) -> tuple[str, ...]:
@@ -308,73 +311,84 @@ class MakingView:
 
 
 class Making:
-    """Makes one thing at a time, in another process. Thread-safe.
+    """Makes one thing at a time, in another process.
 
     Encoding a film takes a core for a while, and drawing a scene takes a renderer that the server's process must not
     import: a crash in a driver would take the page along. Work that is stopped leaves no files.
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self._view = MakingView()
-        self._stopped = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._stopped = False
+        self._aside = Aside("making")
+        """Waits for the process."""
+        self._task: asyncio.Task[None] | None = None
         self._scratch: Path | None = None
 
     def view(self) -> MakingView:
         return self._view
 
-    def scratch(self) -> Path:
-        """A temporary folder for downloads; `close` deletes it."""
-        with self._lock:
-            if self._scratch is None:
-                self._scratch = Path(tempfile.mkdtemp(prefix="workbench-shared-"))
-            return self._scratch
+    @on_loop
+    def start(self, wanted: MakeRequest, download: bool = False) -> bool:
+        """Begin; False if something is being made already.
 
-    def start(self, wanted: MakeRequest) -> bool:
-        """Begin; False if something is being made already."""
-        with self._lock:
-            if self._view.running:
-                return False
-            self._stopped.clear()
-            self._view = MakingView(running=True, doing="starting", made=self._view.made)
-            self._thread = threading.Thread(target=self._run, args=(wanted,), name="making", daemon=True)
-            self._thread.start()
-            return True
+        Args:
+            download: make it in a new temporary folder, which `close` deletes, and not in `wanted.folder`.
+        """
+        if self._view.running:
+            return False
+        self._stopped = False
+        self._view = MakingView(running=True, doing="starting", made=self._view.made)
+        self._task = begin(self._make(wanted, download))
+        return True
 
     def stop(self) -> None:
         """End the present work and leave no files of it. Returns at once."""
-        self._stopped.set()
+        self._stopped = True
 
     def close(self) -> None:
-        """Stop, wait for the end of the process, and delete the scratch folder."""
+        """Stop, wait for the end of the process, and delete the downloads. Called on another thread than the loop."""
         self.stop()
-        if self._thread is not None:
+        if self._task is not None:
             # One that hangs is ended with this process, by its `machine.processes.family`.
-            self._thread.join(END_SECONDS)
+            result_of(asyncio.wait([self._task], timeout=END_SECONDS))
+        self._aside.end()
         if self._scratch is not None:
             shutil.rmtree(self._scratch, ignore_errors=True)
 
-    def _run(self, wanted: MakeRequest) -> None:
+    async def _make(self, wanted: MakeRequest, download: bool) -> None:
+        came = await self._aside.run(lambda: self._run(wanted, download))
+        made = tuple(one for one in came if isinstance(one, Made))
+        problem = "".join(one for one in came if isinstance(one, str) and not self._stopped)
+        self._view = MakingView(problem=problem, made=(*made, *self._view.made))
+
+    def _run(self, wanted: MakeRequest, download: bool) -> list[Made | str]:
+        """What was made, and why not. Runs beside the loop."""
         came: list[Made | str] = []
-        work = Work(_make, wanted, Made | str, tuple[float, str], "that makes it")
-        deal: Deal[Made | str, tuple[float, str]] = Deal(
-            range(1), lambda number, one: came.append(one), self._hear, self._stopped.is_set
-        )
+
+        def take(number: int, one: Made | str) -> None:
+            if download and isinstance(one, Made):
+                one = replace(one, sizes=tuple(path.stat().st_size for path in one.paths))
+            came.append(one)
+
+        def hear(news: tuple[float, str]) -> None:
+            post(lambda: self._hear(*news))
+
         try:
-            Processes(1).run(work, deal)
+            if download:
+                self._scratch = self._scratch or Path(tempfile.mkdtemp(prefix="workbench-shared-"))
+                # A new folder each time: a file of the same name may exist from before.
+                wanted = replace(wanted, folder=Path(tempfile.mkdtemp(dir=self._scratch)))
+            work = Work(_make, wanted, Made | str, tuple[float, str], "that makes it")
+            Processes(1).run(work, Deal(range(1), take, hear, lambda: self._stopped))
         except OSError as error:
-            came.append(f"The process that makes it could not be started: {error}.")
+            came.append(f"It could not be started: {error}.")
         except PoolError as error:
             came.append(sentence(str(error)))
-        with self._lock:
-            made = tuple(one for one in came if isinstance(one, Made))
-            problem = "".join(one for one in came if isinstance(one, str) and not self._stopped.is_set())
-            self._view = MakingView(problem=problem, made=(*made, *self._view.made))
+        return came
 
-    def _hear(self, news: tuple[float, str]) -> None:
-        with self._lock:
-            self._view = replace(self._view, done=news[0], doing=news[1])
+    def _hear(self, done: float, doing: str) -> None:
+        self._view = replace(self._view, done=done, doing=doing)
 
 
 class _Stopped(BaseException):

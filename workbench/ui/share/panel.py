@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import re
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -227,21 +226,19 @@ class SharePanel:
             folder = self._folder / "datasets" / dataset_name(choices.what, f"{now:%Y-%m-%dT%H-%M-%S}")
             self._making.start(replace(wanted, folder=folder, export=export))
             return
-        # A new folder each time: a file of the same name may exist from before.
-        folder = Path(tempfile.mkdtemp(dir=self._making.scratch()))
-        self._making.start(replace(wanted, folder=folder, camera=self._camera()))
+        self._making.start(replace(wanted, camera=self._camera()), download=True)
 
     def _html(self, view: MakingView) -> str:
         made = [(one, self._links(one)) for one in view.made[:MOST_SHOWN]]
         return render("share", view=view, made=made)
 
-    def _links(self, made: Made) -> list[tuple[str, Path, str]]:
-        """Address, path and short name of each file."""
-        # A dataset stays where it is: the .h5 of demonstrations belongs to the .json beside it.
-        kept = self._folder / "datasets"
-        files = [path for path in made.paths if path.is_file() and not path.is_relative_to(kept)]
-        short = short_names([path.name for path in files])
-        return [(self._offers.address(path, download=True), path, name) for path, name in zip(files, short)]
+    def _links(self, made: Made) -> list[tuple[str, str, str, int]]:
+        """Address, name, short name and bytes of each file to download. A dataset stays where it is: the .h5 of
+        demonstrations belongs to the .json next to it."""
+        paths = made.paths[: len(made.sizes)]
+        names = [path.name for path in paths]
+        addresses = [self._offers.address(path, download=True) for path in paths]
+        return list(zip(addresses, names, short_names(names), made.sizes))
 
 
 def will_make(
@@ -345,6 +342,10 @@ class SharePart(PagePart[ReviewView]):
     def do(self, command: Command, visitor: Visitor) -> None:
         owner = self._rerun if isinstance(command, RerunView.does) else self._share
         owner.do(command, visitor)
+
+    def close(self) -> None:
+        """Called when the page goes."""
+        self._rerun.end()
 
     def draw(self, view: ReviewView) -> None:
         opened = {one.id: one.episode for one in view.opened}

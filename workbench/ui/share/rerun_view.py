@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import gzip
+import hashlib
 import logging
 import secrets
-import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -20,6 +21,8 @@ from workbench.commands.share import CloseRerun, OpenInRerun
 from workbench.machine.folders import web_assets_folder
 from workbench.recording.reader.reading import read_store_id
 from workbench.recording.rerun.viewer import VIEWER_FILES, VIEWER_POLICY, viewer_file, viewer_is_cached
+from workbench.session.loop import Aside, later, on_loop, post
+from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.ui.server.file_response import Downloads, FileReply
 from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.widgets.templates import render
@@ -57,9 +60,11 @@ class RerunPages:
 
     def __init__(self, gated_server: GatedServer, offers: Downloads) -> None:
         self._offers = offers
-        self._lock = threading.Lock()
+        self._secret = secrets.token_bytes(32)
         self._shown: dict[str, tuple[tuple[Path, ...], Callable[[], Moments]]] = {}
-        self._keys: dict[tuple[Path, ...], str] = {}
+        """Recordings by the random part of their address; requests read it on other threads."""
+        self.unpacking = Aside("rerun-viewer")
+        """Unpacks the viewer."""
         headers = {"Content-Security-Policy": VIEWER_POLICY, "Cache-Control": "private, max-age=604800"}
         gated_server.add_route(_VIEWER, _viewer_file, headers)
         gated_server.add_route(_SHOW, self._go_on, {**headers, "Cache-Control": "no-store"})
@@ -70,21 +75,20 @@ class RerunPages:
         Args:
             moments: called when the address is opened; the step at which each of them begins, if not the first.
         """
-        paths = tuple(Path(path).resolve() for path in recordings)
-        with self._lock:
-            key = self._keys.setdefault(paths, secrets.token_urlsafe(16))
-            self._shown[key] = paths, moments
+        paths = tuple(Path(path).absolute() for path in recordings)
+        # The same for the same files, and unknown to others.
+        key = hashlib.blake2b(repr(paths).encode(), key=self._secret, digest_size=16).hexdigest()
+        self._shown[key] = paths, moments
         return f"{_SHOW}{key}/"
 
     def _go_on(self, asked: str) -> tuple[int, str, bytes]:
-        with self._lock:
-            shown = self._shown.get(asked.partition("/")[0])
+        shown = self._shown.get(asked.partition("/")[0])
         if shown is None:
             return 404, "text/plain; charset=utf-8", b"There is no such recording."
         paths, moments = shown
         names = ", ".join(path.stem for path in paths)
         # The first step too: rerun follows the data until it reads, at the end of a file, that it shall pause.
-        begins = {**dict.fromkeys(paths, 0), **{path.resolve(): step for path, step in moments().items()}}
+        begins = {**dict.fromkeys(paths, 0), **{path.absolute(): step for path, step in moments().items()}}
         page = render(
             "rerun_go_on",
             names=names,
@@ -135,15 +139,13 @@ class RerunView:
         self._server, self._pages, self._make_way = server, pages, make_way
         self._paths: tuple[Path, ...] = ()
         self._moments: Moments = {}
-        self._chosen = 0
         self._panel: viser.PanelHandle | None = None
-        self._lock = threading.Lock()
-        self._problem = ""
+        self._jobs = Jobs(lambda: None, self._failed)
         self._waiting = False
+        """Whether the viewer is being unpacked."""
+        self._problem = ""
         self._drawn: object = None
         self._width = LEAST
-        self._asked_at: float | None = None
-        """When a page last requested the panel's content, if the panel has got no width since."""
         self._button = server.gui.add_html("")
         self._words = server.gui.add_html("")
 
@@ -151,11 +153,8 @@ class RerunView:
         match command:
             case OpenInRerun() if not self._paths:
                 raise Refused("Select recordings that have a .rrd file first.")
-            case OpenInRerun() if viewer_is_cached():
-                self.open()
             case OpenInRerun():
-                # The page's next commands must not wait for the unpacking.
-                threading.Thread(target=self.open, daemon=True).start()
+                self.open()
             case CloseRerun():
                 self.close()
 
@@ -168,23 +167,28 @@ class RerunView:
             chosen: number of recordings, of which some may have no ``.rrd`` file.
             moments: the step at which each open one is looked at.
         """
-        self._moments = moments
-        self._chosen = len(paths) if chosen is None else chosen
-        self._paths = tuple(paths)
+        self._paths, self._moments = tuple(paths), moments
+        lacking = chosen is not None and chosen > len(self._paths)
+        wanted = (self._paths, lacking, self._waiting, self._problem)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
         off = not self._paths or self._waiting
         self._button.content = tools_html([tool("Open in rerun", OpenInRerun(), off=off)])
-        wanted = (self._paths, self._chosen, self._waiting, self._problem)
-        if wanted != self._drawn:
-            self._drawn = wanted
-            words = render(
-                "rerun",
-                address=self._address(self._paths) if self._paths else None,
-                lacking=self._chosen > len(self._paths),
-                waiting=self._waiting,
-                problem=self._problem,
-            )
-            self._words.content = words
-        self._widen()
+        self._words.content = render(
+            "rerun",
+            address=self._address(self._paths) if self._paths else None,
+            lacking=lacking,
+            waiting=self._waiting,
+            problem=self._problem,
+        )
+
+    def _address(self, paths: tuple[Path, ...]) -> str:
+        def moments() -> Moments:
+            post(lambda: later(SETTLES, self._widen))
+            return {path: self._moments.get(path, 0) for path in paths}
+
+        return self._pages.address(paths, moments)
 
     def _widen(self) -> None:
         """Set the panel's width once a page has placed it.
@@ -192,41 +196,29 @@ class RerunView:
         viser gives 300 pixels to a panel that is docked next to another, and ignores the width given at docking. The
         request for the panel's content tells that it is there.
         """
-        with self._lock:
-            asked = self._asked_at
-            if self._panel is not None and asked is not None and time.monotonic() - asked > SETTLES:
-                self._asked_at = None
-                self._panel.set_width(self._width)
+        if self._panel is not None:
+            self._panel.set_width(self._width)
 
-    def _address(self, paths: tuple[Path, ...]) -> str:
-        def moments() -> Moments:
-            with self._lock:
-                self._asked_at = time.monotonic()
-            return {path: self._moments.get(path, 0) for path in paths}
-
-        return self._pages.address(paths, moments)
-
+    @on_loop
     def open(self) -> None:
-        """Show the recordings in a panel next to the scene; returns when the viewer can be loaded."""
-        paths, moments = self._paths, self._moments
-        with self._lock:
-            if not paths or self._waiting:
-                return
-            self._waiting, self._problem = not viewer_is_cached(), ""
-        try:
-            if self._waiting:
-                self.draw(paths, self._chosen, moments)
-                viewer_file("index.html")
-        except RuntimeError as error:
-            self._problem = str(error)
-            return
-        finally:
-            self._waiting = False
-            self.draw(self._paths, self._chosen, self._moments)
+        """Show the recordings in a panel next to the scene, as soon as the viewer can be loaded."""
+        if not self._waiting:
+            self._problem = ""
+            self._jobs.start("opening rerun", partial(self._open, self._paths, self._moments))
+
+    async def _open(self, paths: tuple[Path, ...], moments: Moments, job: Job) -> None:
+        unpacking = self._pages.unpacking
+        if not await unpacking.run(viewer_is_cached):
+            self._waiting = True
+            try:
+                await unpacking.run(lambda: viewer_file("index.html"))
+            except RuntimeError as error:
+                raise JobFailed(str(error)) from error
+            finally:
+                self._waiting = False
         self.close()
         room = self._make_way(self._fold)
-        with self._lock:
-            self._panel = panel = self._server.gui.add_panel(order=6.0)
+        self._panel = panel = self._server.gui.add_panel(order=6.0)
         with panel.add_tab("rerun", viser.Icon.APP_WINDOW):
             self._server.gui.add_html(tools_html([tool("Close rerun", CloseRerun())]))
             begins = {path: moments.get(path, 0) for path in paths}
@@ -237,14 +229,23 @@ class RerunView:
         panel.dock_left()
         self._width = max(LEAST, round(SHARE * room))
 
-    def _fold(self, folded: bool) -> None:
-        with self._lock:
-            if self._panel is not None:
-                (self._panel.minimize if folded else self._panel.expand)()
+    def _failed(self, failure: JobFailed) -> None:
+        self._problem = str(failure)
 
+    def _fold(self, folded: bool) -> None:
+        if (panel := self._panel) is not None:
+            with suppress(RuntimeError):  # it was closed meanwhile
+                (panel.minimize if folded else panel.expand)()
+
+    @on_loop
     def close(self) -> None:
         """Remove the panel and the viewer in it."""
-        with self._lock:
-            panel, self._panel = self._panel, None
+        panel, self._panel = self._panel, None
         if panel is not None:
             panel.remove()
+
+    @on_loop
+    def end(self) -> None:
+        """Open nothing any more, because the page goes, and the panel with it."""
+        self._jobs.close()
+        self._panel = None
