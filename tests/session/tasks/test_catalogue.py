@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import re
 import threading
@@ -17,7 +18,7 @@ from PIL import Image
 
 from tests.drive.waiting import PATIENCE, until
 from workbench.jobs.task import TaskOptions
-from workbench.session.loop import result_of
+from workbench.session.loop import do, result_of
 from workbench.session.tasks import catalogue as catalogue_module
 from workbench.session.tasks import registered as registered_module
 from workbench.session.tasks.catalogue import Catalogue, Entry, Section
@@ -293,24 +294,41 @@ def test_maniskills_tasks_are_listed_and_drawn_once(child_process: None, tmp_pat
     assert again.view.ids == view.ids and again.view.why_not.keys() >= view.why_not.keys()
 
 
+class Process:
+    """Takes the place of the process of the pictures."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(registered_module, "Background", self.made)
+        self.asked: list[str] = []
+        self.ended = self.closed = 0
+
+    def made(self, niceness: int) -> Process:
+        assert niceness == 19
+        return self
+
+    def end(self) -> None:
+        self.ended += 1
+
+    def close(self) -> None:
+        self.closed += 1
+
+    async def ask(self, question: registered_module.DrawTask) -> object:
+        self.asked.append(question.env_id)
+        return await self.answer()
+
+    async def answer(self) -> object:
+        raise registered_module.JobFailed("it crashed")
+
+
+class Hanging(Process):
+    async def answer(self) -> object:
+        await asyncio.Event().wait()
+
+
 def test_a_task_that_cannot_be_drawn_is_not_tried_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[str] = []
-
-    class Process:
-        def __init__(self, niceness: int) -> None:
-            assert niceness == 19
-
-        def end(self) -> None: ...
-
-        def close(self) -> None: ...
-
-        async def ask(self, question: registered_module.DrawTask) -> object:
-            asked.append(question.env_id)
-            raise registered_module.JobFailed("it crashed")
-
-    monkeypatch.setattr(registered_module, "Background", Process)
+    process = Process(monkeypatch)
     cached(tmp_path, ["A-v1"], not_drawn={})
     for _ in range(4):
         tasks = RegisteredTasks(folder=tmp_path)
@@ -318,4 +336,34 @@ def test_a_task_that_cannot_be_drawn_is_not_tried_for_ever(
         until(lambda tasks=tasks: tasks.view.why_not and not tasks.view.doing, "its end")
         tasks.close()
         assert tasks.view.why_not["A-v1"].text == "it crashed"
-    assert asked == ["A-v1"] * registered_module.MOST_TRIES
+    assert process.asked == ["A-v1"] * registered_module.MOST_TRIES
+
+
+def test_a_picture_that_takes_too_long_is_left_out_and_its_process_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = Hanging(monkeypatch)
+    monkeypatch.setattr(registered_module, "ANSWER_SECONDS", 0.01)
+    tasks = RegisteredTasks(folder=cached(tmp_path, ["A-v1", "B-v1"], not_drawn={}))
+    tasks.start()
+    until(lambda: len(tasks.view.why_not) == 2 and not tasks.view.doing, "its end")
+    assert process.ended >= 2 and "longer than" in tasks.view.why_not["A-v1"].text
+    tasks.close()
+
+
+def test_it_ends_in_the_middle_of_a_picture_and_begins_nothing_after_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = Hanging(monkeypatch)
+    folder = cached(tmp_path, ["A-v1"], not_drawn={})
+    tasks = RegisteredTasks(folder=folder)
+    tasks.start()
+    until(lambda: process.asked, "the question")
+    tasks.close()
+    until(lambda: not tasks.view.doing, "its end")
+    assert process.closed == 1 and not tasks.view.why_not
+    never = RegisteredTasks(folder=folder)
+    never.close()
+    never.start()
+    do(lambda: None)
+    assert never.view == registered_module.RegisteredView() and process.asked == ["A-v1"]
