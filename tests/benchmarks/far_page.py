@@ -42,6 +42,7 @@ from tests.ui.tabs import camera_message, handshake, messages_in
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.ui.app.live_page import Page
+from workbench.ui.app.pages import Pages
 from workbench.ui.scene.viewpoint import FOV, Stage
 from workbench.ui.server.gated_server import ServerOptions, open_server
 from workbench.ui.widgets.visitors import Visitors
@@ -129,10 +130,12 @@ def measure(played: Played, options: Options) -> str:
             recordings=Path(folder) / "kept",
             make_worker=partial(Playing, played, made),  # type: ignore[arg-type]
         )
-        page = Page(gated.server, Visitors(gated.server), session, stage=Stage(gated.server))
+        stage = Stage(gated.server)
+        page = Page(gated.server, Visitors(gated.server), session, stage=stage)
+        pages = Pages(gated.server, stage, lambda which, dark: page)
         wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
         page.redraw()
-        page.start()
+        pages.start("live")
         with line_to(gated.url, BITS, DELAY) as line:
             address, how = handshake(line.address(gated.url))
             how["compression"] = "deflate"
@@ -153,7 +156,7 @@ def measure(played: Played, options: Options) -> str:
                 times.append(client.press("Pause"))
             # Two messages an update, of positions and of rotations.
             rate = (client.counts["poses"] - poses) / 2 / (time.monotonic() - began)
-            page.stop()
+            pages.stop()
             session.close()
             gated.close()
             thread.join(20.0)

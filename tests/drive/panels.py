@@ -21,6 +21,7 @@ from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage
 
 from tests.drive.own_controls import Controls, SeenButton, SeenField
 from workbench.commands.command import Command, Refused
+from workbench.session.loop import result_of
 from workbench.ui.widgets.parts import Parts
 from workbench.ui.widgets.templates import asks
 from workbench.ui.widgets.visitors import Visitor, Visitors
@@ -295,7 +296,7 @@ class Panels:
     def do(self, command: Command) -> None:
         """Ask for this, as a key or a script does; why it was refused is among the notices."""
         try:
-            self.visitors.do(command, self.visitor)
+            result_of(self.visitors._carry_out(command, self.visitor))
         except Refused as reason:
             self.client.notices.append(str(reason))
         self._threads.wait()

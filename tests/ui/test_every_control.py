@@ -76,8 +76,7 @@ def with_values(kind: type[Command], seed: int) -> Iterator[Command]:
 
 @pytest.mark.parametrize("which", ["start", "live", "review"])
 def test_no_command_fails_otherwise_than_by_a_sentence(place: Workplace, which: Any) -> None:
-    place.pages.show(which)
-    assert place.pages.wait_for(which, timeout=60)
+    place.pages.show(which).result(60)
     assert inputs_of(place.server.gui) == [], "viser's own have no order beside commands"
     (visitor,), done = place.visitors.all(), 0
     for kind in COMMANDS:
@@ -90,4 +89,4 @@ def test_no_command_fails_otherwise_than_by_a_sentence(place: Workplace, which: 
             except Refused as reason:
                 assert str(reason).strip()
     assert done > {"start": 3, "live": 60, "review": 30}[which]
-    assert place.pages.wait_for(which, timeout=60)
+    assert place.pages.shown == which

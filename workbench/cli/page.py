@@ -34,7 +34,8 @@ from workbench.session.process.supervisor import WorkerOptions
 from workbench.session.protocol.messages import Event, Loaded, LoadFailed
 from workbench.session.tasks.recents import RecentTasks
 from workbench.ui.app.open_task import Choices
-from workbench.ui.app.workplace import Which, Workplace
+from workbench.ui.app.pages import Which
+from workbench.ui.app.workplace import Workplace
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.listening import ServerError
 

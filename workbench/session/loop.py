@@ -30,6 +30,7 @@ _here = threading.local()
 @functools.cache
 def _loop() -> asyncio.AbstractEventLoop:
     loop = asyncio.new_event_loop()
+    loop.set_exception_handler(_report)
 
     def run() -> None:
         _here.is_loop = True
@@ -37,6 +38,11 @@ def _loop() -> asyncio.AbstractEventLoop:
 
     threading.Thread(target=run, name="loop", daemon=True).start()
     return loop
+
+
+def _report(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Report what a task raised that nobody awaits."""
+    report_failure(context["message"], context.get("exception") or RuntimeError("of unknown cause"))
 
 
 def is_here() -> bool:
@@ -95,13 +101,18 @@ def later(seconds: float, change: Callable[[], object]) -> asyncio.TimerHandle:
     return _loop().call_later(seconds, change)
 
 
+def submit(work: Coroutine[Any, Any, Value]) -> futures.Future[Value]:
+    """Begin work on the loop, from another thread."""
+    return asyncio.run_coroutine_threadsafe(work, _loop())
+
+
 def result_of(work: Coroutine[Any, Any, Value], check: Callable[[], None] = lambda: None) -> Value:
     """Wait for work on the loop; called on another thread than the loop.
 
     Args:
         check: called often meanwhile; what it raises cancels the work, and is raised.
     """
-    future = asyncio.run_coroutine_threadsafe(work, _loop())
+    future = submit(work)
     while True:
         done, _ = futures.wait([future], _LOOK)
         if done:
@@ -179,11 +190,12 @@ class Aside:
         self._ended = True
         self._work.put(None)
 
-    def close(self) -> None:
-        """End the thread when all queued work is done, and wait for that; called on another thread than the loop."""
+    def close(self, within: float | None = None) -> None:
+        """End the thread when all queued work is done, and wait for that, at most so many seconds; called on another thread
+        than the loop."""
         self.end()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(within)
 
     def _run(self) -> None:
         while (next_work := self._work.get()) is not None:

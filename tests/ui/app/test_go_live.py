@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
@@ -20,8 +21,10 @@ from workbench.commands.run import PlayRun
 from workbench.jobs.task import TaskOptions
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
+from workbench.session.loop import do
 from workbench.session.protocol.messages import LoadFailed
 from workbench.ui.app.go_live import GoLive, GoLivePart
+from workbench.ui.app.pages import Which
 from workbench.ui.app.workplace import Workplace
 from workbench.ui.server.gated_server import GatedServer
 
@@ -50,6 +53,9 @@ class Desk:
         self.place, self.live, self.other, self.panels = place, live, other, panels
         self.person = Person()
         self.opened: list[TaskName] = []
+        self.shown: list[str] = []
+        """Pages that were asked for; none is built."""
+        place.pages.show = self._show
         self.go_live = GoLive(place, self._make, self.person, TaskOptions())
         self.part = GoLivePart(place.server, self.go_live)
         panels.visitors.do = self.part.do
@@ -59,12 +65,17 @@ class Desk:
         self.opened.append(task)
         return self.other
 
+    def _show(self, which: Which, anew: bool = False) -> Future[None]:
+        self.shown.append(which)
+        return Future()
+
     def go(self, which: int, state: int = 2) -> None:
-        self.go_live.go(self.place.shelf.review.view().opened[which].id, state)
+        opened = self.place.shelf.review.view().opened[which]
+        do(lambda: self.go_live.go(opened.id, state))
 
     def is_led_to_the_live_page(self) -> None:
         """Though nobody looks: nothing draws the review here."""
-        until(lambda: self.place.pages._wish == "live", "the live page", seen=self.go_live.going)
+        until(lambda: self.shown == ["live"], "the live page", seen=self.go_live.going)
         assert self.go_live.going() == ""
 
 
@@ -116,7 +127,7 @@ def test_what_fails_on_the_way_is_shown_live_and_what_failed_before_is_no_reason
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
     time.sleep(0.2)  # so long a page would be led there for a failure
-    assert desk.go_live.going() == "restoring Push-v1 at step 2 …" and desk.place.pages._wish is None
+    assert desk.go_live.going() == "restoring Push-v1 at step 2 …" and desk.shown == []
     desk.live._take(LoadFailed(problem(), kept=True))
     desk.is_led_to_the_live_page()
 
@@ -167,6 +178,6 @@ def test_who_presses_again_stays_and_nobody_is_asked_any_more(desk: Desk) -> Non
 def test_a_review_that_is_shown_anew_waits_for_nothing_that_is_under_way(desk: Desk) -> None:
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
-    assert desk.go_live.going()
+    until(lambda: desk.go_live.going().startswith("restoring"), "the way")
     GoLivePart(desk.place.server, desk.go_live)
     assert desk.go_live.going() == ""

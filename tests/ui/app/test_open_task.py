@@ -20,6 +20,7 @@ from workbench.core.camera_data import CameraKey, CameraSettings
 from workbench.jobs.task import TaskOptions
 from workbench.session.cameras.events import CameraChosen, CameraPlaced
 from workbench.session.live.session import KeptWork, Session
+from workbench.session.loop import do, result_of
 from workbench.session.tasks.catalogue import Entry, Section
 from workbench.session.tasks.recents import RecentTasks
 from workbench.session.tasks.registered import RegisteredTasks
@@ -52,7 +53,8 @@ class Desk:
         return next(one for one in self.catalogue.view().entries if one.name == name)
 
     def choose(self, name: str) -> None:
-        self.place.open_task.choose(self.row(name).number)
+        number = self.row(name).number
+        do(lambda: self.place.open_task.choose(number))
 
     def session_of(self, name: str) -> Session:
         """The open session, once it is that of this file."""
@@ -104,7 +106,7 @@ def test_a_file_of_the_folder_opens_unasked_with_the_options_of_the_run(desk: De
     desk.choose("push.py")
     session = desk.session_of("push.py")
     assert desk.opened == [(str(desk.folder / "work/push.py"), TaskOptions(5))]
-    assert desk.place.pages.wait_for("live", 60)
+    until(lambda: desk.place.pages.shown == "live", "the page")
     desk.choose("push.py")
     desk.idle()
     assert desk.place.home is session, "what is open is not opened again"
@@ -114,7 +116,7 @@ def test_a_file_of_the_folder_opens_unasked_with_the_options_of_the_run(desk: De
 def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
     desk.choose("push.py")
     first = desk.session_of("push.py")
-    desk.place.pages.wait_for("live", 60)
+    until(lambda: desk.place.pages.shown == "live", "the page")
     first.change(selected_env=1, speed=2.0)
     now = camera(first, CAMERA).now
     assert now is not None
@@ -141,7 +143,7 @@ def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
 def test_a_file_from_elsewhere_asks_once_and_a_no_leaves_all_as_it_is(desk: Desk) -> None:
     desk.choose("push.py")
     first = desk.session_of("push.py")
-    desk.place.pages.wait_for("live", 60)
+    until(lambda: desk.place.pages.shown == "live", "the page")
     desk.choose("other.py")
     asked = until(lambda: desk.panels.html("wb-trust"), "the question")
     assert TASK.splitlines()[1] in asked and "outside of the folder" in asked
@@ -177,7 +179,7 @@ def test_what_is_gone_is_said_and_nothing_is_opened(desk: Desk) -> None:
     file = desk.folder / "work/push.py"
     row = desk.row("push.py")
     file.unlink()
-    desk.place.open_task.choose(row.number)
+    do(lambda: desk.place.open_task.choose(row.number))
     desk.idle()
     until(lambda: [one.name for one in desk.rows(Section.FOLDER)] == ["pull.py"], "the list without it")
     assert desk.opened == [] and desk.place.session is None
@@ -186,11 +188,12 @@ def test_what_is_gone_is_said_and_nothing_is_opened(desk: Desk) -> None:
 def test_the_recordings_are_a_row_and_a_task_is_opened_from_there_too(
     child_process: None, desk: Desk
 ) -> None:
-    desk.place.open_task.choose(desk.rows(Section.RECORDINGS)[0].number)
-    assert desk.place.pages.wait_for("review", 60)
+    (recordings,) = desk.rows(Section.RECORDINGS)
+    do(lambda: desk.place.open_task.choose(recordings.number))
+    until(lambda: desk.place.pages.shown == "review", "the page")
     desk.choose("push.py")
     desk.session_of("push.py")
-    assert desk.place.pages.wait_for("live", 60)
+    until(lambda: desk.place.pages.shown == "live", "the page")
 
 
 def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
@@ -212,8 +215,8 @@ def test_the_machine_is_free_for_pictures_only_while_no_task_is_at_work(
 def test_a_new_task_is_written_where_the_workbench_was_started_and_opened(desk: Desk) -> None:
     for name in ("push", "../elsewhere/mine", "class"):
         with pytest.raises(ValueError):
-            desk.place.open_task.create(name, "minimal")
-    desk.place.open_task.create("stack_two", "tabletop")
+            result_of(desk.place.open_task.create(name, "minimal"))
+    result_of(desk.place.open_task.create("stack_two", "tabletop"))
     desk.session_of("stack_two.py")
     assert "class StackTwoEnv" in (desk.folder / "work" / "stack_two.py").read_text()
     assert desk.row("stack_two.py").section is Section.FOLDER

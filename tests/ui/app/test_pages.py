@@ -58,8 +58,7 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
     threads: list[int] = []
     for number in range(SWAPS):
         which = "review" if number % 2 == 0 else "live"
-        place.pages.show(which)
-        assert place.pages.wait_for(which, timeout=60)
+        place.pages.show(which).result(60)
         with tabs_of(gated_server.url) as tabs:
             tab = tabs.open()
             until(lambda tab=tab: tab.open and panels.html("wb-status"), f"the {which} page, drawn")
@@ -121,7 +120,7 @@ def test_a_recording_that_is_wanted_is_opened_also_if_it_is_not_the_newest(
     write(tmp_path, made(4, seed=9))
     place.pages.start("live")
     place.look_at(older)
-    assert place.pages.wait_for("review", timeout=60)
+    until(lambda: place.pages.shown == "review", "the page")
     review = place.shelf.review
     with tabs_of(gated_server.url) as tabs:
         tabs.open()

@@ -17,7 +17,8 @@ from workbench.session.live.session import Session
 from workbench.session.record.recording import RecordingWanted
 from workbench.session.record.saving import SaveWanted
 from workbench.session.run.events import EnvsReset
-from workbench.ui.app.workplace import Which, Workplace
+from workbench.ui.app.pages import Which
+from workbench.ui.app.workplace import Workplace
 from workbench.ui.server.gated_server import GatedServer
 
 

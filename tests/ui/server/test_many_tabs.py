@@ -23,6 +23,7 @@ from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
 from workbench.session.run.events import PagesCounted, RunEvent
 from workbench.ui.app.live_page import Page
+from workbench.ui.app.pages import Pages
 from workbench.ui.scene.viewpoint import Stage
 from workbench.ui.server import strangers
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
@@ -65,13 +66,14 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     gated_server, told = open_server(ServerOptions(port=0)), [0]
     session, stage = Told(told, tmp_path_factory.mktemp("author")), Stage(gated_server.server)
     page = Page(gated_server.server, Visitors(gated_server.server), session, stage=stage)
-    page.start()
+    pages = Pages(gated_server.server, stage, lambda which, dark: page)
+    pages.start("live")
     try:
         with tabs_of(gated_server.url) as tabs:
             wait_until(session, lambda view: view.task is not None, "the first load")
             yield House(gated_server, session, stage, tabs, told)
     finally:
-        page.stop()
+        pages.stop()
         session.close()
         gated_server.close()
 

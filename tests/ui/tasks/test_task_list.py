@@ -49,7 +49,7 @@ class Chosen:
     def choose(self, number: int) -> None:
         self.numbers.append(number)
 
-    def create(self, name: str, template: TemplateName) -> None:
+    async def create(self, name: str, template: TemplateName) -> None:
         if name == "taken":
             raise ValueError("There is a file taken.py already.")
         self.created.append((name, template))
@@ -116,14 +116,13 @@ def test_enter_opens_the_first_that_is_not_open_or_says_that_there_is_none(
     panels.visitors.do = TaskList(panels.server, chosen).do
     panels.type("Search", ".py")
     panels.do(OpenFoundTask())
-    until(lambda: chosen.numbers == [number_of(chosen, "pull.py")], "the one that is not open")
+    assert chosen.numbers == [number_of(chosen, "pull.py")]
     panels.type("Search", "push.py")
     panels.do(OpenFoundTask())
-    until(lambda: chosen.numbers[1:] == [number_of(chosen, "push.py")], "the only one")
+    assert chosen.numbers[1:] == [number_of(chosen, "push.py")]
     panels.type("Search", "nothing like it")
     panels.do(OpenFoundTask())
-    until(lambda: len(panels.client.notices) == 1, "the reason")
-    assert len(chosen.numbers) == 2
+    assert len(chosen.numbers) == 2 and len(panels.client.notices) == 1
 
 
 def test_a_path_is_looked_for_and_enter_opens_what_it_means_then(
@@ -142,7 +141,6 @@ def test_a_path_is_looked_for_and_enter_opens_what_it_means_then(
     file.parent.mkdir()
     file.write_text("class Other(BaseEnv): pass\n")
     panels.do(OpenFoundTask())
-    until(lambda: chosen.numbers, "the file")
     entry = chosen.catalogue.entry(chosen.numbers[0])
     assert entry is not None and entry.file == file
     panels.type("Search", f"{file}:Other")
@@ -151,8 +149,7 @@ def test_a_path_is_looked_for_and_enter_opens_what_it_means_then(
     for words in (f"{file}", "push.py"):
         panels.type("Search", words)
     panels.do(OpenFoundTask())
-    until(lambda: len(chosen.numbers) == 2, "the file of the folder")
-    assert chosen.numbers[1] == number_of(chosen, "push.py")
+    assert chosen.numbers[1:] == [number_of(chosen, "push.py")]
     assert panels.client.notices == []
 
 
@@ -162,9 +159,8 @@ def test_words_that_no_path_can_have_leave_the_list_alive(panels: Panels, chosen
     panels.visitors.do = listed.do
     panels.type("Search", words)
     panels.do(OpenFoundTask())
-    until(lambda: panels.client.notices, "the reason")
     listed.draw()
-    assert chosen.numbers == []
+    assert chosen.numbers == [] and len(panels.client.notices) == 1
 
 
 def test_the_best_match_is_a_file_that_is_there() -> None:

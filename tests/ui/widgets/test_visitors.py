@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import threading
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ from workbench.commands.command import Command, Refused
 from workbench.commands.envs import NextEnv, SelectEnv
 from workbench.commands.run import SetSeed, Step, TogglePlay
 from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.widgets.visitors import PATH, Visitor, Visitors
+from workbench.ui.widgets.visitors import PATH, Done, Visitor, Visitors
 
 
 @dataclass
@@ -32,14 +33,21 @@ class House:
     came: list[tuple[str, Command]] = field(default_factory=list)
     go_on: threading.Event = field(default_factory=threading.Event)
 
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         match command:
             case NextEnv():
-                assert self.go_on.wait(PATIENCE)
+                return self._wait(command, visitor)
             case SelectEnv(env=env) if env > 3:
                 raise Refused(f"There is no env {env}.")
             case TogglePlay():
                 raise LookupError("of a test")
+        self.came.append((visitor.name, command))
+        return None
+
+    async def _wait(self, command: Command, visitor: Visitor) -> None:
+        async with asyncio.timeout(PATIENCE):
+            while not self.go_on.is_set():
+                await asyncio.sleep(0.01)
         self.came.append((visitor.name, command))
 
     def names(self) -> list[str]:

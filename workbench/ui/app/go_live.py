@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +29,7 @@ from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.side_files import side_files_text
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared
 from workbench.session.live.session import Session
-from workbench.session.loop import begin, do
+from workbench.session.loop import Aside, begin, do
 from workbench.session.review.view import ReviewView
 from workbench.ui.live.banners import is_busy_for_long
 from workbench.ui.review.rescore import RECORDED, TODAYS
@@ -52,6 +51,8 @@ NEW_ENVS = 4
 
 _LOOK = 0.05
 """Seconds between two checks whether a live env exists."""
+_OPENED_WITHIN = 2.0
+"""Seconds that the end of the program waits for a session that is being opened."""
 MakeSession = Callable[[TaskName, TaskOptions], Session]
 
 
@@ -62,9 +63,9 @@ class _Way:
     info: EpisodeInfo
     run: RecordedRun
     state: int
-    given_up: threading.Event = field(default_factory=threading.Event)
-    thread: threading.Thread | None = None
-    """Thread that waits for the consent to run the code."""
+    given_up: bool = False
+    asks: bool = False
+    """Whether a person may have to say that the code may run."""
     number: int = 0
     """Value of `TimelineView.entered` once the env has the recorded state."""
     problems: int = 0
@@ -84,7 +85,7 @@ class _Way:
         """Text for the page: what the transition waits for."""
         task = self.info.task
         if self.session is None:
-            return f"waiting for permission to run the code of {task}"
+            return f"waiting for permission to run the code of {task}" if self.asks else f"opening {task} …"
         view = self.session.view()
         if view.task is None:
             doing = f"loading {task} at step {self.state}"
@@ -98,7 +99,7 @@ class GoLive:
 
     If the recording's task is open already, its env (or all) gets the recorded state; else another session is opened
     for it, and closed here, with the folder of a recorded text. The review stays until the live page has something to
-    show.
+    show. Used on the loop, but for `close`.
 
     Args:
         place: The pages, and the open session, if any.
@@ -115,10 +116,12 @@ class GoLive:
         base: TaskOptions,
     ) -> None:
         self._place, self._make, self._clearances, self._base = place, make_session, clearances, base
-        self._lock = threading.Lock()
         self._own: tuple[Session, Path | None] | None = None
         self.recorded_source, self.everywhere = False, False
         self._way: _Way | None = None
+        self._opening = Aside("go-live")
+        """Asks for consent, and opens sessions."""
+        self._ending = Aside("end-session")
 
     def go(self, id: str, state: int) -> None:
         """Continue live from a state of an opened recording; if that is in progress, cancel it."""
@@ -134,74 +137,88 @@ class GoLive:
         except CannotEnterRecording as error:
             self._say(str(error))
             return
-        info = one.episode.info
-        if (why := self._clearances.refused_arguments(info)) is not None:
-            self._say(sentence(why))
-            return
         if self.recorded_source:
             run = replace(run, name=f"{run.name} as it was recorded")
-        self._way = way = _Way(info, run, state)
-        there = None if self.recorded_source else self._open_already(info)
-        if there is not None:
-            self._enter(there, way)
-            return
-        wanted = CodeToRun(reference_of(info), info, self.recorded_source, followed=not self.recorded_source)
-        # An answer may take long, and what a page asks for next waits for the end of this.
-        way.thread = threading.Thread(
-            target=self._clear_and_go, args=(way, wanted), name="clear", daemon=True
-        )
-        way.thread.start()
+        self._way = way = _Way(one.episode.info, run, state)
+        begin(self._go(way))
+
+    async def _go(self, way: _Way) -> None:
+        info, recorded_source = way.info, self.recorded_source
+        try:
+            why = await self._opening.run(lambda: self._clearances.refused_arguments(info))
+            if why is not None:
+                raise NotCleared(why)
+            session = None if recorded_source else self._open_already(info)
+            if session is None:
+                session = await self._open(way, recorded_source)
+            if session is not None:
+                await self._enter(session, way)
+        except (CannotEnterRecording, NotCleared) as error:
+            if not way.given_up:
+                self._say(sentence(str(error)))
+        finally:
+            if self._way is way:
+                self._way = None
 
     def _open_already(self, info: EpisodeInfo) -> Session | None:
         """An open session with this task in today's code."""
-        with self._lock:
-            session = self._place.session
-            if session is not None and (self._own is None or self._own[1] is None):
-                task = session.view().task
-                if task is None or not why_not_enter(task, info):
-                    return session
-            known = self._place.home if self._place.home is not session else None
-            task = None if known is None else known.view().task
-            return known if task is not None and not why_not_enter(task, info) else None
+        session = self._place.session
+        if session is not None and (self._own is None or self._own[1] is None):
+            task = session.view().task
+            if task is None or not why_not_enter(task, info):
+                return session
+        known = self._place.home if self._place.home is not session else None
+        task = None if known is None else known.view().task
+        return known if task is not None and not why_not_enter(task, info) else None
 
-    def _clear_and_go(self, way: _Way, wanted: CodeToRun) -> None:
-        folder: Path | None = None
-        try:
-            reference = self._clearances.clear(wanted, way.given_up.is_set)
+    async def _open(self, way: _Way, recorded_source: bool) -> Session | None:
+        """Another session for the recording's task; None if the transition is given up meanwhile.
+
+        Raises:
+            CannotEnterRecording, NotCleared: it may not be opened.
+        """
+        info = way.info
+        wanted = CodeToRun(reference_of(info), info, recorded_source, followed=not recorded_source)
+        options = options_of(info, NEW_ENVS if self.everywhere else 1, self._base)
+
+        def open_cleared() -> tuple[Session, Path | None] | None:
+            folder, reference = None, self._clearances.clear(wanted, lambda: way.given_up)
             if wanted.recorded_text:
-                folder, reference = write_source(wanted.info)
-        except (CannotEnterRecording, NotCleared) as error:
-            if not way.given_up.is_set():
-                self._say(sentence(str(error)))
-            if self._way is way:
-                self._way = None
-            return
-        with self._lock:
-            if way.given_up.is_set():
-                if folder is not None:
-                    shutil.rmtree(folder, ignore_errors=True)
-                return
-            session = self._open(reference, options_of(wanted.info, self._count(), self._base), folder)
-        self._enter(session, way)
+                folder, reference = write_source(info)
+            if not way.given_up:
+                if self._place.home is not None:
+                    self._place.home.do(PauseRun())
+                return self._make(reference, options), folder
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+            return None
 
-    def _enter(self, session: Session, way: _Way) -> None:
+        way.asks = True
+        opened = await self._opening.run(open_cleared)
+        if opened is None or way.given_up:
+            if opened is not None:
+                self._ending.begin(lambda: _end(*opened))
+            return None
+        self._let_go()
+        self._own = opened
+        return opened[0]
+
+    async def _enter(self, session: Session, way: _Way) -> None:
+        """Put the recorded state into the env, and show the live page once it is there."""
         self._place.session = session
         way.problems = session.view().problem_serial
         way.number = session.enter_recording(way.run, self.everywhere, way.info.source_file, way.info.source)
         way.session = session
-        do(lambda: begin(self._change_pages_when_there(way)))
-
-    async def _change_pages_when_there(self, way: _Way) -> None:
         while self._way is way:
             if way.is_over():
-                self._way = None
                 self._place.pages.show("live")
+                return
             await asyncio.sleep(_LOOK)
 
     def _give_up(self) -> None:
         way, self._way = self._way, None
         if way is not None:
-            way.given_up.set()
+            way.given_up = True
 
     def going(self) -> str:
         """Text: what the transition waits for; empty without a transition."""
@@ -224,42 +241,25 @@ class GoLive:
             return
         self._place.session = self._place.home
         self._place.pages.show("live")
-        with self._lock:
-            self._let_go()
+        self._let_go()
 
     def let_go(self) -> None:
         """Give up a transition, and end a session that was opened here, because a person opens another task."""
         self._give_up()
-        with self._lock:
-            self._let_go()
+        self._let_go()
 
     def close(self) -> None:
-        """End the session opened here; the pages must be stopped."""
-        way = self._way
-        self._give_up()
-        if way is not None and way.thread is not None:
-            way.thread.join()
-        with self._lock:
-            own, self._own = self._own, None
-        if own is not None:
-            _end(*own)
-
-    def _count(self) -> int:
-        return NEW_ENVS if self.everywhere else 1
-
-    def _open(self, reference: TaskName, options: TaskOptions, folder: Path | None) -> Session:
-        if self._place.home is not None:
-            self._place.home.do(PauseRun())
-        session = self._make(reference, options)
-        self._let_go()
-        self._own = session, folder
-        return session
+        """End the session opened here; the pages must be stopped. Called on another thread than the loop."""
+        do(self.let_go)
+        self._opening.close(_OPENED_WITHIN)
+        do(lambda: None)  # what was opened meanwhile is given up by now
+        self._ending.close()
 
     def _let_go(self) -> None:
-        """End the session that was opened here, in a thread; the caller shows another page meanwhile."""
-        if self._own is not None:
-            threading.Thread(target=_end, args=self._own, name="end-session", daemon=True).start()
-        self._own = None
+        """End the session that was opened here; the caller shows another page meanwhile."""
+        own, self._own = self._own, None
+        if own is not None:
+            self._ending.begin(lambda: _end(*own))
 
     def _say(self, text: str) -> None:
         tell_all(self._place.server, "This recording cannot be continued", text, "red")

@@ -33,8 +33,10 @@ from workbench.session.cameras.events import CameraChosen
 from workbench.session.live import state
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
+from workbench.session.loop import Aside, post
 from workbench.session.run.events import PagesCounted
 from workbench.ui.app.marks import EPISODES, STUDIO, Marks
+from workbench.ui.app.pages import draw_apart
 from workbench.ui.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.cameras.studio import StudioPanel
@@ -68,10 +70,9 @@ from workbench.ui.widgets.fields import choice
 from workbench.ui.widgets.hotkeys import add_hints, key_rows, register
 from workbench.ui.widgets.open_tabs import OpenTabs
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
-from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.tools import tool, tools_html
-from workbench.ui.widgets.visitors import Visitor, Visitors
+from workbench.ui.widgets.visitors import Done, Visitor, Visitors
 
 DOES: frozenset[type[Command]] = frozenset(
     {
@@ -128,7 +129,7 @@ class Page:
         visitors: Visitors,
         session: Session,
         dark: bool = True,
-        on_review: Callable[[], None] = lambda: None,
+        on_review: Callable[[], object] = lambda: None,
         on_look: Callable[[Path], None] = lambda path: None,
         stage: Stage | None = None,
         also: frozenset[type[Command]] = frozenset(),
@@ -141,7 +142,9 @@ class Page:
         self._clock = clock
         self._link = partial(editor_link, editor, known=session.knows_file)
         self._on_review, self._on_look = on_review, on_look
-        self._loop = RedrawLoop(server, "page", session.wait, lambda: self._count_clients() > 0, self.redraw)
+        self._visitors_counted = -1
+        self._choices = Aside("choices")
+        """Keeps what a person chose for later runs."""
         self._panels_due = DrawDue(PANELS_EVERY, clock)
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
@@ -184,7 +187,8 @@ class Page:
         register(server, visitors, kinds, "live page")
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", rows=key_rows(kinds)))
-        server.scene.on_click()(self._on_scene_click)
+        # viser awaits coroutines, although its types do not say so.
+        server.scene.on_click()(self._on_scene_click)  # type: ignore[arg-type]
 
     def _is_own(self, file: str) -> bool:
         return isinstance(self._session.reference, str) and self._session.knows_file(file)
@@ -257,21 +261,27 @@ class Page:
         self._envs_fitted = 0
         """Width of the page in pixels for which the width of the table was set last."""
 
-    # --- start and stop --------------------------------------------------------------------------
-
-    def start(self) -> None:
-        """Draw it, then keep drawing it in a thread."""
-        self._loop.start()
-
-    def stop(self) -> None:
-        """Stop redrawing; returns when the loop has ended."""
-        self._loop.stop()
-        # The session may live on under another page, and must not render for this one.
-        self._session.happen(PagesCounted(0))
+    # --- drawing ---------------------------------------------------------------------------------
 
     @property
     def dark(self) -> bool:
+        """Its theme."""
         return self._view_panel.dark
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """See `ShownPage`."""
+        return self._session.wait(seen, timeout)
+
+    def counted(self, visitors: int) -> None:
+        """So many browsers show it: for none, nothing is rendered."""
+        if visitors != self._visitors_counted:
+            self._visitors_counted = visitors
+            self._session.happen(PagesCounted(visitors))
+
+    def close(self) -> None:
+        """It is shown no more. The session may live on under another page, and must not render for this one."""
+        self.counted(0)
+        self._choices.end()
 
     def redraw(self) -> None:
         """Draw the present state of the session; where only steps advance, the panels are drawn less often than
@@ -287,7 +297,7 @@ class Page:
 
     # --- what a person does ----------------------------------------------------------------------
 
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         """Carry out a command of a page. Raises `Refused`."""
         session = self._session
         match command:
@@ -311,7 +321,7 @@ class Page:
                 self._view_panel.toggle_only_selected()
             case CloseHints():
                 self._hints.content = ""
-                close_hints()
+                self._choices.begin(close_hints)
             case SelectCamera():
                 session.do(command, visitor.name)
                 self._open_tabs.open(visitor, STUDIO)
@@ -323,7 +333,8 @@ class Page:
             case _ if isinstance(command, CamerasPanel.does):
                 self._cameras.do(command, visitor)
             case _:
-                self._parts.do(command, visitor)
+                return self._parts.do(command, visitor)
+        return None
 
     def _unfolded(self, panel: str) -> None:
         """Handle that a page shows this panel."""
@@ -354,11 +365,6 @@ class Page:
         else:
             self._envs.fold()
             self._env_window.minimize()
-
-    def _count_clients(self) -> int:
-        count = self._framing.follow()
-        self._session.happen(PagesCounted(count))
-        return count
 
     # --- the 3-D view ----------------------------------------------------------------------------
 
@@ -430,7 +436,10 @@ class Page:
             return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height, fovy, acting)
         return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
 
-    def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
+    async def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
+        post(lambda: self._clicked(event))
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
         layout, view = self._layout, self._session.view()
         if layout is None or view.task is None:
             return

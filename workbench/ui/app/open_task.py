@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import threading
+import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,9 +14,10 @@ from workbench.commands.run import PauseRun
 from workbench.commands.tasks import TemplateName
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import example_tasks
-from workbench.machine.processes.watched_thread import watched_thread
+from workbench.machine.processes.watched_thread import report_failure
 from workbench.session.clearance import Clearances, NotCleared
 from workbench.session.live.session import KeptWork, Session
+from workbench.session.loop import Aside, begin, result_of
 from workbench.session.tasks.catalogue import Catalogue, Entry, Section
 from workbench.session.tasks.recents import RecentTasks, lasting
 from workbench.ui.widgets.notices import tell_all
@@ -46,9 +47,9 @@ _SHOWN_WITHIN = 10.0
 class OpenTask:
     """Opens what a person chooses from the list.
 
-    One thread does it, since a question may wait for minutes and a session that ends writes its recordings. Of several
+    One at a time, since a question may wait for minutes and a session that ends writes its recordings. Of several
     wishes the last counts: a question for an earlier one is withdrawn. The page of the new session is shown first, then
-    the old session is closed as at the end of the program.
+    the old session is closed as at the end of the program. Used on the loop, but for `close`.
 
     Args:
         place: The pages and the open session.
@@ -62,16 +63,15 @@ class OpenTask:
     ) -> None:
         self._place, self._open_session = place, open_session
         self.catalogue, self._clearances = catalogue, clearances
-        self._wake = threading.Condition()
         self._wish: Entry | None = None
+        self._opening: asyncio.Task[None] | None = None
+        self._aside = Aside("open-task")
         self._doing = ""
         self._closing = False
         self._ran: set[str] = set()
         """References of tasks that were open in this run; opening one again asks for no consent."""
         self._kept: dict[str, KeptWork] = {}
         """Work kept of sessions of this run, by `lasting` reference."""
-        self._thread = watched_thread("open-task", self._serve)
-        self._thread.start()
 
     def choose(self, number: int) -> None:
         """Open the row of this number; returns at once. What is not listed is refused."""
@@ -80,13 +80,13 @@ class OpenTask:
             self._want(entry)
 
     def _want(self, entry: Entry) -> None:
-        with self._wake:
-            self._wish = entry
-            self._wake.notify_all()
+        self._wish = entry
+        if self._opening is None or self._opening.done():
+            self._opening = begin(self._open_wishes())
 
-    def create(self, name: str, template: TemplateName) -> None:
+    async def create(self, name: str, template: TemplateName) -> None:
         """Write a new task into the folder of the list, and open it; see `Chooser.create`."""
-        made = write_new_task(name, template, self.catalogue.folder)
+        made = await self._aside.run(lambda: write_new_task(name, template, self.catalogue.folder))
         # Not by its number: a search that began before it was written may end now, and list it not.
         self._want(self.catalogue.add_file(made.file, made.env_id))
 
@@ -101,33 +101,31 @@ class OpenTask:
 
     def close(self) -> None:
         """Withdraw a question and end the thread; a session that is being closed is waited for."""
-        with self._wake:
-            self._closing = True
-            self._wake.notify_all()
-        self._thread.join()
+        self._closing = True
+        if self._opening is not None:
+            result_of(asyncio.wait([self._opening]))
+        self._aside.close()
         self.catalogue.close()
 
-    def _serve(self) -> None:
-        while True:
-            with self._wake:
-                self._wake.wait_for(lambda: self._wish is not None or self._closing)
-                if self._closing:
-                    return
-                entry, self._wish = self._wish, None
+    async def _open_wishes(self) -> None:
+        while (entry := self._wish) is not None and not self._closing:
+            self._wish = None
             try:
-                if entry is not None:
-                    self._open(entry)
+                await self._open(entry)
+            except Exception as error:
+                report_failure(f"{entry.name} was not opened", error)
             finally:
                 self._doing = ""
 
     def _withdrawn(self) -> bool:
         return self._closing or self._wish is not None
 
-    def _open(self, entry: Entry) -> None:
+    async def _open(self, entry: Entry) -> None:
         if entry.section is Section.RECORDINGS:
             self._place.pages.show("review")
             return
-        if entry.file is not None and not entry.file.is_file():
+        file = entry.file
+        if file is not None and not await self._aside.run(file.is_file):
             self._say(f"{entry.name} is gone", f"There is no file {entry.file} any more.")
             self.catalogue.refresh()
             return
@@ -139,18 +137,18 @@ class OpenTask:
             return
         self._doing = f"Opening {entry.name}: asking whether its code may run"
         try:
-            reference = self._cleared(entry)
+            reference = await self._aside.run(lambda: self._cleared(entry))
         except NotCleared as error:
             if not self._withdrawn():
                 self._say(f"{entry.name} is not opened", sentence(str(error)))
             return
         self._doing = f"Opening {entry.name} …"
         if not self._withdrawn():
-            self._change(reference, entry)
+            await self._change(reference, entry)
 
     def _cleared(self, entry: Entry) -> TaskName:
-        """What to open. A file is opened unasked where the workbench was started, if it is one of the examples, and if it
-        was open before in this run.
+        """What to open; asks a person if need be, and waits for the answer. A file is opened unasked where the workbench was
+        started, if it is one of the examples, and if it was open before in this run.
 
         Raises:
             NotCleared: it may not run.
@@ -161,26 +159,25 @@ class OpenTask:
             return entry.reference
         return self._clearances.clear_file(file, file_and_class(entry.reference)[1], self._withdrawn)
 
-    def _change(self, reference: TaskName, entry: Entry) -> None:
+    async def _change(self, reference: TaskName, entry: Entry) -> None:
         place, old = self._place, self._place.home
         place.go_live.let_go()
         if old is not None:
             old.do(PauseRun())
             self._kept[lasting(str(old.reference))] = old.kept_work()
-            if isinstance(
-                old.reference, str
-            ):  # not the texts of a recording, which name a path and are other code
+            # Not the texts of a recording, which name a path and are other code.
+            if isinstance(old.reference, str):
                 self._ran.add(lasting(old.reference))
         kept = self._kept.get(lasting(entry.reference))
-        place.session = place.home = self._open_session(
-            reference, entry.options or self.catalogue.options, kept
-        )
-        place.pages.show("live", anew=True)
+        options = entry.options or self.catalogue.options
+        session = await self._aside.run(lambda: self._open_session(reference, options, kept))
+        place.session = place.home = session
         # Until then the old page draws the old session.
-        place.pages.wait_until_shown(_SHOWN_WITHIN)
+        shown = asyncio.wrap_future(place.pages.show("live", anew=True))
+        await asyncio.wait([shown], timeout=_SHOWN_WITHIN)
         if old is not None:
             self._doing = "Closing the task before: its recordings are written …"
-            old.close()
+            await self._aside.run(old.close)
 
     def _say(self, title: str, text: str) -> None:
         tell_all(self._place.server, title, text, "red")

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import threading
+import asyncio
 from collections.abc import Callable
 
 import viser
 
-from workbench.machine.processes.watched_thread import watched_thread
 from workbench.session.live.session import Session
+from workbench.session.loop import begin, do
 from workbench.session.record.recording import RecordingStatus
 from workbench.ui.widgets.notices import tell_all
 
-_LOOK_SECONDS = 0.5
+_LOOK = 0.2
+"""Seconds between two looks."""
 REFUSED_SECONDS = 8.0
 
 
@@ -32,23 +33,18 @@ class RecordingProblems:
     ) -> None:
         self._server, self._session, self._on_notice = server, session, on_notice
         self._before = RecordingStatus()
-        self._closing = threading.Event()
-        self._thread = watched_thread("recording-problems", self._watch)
-        self._thread.start()
+        self._watching = do(lambda: begin(self._watch()))
 
     def close(self) -> None:
-        self._closing.set()
-        self._thread.join()
+        """Called on another thread than the loop."""
+        do(self._watching.cancel)
 
-    def _watch(self) -> None:
-        seen = -1
-        while not self._closing.is_set():
+    async def _watch(self) -> None:
+        while True:
             session = self._session()
-            if session is None:
-                self._closing.wait(_LOOK_SECONDS)
-                continue
-            seen = session.wait(seen, _LOOK_SECONDS)
-            self._tell(session.view().recording)
+            if session is not None:
+                self._tell(session.view().recording)
+            await asyncio.sleep(_LOOK)
 
     def _tell(self, now: RecordingStatus) -> None:
         before, self._before = self._before, now

@@ -40,6 +40,7 @@ from workbench.session.review.review import Review
 from workbench.session.review.state import MOST_OPEN
 from workbench.session.review.view import PictureReader, ReviewView, column_at, outcome_text
 from workbench.ui.app.go_live import GoLivePart
+from workbench.ui.app.pages import draw_apart
 from workbench.ui.cameras.panel import CamerasPanel
 from workbench.ui.library.listing import Action
 from workbench.ui.library.panel import LibraryPanel
@@ -56,10 +57,9 @@ from workbench.ui.tasks.task_list import OpenDialog
 from workbench.ui.widgets.hotkeys import key_rows, register
 from workbench.ui.widgets.open_tabs import OpenTabs
 from workbench.ui.widgets.parts import Clock, DrawDue, PagePart, Parts
-from workbench.ui.widgets.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.tools import tool, tools_html
-from workbench.ui.widgets.visitors import Visitor
+from workbench.ui.widgets.visitors import Done, Visitor
 
 if TYPE_CHECKING:
     from workbench.ui.app.workplace import Workplace
@@ -112,7 +112,6 @@ class ReviewPage:
     ) -> None:
         self._place, self._clock = place, clock
         self._server, self._review = server, review = place.server, place.shelf.review
-        self._loop = RedrawLoop(server, "review-page", review.wait, self._has_viewers, self.redraw)
         self._reader = PictureReader()
         self._requests: tuple[CameraRequest, ...] = ()
         self._pictures: dict[CameraKey, Picture] = {}
@@ -124,7 +123,6 @@ class ReviewPage:
         self._unfolded = "", 0.0
         """Name of the panel (library or rerun) that was unfolded last, and when, until the width was checked."""
         self._told = DrawDue(TOLD_EVERY, clock)
-        self._framing = place.stage.framing
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH)
@@ -245,23 +243,23 @@ class ReviewPage:
         # The panel stays: a person goes from the best episode to the worst.
         self._review.open(ids, library_stays=self._smallest_view() >= LEAST_BESIDE_SWEEP)
 
-    # --- start and stop --------------------------------------------------------------------------
-
-    def start(self) -> None:
-        """Draw it, then keep drawing it in a thread."""
-        self._loop.start()
-
-    def stop(self) -> None:
-        """Stop redrawing; returns when the loop has ended."""
-        self._loop.stop()
-        self._library.close()
+    # --- drawing ---------------------------------------------------------------------------------
 
     @property
     def dark(self) -> bool:
+        """Its theme."""
         return self._view_panel.dark
 
-    def _has_viewers(self) -> bool:
-        return self._framing.follow() > 0
+    def wait(self, seen: int, timeout: float) -> int:
+        """See `ShownPage`."""
+        return self._review.wait(seen, timeout)
+
+    def counted(self, visitors: int) -> None:
+        """A review plays whoever looks."""
+
+    def close(self) -> None:
+        """It is shown no more."""
+        self._library.close()
 
     def redraw(self) -> None:
         """Draw the present state of the review."""
@@ -390,7 +388,7 @@ class ReviewPage:
 
     # --- what a person does ------------------------------------------------------------------------
 
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         """Carry out a command of a page. Raises `Refused`."""
         match command:
             case ShowLive():
@@ -417,7 +415,8 @@ class ReviewPage:
             case _ if isinstance(command, CamerasPanel.does):
                 self._cameras.do(command, visitor)
             case _:
-                self._parts.do(command, visitor)
+                return self._parts.do(command, visitor)
+        return None
 
     def _rescore_chosen(self) -> None:
         opened = tuple(one.id for one in self._review.view().opened)

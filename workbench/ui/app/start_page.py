@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from typing import TYPE_CHECKING
 
@@ -13,15 +12,11 @@ from workbench.ui.scene.viewpoint import BRAND
 from workbench.ui.tasks.task_list import TaskList
 from workbench.ui.widgets.hotkeys import register
 from workbench.ui.widgets.parts import Clock
-from workbench.ui.widgets.redraw_loop import RedrawLoop
 from workbench.ui.widgets.templates import render
-from workbench.ui.widgets.visitors import Visitor
+from workbench.ui.widgets.visitors import Done, Visitor
 
 if TYPE_CHECKING:
     from workbench.ui.app.workplace import Workplace
-
-LOOK = 0.1
-"""Seconds between two checks whether the list has changed."""
 
 
 class StartPage:
@@ -36,10 +31,6 @@ class StartPage:
     def __init__(self, place: Workplace, dark: bool = True, clock: Clock = time.monotonic) -> None:
         self._server = server = place.server
         self.dark = dark
-        self._resting = threading.Event()
-        self._loop = RedrawLoop(
-            server, "start-page", self._wait, lambda: place.stage.framing.follow() > 0, self.redraw
-        )
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label("Workbench")
         self._apply_theme()
@@ -50,7 +41,7 @@ class StartPage:
         kinds = frozenset({ShowRecordings, ToggleTheme, *TaskList.does}) | place.does
         register(server, place.visitors, kinds, "start page")
 
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         """Carry out a command of a page. Raises `Refused`."""
         match command:
             case ShowRecordings():
@@ -59,30 +50,29 @@ class StartPage:
                 self.dark = not self.dark
                 self._apply_theme()
             case _ if isinstance(command, TaskList.does):
-                self._list.do(command, visitor)
+                return self._list.do(command, visitor)
             case TellDrawnInSoftware():
                 self._place.stage.in_software.told_by(visitor)
             case _:
                 raise Refused(f"Not on this page: {command.help()}.")
+        return None
 
-    def start(self) -> None:
-        """Draw it, then keep drawing it in a thread."""
-        self._loop.start()
+    def wait(self, seen: int, timeout: float) -> int:
+        """It is drawn at its own pace; see `Pages`."""
+        time.sleep(timeout)
+        return seen
 
-    def stop(self) -> None:
-        """Stop redrawing; returns when the loop has ended."""
-        self._resting.set()
-        self._loop.stop()
+    def counted(self, visitors: int) -> None:
+        """It has no pictures that somebody would have to draw."""
+
+    def close(self) -> None:
+        """Nothing of it lasts."""
 
     def redraw(self) -> None:
         """Draw what has changed."""
         with self._server.atomic():
             self._list.draw()
         self._server.flush()
-
-    def _wait(self, seen: int, timeout: float) -> int:
-        self._resting.wait(min(timeout, LOOK))
-        return seen + 1
 
     def _apply_theme(self) -> None:
         self._server.gui.configure_theme(

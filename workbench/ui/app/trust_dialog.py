@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
 import secrets
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -12,6 +12,7 @@ import viser
 from workbench.commands.command import Refused
 from workbench.commands.page import AnswerTrust
 from workbench.session.clearance import FOLLOWED, Consent, TrustQuestion
+from workbench.session.loop import result_of
 from workbench.ui.library.dialogs import Dialog
 from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.tools import Tool, tools_html
@@ -34,8 +35,7 @@ class _Pending:
     question: TrustQuestion
     name: str = field(default_factory=lambda: secrets.token_urlsafe(12))
     """Random: a page that was open before this program was started has no question of this name."""
-    answered: threading.Event = field(default_factory=threading.Event)
-    answer: Consent = Consent.NO
+    answer: asyncio.Future[Consent] = field(default_factory=asyncio.Future)
 
 
 class TrustDialog:
@@ -46,7 +46,6 @@ class TrustDialog:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._lock = threading.RLock()
         self._waiting: list[_Pending] = []
         """Pending questions; the first is shown."""
         self._window: Dialog | None = None
@@ -54,49 +53,47 @@ class TrustDialog:
 
     def say_no(self) -> bool:
         """Answer the question that is shown with a no; False if there is none."""
-        with self._lock:
-            if not self._waiting:
-                return False
-            self._take(Consent.NO)
-            return True
+        if not self._waiting:
+            return False
+        self._take(Consent.NO)
+        return True
 
     def answer(self, command: AnswerTrust) -> None:
         """Answer the question that is shown. Raises `Refused` if it is another one, or answered already."""
-        with self._lock:
-            is_shown = self._waiting and self._waiting[0].name == command.question
-            if not is_shown or not self._take(Consent(command.answer)):
-                raise Refused("This question was answered or withdrawn before.")
+        is_shown = self._waiting and self._waiting[0].name == command.question
+        if not is_shown or not self._take(Consent(command.answer)):
+            raise Refused("This question was answered or withdrawn before.")
 
     def _take(self, answer: Consent) -> bool:
         """Answer the first question; False if it is answered already."""
         shown = self._waiting[0]
-        if shown.answered.is_set():
+        if shown.answer.done():
             return False
-        shown.answer = answer
-        shown.answered.set()
+        shown.answer.set_result(answer)
         return True
 
     def ask(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
-        """Show the question and wait for the answer. Never call it while a page's command is done: the answer, which that
-        page asks for next, would wait for its end.
+        """Show the question and wait for the answer; called on another thread than the loop.
 
         Args:
             stopped: called often; True withdraws the question.
         """
+        return result_of(self._asked(question, stopped))
+
+    async def _asked(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
         pending = _Pending(question)
-        with self._lock:
-            self._waiting.append(pending)
+        self._waiting.append(pending)
         try:
             while not self._closed and not stopped():
                 self._keep_shown()
-                if pending.answered.wait(_LOOK):
-                    return pending.answer
+                await asyncio.wait([pending.answer], timeout=_LOOK)
+                if pending.answer.done():
+                    return pending.answer.result()
             return Consent.NO
         finally:
-            with self._lock:
-                if self._waiting[0] is pending:
-                    self._take_down()
-                self._waiting.remove(pending)
+            if self._waiting[0] is pending:
+                self._take_down()
+            self._waiting.remove(pending)
 
     def close(self) -> None:
         """Withdraw every question."""
@@ -104,17 +101,16 @@ class TrustDialog:
 
     def _keep_shown(self) -> None:
         """Open the dialog of the first question, again if a page switch has removed it."""
-        with self._lock:
-            if self._window is not None and not self._window.modal.closed:
-                return
-            pending = self._waiting[0]
-            gui = self._server.gui
-            with self._server.atomic():
-                self._window = Dialog(self._server, TITLE)
-                with self._window.modal:
-                    gui.add_html(buttons_html(pending.name, pending.question.more))
-                    # After the buttons, so that nothing in it has the focus; page.css puts it above them.
-                    gui.add_html(question_html(pending.question))
+        if self._window is not None and not self._window.modal.closed:
+            return
+        pending = self._waiting[0]
+        gui = self._server.gui
+        with self._server.atomic():
+            self._window = Dialog(self._server, TITLE)
+            with self._window.modal:
+                gui.add_html(buttons_html(pending.name, pending.question.more))
+                # After the buttons, so that nothing in it has the focus; page.css puts it above them.
+                gui.add_html(question_html(pending.question))
 
     def _take_down(self) -> None:
         window, self._window = self._window, None

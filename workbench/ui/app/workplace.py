@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import logging
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import psutil
-import viser
 
 from workbench.commands.command import Command, Refused
 from workbench.commands.page import AnswerTrust, CloseDialog, OpenHelp, RenewToken
 from workbench.jobs.task import TaskOptions
-from workbench.machine.processes.watched_thread import watched_thread
 from workbench.recording.library.library import Library
 from workbench.recording.reader.reading import recover_confined, recovered_text
 from workbench.session.clearance import Clearances
 from workbench.session.live.session import Session
+from workbench.session.loop import Aside
 from workbench.session.rescore.recordings import Rescorer
 from workbench.session.review.recorded_scene import SceneProcess
 from workbench.session.review.review import Review
@@ -29,6 +26,7 @@ from workbench.session.tasks.registered import RegisteredTasks
 from workbench.ui.app import help_pages
 from workbench.ui.app.go_live import GoLive, MakeSession
 from workbench.ui.app.open_task import Choices, OpenTask
+from workbench.ui.app.pages import Pages, ShownPage, Which
 from workbench.ui.app.recording_problems import RecordingProblems
 from workbench.ui.app.review_page import ReviewPage
 from workbench.ui.app.start_page import StartPage
@@ -38,17 +36,16 @@ from workbench.ui.scene.viewpoint import Stage
 from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.share.panel import Sharing
 from workbench.ui.tasks.task_list import PICTURES, picture_route
-from workbench.ui.widgets.visitors import PATH, Visitor, Visitors
+from workbench.ui.widgets.visitors import PATH, Done, Visitor, Visitors
 
 if TYPE_CHECKING:
-    from workbench.ui.app.live_page import Page
-
-log = logging.getLogger(__name__)
+    pass
 
 ENOUGH_MEMORY = 4 << 30
 """Minimum free memory in bytes for drawing pictures of tasks while a task is open."""
 
-Which = Literal["start", "live", "review"]
+_RECOVERED_WITHIN = 10.0
+"""Seconds that the end of the program waits for the recovery of episodes."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +88,9 @@ class Workplace:
         self.server, self._recordings, self._tasks = gated_server.server, recordings, tasks
         self._imports, self._on_notice, self._editor = base.imports, on_notice, editor
         self._shelf: Shelf | None = None
-        self._lock = threading.Lock()
-        self._recovering: threading.Thread | None = None
+        self._first: Path | Literal["newest"] = "newest"
+        """Recording that the first review opens."""
+        self._recovering = Aside("recover")
         self.renew_token: Callable[[], None] | None = None
         """Set before the first page is shown, where there is a token."""
         self.visitors = Visitors(self.server)
@@ -125,35 +123,27 @@ class Workplace:
     @property
     def shelf(self) -> Shelf:
         """The folder is read at the first access, by the first review page; it stays open until the program ends."""
-        return self._shelf_with("newest")
+        self._shelf = self._shelf or self._make_shelf()
+        return self._shelf
 
-    def _shelf_with(self, first: Path | Literal["newest"]) -> Shelf:
-        """The shelf, whose review opens this recording; the newest only when the shelf is made."""
-        with self._lock:
-            if self._shelf is not None:
-                if first != "newest":
-                    self._shelf.review.open_first(first)
-            else:
-                library = Library(self._recordings)
-                review = Review(library, make_scene=SceneProcess(self._tasks, self._imports))
-                library.on_change = review.library_changed
-                review.open_first(first)
-                library.watch()
-                self._shelf = Shelf(library, review)
-                if self.session is None:
-                    # With a live env its recorder has recovered them already, and is writing.
-                    self._recovering = threading.Thread(
-                        target=self._recover, args=(self._shelf,), name="recover", daemon=True
-                    )
-                    self._recovering.start()
-            return self._shelf
+    def _make_shelf(self) -> Shelf:
+        library = Library(self._recordings)
+        review = Review(library, make_scene=SceneProcess(self._tasks, self._imports))
+        library.on_change = review.library_changed
+        review.open_first(self._first)
+        library.watch()
+        shelf = Shelf(library, review)
+        if self.session is None:
+            # With a live env its recorder has recovered them already, and is writing.
+            self._recovering.begin(lambda: self._recover(shelf))
+        return shelf
 
     @property
     def does(self) -> frozenset[type[Command]]:
         """Commands that are carried out whichever page is shown."""
         return frozenset({OpenHelp} if self.renew_token is None else {OpenHelp, RenewToken})
 
-    def _do(self, command: Command, visitor: Visitor) -> None:
+    def _do(self, command: Command, visitor: Visitor) -> Done:
         match command:
             case OpenHelp():
                 pass  # The browser itself opens the page (``web_assets/panels.js``).
@@ -166,7 +156,8 @@ class Workplace:
             case CloseDialog() if self.dialog.say_no():
                 pass
             case _:
-                self.pages.do(command, visitor)
+                return self.pages.do(command, visitor)
+        return None
 
     def _recover(self, shelf: Shelf) -> None:
         """Recover episodes of a writer that was killed."""
@@ -202,12 +193,10 @@ class Workplace:
         self.pages.stop()
         self._problems.close()
         self.open_task.close()
-        with self._lock:
-            if self._shelf is not None:
-                if self._recovering is not None:
-                    self._recovering.join(timeout=10.0)
-                self._shelf.review.close()
-                self._shelf.library.close()
+        self._recovering.close(_RECOVERED_WITHIN)
+        if self._shelf is not None:
+            self._shelf.review.close()
+            self._shelf.library.close()
         for part in (self.sharing, self.dialog, self.rescorer, self.go_live):
             part.close()
         if self.home is not None:
@@ -215,11 +204,12 @@ class Workplace:
 
     def look_at(self, recording: Path) -> None:
         """Open the recording with this file in the review."""
-        self._shelf_with(recording)
-        self._looks_at = True
+        self._first, self._looks_at = recording, True
+        if self._shelf is not None:
+            self._shelf.review.open_first(recording)
         self.pages.show("review")
 
-    def _page(self, which: Which, dark: bool) -> Page | ReviewPage | StartPage:
+    def _page(self, which: Which, dark: bool) -> ShownPage:
         if which == "start":
             return StartPage(self, dark)
         if which == "review":
@@ -242,116 +232,3 @@ class Workplace:
             editor=self._editor,
             chooser=self.open_task,
         )
-
-
-# --- Which page is on the server: start, live or review -----------------------------------------
-
-
-class Pages:
-    """Replaces one page by another on the same server.
-
-    viser has one page a server, so a page is removed whole and the other is built in its place; every open browser
-    follows. The session and the review live on meanwhile, the bodies in the 3-D view stay (`Stage`), and nothing is
-    sent before the new page was drawn once, so that no empty control is ever seen. Buttons of the very page that is
-    removed ask for the switch, so a thread of its own does it.
-
-    Args:
-        server: Of viser.
-        stage: The 3-D view that the pages share.
-        make: Builds a page on the empty server, given which one and whether it is dark.
-    """
-
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        stage: Stage,
-        make: Callable[[Which, bool], Page | ReviewPage | StartPage],
-    ) -> None:
-        self._server, self._stage, self._make = server, stage, make
-        self._wake = threading.Condition()
-        self._wish: Which | None = None
-        self._shown: Which | None = None
-        self._anew = False
-        self._page: Page | ReviewPage | StartPage | None = None
-        self._building = False
-        self._ending = False
-        self._thread = watched_thread("pages", self._serve)
-
-    def start(self, which: Which) -> None:
-        """Show the first page; returns when it is shown."""
-        self._show(which)
-        self._thread.start()
-
-    def show(self, which: Which, anew: bool = False) -> None:
-        """Request a page. Returns at once, so that a button of the present page may call it.
-
-        Args:
-            anew: build it also if it is shown: it has another session.
-        """
-        with self._wake:
-            # A requested rebuild stays requested until the page is built.
-            self._wish, self._anew = which, anew or (self._anew and self._wish == which)
-            self._wake.notify_all()
-
-    def wait_for(self, which: Which, timeout: float) -> bool:
-        """Sleep until that page is shown; False after `timeout` seconds."""
-        with self._wake:
-            return self._wake.wait_for(lambda: self._shown == which, timeout)
-
-    def wait_until_shown(self, timeout: float) -> bool:
-        """Sleep until no page is requested or being built; False after `timeout` seconds."""
-        with self._wake:
-            return self._wake.wait_for(lambda: self._wish is None and not self._building, timeout)
-
-    def do(self, command: Command, visitor: Visitor) -> None:
-        """Let the page that is shown carry out a command."""
-        page = self._page
-        if page is None:
-            raise Refused("Nothing is shown yet.")
-        page.do(command, visitor)
-
-    def stop(self) -> None:
-        """Stop redrawing the present page; it stays as it is until the server closes."""
-        with self._wake:
-            self._ending = True
-            self._wake.notify_all()
-        if self._thread.is_alive():
-            self._thread.join(timeout=10.0)
-        if self._page is not None:
-            self._page.stop()
-
-    def _serve(self) -> None:
-        while True:
-            with self._wake:
-                self._wake.wait_for(lambda: self._wish is not None or self._ending)
-                if self._ending:
-                    return
-                wish, self._wish = self._wish, None
-                anew, self._anew = self._anew, False
-                self._building = True
-            try:
-                if wish is not None and (anew or wish != self._shown):
-                    self._show(wish)
-            except Exception:
-                # The thread must survive, or no button could show a page again.
-                log.exception("The page could not be built.")
-            finally:
-                with self._wake:
-                    self._building = False
-                    self._wake.notify_all()
-
-    def _show(self, which: Which) -> None:
-        dark = self._page.dark if self._page is not None else True
-        if self._page is not None:
-            self._page.stop()
-        with self._server.atomic():
-            if self._page is not None:
-                # Remove all of the old page: handles, commands, callbacks, nodes.
-                self._stage.clear()
-                self._server.gui.reset()
-            self._page = self._make(which, dark)
-            self._page.start()
-        self._server.flush()
-        with self._wake:
-            self._shown = which
-            self._wake.notify_all()

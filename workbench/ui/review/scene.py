@@ -15,6 +15,7 @@ from workbench.commands.review import SelectRecording
 from workbench.core.camera_data import CameraInfo, CameraKey, Picture
 from workbench.core.scene.shapes import BodyKind, Material, SceneGeometry, Visual, fingerprint
 from workbench.recording.episode.episode import CameraTrack
+from workbench.session.loop import post
 from workbench.session.review.compare import distances
 from workbench.session.review.review import Review
 from workbench.session.review.state import MOST_COMPARED
@@ -195,7 +196,8 @@ class ReviewIn3D:
         self._scene_of: object = None
         self._looks: Looks | None = None
         """Looks that the bodies were built with."""
-        server.scene.on_click()(self._on_click)
+        # viser awaits coroutines, although its types do not say so.
+        server.scene.on_click()(self._on_click)  # type: ignore[arg-type]
 
     def draw(
         self,
@@ -293,7 +295,10 @@ class ReviewIn3D:
         acting = acting_box(scene.geometry, poses, scene.layout)
         return frame_one(scene.layout, None, aspect, covered, acting=acting)
 
-    def _on_click(self, event: viser.SceneClickEvent) -> None:
+    async def _on_click(self, event: viser.SceneClickEvent) -> None:
+        post(lambda: self._clicked(event))
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
         scene, view = self._scene, self._view
         if scene is None or scene.ghosts or len(view.opened) < 2:
             return

@@ -22,7 +22,7 @@ from workbench.commands.tasks import (
     OpenTaskList,
     TemplateName,
 )
-from workbench.session.loop import begin, on_loop
+from workbench.session.loop import begin
 from workbench.session.tasks.catalogue import Catalogue, CatalogueView, Entry, Section
 from workbench.session.tasks.typed import NotAPath
 from workbench.ui.library.dialogs import Dialog
@@ -30,7 +30,7 @@ from workbench.ui.widgets.fields import Field, choice
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render, sentence
 from workbench.ui.widgets.tools import tool, tools_html
-from workbench.ui.widgets.visitors import Visitor
+from workbench.ui.widgets.visitors import Done, Visitor
 
 PICTURES = "/task_pictures/"
 """Prefix of the route of the pictures of registered tasks."""
@@ -52,7 +52,7 @@ class Chooser(Protocol):
         """Open this row of the list; returns at once. A number that is not listed is refused."""
         ...
 
-    def create(self, name: str, template: TemplateName) -> None:
+    async def create(self, name: str, template: TemplateName) -> None:
         """Write a new task into the folder of the list, and open it.
 
         Raises:
@@ -149,15 +149,14 @@ class TaskList:
         self._drawn = wanted
         self._html.content = tasks_html(view, search, doing, self._chooser.is_open, self._find.name)
 
-    @on_loop
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         match command:
             case OpenListedTask(number=number):
                 if self._chooser.catalogue.entry(number) is None:
                     raise Refused("It is no longer in the list.")
                 self._choose(number)
             case OpenFoundTask():
-                begin(self._open_found(self._search.words, visitor))
+                return self._open_found(self._search.words)
             case LookForTasks(words=words):
                 self._look_for(words[:LONGEST_WORDS])
             case ClearTaskSearch():
@@ -169,11 +168,15 @@ class TaskList:
             case ChooseTemplate(template=template):
                 self._template = template
             case CreateTask():
-                try:
-                    self._chooser.create(self._name.strip(), self._template)
-                except ValueError as why:
-                    raise Refused(str(why)) from None
-                self._on_chosen()
+                return self._create(self._name.strip(), self._template)
+        return None
+
+    async def _create(self, name: str, template: TemplateName) -> None:
+        try:
+            await self._chooser.create(name, template)
+        except ValueError as why:
+            raise Refused(str(why)) from None
+        self._on_chosen()
 
     def _look_for(self, words: str) -> None:
         self._search = Search(words)
@@ -191,14 +194,13 @@ class TaskList:
         except NotAPath as error:
             return Search(words, why_not=sentence(str(error)))
 
-    async def _open_found(self, words: str, visitor: Visitor) -> None:
+    async def _open_found(self, words: str) -> None:
         search = await self._read(words)
         found = shown_rows(self._chooser.catalogue.view(), search)
         best = best_row([row for rows in found.values() for row in rows], self._chooser.is_open)
         if best is None:
-            visitor.tell("Nothing in the list has these words.")
-        else:
-            self._choose(best.number)
+            raise Refused("Nothing in the list has these words.")
+        self._choose(best.number)
 
     def _choose(self, number: int) -> None:
         self._chooser.choose(number)
@@ -315,7 +317,7 @@ class OpenDialog(PagePart[object]):
         self._shown: tuple[Dialog, TaskList] | None = None
         """Opened and closed by `draw`, which alone uses its fields."""
 
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         match command:
             case OpenTaskList():
                 if not self.close():
@@ -325,7 +327,8 @@ class OpenDialog(PagePart[object]):
                 shown = self._shown
                 if not self._wanted or shown is None:
                     raise Refused("The list of tasks is closed.")
-                shown[1].do(command, visitor)
+                return shown[1].do(command, visitor)
+        return None
 
     def add_button(self) -> None:
         """Add the button that opens it to the present container."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import ClassVar, Generic, TypeVar
 
 from workbench.commands.command import Command, Refused
-from workbench.ui.widgets.visitors import Visitor
+from workbench.ui.widgets.visitors import Done, Visitor
 
 Clock = Callable[[], float]
 """Seconds: `time.monotonic`, or a test's own clock. All parts of a page share one."""
@@ -41,8 +41,8 @@ class PagePart(Generic[View]):
     def draw(self, view: View) -> None:
         raise NotImplementedError
 
-    def do(self, command: Command, visitor: Visitor) -> None:
-        """Carry out a command in `does`. Runs on any thread. Raises `Refused`."""
+    def do(self, command: Command, visitor: Visitor) -> Done:
+        """Carry out a command in `does`. Runs on the loop (`session.loop`), and must not block. Raises `Refused`."""
         raise NotImplementedError
 
 
@@ -95,13 +95,13 @@ class Parts(Generic[View]):
         """Commands that these parts carry out."""
         return frozenset(self._owners)
 
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         """Let the part carry out the command that has it in `does`. Raises `Refused`, also for a command that no
         part has."""
         owner = self._owners.get(type(command))
         if owner is None:
             raise Refused(f"Not on this page: {command.help()}.")
-        owner.do(command, visitor)
+        return owner.do(command, visitor)
 
     def draw(self, view: View) -> None:
         due = [is_due.is_due(part.key(view), part.urgent(view)) for part, is_due in self._parts]

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import secrets
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -16,6 +16,7 @@ from websockets.asyncio.server import ServerConnection
 
 from workbench.commands import COMMANDS
 from workbench.commands.command import Command, Refused
+from workbench.session.loop import submit
 from workbench.ui.server.strangers import RareLog
 from workbench.ui.widgets.templates import render
 
@@ -50,16 +51,15 @@ class Visitor:
     client: viser.ClientHandle
     page_width: int = 0
     """Width of the page in CSS pixels when it connected last; 0 before."""
-    turn: asyncio.Lock = field(default_factory=asyncio.Lock)
-    """Lock that is held while a command of this page is carried out: commands are carried out in the order in
-    which they came."""
 
     def tell(self, text: str, title: str = "Not possible") -> None:
         self.client.add_notification(title, text, color="orange", auto_close_seconds=TOLD_SECONDS)
 
 
-Do = Callable[[Command, Visitor], None]
-"""Carries out a command of a page, on any thread. Raises `Refused` with a sentence for the person."""
+Done = Coroutine[Any, Any, None] | None
+"""The rest of a command that waits for something; None if it is carried out."""
+Do = Callable[[Command, Visitor], Done]
+"""Carries out a command of a page, on the loop (`session.loop`). Raises `Refused` with a sentence for the person."""
 
 
 class Visitors:
@@ -102,18 +102,22 @@ class Visitors:
         return asked
 
     async def ask(self, command: Command, visitor: Visitor) -> str:
-        """Do it after what this page asked for before. Returns why it was refused, or an empty text; the page is told."""
-        async with visitor.turn:
-            try:
-                await asyncio.to_thread(self.do, command, visitor)
-            except Refused as reason:
-                visitor.tell(str(reason))
-                return str(reason)
-            except Exception:
-                log.exception("Failed: %r", command)
-                visitor.tell("It failed; the reason is in the terminal.", "Failed")
-                return "it failed"
+        """Do it after what any page asked for before. Returns why it was refused, or an empty text; the page is told."""
+        try:
+            await asyncio.wrap_future(submit(self._carry_out(command, visitor)))
+        except Refused as reason:
+            visitor.tell(str(reason))
+            return str(reason)
+        except Exception:
+            log.exception("Failed: %r", command)
+            visitor.tell("It failed; the reason is in the terminal.", "Failed")
+            return "it failed"
         return ""
+
+    async def _carry_out(self, command: Command, visitor: Visitor) -> None:
+        rest = self.do(command, visitor)
+        if rest is not None:
+            await rest
 
     async def serve(self, connection: ServerConnection) -> None:
         """Answer one page's commands until it leaves."""
