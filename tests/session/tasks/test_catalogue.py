@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import re
 import threading
@@ -17,6 +18,7 @@ from PIL import Image
 
 from tests.drive.waiting import PATIENCE, until
 from workbench.jobs.task import TaskOptions
+from workbench.session.loop import do, result_of
 from workbench.session.tasks import catalogue as catalogue_module
 from workbench.session.tasks import registered as registered_module
 from workbench.session.tasks.catalogue import Catalogue, Entry, Section
@@ -55,12 +57,20 @@ def made(tmp_path: Path) -> Iterator[Callable[..., Catalogue]]:
         one.close()
 
 
-def listed(catalogue: Catalogue) -> dict[Section, list[Entry]]:
-    catalogue.refresh()
-    until(lambda: catalogue._searching is None and not catalogue.registered.view.doing, "the list")
-    until(lambda: catalogue.registered.view.ids or catalogue.registered.view.problem, "the ids")
+def rows_of(catalogue: Catalogue) -> dict[Section, list[Entry]]:
     rows = catalogue.view().entries
     return {section: [one for one in rows if one.section is section] for section in Section}
+
+
+def listed(catalogue: Catalogue, *in_folder: str) -> dict[Section, list[Entry]]:
+    """The rows, once these files of the folder and ManiSkill's tasks are listed."""
+    catalogue.refresh()
+    until(lambda: not catalogue.view().searching, "the first search")
+    names = lambda: [one.name for one in rows_of(catalogue)[Section.FOLDER]]  # noqa: E731
+    until(lambda: names() == list(in_folder), f"the rows {in_folder}", seen=names)
+    registered = catalogue.registered
+    until(lambda: registered.view.ids and not registered.view.doing, "the ids", seen=lambda: registered.view)
+    return rows_of(catalogue)
 
 
 def test_all_sections_are_there_and_say_what_is_opened(
@@ -71,7 +81,7 @@ def test_all_sections_are_there_and_say_what_is_opened(
     (tmp_path / "work/sub/push.py").write_text(f"@register_env('Push-v1')\n{TASK}")
     catalogue.recents.add(str(tmp_path / "work/sub/push.py"), TaskOptions(8, env_kwargs={"size": 2}))
     catalogue.recents.add(str(tmp_path / "gone.py:Task"), TaskOptions())
-    rows = listed(catalogue)
+    rows = listed(catalogue, "sub/push.py")
     gone, recent = rows[Section.RECENT]
     assert gone.gone and gone.name == "gone.py:Task" and not recent.gone
     assert "sub/" in recent.about and "8 envs" in recent.about and "size=2" in recent.about
@@ -90,16 +100,16 @@ def test_only_a_listed_number_is_an_entry_and_it_is_never_anothers(
     catalogue = made()
     file = tmp_path / "work/push.py"
     file.write_text(TASK)
-    (entry,) = listed(catalogue)[Section.FOLDER]
+    (entry,) = listed(catalogue, "push.py")[Section.FOLDER]
     assert catalogue.entry(entry.number) == entry
     for number in (0, -1, 10**9, entry.number + 1000):
         assert catalogue.entry(number) is None
     file.unlink()
     (tmp_path / "work/other.py").write_text(TASK)
-    (other,) = listed(catalogue)[Section.FOLDER]
+    (other,) = listed(catalogue, "other.py")[Section.FOLDER]
     assert other.number != entry.number and catalogue.entry(entry.number) is None
     file.write_text(TASK)
-    again = {one.name: one.number for one in listed(catalogue)[Section.FOLDER]}
+    again = {one.name: one.number for one in listed(catalogue, "other.py", "push.py")[Section.FOLDER]}
     assert again == {"push.py": entry.number, "other.py": other.number}
 
 
@@ -110,36 +120,56 @@ def test_the_list_follows_its_folder_and_stays_the_same_while_nothing_changes(
     catalogue = made()
     work = tmp_path / "work"
 
-    def comes_to(*names: str) -> None:
-        def seen() -> list[str]:
-            catalogue.follow()
-            return [one.name for one in catalogue.view().entries if one.section is Section.FOLDER]
+    def seen() -> list[str]:
+        return [f"{one.name}: {one.about}" for one in rows_of(catalogue)[Section.FOLDER]]
 
-        until(lambda: seen() == list(names), f"the rows {names}", seen=seen)
+    def comes_to(*rows: str) -> None:
+        until(lambda: seen() == list(rows), f"the rows {rows}", seen=seen)
 
+    catalogue.refresh()
     comes_to()
     (work / "push.py").write_text(TASK)
-    comes_to("push.py")
+    comes_to("push.py: Task")
     (work / "pull.py").write_text("class Task(BaseEnv)\n    pass\n")
-    comes_to("pull.py", "push.py")
-    assert "line 1" in catalogue.view().entries[0].about, "where it is not Python yet"
+    comes_to("pull.py: not Python yet: line 1", "push.py: Task")
     (work / "pull.py").write_text(TASK)
-    until(
-        lambda: (catalogue.follow(), catalogue.view().entries[0].about)[1] == "Task",
-        "the class, once it is mended",
-    )
+    comes_to("pull.py: Task", "push.py: Task")
     (work / "push.py").rename(work / "shove.py")
-    comes_to("pull.py", "shove.py")
+    comes_to("pull.py: Task", "shove.py: Task")
     (work / "pull.py").unlink()
-    comes_to("shove.py")
+    comes_to("shove.py: Task")
+    until(lambda: not catalogue.registered.view.doing, "the ids")
     searches: list[int] = []
     find = catalogue_module.find_task_files
     monkeypatch.setattr(
         catalogue_module, "find_task_files", lambda *given: (searches.append(1), find(*given))[1]
     )
-    serial = catalogue.view().serial
-    until(lambda: (catalogue.follow(), len(searches))[1] > 2, "further searches")
-    assert catalogue.view().serial == serial
+    view = catalogue.view()
+    until(lambda: catalogue.view() and len(searches) > 2, "further searches")
+    assert catalogue.view() is view
+
+
+def test_a_list_that_nobody_looks_at_does_not_follow_its_folder(
+    made: Callable[..., Catalogue], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(catalogue_module, "SEARCH_SECONDS", 0.01)
+    monkeypatch.setattr(catalogue_module, "SHOWN_SECONDS", 0.05)
+    searches: list[int] = []
+    find = catalogue_module.find_task_files
+    monkeypatch.setattr(
+        catalogue_module, "find_task_files", lambda *given: (searches.append(1), find(*given))[1]
+    )
+    catalogue = made()
+    assert not catalogue.view().entries, "nothing is looked for before somebody asks"
+    catalogue.refresh()
+
+    def rests() -> bool:
+        before = len(searches)
+        return not threading.Event().wait(0.2) and len(searches) == before > 0
+
+    until(rests, "an end of the searches")
+    before = len(searches)
+    until(lambda: catalogue.view() and len(searches) > before, "another search, once somebody looks")
 
 
 def test_what_changes_behind_a_search_that_is_under_way_is_found_by_the_next(
@@ -161,8 +191,8 @@ def test_what_changes_behind_a_search_that_is_under_way_is_found_by_the_next(
     file.unlink()
     catalogue.refresh()
     go_on.set()
-    until(lambda: catalogue._searching is None, "the end of both searches")
-    assert not [one for one in catalogue.view().entries if one.section is Section.FOLDER]
+    until(lambda: not catalogue.view().searching, "the list")
+    assert not rows_of(catalogue)[Section.FOLDER]
 
 
 @pytest.mark.parametrize(
@@ -184,7 +214,7 @@ def test_a_typed_path_is_a_row(
     monkeypatch.chdir(work)
     monkeypatch.setenv("HOME", str(tmp_path))
     (work / "my task.py").write_text(TASK)
-    entry = catalogue.typed(text.format(work=work))
+    entry = result_of(catalogue.typed(text.format(work=work)))
     assert entry is not None and catalogue.entry(entry.number) == entry
     assert (entry.section, entry.file, entry.reference) == (
         Section.TYPED,
@@ -201,6 +231,8 @@ def test_a_typed_path_is_a_row(
         ("notes.txt", "not a .py file"),
         ("/dev/null", "/dev/null"),
         ("/" + "x" * 300 + ".py", "xxx"),
+        ("/a\0b.py", "null byte"),
+        ("/\ud800.py", "surrogates"),
     ],
 )
 def test_what_is_wrong_with_a_typed_path_is_told(
@@ -211,7 +243,7 @@ def test_what_is_wrong_with_a_typed_path_is_told(
     (work / "push.py").write_text(TASK)
     (work / "notes.txt").write_text("")
     with pytest.raises(NotAPath, match=re.escape(said)):
-        catalogue.typed(text.format(work=work))
+        result_of(catalogue.typed(text.format(work=work)))
 
 
 def test_a_cached_list_names_no_file_and_no_module(made: Callable[..., Catalogue]) -> None:
@@ -262,27 +294,76 @@ def test_maniskills_tasks_are_listed_and_drawn_once(child_process: None, tmp_pat
     assert again.view.ids == view.ids and again.view.why_not.keys() >= view.why_not.keys()
 
 
+class Process:
+    """Takes the place of the process of the pictures."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(registered_module, "Background", self.made)
+        self.asked: list[str] = []
+        self.ended = self.closed = 0
+
+    def made(self, niceness: int) -> Process:
+        assert niceness == 19
+        return self
+
+    def end(self) -> None:
+        self.ended += 1
+
+    def close(self) -> None:
+        self.closed += 1
+
+    async def ask(self, question: registered_module.DrawTask) -> object:
+        self.asked.append(question.env_id)
+        return await self.answer()
+
+    async def answer(self) -> object:
+        raise registered_module.JobFailed("it crashed")
+
+
+class Hanging(Process):
+    async def answer(self) -> object:
+        await asyncio.Event().wait()
+
+
 def test_a_task_that_cannot_be_drawn_is_not_tried_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[str] = []
-
-    class Process:
-        def __init__(self, niceness: int) -> None:
-            assert niceness == 19
-
-        def close(self) -> None: ...
-
-        async def ask(self, question: registered_module.DrawTask) -> object:
-            asked.append(question.env_id)
-            raise registered_module.JobFailed("it crashed")
-
-    monkeypatch.setattr(registered_module, "Background", Process)
+    process = Process(monkeypatch)
     cached(tmp_path, ["A-v1"], not_drawn={})
     for _ in range(4):
         tasks = RegisteredTasks(folder=tmp_path)
         tasks.start()
-        until(lambda tasks=tasks: tasks._thread is not None and not tasks._thread.is_alive(), "its end")
+        until(lambda tasks=tasks: tasks.view.why_not and not tasks.view.doing, "its end")
         tasks.close()
         assert tasks.view.why_not["A-v1"].text == "it crashed"
-    assert asked == ["A-v1"] * registered_module.MOST_TRIES
+    assert process.asked == ["A-v1"] * registered_module.MOST_TRIES
+
+
+def test_a_picture_that_takes_too_long_is_left_out_and_its_process_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = Hanging(monkeypatch)
+    monkeypatch.setattr(registered_module, "ANSWER_SECONDS", 0.01)
+    tasks = RegisteredTasks(folder=cached(tmp_path, ["A-v1", "B-v1"], not_drawn={}))
+    tasks.start()
+    until(lambda: len(tasks.view.why_not) == 2 and not tasks.view.doing, "its end")
+    assert process.ended >= 2 and "longer than" in tasks.view.why_not["A-v1"].text
+    tasks.close()
+
+
+def test_it_ends_in_the_middle_of_a_picture_and_begins_nothing_after_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = Hanging(monkeypatch)
+    folder = cached(tmp_path, ["A-v1"], not_drawn={})
+    tasks = RegisteredTasks(folder=folder)
+    tasks.start()
+    until(lambda: process.asked, "the question")
+    tasks.close()
+    until(lambda: not tasks.view.doing, "its end")
+    assert process.closed == 1 and not tasks.view.why_not
+    never = RegisteredTasks(folder=folder)
+    never.close()
+    never.start()
+    do(lambda: None)
+    assert never.view == registered_module.RegisteredView() and process.asked == ["A-v1"]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from tests.drive.panels import Panels
+from tests.drive.waiting import until
 from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.commands.tasks import (
     ClearTaskSearch,
@@ -25,6 +26,7 @@ from workbench.ui.tasks.task_list import (
     CREATE,
     OPEN,
     OpenDialog,
+    Search,
     TaskList,
     best_row,
     picture_route,
@@ -60,14 +62,16 @@ class Chosen:
 
 
 @pytest.fixture
-def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Chosen:
+def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Chosen]:
     monkeypatch.setattr(RegisteredTasks, "start", lambda self: None)
     for name in ("push.py", "pull.py"):
         (tmp_path / name).write_text("class Task(BaseEnv): pass\n")
     recents = RecentTasks(lambda: tmp_path / "state")
     catalogue = Catalogue(tmp_path, tmp_path / "recordings", recents, RegisteredTasks(), TaskOptions())
-    catalogue._search()
-    return Chosen(catalogue)
+    catalogue.refresh()
+    until(lambda: not catalogue.view().searching, "the first search")
+    yield Chosen(catalogue)
+    catalogue.close()
 
 
 def number_of(chosen: Chosen, name: str) -> int:
@@ -121,6 +125,44 @@ def test_enter_opens_the_first_that_is_not_open_or_says_that_there_is_none(
     assert len(chosen.numbers) == 2 and len(panels.client.notices) == 1
 
 
+def test_a_path_is_looked_for_and_enter_opens_what_it_means_then(
+    panels: Panels, chosen: Chosen, tmp_path: Path
+) -> None:
+    listed = TaskList(panels.server, chosen)
+    panels.visitors.do = listed.do
+    file = tmp_path / "elsewhere" / "other.py"
+
+    def html() -> str:
+        listed.draw()
+        return panels.html("wb-tasks")
+
+    panels.type("Search", str(file))
+    until(lambda: "does not exist" in html(), "what is wrong with the path", seen=html)
+    file.parent.mkdir()
+    file.write_text("class Other(BaseEnv): pass\n")
+    panels.do(OpenFoundTask())
+    entry = chosen.catalogue.entry(chosen.numbers[0])
+    assert entry is not None and entry.file == file
+    panels.type("Search", f"{file}:Other")
+    until(lambda: f"{file}:Other</b>" in html(), "the row of the path", seen=html)
+    # What a quick hand types next counts, not what was looked for before.
+    for words in (f"{file}", "push.py"):
+        panels.type("Search", words)
+    panels.do(OpenFoundTask())
+    assert chosen.numbers[1:] == [number_of(chosen, "push.py")]
+    assert panels.client.notices == []
+
+
+@pytest.mark.parametrize("words", ["a/\0.py", "/\x1b[31m\0", "file://[/x.py"])
+def test_words_that_no_path_can_have_leave_the_list_alive(panels: Panels, chosen: Chosen, words: str) -> None:
+    listed = TaskList(panels.server, chosen)
+    panels.visitors.do = listed.do
+    panels.type("Search", words)
+    panels.do(OpenFoundTask())
+    listed.draw()
+    assert chosen.numbers == [] and len(panels.client.notices) == 1
+
+
 def test_the_best_match_is_a_file_that_is_there() -> None:
     gone, there, other = replace(PUSH, gone=True), PUSH, PICK
     assert best_row([gone, there, other], lambda row: False) == there
@@ -155,8 +197,8 @@ def test_a_name_that_no_file_can_have_is_refused(panels: Panels, chosen: Chosen,
     assert len(panels.client.notices) == 1 and panels.typed("Name") == ""
 
 
-def html(view: CatalogueView, words: str = "", doing: str = "") -> str:
-    return tasks_html(view, words, doing)
+def html(view: CatalogueView) -> str:
+    return tasks_html(view, Search(), "")
 
 
 def test_names_are_escaped_and_what_is_gone_says_so() -> None:
@@ -189,7 +231,10 @@ def test_the_dialog_opens_once_chooses_and_goes(panels: Panels, chosen: Chosen) 
     panels.do(OpenListedTask(number=push))
     assert chosen.numbers == [push], "it is closed"
     panels.do(OpenTaskList())
+    dialog.draw(None)
+    assert "push.py" in panels.html("wb-tasks")
     panels.do(OpenTaskList())
+    dialog.draw(None)
     assert panels.html("wb-tasks") == "", "the key that opened it closes it"
 
 

@@ -77,18 +77,13 @@ class TaskFileReader:
         return known[1]
 
 
-def find_task_files(
-    folder: Path,
-    stopped: Callable[[], bool] = lambda: False,
-    read: Callable[[Path], TaskFile | None] | None = None,
-) -> FoundTasks:
+def find_task_files(folder: Path, read: Callable[[Path], TaskFile | None] | None = None) -> FoundTasks:
     """The task files in and below a folder.
 
     Hidden folders, Python environments, installed packages and links are left out. The search ends early, and says so, in
     a folder that has too many files or takes too long.
 
     Args:
-        stopped: asked often; True ends the search.
         read: reads a file; None for `read_task_file`.
     """
     read = read or read_task_file
@@ -101,7 +96,7 @@ def find_task_files(
             left_out = f"Only the first {MOST_LOOKED_AT} Python files were searched."
         elif len(found) >= MOST_FOUND:
             left_out = f"Only the first {MOST_FOUND} task files are listed."
-        elif time.monotonic() > ends_at or stopped():
+        elif time.monotonic() > ends_at:
             left_out = f"The search ended after {LONGEST:.0f} s."
         if left_out:
             break

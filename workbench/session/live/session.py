@@ -80,6 +80,7 @@ from workbench.session.run.events import (
     WorkerDied,
 )
 from workbench.session.run.loading import files_at_fault, first_requests, watched_files
+from workbench.session.run.policies import ListPolicies, PolicySearch
 from workbench.session.run.run import Run, first_run
 
 Value = TypeVar("Value")
@@ -170,6 +171,7 @@ class Session:
         self._profiles = ProfileJobs(self._background, self._happen)
         self._plans = PlanJobs(self._happen)
         self._seeds = SeedsJobs(recordings, self._happen)
+        self._policies = PolicySearch(self._happen)
         self._asker = Asker(self._send)
         self._studio = StudioJobs(self._asker, self._background, self._notify, self._happen)
         # Last: what it recovers happens at once.
@@ -242,6 +244,8 @@ class Session:
                 self._plans.perform(effect)
             case BeginSeeds() | EndSeeds():
                 self._seeds.perform(effect)
+            case ListPolicies():
+                self._policies.perform(effect)
             case BeginEpisodes() | TakeStep() | EndEpisodes():
                 self._recorder.perform(effect)
             case BeginSaving():
@@ -283,6 +287,7 @@ class Session:
             profile=self._state.profile,
             seeds=self._state.seeds,
             solve=self._state.solving.view(env),
+            known_policies=self._state.policies.found,
         )
         studio = studio_view_of(self._state.studio, self._run, self._studio.progress)
         return replace(view, studio=studio)
@@ -305,11 +310,6 @@ class Session:
         """What a person did in this session, for a later session of the same task."""
         run = self._run
         return KeptWork(run.options, run.settings, run.seed, kept_placements(self._state.studio))
-
-    @property
-    def task_folder(self) -> Path | None:
-        """Folder of the task's own file, where policies are looked for too."""
-        return self._run.folder
 
     @property
     def worker_pid(self) -> int | None:
@@ -368,6 +368,7 @@ class Session:
         self._profiles.close()
         self._plans.close()
         self._seeds.close()
+        self._policies.close()
         self._studio.close()
         self._past_saver.close()
         self._background.close()

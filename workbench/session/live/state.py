@@ -17,6 +17,7 @@ from workbench.session.record import recording as of_recording
 from workbench.session.record.saving import SaveEvent, SaveWanted
 from workbench.session.rescore import rescoring as of_rescoring
 from workbench.session.run import apply as of_run
+from workbench.session.run import policies as of_policies
 from workbench.session.run.events import Now, RunEffect, RunEvent
 from workbench.session.run.run import Run
 
@@ -31,6 +32,7 @@ SessionEvent = (
     | of_profile.ProfileEvent
     | of_seeds.SeedsEvent
     | of_solver.SolverEvent
+    | of_policies.PoliciesListed
     | StudioEvent
 )
 Effect = (
@@ -42,6 +44,7 @@ Effect = (
     | of_profile.ProfileEffect
     | of_seeds.SeedsEffect
     | of_solver.SolverEffect
+    | of_policies.ListPolicies
     | StudioEffect
     | Then
 )
@@ -74,6 +77,8 @@ class State:
     """The task solved from many seeds."""
     solving: of_solver.Solving = of_solver.Solving()
     """Plans of the source of actions *solve*."""
+    policies: of_policies.KnownPolicies = of_policies.KnownPolicies()
+    """Policies to choose from, for the source of actions *policy*."""
 
 
 def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
@@ -90,10 +95,11 @@ def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effe
     profile, for_profile = of_profile.apply(state.profile, event, run)
     seeds, for_seeds = of_seeds.apply(state.seeds, event, run)
     solving, for_solver = of_solver.apply(state.solving, event, run)
+    policies, for_policies = of_policies.apply(state.policies, event, run)
     studio, for_studio = of_studio.apply(state.studio, event, run, now)
-    new = State(run, recording, studio, rescoring, checks, profile, seeds, solving)
+    new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies)
     same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
     # Rescoring begins before checks: the later of two jobs of one priority comes first. What the run has to do comes after
     # them: when a load is done a recording continues before a recorded run is entered.
     for_jobs = [*for_recording, *for_rescoring, *for_checks, *for_profile, *for_seeds, *for_solver]
-    return state if same else new, [*for_jobs, *for_run, *for_studio]
+    return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio]

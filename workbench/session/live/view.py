@@ -142,6 +142,8 @@ class SessionView:
     """The camera studio."""
     solve: SolveView = SolveView()
     """The plans of the selected env."""
+    known_policies: tuple[str, ...] = ()
+    """Policies to choose from, as they were listed last."""
 
     @property
     def shown_cameras(self) -> ShownCameras | None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import ast
+import asyncio
+import math
 import os
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,13 +13,20 @@ from enum import Enum
 from functools import cache
 from pathlib import Path
 
-from workbench.authoring.loading.find_tasks import FoundTasks, TaskFile, TaskFileReader, find_task_files
+from workbench.authoring.loading.find_tasks import (
+    FoundTasks,
+    TaskFile,
+    TaskFileReader,
+    find_task_files,
+    read_task_file,
+)
 from workbench.commands.run import MOST_ENVS
 from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import example_tasks
 from workbench.machine.parse_python import parse_python
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.text import short_line
+from workbench.session.loop import Aside, begin, do, on_loop
 from workbench.session.tasks.recents import RecentTask, RecentTasks
 from workbench.session.tasks.registered import RegisteredTasks, RegisteredView
 from workbench.session.tasks.typed import typed_path
@@ -28,6 +36,8 @@ SEARCH_SECONDS = 1.0
 """Pause between two searches of the folder."""
 SEARCH_SHARE = 0.05
 """Largest share of the time that is spent on searches: a slow folder is searched less often."""
+SHOWN_SECONDS = 2.0
+"""Seconds after `Catalogue.view` for which the list counts as shown; a page asks for it several times a second."""
 
 
 class Section(Enum):
@@ -46,7 +56,7 @@ class Entry:
     """A row of the list. Its texts are printable, not escaped."""
 
     number: int
-    """Number that a page sends to choose the row; never given to another row while the program runs."""
+    """Number that a page sends to choose the row; never given to another row while the program runs. 0 for none yet."""
     section: Section
     name: str
     about: str
@@ -81,12 +91,12 @@ class CatalogueView:
     left_out: str = ""
     """Why the search may have missed files."""
     registered: RegisteredView = RegisteredView()
-    serial: int = 0
 
 
 class Catalogue:
-    """Lists recent tasks, task files of a folder, examples, recordings and registered ids. Thread-safe.
+    """Lists recent tasks, task files of a folder, examples, recordings and registered ids.
 
+    The list is one value, which is replaced on the loop. It follows the disk while it is shown.
     A page chooses by number: `entry` knows only what was listed, or typed and found.
 
     Args:
@@ -108,128 +118,123 @@ class Catalogue:
         self.folder = Path(os.path.realpath(folder))
         self.recents, self.registered, self.options = recents, registered, options
         self._recordings = recordings
-        self._lock = threading.Lock()
-        self._closing = threading.Event()
-        self._searching: threading.Thread | None = None
-        self._once_more = False
-        self._numbers: dict[tuple[Section, str], int] = {}
-        self._found: FoundTasks | None = None
-        """Result of the last search; None before the first search has ended."""
+        self._aside = Aside("find-tasks")
+        self._following: asyncio.Task[None] | None = None
         self._files = TaskFileReader()
-        self._search_again = 0.0
+        self._numbers: dict[tuple[Section, str], int] = {}
         self._typed: dict[int, Entry] = {}
-        self._seen: tuple[int, int] | None = None
-        self._changes = 0
-        self._view = CatalogueView(folder=_shown(str(self.folder)))
+        self._shown_at = -math.inf
+        self._on_disk = CatalogueView(folder=_shown(str(self.folder)), searching=True)
+        """The list without the registered tasks."""
+        self._view = self._on_disk
+        registered.on_change = self._list
 
+    @on_loop
     def refresh(self) -> None:
-        """Search the folder and look at the recent tasks again. Returns at once."""
-        self._begin_search(again=True)
-
-    def follow(self) -> None:
-        """`refresh`, unless a search is under way or has just ended. Call it while the list is in sight."""
-        if time.monotonic() >= self._search_again:
-            self._begin_search(again=False)
+        """Search the folder and look at the recent tasks again, and follow them from now on. Returns at once."""
+        self.registered.start()
+        if self._following is not None:
+            self._following.cancel()  # a search that is under way may have passed by what has changed
+        self._following = begin(self._follow())
 
     def view(self) -> CatalogueView:
-        """The list; cheap while nothing changes."""
-        registered = self.registered.view
-        with self._lock:
-            now = self._changes, registered.serial
-            if now != self._seen:
-                self._seen = now
-                view = replace(
-                    self._view,
-                    entries=tuple(self._entries(registered)),
-                    searching=self._found is None,
-                    left_out="" if self._found is None else self._found.left_out,
-                    registered=registered,
-                )
-                if view != self._view:
-                    self._view = replace(view, serial=view.serial + 1)
-            return self._view
+        """The list at this moment. Called again and again while the list is shown."""
+        self._shown_at = time.monotonic()
+        return self._view
 
     def entry(self, number: int) -> Entry | None:
         """The row of this number that is listed or was typed; None if there is none."""
-        listed = next((entry for entry in self.view().entries if entry.number == number), None)
+        listed = next((entry for entry in self._view.entries if entry.number == number), None)
         return self._typed.get(number) if listed is None else listed
 
-    def typed(self, text: str) -> Entry | None:
+    async def typed(self, text: str) -> Entry | None:
         """The row of the task file that a person has typed the path of; None for a text that is no path.
 
         Raises:
             NotAPath: the file cannot be opened.
         """
+        aside = Aside("typed-path")  # one for each text: a disk that hangs must not keep the next
+        try:
+            found = await aside.run(lambda: self._find_typed(text))
+        finally:
+            aside.end()
+        if found is None:
+            return None
+        entry = self._numbered(found)
+        self._typed[entry.number] = entry
+        return entry
+
+    @on_loop
+    def add_file(self, file: Path, env_id: str) -> Entry:
+        """List a task file of the folder that was just written; returns its row."""
+        entry = self._numbered(self._of_folder(TaskFile(file, (env_id,), ())))
+        rows = self._on_disk.entries
+        if all(row.number != entry.number for row in rows):
+            self._on_disk = replace(self._on_disk, entries=(entry, *rows))
+            self._list()
+        return entry
+
+    def close(self) -> None:
+        """End the search and the process of the pictures. Called on another thread than the loop."""
+        do(self._end)
+        self.registered.close()
+
+    def _end(self) -> None:
+        self._aside.end()  # which cancels a search that is begun later
+        if self._following is not None:
+            self._following.cancel()
+
+    async def _follow(self) -> None:
+        while True:
+            began = time.monotonic()
+            try:
+                found = await self._aside.run(self._search)
+                self._on_disk = replace(found, entries=tuple(map(self._numbered, found.entries)))
+            except Exception as error:
+                report_failure("The folder could not be searched for tasks", error)
+                self._on_disk = replace(self._on_disk, searching=False)
+            self._list()
+            took = time.monotonic() - began
+            await asyncio.sleep(max(SEARCH_SECONDS, took / SEARCH_SHARE))
+            while time.monotonic() - self._shown_at > SHOWN_SECONDS:
+                await asyncio.sleep(SEARCH_SECONDS)
+
+    def _list(self) -> None:
+        """List what is known now."""
+        registered = self.registered.view
+        entries = (*self._on_disk.entries, *self._of_maniskill(registered))
+        view = replace(self._on_disk, entries=entries, registered=registered)
+        if view != self._view:
+            self._view = view
+
+    # --- beside the loop -----------------------------------------------------------------------------
+
+    def _search(self) -> CatalogueView:
+        """The list without numbers and registered tasks."""
+        found = find_task_files(self.folder, self._files.read)
+        return CatalogueView(tuple(self._entries(found)), self._on_disk.folder, left_out=found.left_out)
+
+    def _find_typed(self, text: str) -> Entry | None:
         named = typed_path(text, self.folder)
         if named is None:
             return None
         file, class_name = named
         reference = f"{file}:{class_name}" if class_name else str(file)
-        with self._lock:
-            about = _about(self._files.read(file) or TaskFile(file, (), ()))
-            entry = self._entry(Section.TYPED, reference, reference, about, file=file)
-            self._typed[entry.number] = entry
-        return entry
-
-    def add_file(self, file: Path, env_id: str) -> Entry:
-        """List a task file of the folder that was just written; returns its row."""
-        task = TaskFile(file, (env_id,), ())
-        with self._lock:
-            found = self._found or FoundTasks()
-            if all(known.path != file for known in found.files):
-                self._found = replace(found, files=(task, *found.files))
-                self._changes += 1
-            return self._of_folder(task)
-
-    def close(self) -> None:
-        """End the search and the process of the pictures."""
-        self._closing.set()
-        self.registered.close()
-        with self._lock:
-            searching = self._searching
-        if searching is not None:
-            searching.join()
-
-    def _begin_search(self, again: bool) -> None:
-        """
-        Args:
-            again: Whether to search once more after a search that is under way: it may have passed by what has changed.
-        """
-        self.registered.start()
-        with self._lock:
-            if self._closing.is_set():
-                return
-            if self._searching is not None and self._searching.is_alive():
-                self._once_more |= again
-                return
-            self._searching = threading.Thread(target=self._search, name="find-tasks", daemon=True)
-            self._searching.start()
-
-    def _search(self) -> None:
-        while True:
-            found, began = FoundTasks(), time.monotonic()
-            try:
-                found = find_task_files(self.folder, self._closing.is_set, self._files.read)
-            except Exception as error:
-                report_failure("The folder could not be searched for tasks", error)
-            with self._lock:
-                self._found = found
-                self._changes += 1
-                took = time.monotonic() - began
-                self._search_again = time.monotonic() + max(SEARCH_SECONDS, took / SEARCH_SHARE)
-                if not self._once_more or self._closing.is_set():
-                    self._searching = None
-                    return
-                self._once_more = False
+        about = _about(read_task_file(file) or TaskFile(file, (), ()))
+        return _entry(Section.TYPED, reference, reference, about, file=file)
 
     # --- entries -------------------------------------------------------------------------------------
 
-    def _entries(self, registered: RegisteredView) -> Iterator[Entry]:
+    def _numbered(self, entry: Entry) -> Entry:
+        number = self._numbers.setdefault((entry.section, entry.reference), len(self._numbers) + 1)
+        return replace(entry, number=number)
+
+    def _entries(self, found: FoundTasks) -> Iterator[Entry]:
         yield from map(self._recent, self.recents.list())
-        yield from map(self._of_folder, () if self._found is None else self._found.files)
+        yield from map(self._of_folder, found.files)
         for task in example_tasks():
-            yield self._entry(Section.EXAMPLES, str(task), task.name, _first_line(task), file=task)
-        yield self._entry(
+            yield _entry(Section.EXAMPLES, str(task), task.name, _first_line(task), file=task)
+        yield _entry(
             Section.RECORDINGS,
             "",
             f"{self._recordings.name or self._recordings}/",
@@ -237,17 +242,17 @@ class Catalogue:
             if self._recordings.is_dir()
             else "No recordings here yet. workbench review FOLDER opens another folder.",
         )
+
+    def _of_maniskill(self, registered: RegisteredView) -> Iterator[Entry]:
         why_not = registered.why_not
         # Tasks that cannot be opened before a download come last.
         for env_id in sorted(registered.ids, key=why_not.__contains__):
             why = why_not.get(env_id)
-            entry = self._entry(
-                Section.REGISTERED, env_id, env_id, "" if why is None else why.text, env_id=env_id
-            )
+            entry = _entry(Section.REGISTERED, env_id, env_id, "" if why is None else why.text, env_id=env_id)
             blank = (
                 "" if why is None else "needs a download" if why.needs_download else "cannot be drawn here"
             )
-            yield replace(entry, blank=blank)
+            yield self._numbered(replace(entry, blank=blank))
 
     def _recent(self, task: RecentTask) -> Entry:
         file = task.file
@@ -256,18 +261,18 @@ class Catalogue:
         kwargs = "".join(f", {name}={value}" for name, value in task.env_kwargs.items())
         how = f"{num_envs} {'env' if num_envs == 1 else 'envs'}{kwargs}"
         if file is None:
-            return self._entry(
+            return _entry(
                 Section.RECENT, task.reference, task.reference, how, options=options, env_id=task.reference
             )
         name = task.reference.rpartition("/")[2]
         about = f"{self._place(file)} · {how}"
-        return self._entry(
+        return _entry(
             Section.RECENT, task.reference, name, about, file=file, gone=not file.is_file(), options=options
         )
 
     def _of_folder(self, task: TaskFile) -> Entry:
         name = str(task.path.relative_to(self.folder))
-        return self._entry(Section.FOLDER, str(task.path), name, _about(task), file=task.path)
+        return _entry(Section.FOLDER, str(task.path), name, _about(task), file=task.path)
 
     def _place(self, file: Path) -> str:
         """The folder of a file, as a person would write it."""
@@ -278,19 +283,18 @@ class Catalogue:
         home = Path.home()
         return f"~/{folder.relative_to(home)}" if folder.is_relative_to(home) else str(folder)
 
-    def _entry(
-        self,
-        section: Section,
-        reference: str,
-        name: str,
-        about: str,
-        file: Path | None = None,
-        gone: bool = False,
-        options: TaskOptions | None = None,
-        env_id: str = "",
-    ) -> Entry:
-        number = self._numbers.setdefault((section, reference), len(self._numbers) + 1)
-        return Entry(number, section, _shown(name), _shown(about), reference, file, gone, options, env_id)
+
+def _entry(
+    section: Section,
+    reference: str,
+    name: str,
+    about: str,
+    file: Path | None = None,
+    gone: bool = False,
+    options: TaskOptions | None = None,
+    env_id: str = "",
+) -> Entry:
+    return Entry(0, section, _shown(name), _shown(about), reference, file, gone, options, env_id)
 
 
 def _about(task: TaskFile) -> str:

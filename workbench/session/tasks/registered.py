@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import io
 import logging
 import re
-import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -20,8 +22,9 @@ from workbench.machine.files import read_regular_file, replace_file
 from workbench.machine.folders import cache_folder
 from workbench.machine.maniskill_installed import installed_maniskills, lines_if_lacking
 from workbench.machine.processes.child_python import LOWEST
-from workbench.machine.processes.watched_thread import watched_thread
-from workbench.session.loop import result_of
+from workbench.machine.processes.watched_thread import report_failure
+from workbench.machine.processes.wire import Question
+from workbench.session.loop import Aside, begin, do, on_loop
 from workbench.session.process.askers import Background
 from workbench.session.process.jobs import JobFailed
 from workbench.session.protocol.questions import DrawTask, ListTasks
@@ -34,19 +37,20 @@ MOST_TRIES = 2
 """Attempts to draw a task before `AGAIN_AFTER` has to pass."""
 AGAIN_AFTER = 7 * 24 * 3600.0
 """Seconds after which a task that failed so often is tried again: what it lacks may have been downloaded."""
-LONGEST_LIST, LONGEST_DRAWING = 120.0, 120.0
-"""Timeouts in seconds; on two cores with a software renderer most tasks are drawn in 5 s."""
+ANSWER_SECONDS = 120.0
+"""Timeout of the list and of each picture; on two cores with a software renderer most tasks are drawn in 5 s."""
 PICTURES_A_PROCESS = 20
 """Pictures that one process draws before another is started: SAPIEN keeps the meshes of closed scenes."""
 LONGEST_WHY = 300
 WIDTH, HEIGHT = 160, 120
 LARGEST_PICTURE = 64 * 1024
 """Most bytes of a cached picture; 160 x 120 pixels take 6 kB."""
-_LOOK = 0.5
+_LOOK_SECONDS = 0.5
 """Seconds between two checks whether drawing may continue."""
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,119}")
 """Pattern of an id. Without a dot, a slash and a colon an id cannot be a file or a module, whoever wrote it into the
 cache."""
+Value = TypeVar("Value")
 
 
 class NotDrawn(msgspec.Struct, frozen=True):
@@ -78,7 +82,6 @@ class RegisteredView:
     """``listing the tasks``, ``drawing PickCube-v1``; empty if nothing is being done."""
     problem: str = ""
     """Why there is no list, as sentences."""
-    serial: int = 0
 
     @property
     def waiting(self) -> int:
@@ -93,150 +96,142 @@ class RegisteredTasks:
     that the kernel knows: it gets what is left over. It ends when all is done.
 
     Args:
-        may_work: asked before every picture; False makes it wait, and frees the memory of the process.
+        may_work: asked on the loop before every picture; False makes it wait, and frees the memory of the process.
         folder: for the cached list and pictures; None for the user's cache.
     """
 
     def __init__(self, may_work: Callable[[], bool] = lambda: True, folder: Path | None = None) -> None:
         self._may_work, self._given_folder = may_work, folder
-        self._lock = threading.Lock()
-        self._view = RegisteredView()
-        self._cached = _Cached([])
+        self.view = RegisteredView()
+        """What is known at this moment."""
+        self.on_change: Callable[[], None] = lambda: None
+        """Called on the loop when there is another view."""
         self._folder = Path()
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._disk = Aside("registered-tasks")
+        self._process = Background(niceness=LOWEST)
+        self._work: asyncio.Task[None] | None = None
 
-    @property
-    def view(self) -> RegisteredView:
-        return self._view
-
+    @on_loop
     def start(self) -> None:
         """Begin to list and to draw, if that has not begun. Returns at once."""
-        with self._lock:
-            if self._thread is None and not self._closing.is_set():
-                self._thread = watched_thread("registered-tasks", self._work)
-                self._thread.start()
+        if self._work is None:
+            self._work = begin(self._list_and_draw())
 
     def picture(self, env_id: str) -> bytes | None:
         """The JPEG of a listed task; None without one."""
-        return _read_jpeg(self._file(env_id)) if env_id in self._view.pictures else None
+        return _read_jpeg(self._file(env_id)) if env_id in self.view.pictures else None
 
     def close(self) -> None:
-        """End the process."""
-        self._closing.set()
-        with self._lock:
-            thread = self._thread
-        if thread is not None:
-            thread.join()
+        """End the process. Called on another thread than the loop."""
+        do(self._end)
+        self._process.close()
 
-    # --- on its thread -------------------------------------------------------------------------------
+    def _end(self) -> None:
+        self._disk.end()  # which cancels work that is begun later
+        if self._work is not None:
+            self._work.cancel()
 
-    def _work(self) -> None:
-        if (lacking := lines_if_lacking("A list of its tasks")) is not None:
-            self._say(problem=" ".join(lacking))
-            return
-        self._folder = self._given_folder or _version_folder()
-        self._cached = _read_list(self._folder)
-        process = Background(niceness=LOWEST)
+    async def _list_and_draw(self) -> None:
         try:
-            self._list(process)
-            self._say(pictures=frozenset(one for one in self._cached.ids if _read_jpeg(self._file(one))))
-            self._draw_all(process)
+            lacking = await self._disk.run(lambda: lines_if_lacking("A list of its tasks"))
+            if lacking is not None:
+                self._tell(problem=" ".join(lacking))
+                return
+            self._folder = self._given_folder or await self._disk.run(_version_folder)
+            cached = await self._disk.run(lambda: _read_list(self._folder))
+            self._tell(ids=tuple(cached.ids), why_not=cached.not_drawn)
+            if not cached.ids:
+                await self._list()
+            self._tell(pictures=await self._disk.run(self._find_pictures))
+            await self._draw_all()
+        except Exception as error:
+            report_failure("ManiSkill's tasks could not be listed and drawn", error)
         finally:
-            process.close()
-            self._say(doing="")
+            self._process.end()
+            self._tell(doing="")
 
-    def _list(self, process: Background) -> None:
-        if not self._cached.ids:
-            self._say(doing="listing ManiSkill's tasks")
-            try:
-                ids = result_of(process.ask(ListTasks()), self._within(LONGEST_LIST))
-            except (JobFailed, _Ended) as failure:
-                if not self._closing.is_set():
-                    self._say(problem=f"ManiSkill's tasks could not be listed: {failure}.")
-                return
-            self._cached.ids = sorted(filter(_ID.fullmatch, ids))[:MOST_TASKS]
-            self._keep()
-        self._say(ids=tuple(self._cached.ids), why_not=dict(self._cached.not_drawn))
+    async def _list(self) -> None:
+        self._tell(doing="listing ManiSkill's tasks")
+        try:
+            ids = await self._ask(ListTasks())
+        except JobFailed as failure:
+            self._tell(problem=f"ManiSkill's tasks could not be listed: {failure}.")
+            return
+        self._tell(ids=tuple(_checked(ids)))
+        await self._keep_list()
 
-    def _draw_all(self, process: Background) -> None:
-        count = 0
+    async def _draw_all(self) -> None:
+        tried, count = self.view.why_not, 0
         # A task that failed before comes after all others.
-        for env_id in sorted(self._cached.ids, key=self._cached.not_drawn.__contains__):
-            if env_id in self._view.pictures or not self._may_try(env_id):
+        for env_id in sorted(self.view.ids, key=tried.__contains__):
+            if env_id in self.view.pictures or not _may_try(tried.get(env_id)):
                 continue
-            if not self._wait_until_allowed(process):
-                return
-            self._say(doing=f"drawing {env_id}")
+            while not self._may_work():
+                self._process.end()
+                self._tell(doing="")
+                await asyncio.sleep(_LOOK_SECONDS)
+            self._tell(doing=f"drawing {env_id}")
             try:
-                drawn = result_of(process.ask(DrawTask(env_id)), self._within(LONGEST_DRAWING))
+                drawn = await self._ask(DrawTask(env_id))
                 if drawn.pixels is None:
-                    self._note_failure(env_id, drawn.why_not, drawn.needs_download)
+                    await self._note_failure(env_id, drawn.why_not, drawn.needs_download)
                     continue
-                _write(self._file(env_id), _jpeg(drawn.pixels))
-            except (JobFailed, _Ended, ValueError) as failure:
-                if self._closing.is_set():
-                    return
-                if isinstance(failure, _Ended):
-                    process.close()  # it may be in an endless loop
-                self._note_failure(env_id, str(failure))
+                await self._disk.run(partial(_write_jpeg, self._file(env_id), drawn.pixels))
+            except (JobFailed, ValueError) as failure:
+                await self._note_failure(env_id, str(failure))
                 continue
             except OSError as error:
-                self._say(problem=f"Pictures of tasks cannot be kept: {error}.")
+                self._tell(problem=f"Pictures of tasks cannot be kept: {error}.")
                 return
-            self._say(pictures=self._view.pictures | {env_id})
+            self._tell(pictures=self.view.pictures | {env_id})
             count += 1
             if count % PICTURES_A_PROCESS == 0:
-                process.close()
+                self._process.end()
 
-    def _wait_until_allowed(self, process: Background) -> bool:
-        """Wait until drawing may continue; False if the process has to end."""
-        while not self._may_work():
-            process.close()
-            self._say(doing="")
-            if self._closing.wait(_LOOK):
-                return False
-        return not self._closing.is_set()
+    async def _ask(self, question: Question[Value]) -> Value:
+        """Ask the process.
 
-    def _within(self, seconds: float) -> Callable[[], None]:
-        ends_at = time.monotonic() + seconds
-
-        def check() -> None:
-            if self._closing.is_set():
-                raise _Ended("the workbench ends")
-            if time.monotonic() > ends_at:
-                raise _Ended(f"it took longer than {seconds:.0f} s")
-
-        return check
-
-    def _may_try(self, env_id: str) -> bool:
-        before = self._cached.not_drawn.get(env_id)
-        return before is None or before.tries < MOST_TRIES or abs(time.time() - before.last) > AGAIN_AFTER
-
-    def _note_failure(self, env_id: str, why: str, needs_download: bool = False) -> None:
-        before = self._cached.not_drawn.get(env_id)
-        tries = 1 if before is None else before.tries + 1
-        self._cached.not_drawn[env_id] = NotDrawn(why[:LONGEST_WHY], needs_download, tries, time.time())
-        self._keep()
-        self._say(why_not=dict(self._cached.not_drawn))
-
-    def _keep(self) -> None:
+        Raises:
+            JobFailed: there is no answer, or not in time.
+        """
         try:
-            _write(self._folder / LIST_FILE, msgspec.json.encode(self._cached))
+            async with asyncio.timeout(ANSWER_SECONDS):
+                return await self._process.ask(question)
+        except TimeoutError:
+            self._process.end()  # it may be in an endless loop
+            raise JobFailed(f"it took longer than {ANSWER_SECONDS:.0f} s") from None
+
+    async def _note_failure(self, env_id: str, why: str, needs_download: bool = False) -> None:
+        before = self.view.why_not.get(env_id)
+        tries = 1 if before is None else before.tries + 1
+        failed = NotDrawn(why[:LONGEST_WHY], needs_download, tries, time.time())
+        self._tell(why_not={**self.view.why_not, env_id: failed})
+        await self._keep_list()
+
+    async def _keep_list(self) -> None:
+        content = msgspec.json.encode(_Cached(list(self.view.ids), dict(self.view.why_not)))
+        try:
+            await self._disk.run(partial(_write, self._folder / LIST_FILE, content))
         except OSError as error:
             log.warning(
                 "The list of ManiSkill's tasks cannot be kept, and is made again in the next run: %s", error
             )
 
+    def _find_pictures(self) -> frozenset[str]:
+        return frozenset(one for one in self.view.ids if _read_jpeg(self._file(one)))
+
     def _file(self, env_id: str) -> Path:
         return self._folder / f"{env_id}.jpg"
 
-    def _say(self, **changes: object) -> None:
-        self._view = replace(self._view, serial=self._view.serial + 1, **changes)  # type: ignore[arg-type]
+    def _tell(self, **changes: object) -> None:
+        view = replace(self.view, **changes)  # type: ignore[arg-type]
+        if view != self.view:
+            self.view = view
+            self.on_change()
 
 
-class _Ended(Exception):
-    """The work is no longer wanted, or takes too long."""
+def _may_try(before: NotDrawn | None) -> bool:
+    return before is None or before.tries < MOST_TRIES or abs(time.time() - before.last) > AGAIN_AFTER
 
 
 def _version_folder() -> Path:
@@ -252,8 +247,12 @@ def _read_list(folder: Path) -> _Cached:
         cached = msgspec.json.decode(read_regular_file(folder / LIST_FILE, 1 << 20), type=_Cached)
     except (OSError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return _Cached([])  # made again
-    cached.ids = sorted(filter(_ID.fullmatch, cached.ids))[:MOST_TASKS]
+    cached.ids = _checked(cached.ids)
     return cached
+
+
+def _checked(ids: Iterable[str]) -> list[str]:
+    return sorted(filter(_ID.fullmatch, ids))[:MOST_TASKS]
 
 
 def _read_jpeg(file: Path) -> bytes | None:
@@ -269,8 +268,8 @@ def _write(file: Path, content: bytes) -> None:
     replace_file(file, content)
 
 
-def _jpeg(pixels: np.ndarray) -> bytes:
-    """The middle of a picture, in the shape of the cached ones. Raises ValueError for what is no picture."""
+def _write_jpeg(file: Path, pixels: np.ndarray) -> None:
+    """Write the middle of a picture, in the shape of the cached ones. Raises ValueError for what is no picture."""
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or not 0 < pixels.size < 1 << 26:
         raise ValueError("it is no picture")
     height, width = pixels.shape[:2]
@@ -280,4 +279,4 @@ def _jpeg(pixels: np.ndarray) -> bytes:
     left, top = (size[0] - WIDTH) // 2, (size[1] - HEIGHT) // 2
     written = io.BytesIO()
     image.crop((left, top, left + WIDTH, top + HEIGHT)).save(written, "JPEG", quality=80)
-    return written.getvalue()
+    _write(file, written.getvalue())

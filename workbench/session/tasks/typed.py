@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from urllib.parse import unquote, urlsplit
+from urllib.parse import unquote
 
 from workbench.authoring.loading.reference import (
     check_task_file,
@@ -40,7 +40,7 @@ def typed_path(text: str, folder: Path) -> tuple[Path, str | None] | None:
     while len(text) > 1 and text[0] + text[-1] in _QUOTES:
         text = text[1:-1].strip()
     if text.startswith("file://"):
-        text = unquote(urlsplit(text).path)
+        text = unquote("/" + text.removeprefix("file://").partition("/")[2])
     text = _LINE.sub("", text)
     if (named := split_reference(text)) is not None:
         module = find_module(named[0])
@@ -53,6 +53,6 @@ def typed_path(text: str, folder: Path) -> tuple[Path, str | None] | None:
         check_task_file(path)
     except TaskError as error:
         raise NotAPath(error.problem.message) from error
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, ValueError) as error:  # ValueError: characters that no path can have
         raise NotAPath(f"{text} is not a path that can be opened: {error}") from error
     return path, class_name or None

@@ -35,6 +35,7 @@ class StartPage:
         server.gui.set_panel_label("Workbench")
         self._apply_theme()
         server.gui.add_html(render("start_head", version=workbench.__version__))
+        place.open_task.catalogue.refresh()
         self._list = TaskList(server, place.open_task)
         self._place = place
         kinds = frozenset({ShowRecordings, ToggleTheme, *TaskList.does}) | place.does

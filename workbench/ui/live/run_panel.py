@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import threading
-import time
-from pathlib import Path
 from typing import Literal
 
 import viser
@@ -27,10 +23,7 @@ from workbench.commands.run import (
     Step,
     TogglePlay,
 )
-from workbench.jobs.policy import NoPolicy, find_policy, list_policies
 from workbench.jobs.task import ActionDimension, ActionSource
-from workbench.machine.kept_choices import keep_policy, used_policies
-from workbench.machine.processes.watched_thread import watched_thread
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.protocol.messages import EpisodeEnd
@@ -148,51 +141,6 @@ STEP, RESET_ALL, RESET_THIS = "Step", "Reset all", "Reset this env"
 PREVIOUS, NEXT = "‹ previous", "next ›"
 CHOOSE = "choose one"
 KNOWN_HINT = "Functions of one parameter in the files where the command was started and beside the task, and policies used before."
-LOOK_EVERY = 5.0
-"""Seconds between two searches for policies."""
-
-
-class KnownPolicies:
-    """Policies to choose from: policies that were used in this folder, and functions in its files and those of the
-    task's folder."""
-
-    def __init__(self) -> None:
-        self._here = Path.cwd()
-        self._found: tuple[str, ...] = ()
-        self._looked = -math.inf
-        self._looking: threading.Thread | None = None
-        self._kept: str | None = None
-
-    def look(self, task_folder: Path | None, acting: str | None) -> tuple[str, ...]:
-        """Known policies; searched again every `LOOK_EVERY` seconds on a thread, since the search reads many files.
-
-        Args:
-            acting: the policy that is chosen; kept for the next run if there is such a file or module.
-        """
-        if acting is not None and acting != self._kept:
-            self._kept = acting
-            with contextlib.suppress(NoPolicy):
-                find_policy(acting, task_folder)
-                keep_policy(self._here, acting)
-                self._looked = -math.inf
-        looking = self._looking is not None and self._looking.is_alive()
-        if not looking and time.monotonic() - self._looked > LOOK_EVERY:
-            self._looked = time.monotonic()
-            self._looking = watched_thread("policies", lambda: self._look(task_folder))
-            self._looking.start()
-        return self._found
-
-    def _look(self, task_folder: Path | None) -> None:
-        used = [one for one in used_policies(self._here) if _is_there(one, task_folder)]
-        self._found = tuple(dict.fromkeys([*used, *list_policies(self._here, task_folder)]))
-
-
-def _is_there(reference: str, task_folder: Path | None) -> bool:
-    try:
-        find_policy(reference, task_folder)
-    except NoPolicy:
-        return False
-    return True
 
 
 class RunPanel(PagePart[SessionView]):
@@ -230,7 +178,6 @@ class RunPanel(PagePart[SessionView]):
                 hint="module:function or file.py:function, given obs, returns the action.",
             )
             self._known = choice(server, "Known", SetPolicy, "policy", (CHOOSE,), CHOOSE, hint=KNOWN_HINT)
-            self._policies = KnownPolicies()
             self._policy_hint = gui.add_html(render("policy_hint"))
             self._policy.visible = self._known.visible = self._policy_hint.visible = False
             self._sliders = ActionSliders(server, session)
@@ -260,15 +207,12 @@ class RunPanel(PagePart[SessionView]):
         self._end.show(view.settings.episode_end, off=not can_act)
         self._source.show(view.settings.action_source, off=not can_act)
         self._policy.show(view.settings.policy or "")
+        policy, known = view.settings.policy, view.known_policies
         policy_wanted = view.settings.action_source == "policy"
         self._policy.visible = policy_wanted
-        self._policy_hint.visible = policy_wanted and not view.settings.policy
-        self._draw_known(view.settings.policy if policy_wanted else None, policy_wanted)
-        self._sliders.draw(view)
-
-    def _draw_known(self, policy: str | None, wanted: bool) -> None:
-        known = self._policies.look(self._session.task_folder, policy) if wanted else ()
-        self._known.visible = bool(known)
+        self._policy_hint.visible = policy_wanted and not policy
+        self._known.visible = policy_wanted and bool(known)
         self._known.show(
             policy if policy in known else "", options={CHOOSE: "", **{one: one for one in known}}
         )
+        self._sliders.draw(view)

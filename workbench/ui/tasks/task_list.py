@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import viser
@@ -22,6 +22,7 @@ from workbench.commands.tasks import (
     OpenTaskList,
     TemplateName,
 )
+from workbench.session.loop import begin
 from workbench.session.tasks.catalogue import Catalogue, CatalogueView, Entry, Section
 from workbench.session.tasks.typed import NotAPath
 from workbench.ui.library.dialogs import Dialog
@@ -68,8 +69,19 @@ class Chooser(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Search:
+    """What is searched for."""
+
+    words: str = ""
+    typed: Entry | None = None
+    """The file whose path the words are."""
+    why_not: str = ""
+    """Why the path in the words cannot be opened."""
+
+
 class TaskList:
-    """A search field and the list, in the present container.
+    """A search field and the list, in the present container. `Catalogue.refresh` was called before.
 
     Enter in the field opens the best match; the arrows lead from the field to the rows.
     """
@@ -88,14 +100,15 @@ class TaskList:
         self,
         server: viser.ViserServer,
         chooser: Chooser,
-        on_chosen: Callable[[], None] = lambda: None,
+        on_chosen: Callable[[], object] = lambda: None,
     ) -> None:
         """
         Args:
             on_chosen: called after a row was chosen.
         """
         self._chooser, self._on_chosen = chooser, on_chosen
-        self._words = self._name = ""
+        self._search = Search()
+        self._name = ""
         self._template: TemplateName = TEMPLATES[0].name
         self._drawn: object = None
         self._find = Field(
@@ -123,31 +136,18 @@ class TaskList:
             )
             server.gui.add_html(tools_html([tool(CREATE, CreateTask())]))
         self._html = server.gui.add_html("")
-        chooser.catalogue.refresh()
 
     def draw(self) -> None:
         """Draw it if something has changed."""
-        self._find.show(self._words)
+        search, view, doing = self._search, self._chooser.catalogue.view(), self._chooser.doing()
+        self._find.show(search.words)
         self._name_field.show(self._name)
         self._template_choice.show(self._template)
-        catalogue = self._chooser.catalogue
-        catalogue.follow()
-        view, doing = catalogue.view(), self._chooser.doing()
-        typed, why_not = self._typed()
-        wanted = view.serial, self._words, doing, typed, why_not
+        wanted = view, search, doing
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        self._html.content = tasks_html(
-            view, self._words, doing, self._chooser.is_open, typed, why_not, self._find.name
-        )
-
-    def _typed(self) -> tuple[Entry | None, str]:
-        """The file whose path the words are; or why it cannot be opened."""
-        try:
-            return self._chooser.catalogue.typed(self._words), ""
-        except NotAPath as error:
-            return None, sentence(str(error))
+        self._html.content = tasks_html(view, search, doing, self._chooser.is_open, self._find.name)
 
     def do(self, command: Command, visitor: Visitor) -> Done:
         match command:
@@ -156,15 +156,11 @@ class TaskList:
                     raise Refused("It is no longer in the list.")
                 self._choose(number)
             case OpenFoundTask():
-                found = shown_rows(self._chooser.catalogue.view(), self._words, self._typed()[0])
-                best = best_row([row for rows in found.values() for row in rows], self._chooser.is_open)
-                if best is None:
-                    raise Refused("Nothing in the list has these words.")
-                self._choose(best.number)
+                return self._open_found(self._search.words)
             case LookForTasks(words=words):
-                self._words = words[:LONGEST_WORDS]
+                self._look_for(words[:LONGEST_WORDS])
             case ClearTaskSearch():
-                self._words = ""
+                self._look_for("")
             case NameTask(name=name):
                 if not name.isprintable():
                     raise Refused("The name has characters that cannot be shown.")
@@ -182,19 +178,38 @@ class TaskList:
             raise Refused(str(why)) from None
         self._on_chosen()
 
+    def _look_for(self, words: str) -> None:
+        self._search = Search(words)
+        begin(self._look_up(words))
+
+    async def _look_up(self, words: str) -> None:
+        found = await self._read(words)
+        if self._search.words == words:
+            self._search = found
+
+    async def _read(self, words: str) -> Search:
+        """What the words mean on the disk."""
+        try:
+            return Search(words, typed=await self._chooser.catalogue.typed(words))
+        except NotAPath as error:
+            return Search(words, why_not=sentence(str(error)))
+
+    async def _open_found(self, words: str) -> None:
+        search = await self._read(words)
+        found = shown_rows(self._chooser.catalogue.view(), search)
+        best = best_row([row for rows in found.values() for row in rows], self._chooser.is_open)
+        if best is None:
+            raise Refused("Nothing in the list has these words.")
+        self._choose(best.number)
+
     def _choose(self, number: int) -> None:
         self._chooser.choose(number)
         self._on_chosen()
 
 
-def shown_rows(view: CatalogueView, words: str, typed: Entry | None) -> dict[Section, list[Entry]]:
-    """The rows of each section, in the order of the list.
-
-    Args:
-        words: searched for.
-        typed: the file whose path the words are.
-    """
-    wanted = words.lower().split()
+def shown_rows(view: CatalogueView, search: Search) -> dict[Section, list[Entry]]:
+    """The rows of each section, in the order of the list."""
+    wanted, typed = search.words.lower().split(), search.typed
     found = [entry for entry in view.entries if entry.matches(wanted)]
     if typed is not None and all(entry.reference != typed.reference for entry in found):
         found.insert(0, typed)
@@ -211,28 +226,21 @@ def best_row(rows: Sequence[Entry], is_open: Callable[[Entry], bool]) -> Entry |
 
 def tasks_html(
     view: CatalogueView,
-    words: str,
+    search: Search,
     doing: str,
     is_open: Callable[[Entry], bool] = lambda entry: False,
-    typed: Entry | None = None,
-    why_not: str = "",
-    search: str = "",
+    field: str = "",
 ) -> str:
     """The list.
 
     Args:
-        words: searched for.
         doing: what is being opened, if anything.
         is_open: whether a row is the open task, which is marked and which Enter does not choose.
-        typed: the file whose path the words are.
-        why_not: why the path in the words cannot be opened.
-        search: name of the field of the search.
+        field: name of the field of the search.
     """
-    found = shown_rows(view, words, typed)
+    found, searched = shown_rows(view, search), bool(search.words.split())
     every = [row for rows in found.values() for row in rows]
-    notes = {
-        section: _note(section, view, bool(rows), bool(words.split())) for section, rows in found.items()
-    }
+    notes = {section: _note(section, view, bool(rows), searched) for section, rows in found.items()}
     sections = [
         {"of": section, "rows": rows, "note": notes[section]}
         for section, rows in found.items()
@@ -241,14 +249,14 @@ def tasks_html(
     return render(
         "tasks",
         view=view,
-        words=words,
+        words=search.words,
         doing=doing,
         open_task=lambda number: OpenListedTask(number=number),
         clear=ClearTaskSearch(),
         found=len(every),
         best=best_row(every, is_open),
-        search=search,
-        why_not=why_not,
+        search=field,
+        why_not=search.why_not,
         sections=sections,
         pictures=view.registered.pictures,
         registered=Section.REGISTERED,
@@ -305,49 +313,40 @@ class OpenDialog(PagePart[object]):
         chooser: Chooser,
     ) -> None:
         self._server, self._chooser = server, chooser
-        self._lock = threading.RLock()
+        self._wanted = False
         self._shown: tuple[Dialog, TaskList] | None = None
+        """Opened and closed by `draw`, which alone uses its fields."""
 
     def do(self, command: Command, visitor: Visitor) -> Done:
         match command:
             case OpenTaskList():
-                self.open()
+                if not self.close():
+                    self._chooser.catalogue.refresh()
+                    self._wanted = True
             case _:
-                with self._lock:
-                    if self._shown is None:
-                        raise Refused("The list of tasks is closed.")
-                    return self._shown[1].do(command, visitor)
+                shown = self._shown
+                if not self._wanted or shown is None:
+                    raise Refused("The list of tasks is closed.")
+                return shown[1].do(command, visitor)
         return None
 
     def add_button(self) -> None:
         """Add the button that opens it to the present container."""
         self._server.gui.add_html(tools_html([tool(OPEN, OpenTaskList())]))
 
-    def open(self) -> None:
-        """Open it; close it if it is open."""
-        with self._lock:
-            if self._shown is not None and not self._shown[0].modal.closed:
-                self.close()
-                return
-            with self._server.atomic():
-                dialog = Dialog(self._server, "Open a task")
-                with dialog.modal:
-                    listed = TaskList(self._server, self._chooser, self._close_chosen)
-                self._shown = dialog, listed
-
-    def _close_chosen(self) -> None:
-        self.close()
-
     def close(self) -> bool:
-        """False if it is closed."""
-        with self._lock:
-            shown, self._shown = self._shown, None
-            return shown is not None and shown[0].close()
+        """Close it; False if it is closed."""
+        was, self._wanted = self._wanted, False
+        return was
 
     def draw(self, view: object) -> None:
-        with self._lock:
+        if not self._wanted:
             if self._shown is not None:
-                if self._shown[0].modal.closed:
-                    self._shown = None
-                else:
-                    self._shown[1].draw()
+                self._shown[0].close()
+                self._shown = None
+            return
+        if self._shown is None:
+            dialog = Dialog(self._server, "Open a task")
+            with dialog.modal:
+                self._shown = dialog, TaskList(self._server, self._chooser, self.close)
+        self._shown[1].draw()

@@ -1,0 +1,71 @@
+"""Policies to choose from: when they are listed, that the list follows the folder, and what is kept for the next run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.drive.session import Told
+from tests.drive.waiting import until
+from workbench.commands.run import ChooseActions, SetPolicy
+from workbench.jobs.task import TaskOptions
+from workbench.machine.kept_choices import used_policies
+from workbench.session.protocol.messages import Settings
+from workbench.session.run import policies
+from workbench.session.run.events import FileSaved, PagesCounted
+from workbench.session.run.policies import KnownPolicies, ListPolicies, PoliciesListed, Wanted, apply
+from workbench.session.run.run import first_run
+
+ACT = "def act(obs):\n    pass\n"
+
+
+def test_they_are_listed_while_a_page_is_open_and_policies_act() -> None:
+    run = first_run("push.py", TaskOptions(), 1, Settings(action_source="policy"))
+    folder = Path.cwd()
+    known, effects = apply(KnownPolicies(), FileSaved(), run)
+    assert effects == []
+    known, effects = apply(known, FileSaved(), replace(run, pages=1))
+    assert effects == [ListPolicies(Wanted(folder, None))]
+    known, effects = apply(known, PoliciesListed(("a.py:act",)), replace(run, pages=2))
+    assert known.found == ("a.py:act",) and effects == []
+    acts = replace(run, pages=1, settings=Settings(action_source="policy", policy="a.py:act"))
+    known, effects = apply(known, FileSaved(), acts)
+    assert effects == [ListPolicies(Wanted(folder, "a.py:act"))]
+    for changed in (replace(acts, pages=0), replace(acts, settings=Settings())):
+        after, effects = apply(known, FileSaved(), changed)
+        assert effects == [ListPolicies(None)] and after.found == known.found
+        assert apply(after, FileSaved(), changed) == (after, [])
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder in which the command was started; requested before `told`."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setattr(policies, "LIST_SECONDS", 0.02)
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    return here
+
+
+def test_the_list_follows_the_folder_and_one_that_acts_is_kept(here: Path, told: Told) -> None:
+    def listed(*wanted: str) -> None:
+        until(lambda: told.view.known_policies == wanted, f"{wanted}", seen=lambda: told.view.known_policies)
+
+    (here / "b.py").write_text(ACT)
+    told.session.happen(PagesCounted(1))
+    told.session.do(ChooseActions(source="policy"))
+    listed("b.py:act")
+    (here / "a.py").write_text(ACT)
+    listed("a.py:act", "b.py:act")
+    told.session.do(SetPolicy(policy="b.py:act"))
+    listed("b.py:act", "a.py:act")
+    assert used_policies(here) == ("b.py:act",)
+    told.session.do(SetPolicy(policy="not_there.py:act"))
+    (here / "c.py").write_text(ACT)
+    listed("b.py:act", "a.py:act", "c.py:act")
+    assert used_policies(here) == ("b.py:act",), "one that is not there is not kept"
+    (here / "b.py").unlink()
+    listed("a.py:act", "c.py:act")
