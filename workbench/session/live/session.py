@@ -316,6 +316,11 @@ class Session:
         """Process id of the worker; None while there is none."""
         return self._worker.pid
 
+    @property
+    def episodes_written(self) -> int:
+        """Number of episodes whose files are written, also while the loop is busy."""
+        return self._recorder.finisher.finished.count
+
     def knows_file(self, path: str) -> bool:
         """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder. Looks at the
         disk."""
