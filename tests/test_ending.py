@@ -19,6 +19,8 @@ from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import provoke, provoked, write_task
 from tests.ui.tabs import open_deaf_tab, tabs_of
+from workbench.commands.recording import ChooseRecordedEnvs, ToggleRecording
+from workbench.commands.run import PlayRun
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -94,6 +96,25 @@ def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:
     assert recordings and not [problem for problem in map(verify_rrd, recordings) if problem is not None]
     ending = "\n".join(opened.lines[said:])
     assert "Traceback" not in ending, "\n".join(opened.lines)
+
+
+@pytest.mark.slow
+def test_ctrl_c_waits_for_the_episodes_that_are_being_written(tmp_path: Path) -> None:
+    """For longer than for a disk that hangs."""
+    count = 32
+    shutil.copy(TASK, tmp_path)
+    arguments = (TASK.name, "--num-envs", str(count), "--env", "render_backend=none", "--no-spare")
+    with open_workbench(*arguments, cwd=tmp_path) as opened, tabs_of(opened.url) as tabs:
+        opened.wait_for_line("loaded", 90)
+        tab = tabs.open()
+        until(lambda: tab.open and tab.name, "the tab")
+        for command in (ChooseRecordedEnvs(envs="all"), ToggleRecording(), PlayRun()):
+            assert "refused" not in tabs.do(tab, command)
+        folder = tmp_path / "recordings"
+        until(lambda: len(list(folder.glob("*.rrd"))) > 0, "the first episode of each env")
+    recordings = list(folder.glob("*.rrd"))
+    assert opened.process.returncode == 0 and len(recordings) >= count, opened.lines[-5:]
+    assert not [problem for problem in map(verify_rrd, recordings) if problem is not None]
 
 
 WITHIN_SECONDS = 2.0
