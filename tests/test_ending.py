@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -10,12 +11,16 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.drive.page import open_workbench
+from tests.drive.episodes import made, write
+from tests.drive.hung_disk import HungDisk
+from tests.drive.page import TASK, open_workbench
 from tests.drive.processes import workers_of
 from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import provoke, provoked, write_task
 from tests.ui.tabs import open_deaf_tab, tabs_of
+from workbench.commands.recording import ChooseRecordedEnvs, ToggleRecording
+from workbench.commands.run import PlayRun
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -91,3 +96,93 @@ def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:
     assert recordings and not [problem for problem in map(verify_rrd, recordings) if problem is not None]
     ending = "\n".join(opened.lines[said:])
     assert "Traceback" not in ending, "\n".join(opened.lines)
+
+
+@pytest.mark.slow
+def test_ctrl_c_waits_for_the_episodes_that_are_being_written(tmp_path: Path) -> None:
+    """For longer than for a disk that hangs."""
+    count = 32
+    shutil.copy(TASK, tmp_path)
+    arguments = (TASK.name, "--num-envs", str(count), "--env", "render_backend=none", "--no-spare")
+    with open_workbench(*arguments, cwd=tmp_path) as opened, tabs_of(opened.url) as tabs:
+        opened.wait_for_line("loaded", 90)
+        tab = tabs.open()
+        until(lambda: tab.open and tab.name, "the tab")
+        for command in (ChooseRecordedEnvs(envs="all"), ToggleRecording(), PlayRun()):
+            assert "refused" not in tabs.do(tab, command)
+        folder = tmp_path / "recordings"
+        until(lambda: len(list(folder.glob("*.rrd"))) > 0, "the first episode of each env")
+    recordings = list(folder.glob("*.rrd"))
+    assert opened.process.returncode == 0 and len(recordings) >= count, opened.lines[-5:]
+    assert not [problem for problem in map(verify_rrd, recordings) if problem is not None]
+
+
+WITHIN_SECONDS = 2.0
+
+
+def ends_while_it_hangs(
+    disk: HungDisk, arguments: tuple[str, ...], what: str, presses: tuple[str, ...]
+) -> None:
+    """Start the command, let the disk hang, press until a call hangs (the last of `presses` again and again), and end it."""
+    with open_workbench(*arguments, cwd=disk.folder, what=what, env=disk.environment()) as opened:
+        if what == "open":
+            opened.wait_for_line("loaded|failed", 90)
+        with tabs_of(opened.url) as tabs:
+            tab = tabs.open()
+            until(lambda: tab.open, "the tab")
+            for press in presses[:-1]:
+                tabs.trigger(tab, press)
+            disk.hang()
+            disk.until_it_hangs(lambda: [tabs.trigger(tab, press) for press in presses[-1:]])
+            server, began = psutil.Process(opened.process.pid), time.monotonic()
+            processes = [server, *server.children(recursive=True)]
+            server.send_signal(signal.SIGINT)
+            assert gone([server])
+            seconds = time.monotonic() - began
+            assert gone(processes)
+    assert opened.process.returncode == 0 and seconds < WITHIN_SECONDS, opened.lines
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("text", "calls", "presses"),
+    [
+        pytest.param(TASK.read_text(), ("stat", "open"), (), id="watching"),
+        pytest.param(
+            TASK.read_text(), ("pwrite", "fsync"), ("Start or stop recording", "Play"), id="recording"
+        ),
+        pytest.param("", ("write", "rename"), ("Write the minimal task into the empty file",), id="edit"),
+    ],
+)
+def test_ctrl_c_ends_the_live_page_whatever_disk_hangs(
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    text: str,
+    calls: tuple[str, ...],
+    presses: tuple[str, ...],
+) -> None:
+    file = tmp_path / "task.py"
+    file.write_text(text)
+    disk = HungDisk(tmp_path, tmp_path_factory.mktemp("aside"), calls)
+    arguments = (str(file), "--num-envs", "1", "--env", "render_backend=none", "--no-spare")
+    ends_while_it_hangs(disk, arguments, "open", presses)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("calls", "what", "arguments"),
+    [
+        pytest.param(("scandir", "open", "stat"), "review", (".",), id="library"),
+        pytest.param(("scandir", "open"), "start", ("--recordings", "/nowhere/recordings"), id="search"),
+    ],
+)
+def test_ctrl_c_ends_a_list_whatever_disk_hangs(
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    calls: tuple[str, ...],
+    what: str,
+    arguments: tuple[str, ...],
+) -> None:
+    write(tmp_path, made(4, seed=1), pictures=False)
+    shutil.copy(TASK, tmp_path)
+    ends_while_it_hangs(HungDisk(tmp_path, tmp_path_factory.mktemp("aside"), calls), arguments, what, ())

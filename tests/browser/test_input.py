@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.far_line import FarLine, line_to
 from tests.drive.page import page_at
+from tests.drive.panels import drop_viser
 from tests.drive.waiting import until
 from workbench.commands.cameras import PickPixel
 from workbench.commands.command import Command, Refused
@@ -370,3 +371,20 @@ def test_a_channel_that_is_lost_alone_comes_back_and_nothing_is_asked_twice(smal
         small.page.keyboard.press("s")
         small.page.wait_for_timeout(200)  # the channel takes a moment to come back
     assert set(small.came) == {Step()}, "what was lost is told, and not sent again"
+
+
+def test_a_page_whose_viser_reconnects_alone_is_heard(small: Small) -> None:
+    page = small.page
+    name = page.locator("[data-page]").get_attribute("data-page")
+    drop_viser(small.gated_server)
+    expect(page.locator("[data-page]")).not_to_have_attribute("data-page", name or "")
+    deadline = time.monotonic() + 60
+    while not small.came and time.monotonic() < deadline:
+        page.keyboard.press("s")
+        page.wait_for_timeout(200)  # the channel takes a moment to come back
+    small.came.clear()
+    page.keyboard.press("f")
+    small.has(FrameScene())
+    press_for_a_while(page, *middle_of(page, small.row(2)))
+    small.has(FrameScene(), SelectEnv(env=2))
+    assert len(page.locator("[data-page]").all()) == 1

@@ -22,9 +22,10 @@ from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage
 from tests.drive.own_controls import Controls, SeenButton, SeenField
 from workbench.commands.command import Command, Refused
 from workbench.session.loop import result_of
+from workbench.ui.server.gated_server import GatedServer
 from workbench.ui.widgets.parts import Parts
 from workbench.ui.widgets.templates import asks
-from workbench.ui.widgets.visitors import Visitor, Visitors
+from workbench.ui.widgets.visitors import PATH, Visitor, Visitors
 
 Kind = Literal["button", "field"]
 """Of an input. A button and what it is for may have the same label."""
@@ -93,6 +94,18 @@ def held_by(server: viser.ViserServer) -> dict[str, int]:
         "messages": len(sockets._broadcast_buffer.message_from_id),
         "pages": len(sockets._client_state_from_id),
     }
+
+
+def drop_viser(gated_server: GatedServer) -> None:
+    """Cut viser's connection of each open page; the channel of commands stays."""
+    listening: Any = gated_server._gated._serving.server
+
+    def drop() -> None:
+        for connection in list(listening.connections):
+            if not connection.request.path.startswith(PATH):
+                connection.transport.abort()
+
+    listening.get_loop().call_soon_threadsafe(drop)
 
 
 def forget_what_was_drawn(parts: Parts[Any]) -> None:

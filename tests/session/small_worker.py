@@ -113,6 +113,17 @@ class SmallWorker:
             self.line.send_bytes(pack_message(Loading(f"step {number}")))
         os.kill(os.getpid(), signal.SIGKILL)
 
+    def chatter(self, _: str) -> None:
+        """As fast as it can, in messages of which the end often comes apart."""
+        number = 0
+        while True:
+            number += 1
+            self.say(f"{number} " + "x" * 20_000)
+
+    def close_its_line(self, seconds: str) -> None:
+        self.line.close()
+        self.work(seconds)
+
     def leave(self, code: str) -> None:
         self.heartbeat.begin("stepping")
         os._exit(int(code))

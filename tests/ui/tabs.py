@@ -7,6 +7,8 @@ cookie and subprotocol, and the first camera message (before it viser does not c
 from __future__ import annotations
 
 import asyncio
+import json
+import re
 import socket
 import threading
 from collections.abc import Iterator, Sequence
@@ -25,7 +27,9 @@ import zstandard
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
+from workbench.commands.command import Command
 from workbench.ui.server.access import cookie_name
+from workbench.ui.widgets.visitors import PATH
 
 
 def handshake(url: str) -> tuple[str, dict[str, Any]]:
@@ -73,6 +77,8 @@ class Tab:
     """Connected, and all that there was at that time has come."""
     commands: dict[str, str] = field(default_factory=dict)
     """The commands of the palette: the id of each, by its label."""
+    name: str = ""
+    """Name of the page, with which it asks for commands."""
 
 
 class Tabs:
@@ -112,6 +118,15 @@ class Tabs:
         said = self._connections[id(tab)].send(msgspec.msgpack.encode(message.as_serializable_dict()))
         asyncio.run_coroutine_threadsafe(said, self._loop).result(timeout=30)
 
+    def do(self, tab: Tab, command: Command) -> dict[str, Any]:
+        """Ask for this command; returns the reply."""
+        address, options = handshake(self._url)
+        del options["subprotocols"]
+        path = f"{address.rstrip('/')}{PATH}?page={tab.name}"
+        with websockets.sync.client.connect(path, proxy=None, **options) as channel:
+            channel.send(json.dumps({"n": 1, "do": command.encode()}))
+            return json.loads(channel.recv(60))
+
     def stop(self) -> None:
         """Close all that are open."""
 
@@ -135,7 +150,10 @@ class Tabs:
                     assert isinstance(frame, bytes)
                     tab.frames += 1
                     tab.megabytes += len(frame) / 2**20
-                    for message in [] if tab.open else messages_in(frame):
+                    for message in [] if tab.open and tab.name else messages_in(frame):
+                        if message["type"] == "GuiHtmlMessage" and not tab.name:
+                            found = re.search('data-page="([^"]+)"', message["props"]["content"])
+                            tab.name = found[1] if found else ""
                         if message["type"] == "RegisterCommandMessage":
                             tab.commands[message["props"]["label"]] = message["uuid"]
                         tab.open = tab.open or message["type"] == "ReplayDoneMessage"

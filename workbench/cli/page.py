@@ -7,9 +7,11 @@ import queue
 import signal
 import sys
 from collections.abc import Callable
+from concurrent import futures
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import NoReturn
 
 from rich.markup import escape
 
@@ -30,6 +32,7 @@ from workbench.machine.kept_choices import kept_choices
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reader.reading import start_reading
 from workbench.session.live.session import HISTORY_BYTES, KeptWork, Session
+from workbench.session.loop import Aside, loop_in_main, on_signal
 from workbench.session.process.supervisor import WorkerOptions
 from workbench.session.protocol.messages import Event, Loaded, LoadFailed
 from workbench.session.tasks.recents import RecentTasks
@@ -39,7 +42,13 @@ from workbench.ui.app.workplace import Workplace
 from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
 from workbench.ui.server.listening import ServerError
 
+_CLOSING_SECONDS = 1.4
+"""Seconds without a written episode after which closing is given up: a disk may hang."""
+_Requests = queue.SimpleQueue[Callable[[], object] | int]
+"""What the command does next, or the exit code with which it ends."""
 
+
+@loop_in_main
 def open_in_terminal(
     task: str,
     options: TaskOptions,
@@ -61,21 +70,21 @@ def open_in_terminal(
     gated_server = _start_server(at, "Workbench")
     if isinstance(gated_server, int):
         return gated_server
-    requests = _PageRequests()
+    requests = _Requests()
     waits_for_a_file = named_file(task) is not None
     shown = waits_for_a_file
     if shown:
-        requests.show_address()
+        requests.put(partial(_print_address, gated_server))
 
     def on_event(event: Event) -> None:
         nonlocal shown
         print_event(event)
         # A broken file can be fixed and saved; an env id that fails has nothing to wait for, and gets no page.
         if not waits_for_a_file and isinstance(event, LoadFailed) and not event.kept:
-            requests.end(1)
+            requests.put(1)
         elif not shown and isinstance(event, Loaded):
             shown = True
-            requests.show_address()
+            requests.put(partial(_print_address, gated_server))
 
     how = _HowToOpen(recordings, worker, history_bytes, RecentTasks(), pictures)
     if waits_for_a_file:
@@ -85,6 +94,7 @@ def open_in_terminal(
     _serve(gated_server, place, "live", f"{task}, {options.num_envs} envs", requests)
 
 
+@loop_in_main
 def start_in_terminal(
     options: TaskOptions,
     at: ServerOptions,
@@ -106,11 +116,12 @@ def start_in_terminal(
         return gated_server
     how = _HowToOpen(recordings, worker, history_bytes, RecentTasks())
     place = _workplace(gated_server, how, options, None, trust, editor=editor)
-    requests = _PageRequests()
-    requests.show_address()
+    requests = _Requests()
+    requests.put(partial(_print_address, gated_server))
     _serve(gated_server, place, "start", f"tasks in {Path.cwd()}", requests)
 
 
+@loop_in_main
 def review_in_terminal(
     folder: Path,
     tasks: tuple[Path, ...],
@@ -132,8 +143,8 @@ def review_in_terminal(
         return gated_server
     how = _HowToOpen(folder, worker, HISTORY_BYTES, RecentTasks())
     place = _workplace(gated_server, how, base, None, trust, tasks, editor)
-    requests = _PageRequests()
-    requests.show_address()
+    requests = _Requests()
+    requests.put(partial(_print_address, gated_server))
     _serve(gated_server, place, "review", f"recordings in {folder}", requests)
 
 
@@ -238,69 +249,47 @@ def _serve(
     place: Workplace,
     first: Which,
     what: str,
-    requests: _PageRequests,
+    requests: _Requests,
 ) -> NoReturn:
+    renew = partial(requests.put, partial(_renew_token, gated_server))
     if gated_server.options.token:
-        place.renew_token = requests.renew
-    requests.handle_signals()
+        place.renew_token = renew
+    on_signal(signal.SIGUSR1, renew)
+    # Not SIGHUP, by which a closed terminal ends its processes.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        on_signal(number, partial(requests.put, 0))
     try:
         place.pages.start(first)
         out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(what)}", soft_wrap=True)
-        requests.wait(gated_server)
+        while not isinstance(request := requests.get(), int):
+            request()
+        code = request
     finally:
         out.print("closing")
-        place.close()
-        gated_server.close()
-    _exit(requests.code)
+        _close(place, gated_server)
+    _exit(code)
 
 
-_PageRequest = Literal["end", "renew", "show"]
+def _close(place: Workplace, gated_server: GatedServer) -> None:
+    """Close all that is open. What takes longer than `_CLOSING_SECONDS` is left, unless episodes are written meanwhile."""
+    closing = Aside("closing").begin(place.close)
+    written = _episodes_written(place)
+    while not futures.wait([closing], _CLOSING_SECONDS).done:
+        if written == (written := _episodes_written(place)):
+            warn("closing takes too long; what was being recorded is recovered at the next start")
+            break
+    gated_server.close()
 
 
-class _PageRequests:
-    """Requests of signals, events and the page for the main thread, and the exit code."""
+def _episodes_written(place: Workplace) -> int:
+    return sum(session.episodes_written for session in {place.home, place.session} if session is not None)
 
-    def __init__(self) -> None:
-        self.code = 0
-        # A signal handler must not take a lock that the main thread holds; putting into this queue takes none.
-        self._requests: queue.SimpleQueue[_PageRequest] = queue.SimpleQueue()
 
-    def end(self, code: int) -> None:
-        self.code = code
-        self._requests.put("end")
-
-    def handle_signals(self) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda number, frame: self._requests.put("end"))
-        # Not SIGHUP, by which a closed terminal ends its processes.
-        signal.signal(signal.SIGUSR1, lambda number, frame: self._requests.put("renew"))
-
-    def renew(self) -> None:
-        """Request a new token. Returns at once."""
-        self._requests.put("renew")
-
-    def show_address(self) -> None:
-        """Request that the address is printed. Returns at once."""
-        self._requests.put("show")
-
-    def wait(self, gated_server: GatedServer) -> None:
-        """Handle requests until the end."""
-        while (request := self._next()) != "end":
-            if request == "show":
-                _print_address(gated_server)
-            if request == "renew" and gated_server.options.token:
-                gated_server.renew_token()
-                print_text("  the token was renewed, and every page was closed; open the new address:")
-                print_addresses(gated_server.addresses())
-
-    def _next(self) -> _PageRequest | None:
-        """The next request, or None after 0.2 s."""
-        try:
-            # With a timeout: if the kernel delivers the signal to another thread (as on a busy machine), the main one, which
-            # runs the handlers, would not wake.
-            return self._requests.get(timeout=0.2)
-        except queue.Empty:
-            return None
+def _renew_token(gated_server: GatedServer) -> None:
+    if gated_server.options.token:
+        gated_server.renew_token()
+        print_text("  the token was renewed, and every page was closed; open the new address:")
+        print_addresses(gated_server.addresses())
 
 
 def _print_address(gated_server: GatedServer) -> None:

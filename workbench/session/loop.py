@@ -2,7 +2,8 @@
 
 What pages ask for, what a worker says and what jobs come to are changes, made one after the other, each whole. So no lock
 guards what they change, and what is read is of one moment. Nothing on the loop blocks: what does (a disk, another process)
-is awaited, or done by an `Aside`. The thread begins with the first use and lasts as long as the process.
+is awaited, or done by an `Aside`. Commands that serve pages run the loop in the main thread (`loop_in_main`); elsewhere a
+daemon thread runs it from the first use on, as long as the process lasts.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import queue
+import signal
 import threading
 from collections.abc import Callable, Coroutine
 from concurrent import futures
@@ -25,19 +27,59 @@ Args = ParamSpec("Args")
 
 
 _here = threading.local()
+_beginning = threading.Lock()
+_begun: asyncio.AbstractEventLoop | None = None
 
 
-@functools.cache
 def _loop() -> asyncio.AbstractEventLoop:
+    global _begun
+    with _beginning:
+        if _begun is None:
+            _begun = _new_loop()
+            threading.Thread(target=_run, args=(_begun.run_forever,), name="loop", daemon=True).start()
+        return _begun
+
+
+def _new_loop() -> asyncio.AbstractEventLoop:
     loop = asyncio.new_event_loop()
     loop.set_exception_handler(_report)
-
-    def run() -> None:
-        _here.is_loop = True
-        loop.run_forever()
-
-    threading.Thread(target=run, name="loop", daemon=True).start()
     return loop
+
+
+def _run(run: Callable[[], Value]) -> Value:
+    _here.is_loop = True
+    return run()
+
+
+def loop_in_main(command: Callable[Args, Value]) -> Callable[Args, Value]:
+    """Make a command run on a thread of its own, where it may block, and the loop on the calling thread meanwhile. That is
+    the main thread of a process that has not used the loop before and does not use it after the command.
+
+    Raises:
+        KeyboardInterrupt: on Ctrl-C, until the command calls `on_signal`. The command's thread is left behind.
+    """
+
+    @functools.wraps(command)
+    def called(*args: Args.args, **kwargs: Args.kwargs) -> Value:
+        global _begun
+        with _beginning:
+            assert _begun is None, "the loop runs on another thread already"
+            loop = _begun = _new_loop()
+        work = functools.partial(command, *args, **kwargs)
+        task = loop.create_task(Aside("command").run(work))
+        # Else Python raises it in whatever change the loop is making.
+        loop.add_signal_handler(signal.SIGINT, task.cancel)
+        try:
+            return _run(lambda: loop.run_until_complete(task))
+        except asyncio.CancelledError:
+            raise KeyboardInterrupt from None
+
+    return called
+
+
+def on_signal(number: signal.Signals, change: Callable[[], object]) -> None:
+    """Make a change at each signal of this number. The loop must run in the main thread."""
+    do(lambda: _loop().add_signal_handler(number, change))
 
 
 def _report(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

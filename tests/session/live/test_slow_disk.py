@@ -15,6 +15,7 @@ from workbench.authoring.loading.watch import SourceWatcher
 from workbench.authoring.problem import Problem
 from workbench.commands.recording import StopRecording
 from workbench.commands.run import Step
+from workbench.session.live import session
 from workbench.session.protocol.messages import LoadFailed, SingleStep
 from workbench.session.record.recording import RecordingWanted
 
@@ -53,6 +54,33 @@ def test_files_that_cannot_be_watched_keep_neither_a_step_nor_the_end(
         problem = Problem("import", "SyntaxError", str(tmp_path / "module.py"), 1, None, "")
         told.tell(LoadFailed(problem, kept=True))
         assert told.view.problem == problem and answers(told)
+
+
+def test_a_disk_that_hangs_as_a_version_comes_keeps_no_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, disk: threading.Event
+) -> None:
+    """After a save, and after the death of a worker, it is looked whether the files are still those of the version."""
+    file = str(tmp_path / "push.py")
+    with told_session(tmp_path, task=file) as told:
+        told.play(2)
+        hangs = threading.Event()
+
+        def read(path: str) -> str:
+            hangs.set()
+            disk.wait(60)
+            return ""
+
+        monkeypatch.setattr(session, "read_source", read)
+        for happens in (lambda: None, told.die):
+            happens()
+            worker = threading.Thread(
+                target=lambda: told.load("patched", source={file: "x = 1"}), daemon=True
+            )
+            worker.start()
+            assert hangs.wait(60)
+            assert answers(told)
+            worker.join(20)
+            assert not worker.is_alive() and answers(told), "what the worker says next is taken"
 
 
 def test_a_recording_that_cannot_be_written_keeps_no_step(

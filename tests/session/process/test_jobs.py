@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
@@ -144,6 +146,44 @@ def test_what_a_change_raises_is_raised_where_it_was_asked_for_and_the_loop_goes
         assert loop.do(lambda: loop.do(lambda: 7)) == 7, "also from the loop itself"
     finally:
         stop_listening(said.append)
+
+
+@pytest.mark.parametrize(
+    ("does", "comes_to"),
+    [
+        (
+            "on_signal(signal.SIGUSR1, got.set); os.kill(os.getpid(), signal.SIGUSR1); assert got.wait(60)",
+            "done, on the loop: True, here: False",
+        ),
+        ("os.kill(os.getpid(), signal.SIGINT); got.wait()", "interrupted"),
+        ("raise LookupError('nothing there')", "nothing there"),
+    ],
+)
+def test_a_command_may_block_while_the_loop_and_its_signals_are_in_the_main_thread(
+    child_process: None, does: str, comes_to: str
+) -> None:
+    script = f"""
+import os, signal, threading
+from workbench.session.loop import do, loop_in_main, on_signal
+
+def is_main():
+    return threading.current_thread() is threading.main_thread()
+
+@loop_in_main
+def command(word):
+    got = threading.Event()
+    {does}
+    return f"{{word}}, on the loop: {{do(is_main)}}, here: {{is_main()}}"
+
+try:
+    print(command("done"))
+except LookupError as error:
+    print(*error.args)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert (ended.stdout.strip(), ended.stderr) == (comes_to, "")
 
 
 def test_who_waits_for_work_of_the_loop_can_give_it_up() -> None:

@@ -147,6 +147,23 @@ def test_the_end_says_what_it_was_at_and_where_and_what_was_sent_before_is_taken
 
 
 @pytest.mark.slow
+def test_whenever_a_worker_dies_its_true_cause_is_told() -> None:
+    """From its first moment on, and in the middle of messages."""
+    with minded() as one:
+        one.first_requests = lambda: [*one.greeting(), do("chatter")]
+        one.worker.replace()
+        one.until_dead(1)
+        for moment in range(20):
+            one.until(lambda: one.worker.pid is not None, "the next worker")
+            heard, number = len(one.events), (signal.SIGKILL, signal.SIGSEGV, signal.SIGABRT)[moment % 3]
+            one.until(lambda count=heard + 2 * moment: len(one.events) >= count, "the moment")
+            os.kill(one.worker.pid or 0, number)
+            death = one.until_dead(moment + 2)
+            assert (death.why, death.end) == (f"was killed by {number.name}", End.DIED), moment
+            one.worker.reset_deaths()
+
+
+@pytest.mark.slow
 def test_the_third_death_in_a_row_is_the_last_until_somebody_asks_and_a_load_forgives_the_earlier_ones() -> (
     None
 ):
@@ -266,6 +283,7 @@ def test_a_load_behind_what_cannot_be_interrupted_ends_the_worker() -> None:
         pytest.param("nonsense x", 0, "unreadable data", marks=pytest.mark.slow),
         ("say this", 1, "no such step"),
         pytest.param("without_a_main_thread 600", 0, "main thread", marks=pytest.mark.slow),
+        pytest.param("close_its_line 600", 0, "closed its line", marks=pytest.mark.slow),
     ],
 )
 def test_what_cannot_go_on_is_ended_with_a_reason_and_another_comes(does: str, fails: int, says: str) -> None:

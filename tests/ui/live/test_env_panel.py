@@ -20,10 +20,10 @@ from workbench.commands.envs import (
     SortEnvs,
     TurnEnvs,
 )
-from workbench.commands.page import ToggleTable
+from workbench.commands.page import TellUnfolded, ToggleTable
 from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
 from workbench.session.run.events import EpisodeStepShown, SettingsChanged
-from workbench.ui.live.env_panel import MOST_ROWS
+from workbench.ui.live.env_panel import MOST_ROWS, TABLE
 
 pytestmark = pytest.mark.thorough
 
@@ -123,6 +123,18 @@ def test_a_step_is_in_the_table_a_moment_later_and_a_press_at_once(table: Table)
     table.show(3, 0.0, env=3, rows=many(steps=np.full(MANY, 6, np.int32)))
     table.ask(SortEnvs(column="return"))
     assert table.html != before
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_the_key_opens_and_closes_the_table_whatever_opened_it(live_page: Live, by_hand: bool) -> None:
+    assert live_page.is_folded("Envs")
+    live_page.do(TellUnfolded(panel=TABLE) if by_hand else ToggleTable())
+    if not by_hand:
+        assert not live_page.is_folded("Envs")
+        live_page.do(TellUnfolded(panel=TABLE))  # as a page says it then
+    for folded in (True, False, True):
+        live_page.do(ToggleTable())
+        assert live_page.is_folded("Envs") == folded
 
 
 def test_a_folded_table_is_not_drawn_while_steps_go_on(table: Table) -> None:

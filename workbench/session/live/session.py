@@ -22,7 +22,7 @@ from workbench.core.capture.recorded_run import RecordedRun
 from workbench.jobs.policy import NoPolicy, PolicyFile, find_policy
 from workbench.jobs.task import Stepped, TaskOptions
 from workbench.machine.kept_choices import keep_check_after_save
-from workbench.machine.processes.watched_thread import listen, stop_listening
+from workbench.machine.processes.watched_thread import listen, report_failure, stop_listening
 from workbench.session.cameras.state import KeptPlacements, first_studio, kept_placements, placed_cameras
 from workbench.session.cameras.state import view_of as studio_view_of
 from workbench.session.cameras.studio import StudioJobs
@@ -205,12 +205,21 @@ class Session:
             wait_for_disk(begun)  # then a save is noticed
 
     def _happen(self, event: SessionEvent) -> list[Future[None]]:
-        """Returns what was begun beside the loop."""
-        before = self._state
+        """Returns what was begun beside the loop. An effect that fails costs no other one: it is reported, or raised to who asked."""
+        before, begun, failure = self._state, list[Future[None]](), None
         self._state, effects = apply(before, event, Now(time.monotonic(), time.time()))
-        begun = [future for effect in effects if (future := self._perform(effect)) is not None]
+        for effect in effects:
+            try:
+                if (future := self._perform(effect)) is not None:
+                    begun.append(future)
+            except Exception as error:
+                failure = failure or error
         if self._state is not before:
             self._notify()
+        if failure is not None and isinstance(event, Asked):
+            raise failure
+        if failure is not None:
+            report_failure("What follows from an event could not be done", failure)
         return begun
 
     @property
@@ -316,6 +325,11 @@ class Session:
         """Process id of the worker; None while there is none."""
         return self._worker.pid
 
+    @property
+    def episodes_written(self) -> int:
+        """Number of episodes whose files are written, also while the loop is busy."""
+        return self._recorder.finisher.finished.count
+
     def knows_file(self, path: str) -> bool:
         """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder. Looks at the
         disk."""
@@ -391,7 +405,12 @@ class Session:
             # Before a person sees the problem and mends the file.
             files = self.look(lambda run: files_at_fault(run, event))
             wait_for_disk(do(lambda: self._perform(Follow(files))) if files else None)
-        on_disk = not isinstance(event, Loaded) or _is_on_disk(event.task.source)
+        on_disk = True
+        if isinstance(event, Loaded):
+            # The watcher finds later what has changed by then.
+            looked = do(lambda: self._aside.begin(partial(_is_on_disk, event.task.source)))
+            wait_for_disk(looked)
+            on_disk = not looked.done() or looked.cancelled() or looked.result()
         if do(lambda: self._handle(event, on_disk)):
             self._on_event(event)
 

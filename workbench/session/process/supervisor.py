@@ -384,6 +384,8 @@ class Supervisor:
             worker.stop(grace=0.3)  # nothing is lost: the server has all that is kept
             return False
         code = worker.exit_code()
+        if code is None and state.why is None:
+            state.why = "closed its line to the server and was ended"
         report, beat = worker.crash_report(), worker.beat()  # both files outlive the process
         worker.stop(grace=0.0)
         with self._condition:

@@ -339,6 +339,7 @@ class Page:
     def _unfolded(self, panel: str) -> None:
         """Handle that a page shows this panel."""
         if panel == ENVS:
+            self._envs_open = True
             self._fit_envs()
             self._envs.unfold()
         elif panel == STUDIO:
