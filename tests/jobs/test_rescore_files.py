@@ -27,6 +27,7 @@ from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.cli.main import main
 from workbench.cli.share import export_in_terminal
 from workbench.cli.terminal.arguments import JobArguments
+from workbench.commands.timeline import StopRescoring
 from workbench.jobs.actions import read_actions
 from workbench.jobs.open_task import open_task
 from workbench.jobs.pool.deal import Deal, ThisProcess, Work
@@ -399,7 +400,7 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
         edit(author, REWARD, "import time; time.sleep(1000)")
         rescorer.start(find_all_sources((author / "recordings",)))
         rescored(rescorer, "loading")
-        rescorer.rescoring.stop()
+        rescorer.do(StopRescoring())
         rescored(rescorer, "stopped")
     finally:
         rescorer.close()
