@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -33,8 +32,6 @@ from workbench.recording.episode.row import Source
 
 _TRIES = 3
 """Maximum number of times that a chunk is started when its workers die."""
-_PERIOD = 0.2
-"""Seconds between two progress messages of a worker."""
 _SIDE = (".rrd", ".h5", ".json")
 """Suffixes of the files of one recording."""
 
@@ -290,33 +287,22 @@ class _Rescorer:
         """Rescore the whole chunk, including recordings with a known result: in another batch an episode may
         differ in the last bits. Returns False if the task raised."""
         sources = [self._source(number) for number in chunk.numbers]
-        missing, told, reported = set(chunk.wanted), 0, time.monotonic()
-
-        def on_steps(steps: int) -> None:
-            nonlocal told, reported
-            if time.monotonic() - reported > _PERIOD:
-                self.queue.send_update(RescoreUpdate(steps=steps - told))
-                told, reported = steps, time.monotonic()
-                if self.queue.limit() <= chunk.numbers[0]:
-                    raise _Stopped
-            last[0] = steps
-
-        last = [0]
+        missing = set(chunk.wanted)
         try:
-            for verdict in rescore(
-                opened, sources, use_env_states=self.setup.use_env_states, on_steps=on_steps
-            ):
-                number = int(verdict.of.id)
-                if number in missing:
-                    missing.remove(number)
-                    of = self.setup.items[number]
-                    verdict = replace(verdict, of=of.source())
-                    self.queue.send_result(number, RescoredRecording(of.place, verdict, of.note))
+            for part in rescore(opened, sources, use_env_states=self.setup.use_env_states):
+                self.queue.send_update(RescoreUpdate(steps=part.steps))
+                for verdict in part.verdicts:
+                    number = int(verdict.of.id)
+                    if number in missing:
+                        missing.remove(number)
+                        of = self.setup.items[number]
+                        verdict = replace(verdict, of=of.source())
+                        self.queue.send_result(number, RescoredRecording(of.place, verdict, of.note))
+                if missing and self.queue.limit() <= chunk.numbers[0]:
+                    raise _Stopped
         except TaskError as error:
             self._fail(missing, error)
             return False
-        finally:
-            self.queue.send_update(RescoreUpdate(steps=last[0] - told))
         return True
 
     def _source(self, number: int) -> Source:

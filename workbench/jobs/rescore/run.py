@@ -78,82 +78,59 @@ def rescore(
     files: Iterable[Source],
     *,
     use_env_states: bool = False,
-    on_steps: Callable[[int], None] = lambda steps: None,
     read: Callable[[Source], Episode] = read_recording,
-) -> Iterator[Verdict[Source]]:
-    """Rescore these episodes with the open task's code; gives a verdict for each, in the order in which they end.
+) -> Iterator[Rescored]:
+    """Rescore these episodes with the open task's code; gives the verdicts in the order in which the episodes end, and a
+    progress a few times a second.
 
     Each env begins an episode (`replay.begin_run`), makes its actions, and then takes the next one, independent of the
     other envs. Envs without one do not move.
 
     Args:
         use_env_states: restore every recorded state after its step, so that nothing drifts.
-        on_steps: called with the number of control steps so far, over all episodes.
         read: reads a file's episode; raises as `read_recording`.
 
     Raises:
         TaskError: the task's code raised.
     """
-    task = opened.env
-    waiting = iter(files)
+    waiting, more = iter(files), True
     rescorings: dict[int, _Rescoring] = {}
-    steps = 0
-    more = True
+    reported, steps = time.monotonic(), 0
     while more or rescorings:
         begun: dict[int, _Rescoring] = {}
-        while more and len(rescorings) + len(begun) < task.num_envs:
-            file = next(waiting, None)
-            if file is None:
+        free = [i for i in range(opened.env.num_envs) if i not in rescorings]
+        while more and len(begun) < len(free):
+            if (file := next(waiting, None)) is None:
                 more = False
                 break
-            reported = _open_episode(opened, file, use_env_states, read)
-            if isinstance(reported, Verdict):
-                yield reported
+            episode = _open_episode(opened, file, use_env_states, read)
+            if isinstance(episode, Verdict):
+                yield Rescored((episode,), 0)
             else:
-                env = next(i for i in range(task.num_envs) if i not in rescorings and i not in begun)
-                begun[env] = reported
+                begun[free[len(begun)]] = episode
         if begun:
             _begin(opened, begun)
             rescorings |= begun
-        if not rescorings:
-            continue
-        _one_step(opened, rescorings, use_env_states)
-        steps += len(rescorings)
-        on_steps(steps)
-        for env in [env for env, rescoring in rescorings.items() if rescoring.at == rescoring.run.length]:
-            yield rescorings.pop(env).verdict()
+        if rescorings:
+            _one_step(opened, rescorings, use_env_states)
+            steps += len(rescorings)
+        ended = [env for env, rescoring in rescorings.items() if rescoring.at == rescoring.run.length]
+        verdicts = tuple(rescorings.pop(env).verdict() for env in ended)
+        if verdicts or time.monotonic() - reported > _PROGRESS_PERIOD:
+            yield Rescored(verdicts, steps)
+            reported, steps = time.monotonic(), 0
 
 
 def answer(
     opened: OpenedTask, request: Rescore, on_progress: Callable[[int, int, Rescored], None]
 ) -> Rescored:
-    """Carry out `request` in a worker.
-
-    Args:
-        on_progress: called a few times a second with the control steps so far, 0, and the new verdicts.
-
-    Returns:
-        the verdicts since the last call of `on_progress`.
-    """
-    reported, steps = time.monotonic(), 0
-    ready: list[Verdict[Source]] = []
-
-    def on_steps(now: int) -> None:
-        nonlocal reported, steps
-        steps = now
-        if time.monotonic() - reported > _PROGRESS_PERIOD:
-            reported = time.monotonic()
-            on_progress(steps, 0, Rescored(tuple(ready), steps))
-            ready.clear()
-
+    """Carry out `request` in a worker: tells all by `on_progress`, and returns what the code raised, if it did."""
     try:
-        for verdict in rescore(
-            opened, request.files, use_env_states=request.use_env_states, on_steps=on_steps
-        ):
-            ready.append(verdict)
+        for part in rescore(opened, request.files, use_env_states=request.use_env_states):
+            on_progress(0, 0, part)
     except TaskError as error:
-        return Rescored(tuple(ready), steps, error.problem)
-    return Rescored(tuple(ready), steps)
+        return Rescored((), 0, error.problem)
+    return Rescored((), 0)
 
 
 def _open_episode(

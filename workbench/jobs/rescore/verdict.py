@@ -249,12 +249,11 @@ def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Rescored:
-    """Progress or end of a `Rescore`."""
+    """Part of the result of rescoring some episodes."""
 
     verdicts: tuple[Verdict[Source], ...]
-    """New verdicts."""
     steps: int
-    """Control steps so far, over all episodes."""
+    """Control steps since the part before, over all episodes."""
     problem: Problem | None = None
     """Exception of the task's code; the rescoring ends with it."""
 

@@ -296,15 +296,12 @@ class Rescorer:
                 failure.problem,
             ) from failure
         self._tell(state="rescoring")
-        began, before, steps = time.monotonic(), self.view.seconds, self.view.steps
+        began = time.monotonic() - self.view.seconds
 
-        def on_part(part: Rescored) -> None:
-            seconds = before + time.monotonic() - began
-            self._tell(part.verdicts, steps=steps + part.steps, seconds=seconds)
+        def on_part(done: int, total: int, part: Rescored) -> None:
+            self._tell(part.verdicts, steps=self.view.steps + part.steps, seconds=time.monotonic() - began)
 
-        question = Rescore(group.files, use_env_states)
-        last = await process.ask(question, lambda done, total, part: on_part(part))
-        on_part(last)
+        last = await process.ask(Rescore(group.files, use_env_states), on_part)
         if last.problem is not None:
             raise JobFailed(f"the code of {group.info.task} raised", last.problem)
 
