@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
+from workbench.core.env.step_result import StepResult
 from workbench.machine.processes.wire import Question
 from workbench.recording.episode.row import Source
 
@@ -244,7 +245,7 @@ def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
     return found
 
 
-# --- the question to a worker ------------------------------------------------------------------------
+# --- questions to a worker -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -265,3 +266,38 @@ class Rescore(Question[Rescored]):
     part: ClassVar[Any] = Rescored
     files: tuple[Source, ...]
     use_env_states: bool
+
+
+# The server keeps the history and hands over snapshots and actions: the batch makes its steps together again, since they may
+# depend on each other by a generator that all envs share. Only for a worker that does not play: its envs move.
+
+
+@dataclass(frozen=True)
+class MomentToRescore:
+    """A past moment to replay: a control step, or a jump if it has a snapshot."""
+
+    action: NDArray[np.float32] | None
+    """(N, A) action; None for a jump, or a task without robots."""
+    snapshot: bytes | None = None
+    """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch."""
+    env_idx: tuple[int, ...] = ()
+    """The envs that are put back to the snapshot."""
+
+
+@dataclass(frozen=True)
+class RescoredMoments:
+    """Reward and evaluate of past moments by today's code."""
+
+    steps: tuple[StepResult, ...]
+    """One for each moment; fewer if one raised."""
+    not_carried: dict[str, str]
+    """What jumps of all envs could not restore, each with the reason."""
+    problem: Problem | None = None
+    """What the moment after `steps` raised."""
+
+
+@dataclass(frozen=True)
+class RescoreMoments(Question[RescoredMoments]):
+    """Replay these moments in order."""
+
+    moments: tuple[MomentToRescore, ...]

@@ -8,11 +8,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from workbench.jobs.rescore.verdict import RescoredMoments, RescoreMoments
 from workbench.session.loop import do
 from workbench.session.process.askers import Background
 from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.protocol.messages import Load
-from workbench.session.protocol.questions import RescoredMoments, RescoreMoments
 from workbench.session.rescore.past import RescoredPast
 from workbench.session.rescore.rescoring import (
     BeginRescoring,

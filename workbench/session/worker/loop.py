@@ -25,7 +25,8 @@ from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
 from workbench.jobs.actions import ActionChooser
 from workbench.jobs.open_task import OpenedTask, Opening, warm_up
-from workbench.jobs.rescore.verdict import Rescore
+from workbench.jobs.rescore.moments import rescore_moments
+from workbench.jobs.rescore.verdict import Rescore, RescoreMoments
 from workbench.jobs.task import Restored, TaskOptions
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.processes.debugger import (
@@ -77,7 +78,6 @@ from workbench.session.protocol.questions import (
     MakeScene,
     PlanActions,
     ProfileStep,
-    RescoreMoments,
     RunCameras,
 )
 from workbench.session.worker.cameras import WorkerCameras
@@ -87,7 +87,6 @@ from workbench.session.worker.go_back import (
     entering_text,
     go_back,
     going_back_text,
-    rescore_moments,
 )
 from workbench.session.worker.guarded_task import REFUSED, GuardedTask, ServerConnection
 from workbench.session.worker.make_scene import SceneEnv, draw_task, registered_ids
