@@ -4,49 +4,32 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 import torch
 
-from workbench.authoring.loading.load import undo_load
-from workbench.authoring.loading.reference import RecordedTask, TaskName, named_file
+from workbench.authoring.loading.reference import RecordedTask, named_file
 from workbench.authoring.problem import Problem, TaskError
 from workbench.core.broken_rule import warn_of
-from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.rules import Finding
 from workbench.jobs.actions import needed_by
-from workbench.jobs.from_recording import CannotEnterRecording, recorded_source
-from workbench.jobs.open_task import OpenedTask, open_task
+from workbench.jobs.from_recording import CannotEnterRecording
+from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.pool.deal import Chunk, Deal, Executor, Failure, ItemQueue, Work
 from workbench.jobs.pool.travel import MOST_BYTES
-from workbench.jobs.rescore.run import rescore
-from workbench.jobs.rescore.verdict import Verdict
-from workbench.jobs.task import TaskOptions
+from workbench.jobs.rescore.run import opened_code, rescore
+from workbench.jobs.rescore.verdict import RescoredBy, Verdict
 from workbench.machine.folders import CurrentFolder
-from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
 
 _TRIES = 3
 """Maximum number of times that a chunk is started when its workers die."""
 _SIDE = (".rrd", ".h5", ".json")
 """Suffixes of the files of one recording."""
-
-
-@dataclass(frozen=True)
-class RescoredBy:
-    """Code and options that rescore some recordings."""
-
-    task: TaskName
-    """The task. Its code may run: the side that submits the job has asked for consent."""
-    options: TaskOptions
-    or_else: TaskOptions
-    """Options to use where the task cannot be opened with `options`."""
-    recorded: EpisodeInfo | None = None
-    """Recording whose text is opened instead of today's code."""
 
 
 @dataclass(frozen=True)
@@ -270,7 +253,11 @@ class _Rescorer:
         """Rescore this chunk, and further ones as long as they are of the same code and nothing is raised: then its envs may
         be in any state. Returns the next chunk."""
         try:
-            with _opened(code, self.queue) as opened:
+            with opened_code(
+                code,
+                on_activity=lambda activity: self.queue.send_update(RescoreUpdate(activity)),
+                on_finding=lambda finding: self.queue.send_update(RescoreUpdate(finding=finding)),
+            ) as opened:
                 while chunk is not None and self.setup.code_of(chunk) == self.at:
                     if not self._rescore(opened, chunk):
                         return self.queue.next()
@@ -322,34 +309,3 @@ class _Rescorer:
             of = self.setup.items[number]
             result = RescoredRecording(of.place, of.verdict(str(error)), of.note, True, problem)
             self.queue.send_result(number, result)
-
-
-@contextmanager
-def _opened(code: RescoredBy, queue: ItemQueue) -> Iterator[OpenedTask]:
-    """Open the task of a code. Raises TaskError, CannotEnterRecording."""
-    if code.recorded is not None:
-        with recorded_source(code.recorded) as reference:
-            with _opened(replace(code, task=reference, recorded=None), queue) as opened:
-                yield opened
-        return
-
-    def begin(options: TaskOptions) -> OpenedTask:
-        return open_task(
-            code.task,
-            options,
-            on_activity=lambda activity: queue.send_update(RescoreUpdate(activity)),
-            on_finding=lambda finding: queue.send_update(RescoreUpdate(finding=finding)),
-        )
-
-    try:
-        opened = begin(code.options)
-    except TaskError:
-        opened = begin(code.or_else)
-    if isinstance(opened.env.env, BatchedCpuMixin):
-        # Else an episode depends, by its last bits, on those that the same process rescored before.
-        opened.env.env.begins_anew = True
-    try:
-        yield opened
-    finally:
-        opened.env.close()
-        undo_load(opened.loaded)

@@ -4,23 +4,35 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.load import undo_load
 from workbench.authoring.problem import TaskError
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import read_states, state_distance
 from workbench.core.env import actions
+from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.step_result import StepResult
+from workbench.core.rules import Finding
 from workbench.core.snapshots.snapshot import step_only
-from workbench.jobs.from_recording import run_of
-from workbench.jobs.open_task import OpenedTask
+from workbench.jobs.from_recording import recorded_source, run_of
+from workbench.jobs.open_task import OpenedTask, open_task
 from workbench.jobs.replay import begin_run, restore_recorded, why_not_replayable
-from workbench.jobs.rescore.verdict import Rescore, Rescored, Scores, Verdict, compare, scalar_entries
+from workbench.jobs.rescore.verdict import (
+    Rescore,
+    Rescored,
+    RescoredBy,
+    Scores,
+    Verdict,
+    compare,
+    scalar_entries,
+)
+from workbench.machine.folders import CurrentFolder
 from workbench.recording.episode.episode import Episode
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.reader.reading import read_recording
@@ -121,13 +133,37 @@ def rescore(
             reported, steps = time.monotonic(), 0
 
 
-def answer(
-    opened: OpenedTask, request: Rescore, on_progress: Callable[[int, int, Rescored], None]
-) -> Rescored:
-    """Carry out `request` in a worker: tells all by `on_progress`, and returns what the code raised, if it did."""
+@contextmanager
+def opened_code(
+    code: RescoredBy,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_finding: Callable[[Finding], None] = lambda finding: None,
+) -> Iterator[OpenedTask]:
+    """Open the task of a code. Raises TaskError, CannotEnterRecording."""
+    text = nullcontext(code.task) if code.recorded is None else recorded_source(code.recorded)
+    with text as task:
+        try:
+            opened = open_task(task, code.options, on_activity=on_activity, on_finding=on_finding)
+        except TaskError:
+            opened = open_task(task, code.or_else, on_activity=on_activity, on_finding=on_finding)
+        if isinstance(opened.env.env, BatchedCpuMixin):
+            # Else an episode depends, by its last bits, on those that the same process rescored before.
+            opened.env.env.begins_anew = True
+        try:
+            yield opened
+        finally:
+            opened.env.close()
+            undo_load(opened.loaded)
+
+
+def answer(request: Rescore, on_progress: Callable[[int, int, Rescored], None]) -> Rescored:
+    """Carry out `request` in a worker: all results go to `on_progress`, and what the code raised is returned."""
     try:
-        for part in rescore(opened, request.files, use_env_states=request.use_env_states):
-            on_progress(0, 0, part)
+        code = RescoredBy(request.task, request.options, request.or_else)
+        with CurrentFolder().again(), opened_code(code) as opened:
+            on_progress(0, 0, Rescored((), 0))
+            for part in rescore(opened, request.files, use_env_states=request.use_env_states):
+                on_progress(0, 0, part)
     except TaskError as error:
         return Rescored((), 0, error.problem)
     return Rescored((), 0)

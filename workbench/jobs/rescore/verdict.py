@@ -9,9 +9,12 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import Problem
 from workbench.core.env.step_result import StepResult
+from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import Question
+from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
 
 SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
@@ -249,6 +252,19 @@ def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
+class RescoredBy:
+    """Code and options that rescore some recordings."""
+
+    task: TaskName
+    """The task. Its code may run: the side that submits the job has asked for consent."""
+    options: TaskOptions
+    or_else: TaskOptions
+    """Options to use where the task cannot be opened with `options`."""
+    recorded: EpisodeInfo | None = None
+    """Recording whose text is opened instead of today's code."""
+
+
+@dataclass(frozen=True)
 class Rescored:
     """Part of the result of rescoring some episodes."""
 
@@ -261,9 +277,14 @@ class Rescored:
 
 @dataclass(frozen=True)
 class Rescore(Question[Rescored]):
-    """Read and rescore these episodes in a worker with the task open; progress is sent as `Rescored` too."""
+    """Open a task in a worker without one, and read and rescore these episodes with it. The first part is sent when the task
+    is open; the answer holds only what is not in the parts."""
 
     part: ClassVar[Any] = Rescored
+    task: TaskName
+    options: TaskOptions
+    or_else: TaskOptions
+    """As in `RescoredBy`."""
     files: tuple[Source, ...]
     use_env_states: bool
 

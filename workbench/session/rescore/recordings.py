@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from typing import Any
 from workbench.authoring.loading.library_names import named_like_library_text
 from workbench.authoring.loading.modules import hidden_by_libraries
 from workbench.authoring.loading.reference import TaskName, named_file
-from workbench.authoring.problem import TaskError
 from workbench.commands.command import Command
 from workbench.jobs.from_recording import (
     CannotEnterRecording,
@@ -36,7 +35,6 @@ from workbench.session.events import Asked
 from workbench.session.loop import Aside, do, on_loop
 from workbench.session.process.askers import Background
 from workbench.session.process.jobs import Job, JobFailed, Jobs
-from workbench.session.protocol.messages import Load
 from workbench.session.rescore.rescoring import RescoreView, Rescoring, RescoringTold, apply_to_job
 
 
@@ -191,7 +189,6 @@ class Rescorer:
         """Rescore these; arguments as in `group_episodes`."""
         if not files:
             return
-
         self._rescoring = self._rescoring.begun(RescoreView("loading", total=len(files), unit="episodes"))
 
         def group() -> tuple[list[RescoreGroup], list[Verdict[Source]]]:
@@ -239,8 +236,6 @@ class Rescorer:
                 lambda: self._clearances.clear_all([group.code for group in groups], lambda: job.stopped)
             )
             await self._rescore_each(job, groups, cleared, use_env_states)
-        except CannotEnterRecording as error:
-            raise JobFailed(str(error)) from error
         finally:
             self._process.end()  # with the code that the recordings named
         self._tell(state="done")
@@ -256,21 +251,15 @@ class Rescorer:
         folder holds recordings of many tasks, and one of them may be gone.
 
         Raises:
-            JobFailed, TaskError, CannotEnterRecording: of the first group, if all fail.
+            JobFailed: of the first group, if all fail.
         """
-        failures: list[JobFailed | TaskError | CannotEnterRecording] = []
-        for group, reference in zip(groups, cleared, strict=True):
+        failures: list[JobFailed] = []
+        for group, task in zip(groups, cleared, strict=True):
             try:
-                if isinstance(reference, NotCleared):
-                    raise CannotEnterRecording(str(reference)) from reference
-                text = recorded_source(group.info) if group.recorded_source else nullcontext(reference)
-                with text as opened:
-                    await self._rescore(job, group, opened, use_env_states)
-            except (JobFailed, TaskError, CannotEnterRecording) as error:
-                failures.append(error)
-                why = str(error)
-                if isinstance(error, JobFailed) and error.problem is not None:
-                    why += f": {error.problem.message}"
+                await self._rescore(job, group, task, use_env_states)
+            except JobFailed as failure:
+                failures.append(failure)
+                why = f"{failure}: {failure.problem.message}" if failure.problem is not None else str(failure)
                 rescored = {verdict.of.id for verdict in self.view.verdicts}
                 missing = [file for file in group.files if file.id not in rescored]
                 self._tell([Verdict(file, task=group.info.task, why_not=why) for file in missing])
@@ -278,32 +267,44 @@ class Rescorer:
             raise failures[0]
 
     async def _rescore(
-        self, job: Job, group: RescoreGroup, reference: TaskName, use_env_states: bool
+        self, job: Job, group: RescoreGroup, task: TaskName | NotCleared, use_env_states: bool
     ) -> None:
-        process = self._process
-        hidden = await self._aside.run(lambda: hidden_modules_text(reference))
-        warnings = tuple(dict.fromkeys((*self.view.warnings, *hidden)))
-        self._tell(state="loading", task=_code_text(group), warnings=warnings)
-        # Never patched into the env of the group before.
-        load = Load(reference, group.options, level="rebuilt")
-        try:
-            await process.ensure(job, load, or_else=replace(load, options=with_renderer(group.options)))
-        except JobFailed as failure:
-            if failure.problem is None:
-                raise
-            raise JobFailed(
-                f"{_code_text(group)} cannot be opened. Choose *as recorded*, or start the workbench with --task FILE",
-                failure.problem,
-            ) from failure
-        self._tell(state="rescoring")
-        began = time.monotonic() - self.view.seconds
+        if isinstance(task, NotCleared):
+            raise JobFailed(str(task))
+        began: float | None = None
 
         def on_part(done: int, total: int, part: Rescored) -> None:
-            self._tell(part.verdicts, steps=self.view.steps + part.steps, seconds=time.monotonic() - began)
+            nonlocal began
+            began = began or time.monotonic() - self.view.seconds
+            seconds, steps = time.monotonic() - began, self.view.steps + part.steps
+            self._tell(part.verdicts, state="rescoring", steps=steps, seconds=seconds)
 
-        last = await process.ask(Rescore(group.files, use_env_states), on_part)
+        with ExitStack() as stack:
+            if group.recorded_source:
+                try:
+                    task = await self._aside.run(lambda: _write_text(group.info, stack, job))
+                except CannotEnterRecording as error:
+                    raise JobFailed(str(error)) from error
+            hidden = await self._aside.run(lambda: hidden_modules_text(task))
+            warnings = tuple(dict.fromkeys((*self.view.warnings, *hidden)))
+            self._tell(state="loading", task=_code_text(group), warnings=warnings)
+            or_else = with_renderer(group.options)
+            question = Rescore(task, group.options, or_else, group.files, use_env_states)
+            last = await self._process.ask(question, on_part)
         if last.problem is not None:
-            raise JobFailed(f"the code of {group.info.task} raised", last.problem)
+            why = f"the code of {group.info.task} raised"
+            if began is None:
+                why = f"{_code_text(group)} cannot be opened. Choose *as recorded*, or start the workbench with --task FILE"
+            raise JobFailed(why, last.problem)
+
+
+def _write_text(info: EpisodeInfo, stack: ExitStack, job: Job) -> str:
+    """Enter `recorded_source` here, so that the text is removed also if the process is killed. Raises
+    CannotEnterRecording."""
+    reference = stack.enter_context(recorded_source(info))
+    if job.stopped:
+        stack.close()
+    return reference
 
 
 def _code_text(group: RescoreGroup) -> str:

@@ -228,6 +228,11 @@ class Worker:
             return registered_ids()
         if isinstance(question, DrawTask):
             return draw_task(question.env_id)
+        if isinstance(question, Rescore):
+            # Imported late: rerun and the readers take a third of a second.
+            from workbench.jobs.rescore import run as rescore_run
+
+            return rescore_run.answer(question, report)
         opened = self._task.opened
         if opened is None:
             raise CannotAnswer("no task is loaded")
@@ -244,14 +249,9 @@ class Worker:
         if isinstance(question, CheckGroup | ProfileStep):
             options = TaskOptions() if self._loaded_by is None else self._loaded_by.options
             return self._checks.answer(opened, options, question, report)
-        if isinstance(question, PlanActions):
-            env_kwargs = {} if self._loaded_by is None else self._loaded_by.options.env_kwargs
-            return self._plans.answer(opened, env_kwargs, question, report)
-        assert isinstance(question, Rescore)
-        # Imported late: rerun and the readers take a third of a second.
-        from workbench.jobs.rescore import run as rescore_run
-
-        return rescore_run.answer(opened, question, report)
+        assert isinstance(question, PlanActions)
+        env_kwargs = {} if self._loaded_by is None else self._loaded_by.options.env_kwargs
+        return self._plans.answer(opened, env_kwargs, question, report)
 
     # --- requests ----------------------------------------------------------------------------------
 
@@ -653,6 +653,7 @@ def _mask(opened: OpenedTask, env_idx: tuple[int, ...] | None) -> np.ndarray:
 _DOING: dict[type, Doing] = {
     Load: "loading",
     RunCameras: "loading",
+    Rescore: "loading",
     SingleStep: "stepping",
     Reset: "resetting",
     Restore: "resetting",
