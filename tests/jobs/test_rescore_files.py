@@ -33,8 +33,8 @@ from workbench.jobs.pool.travel import pack_baggage, relocated
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
 from workbench.jobs.rescore.job import Recording, rescore_recordings, setup_of
-from workbench.jobs.rescore.run import answer
-from workbench.jobs.rescore.verdict import Rescore, RescoredBy
+from workbench.jobs.rescore.run import RescoredBy, answer
+from workbench.jobs.rescore.verdict import Rescore
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording
 from workbench.recording.lerobot.export import ExportOptions

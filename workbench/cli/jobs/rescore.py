@@ -48,7 +48,8 @@ from workbench.jobs.rescore.job import (
     rescore_recordings,
     setup_of,
 )
-from workbench.jobs.rescore.verdict import RescoredBy, Verdict
+from workbench.jobs.rescore.run import RescoredBy
+from workbench.jobs.rescore.verdict import Verdict
 from workbench.jobs.task import TaskOptions
 from workbench.machine.files import replace_file
 from workbench.machine.folders import CurrentFolder

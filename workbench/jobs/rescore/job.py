@@ -21,8 +21,8 @@ from workbench.jobs.from_recording import CannotEnterRecording
 from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.pool.deal import Chunk, Deal, Executor, Failure, ItemQueue, Work
 from workbench.jobs.pool.travel import MOST_BYTES
-from workbench.jobs.rescore.run import opened_code, rescore
-from workbench.jobs.rescore.verdict import RescoredBy, Verdict
+from workbench.jobs.rescore.run import RescoredBy, opened_code, rescore
+from workbench.jobs.rescore.verdict import Verdict
 from workbench.machine.folders import CurrentFolder
 from workbench.recording.episode.row import Source
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
 from workbench.authoring.loading.load import undo_load
+from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import TaskError
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import read_states, state_distance
@@ -26,19 +27,32 @@ from workbench.jobs.replay import begin_run, restore_recorded, why_not_replayabl
 from workbench.jobs.rescore.verdict import (
     Rescore,
     Rescored,
-    RescoredBy,
     Scores,
     Verdict,
     compare,
     scalar_entries,
 )
+from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import CurrentFolder
-from workbench.recording.episode.episode import Episode
+from workbench.recording.episode.episode import Episode, EpisodeInfo
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.reader.reading import read_recording
 
 _PROGRESS_PERIOD = 0.2
 """Seconds between two progress messages."""
+
+
+@dataclass(frozen=True)
+class RescoredBy:
+    """Code and options that rescore some recordings."""
+
+    task: TaskName
+    """The task. Its code may run: the side that submits the job has asked for consent."""
+    options: TaskOptions
+    or_else: TaskOptions
+    """Options to use where the task cannot be opened with `options`."""
+    recorded: EpisodeInfo | None = None
+    """Recording whose text is opened instead of today's code."""
 
 
 @dataclass

@@ -14,7 +14,6 @@ from workbench.authoring.problem import Problem
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import Question
-from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
 
 SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
@@ -252,19 +251,6 @@ def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
-class RescoredBy:
-    """Code and options that rescore some recordings."""
-
-    task: TaskName
-    """The task. Its code may run: the side that submits the job has asked for consent."""
-    options: TaskOptions
-    or_else: TaskOptions
-    """Options to use where the task cannot be opened with `options`."""
-    recorded: EpisodeInfo | None = None
-    """Recording whose text is opened instead of today's code."""
-
-
-@dataclass(frozen=True)
 class Rescored:
     """Part of the result of rescoring some episodes."""
 
@@ -284,7 +270,7 @@ class Rescore(Question[Rescored]):
     task: TaskName
     options: TaskOptions
     or_else: TaskOptions
-    """As in `RescoredBy`."""
+    """Options to use where the task cannot be opened with `options`."""
     files: tuple[Source, ...]
     use_env_states: bool
 
