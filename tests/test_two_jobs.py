@@ -74,13 +74,13 @@ class Rescoring:
         return [worker.pid for keeper in workers_of(psutil.Process()) for worker in keeper.children()]
 
     def ended(self) -> bool:
-        return self._rescorer.rescoring.view.state in ("done", "failed")
+        return self._rescorer.view.state in ("done", "failed")
 
     def told(self) -> str:
-        return self._rescorer.rescoring.view.why
+        return self._rescorer.view.why
 
     def assert_right(self) -> None:
-        (verdict,) = self._rescorer.rescoring.view.verdicts
+        (verdict,) = self._rescorer.view.verdicts
         assert (verdict.why_not, verdict.differs, verdict.length) == ("", False, 8)
 
     def close(self) -> None:

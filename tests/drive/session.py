@@ -32,9 +32,8 @@ from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.process.supervisor import Death, End, Supervisor, Vitals, WorkerOptions
 from workbench.session.protocol.messages import Event, Inspect, Loaded, ReloadReport, Request, Status
-from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.recordings import Rescorer
-from workbench.session.rescore.rescoring import BeginRescoring, RescoreEffect
+from workbench.session.rescore.rescoring import BeginRescoring, RescoreEffect, RescoreView
 from workbench.session.run.events import MomentShown, PastPicturesWanted
 
 TASKS = Path(__file__).parents[2] / "tasks"
@@ -416,7 +415,7 @@ def rescored(rescorer: Rescorer, *states: str) -> RescoreView:
     """What a page shows of the judging of recordings once it is in one of these states."""
 
     def wanted() -> RescoreView | None:
-        view = rescorer.rescoring.view
+        view = rescorer.view
         return view if view.state in states else None
 
-    return until(wanted, " or ".join(states), 120.0, seen=lambda: rescorer.rescoring.view)
+    return until(wanted, " or ".join(states), 120.0, seen=lambda: rescorer.view)

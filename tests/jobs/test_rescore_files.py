@@ -21,20 +21,19 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.drive.episodes import made, write
 from tests.drive.session import rescored
-from workbench.authoring.loading.load import undo_load
 from workbench.authoring.problem import TaskError
 from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.cli.main import main
 from workbench.cli.share import export_in_terminal
 from workbench.cli.terminal.arguments import JobArguments
+from workbench.commands.timeline import StopRescoring
 from workbench.jobs.actions import read_actions
-from workbench.jobs.open_task import open_task
 from workbench.jobs.pool.deal import Deal, ThisProcess, Work
 from workbench.jobs.pool.travel import pack_baggage, relocated
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
-from workbench.jobs.rescore.job import Recording, RescoredBy, rescore_recordings, setup_of
-from workbench.jobs.rescore.run import answer
+from workbench.jobs.rescore.job import Recording, rescore_recordings, setup_of
+from workbench.jobs.rescore.run import RescoredBy, answer
 from workbench.jobs.rescore.verdict import Rescore
 from workbench.jobs.task import TaskOptions
 from workbench.recording.episode.row import UnreadableRecording
@@ -243,12 +242,9 @@ def test_each_verdict_is_told_once_however_often_progress_is(
     clock = itertools.count()
     monkeypatch.setattr("workbench.jobs.rescore.run.time", SimpleNamespace(monotonic=lambda: next(clock)))
     files, said = find_all_sources((author / "recordings",)), []
-    opened = open_task(str(author / "push_cube.py"), TaskOptions(1, env_kwargs={"render_backend": "none"}))
-    try:
-        said.append(answer(opened, Rescore(tuple(files), False), lambda steps, _, now: said.append(now)))
-    finally:
-        opened.env.close()
-        undo_load(opened.loaded)
+    options = TaskOptions(1, env_kwargs={"render_backend": "none"})
+    question = Rescore(str(author / "push_cube.py"), options, options, tuple(files), False)
+    said.append(answer(question, lambda done, total, part: said.append(part)))
     names = [verdict.of.name for now in said for verdict in now.verdicts]
     assert sorted(names) == sorted(file.name for file in files) and len(said) > EPISODES
 
@@ -399,7 +395,7 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
         edit(author, REWARD, "import time; time.sleep(1000)")
         rescorer.start(find_all_sources((author / "recordings",)))
         rescored(rescorer, "loading")
-        rescorer.rescoring.stop()
+        rescorer.do(StopRescoring())
         rescored(rescorer, "stopped")
     finally:
         rescorer.close()

@@ -78,7 +78,8 @@ def test_a_record_of_it_has_no_return_and_says_in_which_scene_it_stands_and_how_
     assert [(row.length, row.total_reward) for row in rows] == [(3, None)]
     opened = open_task(str(file), replace(options, num_envs=1))
     try:
-        (verdict,) = rescore(opened, reading.find_all_sources((few.out,)))
+        parts = list(rescore(opened, reading.find_all_sources((few.out,))))
     finally:
         opened.env.close()
+    (verdict,) = (verdict for part in parts for verdict in part.verdicts)
     assert not verdict.why_not and not verdict.differs and verdict.has == ()

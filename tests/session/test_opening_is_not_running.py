@@ -25,6 +25,7 @@ from tests.drive.waiting import until
 from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.cli.main import main
 from workbench.cli.terminal.output import Exit
+from workbench.commands.timeline import StopRescoring
 from workbench.jobs.record.episodes import RecordOptions
 from workbench.jobs.record.run import record
 from workbench.jobs.task import TaskOptions
@@ -259,8 +260,8 @@ def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
     try:
         rescorer.start(find_all_sources((foreign / "recordings",)))
         until(lambda: asking, "the question")
-        assert rescorer.rescoring.view.state == "asking"
-        rescorer.rescoring.stop()
+        assert rescorer.view.state == "asking"
+        rescorer.do(StopRescoring())
         rescored(rescorer, "stopped")
     finally:
         rescorer.close()

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.session import DEATH, moment
-from tests.ui.scenes import camera, description, problem, step_of, table_scene
+from tests.ui.scenes import camera, description, step_of, table_scene
 from workbench.commands.command import Command, Refused
 from workbench.commands.recording import (
     ChooseRecordedEnvs,
@@ -55,15 +55,13 @@ from workbench.session.record.saving import (
     SaveWanted,
 )
 from workbench.session.rescore import rescoring as of_rescoring
-from workbench.session.rescore.background import StoppedBy
 from workbench.session.rescore.rescoring import (
     BeginRescoring,
-    CodeLoads,
     EndRescoring,
-    MomentsRescored,
     RescoreEffect,
-    RescoringDone,
-    RescoringFailed,
+    RescoreView,
+    RescoringTold,
+    StoppedBy,
 )
 from workbench.session.run.events import (
     EnvsReset,
@@ -131,10 +129,11 @@ EVENTS = st.one_of(
     st.builds(SaveProgressed, numbers, st.just(JobProgress("drawing", 1, 2))),
     st.builds(EpisodesSaved, numbers, st.text(max_size=5)),
     st.builds(SaveFailed, numbers, st.text(max_size=5)),
-    st.builds(CodeLoads, numbers),
-    st.builds(MomentsRescored, numbers, numbers, st.floats(0, 1)),
-    st.builds(RescoringDone, numbers),
-    st.builds(RescoringFailed, numbers, st.text(max_size=5), st.just(problem())),
+    st.builds(
+        RescoringTold,
+        numbers,
+        st.builds(RescoreView, st.sampled_from(["loading", "rescoring", "done", "failed"]), done=numbers),
+    ),
 )
 
 
@@ -254,7 +253,8 @@ def test_what_an_older_recording_or_job_says_changes_nothing_but_the_bytes_that_
     assert effects == [] and said.recording == replace(state.recording, waiting_bytes=-10)
     state, effects = after(loaded(), RESET, STEP, SaveWanted((0,)), SaveWanted((1,)))
     assert [type(effect) for effect in effects] == [BeginSaving]
-    for event in (EpisodesSaved(1, "saved"), SaveFailed(1, "it failed"), CodeLoads(1), RescoringDone(1)):
+    said = RescoringTold(1, RescoreView("done"))
+    for event in (EpisodesSaved(1, "saved"), SaveFailed(1, "it failed"), said):
         assert apply_of_these(state, event) == (state, [])
     state, _ = apply_of_these(state, EpisodesSaved(2, "saved"))
     assert state.recording.status(state.run).saving.message == "saved"

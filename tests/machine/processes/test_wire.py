@@ -75,7 +75,16 @@ def messages() -> list[Any]:
         Inspection(1, 2, refused=(("state", "no"),)),
         Answer(3, pack(step)),
         Call(4, Load("file.py", TaskOptions(2, env_kwargs={"a": [1, None, 2.5]}), source={"f": "text"})),
-        Call(5, Rescore((Source(Path("/a/b.rrd"), None, "1", "one"),), True)),
+        Call(
+            5,
+            Rescore(
+                "file.py",
+                TaskOptions(),
+                TaskOptions(),
+                (Source(Path("/a/b.rrd"), None, "1", "one"),),
+                True,
+            ),
+        ),
     ]
 
 

@@ -25,7 +25,7 @@ from workbench.session.process.jobs import Job, JobFailed, ProcessDied
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.session.record.saving import SaveWanted
-from workbench.session.rescore.background import StoppedBy
+from workbench.session.rescore.rescoring import StoppedBy
 from workbench.session.run.events import FileSaved
 
 FIRST, SECOND = "success-at-reset", "reward-changes"

@@ -39,7 +39,7 @@ from workbench.session.protocol.messages import (
     Status,
 )
 from workbench.session.protocol.messages import Told as ToldRobots
-from workbench.session.rescore.rescoring import CodeLoads, MomentsRescored, RescoringDone
+from workbench.session.rescore.rescoring import RescoreView, RescoringTold
 from workbench.session.run.events import MomentShown, OptionsApplied, PagesCounted, ReadingChosen
 from workbench.session.run.reading import READ_EVERY
 from workbench.session.run.run import Run
@@ -108,9 +108,8 @@ def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_show
     session.change(selected_env=2, cameras=(EYE,))
     played.load("patched", source_hash="b")
     assert played.view.rescored.state == "loading" and played.view.rescored.total == 3
-    session.happen(CodeLoads(1))
-    session.happen(MomentsRescored(1, done=3, seconds=1.0))
-    session.happen(RescoringDone(1))
+    session.happen(RescoringTold(1, RescoreView("rescoring", done=3)))
+    session.happen(RescoringTold(1, RescoreView("done", done=3)))
     assert (played.view.rescored.state, played.view.rescored.done) == ("done", 3)
     session.happen(MomentShown(1))
     session.happen(MomentShown(None))

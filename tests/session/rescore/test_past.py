@@ -23,7 +23,7 @@ from workbench.session.process.jobs import Job
 from workbench.session.protocol.messages import Load
 from workbench.session.rescore.past import RescoredPast
 from workbench.session.rescore.past_rescorer import PastRescorer
-from workbench.session.rescore.rescoring import BeginRescoring, EndRescoring
+from workbench.session.rescore.rescoring import BeginRescoring, EndRescoring, RescoreView
 
 BODIES = 4
 
@@ -194,7 +194,7 @@ def test_a_judgement_that_is_stopped_before_its_turn_keeps_nothing_of_the_past(s
         history = recorded(shared, old, jumped)
         moment = weakref.ref(history.at(history.first))
         rescored = RescoredPast(history)
-        begin = BeginRescoring(1, Load("Nothing-v1", TaskOptions()), rescored)
+        begin = BeginRescoring(1, RescoreView(), Load("Nothing-v1", TaskOptions()), rescored)
         loop.do(lambda: rescorer.perform(begin))
         del history
         shared.load("rebuilt")  # the session keeps it no longer

@@ -23,7 +23,7 @@ from workbench.commands.timeline import StopRescoring
 from workbench.session.history.history import Moment
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
-from workbench.session.rescore.background import RescoreView, StoppedBy
+from workbench.session.rescore.rescoring import RescoreView, StoppedBy
 from workbench.session.run.events import EnvsReset
 
 N = 3

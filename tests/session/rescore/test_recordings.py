@@ -13,6 +13,7 @@ import pytest
 from tests.session.recorded_runs import Recorded, opened, reaching, record
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import read_states
+from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.rescore.run import rescore
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.recording.episode.episode import Episode, EpisodeInfo
@@ -55,6 +56,11 @@ def recorded() -> Recorded:
     return recorded
 
 
+def verdicts_of(task: OpenedTask, files: list[Held], use_env_states: bool) -> list[Verdict]:
+    parts = rescore(task, files, use_env_states=use_env_states, read=Held.read)
+    return [verdict for part in parts for verdict in part.verdicts]
+
+
 def rescored(
     tmp_path: Path, recorded: Recorded, edits: dict[str, str], num_envs: int = 2, use_env_states: bool = False
 ) -> list[Verdict]:
@@ -67,7 +73,7 @@ def rescored(
     file.write_text(text)
     task = opened(str(file), num_envs)
     files = [Held(recorded.run(k).until(STEPS - 3 * k), name=str(k), id=str(k)) for k in range(5)]
-    verdicts = list(rescore(task, files, use_env_states=use_env_states, read=Held.read))
+    verdicts = verdicts_of(task, files, use_env_states)
     task.env.close()
     return sorted(verdicts, key=lambda verdict: verdict.of.name)
 
@@ -107,7 +113,7 @@ def test_what_cannot_be_judged_says_why_and_the_rest_is(tmp_path: Path, recorded
         Held(run.until(4), name="fine"),
         Held(replace(run, env_states={}), name="no states"),
     ]
-    told = {verdict.of.name: verdict for verdict in rescore(task, files, use_env_states=True, read=Held.read)}
+    told = {verdict.of.name: verdict for verdict in verdicts_of(task, files, True)}
     task.env.close()
     assert "3 dimensions" in told["narrow"].why_not and told["empty"].why_not == "it has no step"
     assert told["no states"].why_not == "it holds no env states"
@@ -164,7 +170,7 @@ def test_a_task_without_a_robot_is_given_its_rewards(tmp_path: Path, use_env_sta
     low = np.array([step.evaluate["low"][0] for step in said])
     rows = {name: np.stack([state[name][0] for state in states]) for name in states[0]}
     run = RecordedRun("fallen", 0, {}, np.zeros((10, 0), np.float32), rows, {"low": low}, reward)
-    (verdict,) = rescore(task, [Held(run)], use_env_states=use_env_states, read=Held.read)
+    (verdict,) = verdicts_of(task, [Held(run)], use_env_states)
     task.env.close()
     assert verdict.why_not == "" and reward[0] > reward[-1] and low[-1]
     np.testing.assert_array_equal(verdict.new_reward, reward)

@@ -40,8 +40,8 @@ from workbench.session.process.supervisor import Vitals
 from workbench.session.protocol.messages import ReloadReport, RulesBroken
 from workbench.session.record.recording import RecordingStatus
 from workbench.session.record.saving import SaveStatus
-from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
+from workbench.session.rescore.rescoring import RescoreView
 from workbench.session.run.past import Strip, TimelineView
 from workbench.session.run.run import PastLoad
 

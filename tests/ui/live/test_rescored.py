@@ -22,8 +22,8 @@ from workbench.commands.timeline import (
 )
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.session.rescore import verdict_text
-from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
+from workbench.session.rescore.rescoring import RescoreView
 from workbench.session.run.events import MomentShown
 from workbench.session.run.past import TimelineView
 from workbench.ui.live.rescored import chart_data

@@ -15,12 +15,12 @@ from tests.drive.episodes import made, write
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
 from workbench.commands.review import ChooseRescoreCode
-from workbench.commands.timeline import ShowRescored, TurnRescored
+from workbench.commands.timeline import ShowRescored, StopRescoring, TurnRescored
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
 from workbench.session.rescore import verdict_text
-from workbench.session.rescore.background import RescoreView
+from workbench.session.rescore.rescoring import RescoreView
 from workbench.session.review.review import Review
 from workbench.ui.review.rescore import (
     RECORDED,
@@ -92,12 +92,12 @@ class Told:
     """Stands where what judges again stands for the panel: what it has told last."""
 
     def __init__(self) -> None:
-        self.view, self.rescoring = RescoreView(), self
+        self.view = RescoreView()
 
     def start(self, *args: object, **named: object) -> None:
         """Nothing is judged here."""
 
-    def stop(self) -> None:
+    def do(self, command: StopRescoring) -> None:
         self.view = replace(self.view, state="stopped")
 
 

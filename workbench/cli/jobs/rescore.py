@@ -43,12 +43,12 @@ from workbench.jobs.pool.job_file import JobKey, job_of
 from workbench.jobs.record.run import chunk_of
 from workbench.jobs.rescore.job import (
     Recording,
-    RescoredBy,
     RescoredRecording,
     RescoreSetup,
     rescore_recordings,
     setup_of,
 )
+from workbench.jobs.rescore.run import RescoredBy
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.jobs.task import TaskOptions
 from workbench.machine.files import replace_file

@@ -4,52 +4,32 @@ from __future__ import annotations
 
 import os
 import platform
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 import torch
 
-from workbench.authoring.loading.load import undo_load
-from workbench.authoring.loading.reference import RecordedTask, TaskName, named_file
+from workbench.authoring.loading.reference import RecordedTask, named_file
 from workbench.authoring.problem import Problem, TaskError
 from workbench.core.broken_rule import warn_of
-from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.rules import Finding
 from workbench.jobs.actions import needed_by
-from workbench.jobs.from_recording import CannotEnterRecording, recorded_source
-from workbench.jobs.open_task import OpenedTask, open_task
+from workbench.jobs.from_recording import CannotEnterRecording
+from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.pool.deal import Chunk, Deal, Executor, Failure, ItemQueue, Work
 from workbench.jobs.pool.travel import MOST_BYTES
-from workbench.jobs.rescore.run import rescore
+from workbench.jobs.rescore.run import RescoredBy, opened_code, rescore
 from workbench.jobs.rescore.verdict import Verdict
-from workbench.jobs.task import TaskOptions
 from workbench.machine.folders import CurrentFolder
-from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
 
 _TRIES = 3
 """Maximum number of times that a chunk is started when its workers die."""
-_PERIOD = 0.2
-"""Seconds between two progress messages of a worker."""
 _SIDE = (".rrd", ".h5", ".json")
 """Suffixes of the files of one recording."""
-
-
-@dataclass(frozen=True)
-class RescoredBy:
-    """Code and options that rescore some recordings."""
-
-    task: TaskName
-    """The task. Its code may run: the side that submits the job has asked for consent."""
-    options: TaskOptions
-    or_else: TaskOptions
-    """Options to use where the task cannot be opened with `options`."""
-    recorded: EpisodeInfo | None = None
-    """Recording whose text is opened instead of today's code."""
 
 
 @dataclass(frozen=True)
@@ -273,7 +253,11 @@ class _Rescorer:
         """Rescore this chunk, and further ones as long as they are of the same code and nothing is raised: then its envs may
         be in any state. Returns the next chunk."""
         try:
-            with _opened(code, self.queue) as opened:
+            with opened_code(
+                code,
+                on_activity=lambda activity: self.queue.send_update(RescoreUpdate(activity)),
+                on_finding=lambda finding: self.queue.send_update(RescoreUpdate(finding=finding)),
+            ) as opened:
                 while chunk is not None and self.setup.code_of(chunk) == self.at:
                     if not self._rescore(opened, chunk):
                         return self.queue.next()
@@ -290,33 +274,22 @@ class _Rescorer:
         """Rescore the whole chunk, including recordings with a known result: in another batch an episode may
         differ in the last bits. Returns False if the task raised."""
         sources = [self._source(number) for number in chunk.numbers]
-        missing, told, reported = set(chunk.wanted), 0, time.monotonic()
-
-        def on_steps(steps: int) -> None:
-            nonlocal told, reported
-            if time.monotonic() - reported > _PERIOD:
-                self.queue.send_update(RescoreUpdate(steps=steps - told))
-                told, reported = steps, time.monotonic()
-                if self.queue.limit() <= chunk.numbers[0]:
-                    raise _Stopped
-            last[0] = steps
-
-        last = [0]
+        missing = set(chunk.wanted)
         try:
-            for verdict in rescore(
-                opened, sources, use_env_states=self.setup.use_env_states, on_steps=on_steps
-            ):
-                number = int(verdict.of.id)
-                if number in missing:
-                    missing.remove(number)
-                    of = self.setup.items[number]
-                    verdict = replace(verdict, of=of.source())
-                    self.queue.send_result(number, RescoredRecording(of.place, verdict, of.note))
+            for part in rescore(opened, sources, use_env_states=self.setup.use_env_states):
+                self.queue.send_update(RescoreUpdate(steps=part.steps))
+                for verdict in part.verdicts:
+                    number = int(verdict.of.id)
+                    if number in missing:
+                        missing.remove(number)
+                        of = self.setup.items[number]
+                        verdict = replace(verdict, of=of.source())
+                        self.queue.send_result(number, RescoredRecording(of.place, verdict, of.note))
+                if missing and self.queue.limit() <= chunk.numbers[0]:
+                    raise _Stopped
         except TaskError as error:
             self._fail(missing, error)
             return False
-        finally:
-            self.queue.send_update(RescoreUpdate(steps=last[0] - told))
         return True
 
     def _source(self, number: int) -> Source:
@@ -336,34 +309,3 @@ class _Rescorer:
             of = self.setup.items[number]
             result = RescoredRecording(of.place, of.verdict(str(error)), of.note, True, problem)
             self.queue.send_result(number, result)
-
-
-@contextmanager
-def _opened(code: RescoredBy, queue: ItemQueue) -> Iterator[OpenedTask]:
-    """Open the task of a code. Raises TaskError, CannotEnterRecording."""
-    if code.recorded is not None:
-        with recorded_source(code.recorded) as reference:
-            with _opened(replace(code, task=reference, recorded=None), queue) as opened:
-                yield opened
-        return
-
-    def begin(options: TaskOptions) -> OpenedTask:
-        return open_task(
-            code.task,
-            options,
-            on_activity=lambda activity: queue.send_update(RescoreUpdate(activity)),
-            on_finding=lambda finding: queue.send_update(RescoreUpdate(finding=finding)),
-        )
-
-    try:
-        opened = begin(code.options)
-    except TaskError:
-        opened = begin(code.or_else)
-    if isinstance(opened.env.env, BatchedCpuMixin):
-        # Else an episode depends, by its last bits, on those that the same process rescored before.
-        opened.env.env.begins_anew = True
-    try:
-        yield opened
-    finally:
-        opened.env.close()
-        undo_load(opened.loaded)

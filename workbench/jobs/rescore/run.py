@@ -4,29 +4,55 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.loading.blamed import blamed
+from workbench.authoring.loading.load import undo_load
+from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import TaskError
 from workbench.core.capture.recorded_run import RecordedRun
 from workbench.core.capture.recorded_state import read_states, state_distance
 from workbench.core.env import actions
+from workbench.core.env.cpu_scene import BatchedCpuMixin
 from workbench.core.env.step_result import StepResult
+from workbench.core.rules import Finding
 from workbench.core.snapshots.snapshot import step_only
-from workbench.jobs.from_recording import run_of
-from workbench.jobs.open_task import OpenedTask
+from workbench.jobs.from_recording import recorded_source, run_of
+from workbench.jobs.open_task import OpenedTask, open_task
 from workbench.jobs.replay import begin_run, restore_recorded, why_not_replayable
-from workbench.jobs.rescore.verdict import Rescore, Rescored, Scores, Verdict, compare, scalar_entries
-from workbench.recording.episode.episode import Episode
+from workbench.jobs.rescore.verdict import (
+    Rescore,
+    Rescored,
+    Scores,
+    Verdict,
+    compare,
+    scalar_entries,
+)
+from workbench.jobs.task import TaskOptions
+from workbench.machine.folders import CurrentFolder
+from workbench.recording.episode.episode import Episode, EpisodeInfo
 from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.reader.reading import read_recording
 
 _PROGRESS_PERIOD = 0.2
 """Seconds between two progress messages."""
+
+
+@dataclass(frozen=True)
+class RescoredBy:
+    """Code and options that rescore some recordings."""
+
+    task: TaskName
+    """The task. Its code may run: the side that submits the job has asked for consent."""
+    options: TaskOptions
+    or_else: TaskOptions
+    """Options to use where the task cannot be opened with `options`."""
+    recorded: EpisodeInfo | None = None
+    """Recording whose text is opened instead of today's code."""
 
 
 @dataclass
@@ -78,82 +104,83 @@ def rescore(
     files: Iterable[Source],
     *,
     use_env_states: bool = False,
-    on_steps: Callable[[int], None] = lambda steps: None,
     read: Callable[[Source], Episode] = read_recording,
-) -> Iterator[Verdict[Source]]:
-    """Rescore these episodes with the open task's code; gives a verdict for each, in the order in which they end.
+) -> Iterator[Rescored]:
+    """Rescore these episodes with the open task's code; gives the verdicts in the order in which the episodes end, and a
+    progress a few times a second.
 
     Each env begins an episode (`replay.begin_run`), makes its actions, and then takes the next one, independent of the
     other envs. Envs without one do not move.
 
     Args:
         use_env_states: restore every recorded state after its step, so that nothing drifts.
-        on_steps: called with the number of control steps so far, over all episodes.
         read: reads a file's episode; raises as `read_recording`.
 
     Raises:
         TaskError: the task's code raised.
     """
-    task = opened.env
-    waiting = iter(files)
+    waiting, more = iter(files), True
     rescorings: dict[int, _Rescoring] = {}
-    steps = 0
-    more = True
+    reported, steps = time.monotonic(), 0
     while more or rescorings:
         begun: dict[int, _Rescoring] = {}
-        while more and len(rescorings) + len(begun) < task.num_envs:
-            file = next(waiting, None)
-            if file is None:
+        free = [i for i in range(opened.env.num_envs) if i not in rescorings]
+        while more and len(begun) < len(free):
+            if (file := next(waiting, None)) is None:
                 more = False
                 break
-            reported = _open_episode(opened, file, use_env_states, read)
-            if isinstance(reported, Verdict):
-                yield reported
+            episode = _open_episode(opened, file, use_env_states, read)
+            if isinstance(episode, Verdict):
+                yield Rescored((episode,), 0)
             else:
-                env = next(i for i in range(task.num_envs) if i not in rescorings and i not in begun)
-                begun[env] = reported
+                begun[free[len(begun)]] = episode
         if begun:
             _begin(opened, begun)
             rescorings |= begun
-        if not rescorings:
-            continue
-        _one_step(opened, rescorings, use_env_states)
-        steps += len(rescorings)
-        on_steps(steps)
-        for env in [env for env, rescoring in rescorings.items() if rescoring.at == rescoring.run.length]:
-            yield rescorings.pop(env).verdict()
+        if rescorings:
+            _one_step(opened, rescorings, use_env_states)
+            steps += len(rescorings)
+        ended = [env for env, rescoring in rescorings.items() if rescoring.at == rescoring.run.length]
+        verdicts = tuple(rescorings.pop(env).verdict() for env in ended)
+        if verdicts or time.monotonic() - reported > _PROGRESS_PERIOD:
+            yield Rescored(verdicts, steps)
+            reported, steps = time.monotonic(), 0
 
 
-def answer(
-    opened: OpenedTask, request: Rescore, on_progress: Callable[[int, int, Rescored], None]
-) -> Rescored:
-    """Carry out `request` in a worker.
+@contextmanager
+def opened_code(
+    code: RescoredBy,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_finding: Callable[[Finding], None] = lambda finding: None,
+) -> Iterator[OpenedTask]:
+    """Open the task of a code. Raises TaskError, CannotEnterRecording."""
+    text = nullcontext(code.task) if code.recorded is None else recorded_source(code.recorded)
+    with text as task:
+        try:
+            opened = open_task(task, code.options, on_activity=on_activity, on_finding=on_finding)
+        except TaskError:
+            opened = open_task(task, code.or_else, on_activity=on_activity, on_finding=on_finding)
+        if isinstance(opened.env.env, BatchedCpuMixin):
+            # Else an episode depends, by its last bits, on those that the same process rescored before.
+            opened.env.env.begins_anew = True
+        try:
+            yield opened
+        finally:
+            opened.env.close()
+            undo_load(opened.loaded)
 
-    Args:
-        on_progress: called a few times a second with the control steps so far, 0, and the new verdicts.
 
-    Returns:
-        the verdicts since the last call of `on_progress`.
-    """
-    reported, steps = time.monotonic(), 0
-    ready: list[Verdict[Source]] = []
-
-    def on_steps(now: int) -> None:
-        nonlocal reported, steps
-        steps = now
-        if time.monotonic() - reported > _PROGRESS_PERIOD:
-            reported = time.monotonic()
-            on_progress(steps, 0, Rescored(tuple(ready), steps))
-            ready.clear()
-
+def answer(request: Rescore, on_progress: Callable[[int, int, Rescored], None]) -> Rescored:
+    """Carry out `request` in a worker: all results go to `on_progress`, and what the code raised is returned."""
     try:
-        for verdict in rescore(
-            opened, request.files, use_env_states=request.use_env_states, on_steps=on_steps
-        ):
-            ready.append(verdict)
+        code = RescoredBy(request.task, request.options, request.or_else)
+        with CurrentFolder().again(), opened_code(code) as opened:
+            on_progress(0, 0, Rescored((), 0))
+            for part in rescore(opened, request.files, use_env_states=request.use_env_states):
+                on_progress(0, 0, part)
     except TaskError as error:
-        return Rescored(tuple(ready), steps, error.problem)
-    return Rescored(tuple(ready), steps)
+        return Rescored((), 0, error.problem)
+    return Rescored((), 0)
 
 
 def _open_episode(

@@ -9,7 +9,10 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.authoring.loading.reference import TaskName
 from workbench.authoring.problem import Problem
+from workbench.core.env.step_result import StepResult
+from workbench.jobs.task import TaskOptions
 from workbench.machine.processes.wire import Question
 from workbench.recording.episode.row import Source
 
@@ -244,25 +247,64 @@ def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
     return found
 
 
-# --- the question to a worker ------------------------------------------------------------------------
+# --- questions to a worker -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Rescored:
-    """Progress or end of a `Rescore`."""
+    """Part of the result of rescoring some episodes."""
 
     verdicts: tuple[Verdict[Source], ...]
-    """New verdicts."""
     steps: int
-    """Control steps so far, over all episodes."""
+    """Control steps since the part before, over all episodes."""
     problem: Problem | None = None
     """Exception of the task's code; the rescoring ends with it."""
 
 
 @dataclass(frozen=True)
 class Rescore(Question[Rescored]):
-    """Read and rescore these episodes in a worker with the task open; progress is sent as `Rescored` too."""
+    """Open a task in a worker without one, and read and rescore these episodes with it. The first part is sent when the task
+    is open; the answer holds only what is not in the parts."""
 
     part: ClassVar[Any] = Rescored
+    task: TaskName
+    options: TaskOptions
+    or_else: TaskOptions
+    """Options to use where the task cannot be opened with `options`."""
     files: tuple[Source, ...]
     use_env_states: bool
+
+
+# The server keeps the history and hands over snapshots and actions: the batch makes its steps together again, since they may
+# depend on each other by a generator that all envs share. Only for a worker that does not play: its envs move.
+
+
+@dataclass(frozen=True)
+class MomentToRescore:
+    """A past moment to replay: a control step, or a jump if it has a snapshot."""
+
+    action: NDArray[np.float32] | None
+    """(N, A) action; None for a jump, or a task without robots."""
+    snapshot: bytes | None = None
+    """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch."""
+    env_idx: tuple[int, ...] = ()
+    """The envs that are put back to the snapshot."""
+
+
+@dataclass(frozen=True)
+class RescoredMoments:
+    """Reward and evaluate of past moments by today's code."""
+
+    steps: tuple[StepResult, ...]
+    """One for each moment; fewer if one raised."""
+    not_carried: dict[str, str]
+    """What jumps of all envs could not restore, each with the reason."""
+    problem: Problem | None = None
+    """What the moment after `steps` raised."""
+
+
+@dataclass(frozen=True)
+class RescoreMoments(Question[RescoredMoments]):
+    """Replay these moments in order."""
+
+    moments: tuple[MomentToRescore, ...]

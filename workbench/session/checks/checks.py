@@ -20,7 +20,7 @@ from workbench.session.process.askers import WAITING, Background, Priority
 from workbench.session.process.jobs import Job, JobFailed, Jobs, ProcessDied
 from workbench.session.protocol.messages import Load
 from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
-from workbench.session.rescore.background import StoppedBy
+from workbench.session.rescore.rescoring import StoppedBy
 from workbench.session.run.events import FileSaved, LoadDone, VersionLoaded
 from workbench.session.run.run import Run
 

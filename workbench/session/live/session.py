@@ -307,7 +307,7 @@ class Session:
 
     @on_loop
     def rescored_curve(self, name: str, env: int) -> RescoredCurve | None:
-        """See `PastRescoring.curve`."""
+        """See `Rescoring.curve`."""
         return self._state.rescoring.curve(name, env)
 
     def wait(self, seen: int, timeout: float) -> int:

@@ -27,7 +27,7 @@ SessionEvent = (
     | of_recording.RecordEvent
     | SaveWanted
     | SaveEvent
-    | of_rescoring.RescoreEvent
+    | of_rescoring.RescoringTold
     | of_checks.CheckEvent
     | of_profile.ProfileEvent
     | of_seeds.SeedsEvent
@@ -67,7 +67,7 @@ class State:
     run: Run
     recording: of_recording.LiveRecording
     studio: Studio
-    rescoring: of_rescoring.PastRescoring = of_rescoring.PastRescoring()
+    rescoring: of_rescoring.Rescoring = of_rescoring.Rescoring()
     """The history rescored with the new code."""
     checks: of_checks.Checks = of_checks.Checks()
     """The rules of the running version."""

@@ -26,7 +26,7 @@ from workbench.session.process.heartbeat import Busy
 from workbench.session.process.supervisor import Vitals
 from workbench.session.protocol.messages import ReloadReport, RulesBroken, Settings
 from workbench.session.record.recording import RecordingStatus
-from workbench.session.rescore.background import RescoreView
+from workbench.session.rescore.rescoring import RescoreView
 from workbench.session.run.past import TimelineView
 from workbench.session.run.run import PastLoad, Run, RunState
 

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from workbench.authoring.camera_source.cameras import HookCameras
 from workbench.authoring.loading.reference import TaskName
-from workbench.authoring.problem import Problem
 from workbench.checks.results import RuleResult, StepProfile
 from workbench.core.camera_data import CameraKey, CameraSettings, Picture
 from workbench.core.cameras.report import CameraReport, OfferedPlacement, SearchSpace
-from workbench.core.env.step_result import StepResult
 from workbench.core.rules import Degree
 from workbench.core.scene.shapes import SceneGeometry
-from workbench.jobs.rescore.verdict import Rescore
+from workbench.jobs.rescore.verdict import Rescore, RescoreMoments
 from workbench.machine.processes.wire import Question
 from workbench.planning.options import PlanArguments
 from workbench.session.protocol.messages import Load, PlaceCamera, Reset, WarmUp
@@ -175,37 +173,6 @@ class PlanActions(Question[Planned]):
 
 # --- moments of the past -----------------------------------------------------------------------------
 # The server keeps the history and hands over snapshots and actions. Only for a worker that does not play: its envs move.
-
-
-@dataclass(frozen=True)
-class MomentToRescore:
-    """A past moment to replay: a control step, or a jump if it has a snapshot."""
-
-    action: NDArray[np.float32] | None
-    """(N, A) action; None for a jump, or a task without robots."""
-    snapshot: bytes | None = None
-    """A pickled `core.snapshots.snapshot.Snapshot` of the whole batch."""
-    env_idx: tuple[int, ...] = ()
-    """The envs that are put back to the snapshot."""
-
-
-@dataclass(frozen=True)
-class RescoredMoments:
-    """Reward and evaluate of past moments by today's code."""
-
-    steps: tuple[StepResult, ...]
-    """One for each moment; fewer if one raised."""
-    not_carried: dict[str, str]
-    """What jumps of all envs could not restore, each with the reason."""
-    problem: Problem | None = None
-    """What the moment after `steps` raised."""
-
-
-@dataclass(frozen=True)
-class RescoreMoments(Question[RescoredMoments]):
-    """Replay these moments in order."""
-
-    moments: tuple[MomentToRescore, ...]
 
 
 @dataclass(frozen=True)

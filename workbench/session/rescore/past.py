@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from workbench.core.capture.recorded_run import pose_distances
 from workbench.core.env.step_result import StepResult
-from workbench.jobs.rescore.verdict import Scores, Verdict, compare, scalar_entries
+from workbench.jobs.rescore.verdict import MomentToRescore, Scores, Verdict, compare, scalar_entries
 from workbench.session.history.history import History, Moment
-from workbench.session.protocol.questions import MomentToRescore
 
 MOST_ENTRIES = 24
 """Most entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""

@@ -6,23 +6,20 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
+from workbench.jobs.rescore.verdict import RescoredMoments, RescoreMoments
 from workbench.session.loop import do
 from workbench.session.process.askers import Background
 from workbench.session.process.jobs import Job, JobFailed, Jobs
 from workbench.session.protocol.messages import Load
-from workbench.session.protocol.questions import RescoredMoments, RescoreMoments
 from workbench.session.rescore.past import RescoredPast
 from workbench.session.rescore.rescoring import (
     BeginRescoring,
-    CodeLoads,
     EndRescoring,
-    MomentsRescored,
     RescoreEffect,
-    RescoreEvent,
-    RescoreSummary,
-    RescoringDone,
-    RescoringFailed,
+    RescoreView,
+    RescoringTold,
 )
 
 _CHUNK_SECONDS = 0.1
@@ -38,7 +35,7 @@ class PastRescorer:
     To stop, it sends no more; a process that does not answer (the new code may loop for ever) is ended.
     """
 
-    def __init__(self, process: Background, happen: Callable[[RescoreEvent], object]) -> None:
+    def __init__(self, process: Background, happen: Callable[[RescoringTold], object]) -> None:
         """
         Args:
             process: where it runs; other jobs come first.
@@ -46,8 +43,8 @@ class PastRescorer:
         """
         self._process, self._happen = process, happen
         self._jobs = Jobs(lambda: None, self._failed)
-        self._job = 0
-        """Number of the running or the last job."""
+        self._told = RescoringTold(0, RescoreView())
+        """What the running or the last job has come to."""
         self._past: RescoredPast | None = None
 
     def perform(self, effect: RescoreEffect) -> None:
@@ -56,9 +53,9 @@ class PastRescorer:
         if self._past is not None:
             self._past.release()
         match effect:
-            case BeginRescoring(job=number, load=load, past=past):
-                self._job, self._past = number, past
-                self._jobs.start("rescoring", lambda job: self._rescore(job, number, load, past))
+            case BeginRescoring(job=number, view=view, load=load, past=past):
+                self._told, self._past = RescoringTold(number, view), past
+                self._jobs.start("rescoring", lambda job: self._rescore(job, load, past))
             case EndRescoring():
                 self._past = None
 
@@ -67,26 +64,39 @@ class PastRescorer:
         do(self._jobs.close)
 
     def _failed(self, failure: JobFailed) -> None:
-        self._happen(RescoringFailed(self._job, str(failure), failure.problem))
+        self._tell(state="failed", why=str(failure), problem=failure.problem)
+
+    def _tell(self, **values: Any) -> None:
+        """Tell of these fields of the view."""
+        self._told = replace(self._told, view=replace(self._told.view, **values))
+        self._happen(self._told)
 
     # --- the job -------------------------------------------------------------------------------------
 
-    async def _rescore(self, job: Job, number: int, load: Load, past: RescoredPast) -> None:
+    async def _rescore(self, job: Job, load: Load, past: RescoredPast) -> None:
         summed_up, missed = 0.0, dict[str, str]()
 
         def on_answer(answer: RescoredMoments, seconds: float) -> None:
             nonlocal summed_up
             missed.update(answer.not_carried)
-            now, done, summary = time.monotonic(), past.rescored_steps, None
+            now, done, summary = time.monotonic(), past.rescored_steps, {}
             if answer.problem is not None or done == past.steps or now - summed_up > _SUMMARY_EVERY:
                 summed_up = now
-                summary = RescoreSummary(tuple(past.verdicts()), *past.names())
-            self._happen(MomentsRescored(number, done, seconds, tuple(missed.items()), summary))
+                names, differing = past.names()
+                summary = {"verdicts": tuple(past.verdicts()), "names": names, "differing_names": differing}
+            self._tell(
+                state="rescoring",
+                done=done,
+                steps=done,
+                seconds=self._told.view.seconds + seconds,
+                warnings=tuple(f"not restored: {what}: {why}" for what, why in missed.items()),
+                **summary,
+            )
             if answer.problem is not None:
                 raise JobFailed("the new code raised", answer.problem)
 
         async def rescore_rows(rows: range) -> None:
-            await self._load(job, number, load, past)
+            await self._load(job, load, past)
             await self._replay_steps(past, rows, on_answer)
 
         try:
@@ -94,12 +104,12 @@ class PastRescorer:
                 await self._process.in_turns(job, partial(rescore_rows, rows), priority="low")
         finally:
             past.release()
-        self._happen(RescoringDone(number))
+        self._tell(state="done")
 
-    async def _load(self, job: Job, number: int, load: Load, past: RescoredPast) -> None:
+    async def _load(self, job: Job, load: Load, past: RescoredPast) -> None:
         if self._process.has_loaded(load):
             return
-        self._happen(CodeLoads(number))
+        self._tell(state="loading")
         if self._process.num_envs == past.num_envs:
             # Loading tries the new code at the env's present moment, where the last job ended. There it may raise or
             # loop although it runs from the recorded beginnings: so go to one of these first.

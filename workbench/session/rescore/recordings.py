@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 from workbench.authoring.loading.library_names import named_like_library_text
 from workbench.authoring.loading.modules import hidden_by_libraries
 from workbench.authoring.loading.reference import TaskName, named_file
-from workbench.authoring.problem import TaskError
+from workbench.commands.command import Command
 from workbench.jobs.from_recording import (
     CannotEnterRecording,
     NoRecordedSource,
@@ -31,11 +31,11 @@ from workbench.recording.episode.row import Source, UnreadableRecording
 from workbench.recording.episode.side_files import side_files_text
 from workbench.recording.reader.reading import read_recording
 from workbench.session.clearance import Clearances, CodeToRun, NotCleared, recorded_content
-from workbench.session.loop import Aside, on_loop
+from workbench.session.events import Asked
+from workbench.session.loop import Aside, do, on_loop
 from workbench.session.process.askers import Background
-from workbench.session.process.jobs import Job, JobFailed
-from workbench.session.protocol.messages import Load
-from workbench.session.rescore.background import RescoreView, Rescoring
+from workbench.session.process.jobs import Job, JobFailed, Jobs
+from workbench.session.rescore.rescoring import RescoreView, Rescoring, RescoringTold, apply_to_job
 
 
 @dataclass(frozen=True)
@@ -159,12 +159,23 @@ class Rescorer:
             clearances: decides which code may run; None without a person to ask.
             base: options of every opened task.
         """
-        self.rescoring = Rescoring()
+        self._rescoring = Rescoring()
+        self._jobs = Jobs(lambda: None, self._failed)
         self._process = Background()
         self._aside = Aside("rescore")
         """Thread that reads recordings, and waits for answers of people."""
         self._clearances = clearances or Clearances()
         self._base = base or TaskOptions()
+
+    @property
+    def view(self) -> RescoreView:
+        """A snapshot. Thread-safe."""
+        return self._rescoring.view
+
+    @on_loop
+    def do(self, command: Command) -> None:
+        """Carry out `StopRescoring`. Raises `Refused`."""
+        self._happen(Asked(command))
 
     @on_loop
     def start(
@@ -178,36 +189,56 @@ class Rescorer:
         """Rescore these; arguments as in `group_episodes`."""
         if not files:
             return
+        self._rescoring = self._rescoring.begun(RescoreView("loading", total=len(files), unit="episodes"))
 
-        async def work(job: Job) -> None:
-            try:
-                groups, broken_files = await self._aside.run(
-                    lambda: group_episodes(
-                        files, MOST_AT_ONCE, self._base, file=file, recorded_source=recorded_source
-                    )
-                )
-                notes = [f"with {_code_text(group)}" for group in groups[:MOST_NAMED]]
-                notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
-                notes += dict.fromkeys(g.note for g in groups if g.note)
-                self._update(broken_files, state="asking", notes=tuple(notes))
-                cleared = await self._aside.run(
-                    lambda: self._clearances.clear_all([group.code for group in groups], lambda: job.stopped)
-                )
-                await self._rescore_each(job, groups, cleared, use_env_states)
-            except CannotEnterRecording as error:
-                raise JobFailed(str(error)) from error
-            finally:
-                self._process.end()  # with the code that the recordings named
+        def group() -> tuple[list[RescoreGroup], list[Verdict[Source]]]:
+            return group_episodes(files, MOST_AT_ONCE, self._base, file=file, recorded_source=recorded_source)
 
-        self.rescoring.begin(RescoreView("loading", total=len(files), unit="episodes"), work)
+        self._jobs.start("rescoring", lambda job: self._rescore_all(job, group, use_env_states))
 
     def close(self) -> None:
         """Stop; returns when the process has ended. Called on another thread than the loop."""
-        self.rescoring.close()
+        do(self._jobs.close)
         self._aside.end()
         self._process.close()
 
+    # --- on the loop ---------------------------------------------------------------------------------
+
+    def _happen(self, event: Asked | RescoringTold) -> None:
+        self._rescoring, effects = apply_to_job(self._rescoring, event)
+        if effects:
+            self._jobs.stop()
+
+    def _tell(self, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
+        """Tell of these fields of the view, and of further verdicts."""
+        known = (*self.view.verdicts, *verdicts)
+        view = replace(self.view, verdicts=known, done=len(known), **values)
+        self._happen(RescoringTold(self._rescoring.job, view))
+
+    def _failed(self, failure: JobFailed) -> None:
+        self._tell(state="failed", why=str(failure), problem=failure.problem)
+
     # --- the job -------------------------------------------------------------------------------------
+
+    async def _rescore_all(
+        self,
+        job: Job,
+        group: Callable[[], tuple[list[RescoreGroup], list[Verdict[Source]]]],
+        use_env_states: bool,
+    ) -> None:
+        try:
+            groups, broken_files = await self._aside.run(group)
+            notes = [f"with {_code_text(group)}" for group in groups[:MOST_NAMED]]
+            notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
+            notes += dict.fromkeys(g.note for g in groups if g.note)
+            self._tell(broken_files, state="asking", notes=tuple(notes))
+            cleared = await self._aside.run(
+                lambda: self._clearances.clear_all([group.code for group in groups], lambda: job.stopped)
+            )
+            await self._rescore_each(job, groups, cleared, use_env_states)
+        finally:
+            self._process.end()  # with the code that the recordings named
+        self._tell(state="done")
 
     async def _rescore_each(
         self,
@@ -220,62 +251,60 @@ class Rescorer:
         folder holds recordings of many tasks, and one of them may be gone.
 
         Raises:
-            JobFailed, TaskError, CannotEnterRecording: of the first group, if all fail.
+            JobFailed: of the first group, if all fail.
         """
-        failures: list[JobFailed | TaskError | CannotEnterRecording] = []
-        for group, reference in zip(groups, cleared, strict=True):
+        failures: list[JobFailed] = []
+        for group, task in zip(groups, cleared, strict=True):
             try:
-                if isinstance(reference, NotCleared):
-                    raise CannotEnterRecording(str(reference)) from reference
-                text = recorded_source(group.info) if group.recorded_source else nullcontext(reference)
-                with text as opened:
-                    await self._rescore(job, group, opened, use_env_states)
-            except (JobFailed, TaskError, CannotEnterRecording) as error:
-                failures.append(error)
-                why = str(error)
-                if isinstance(error, JobFailed) and error.problem is not None:
-                    why += f": {error.problem.message}"
-                rescored = {verdict.of.id for verdict in self.rescoring.view.verdicts}
+                await self._rescore(job, group, task, use_env_states)
+            except JobFailed as failure:
+                failures.append(failure)
+                why = f"{failure}: {failure.problem.message}" if failure.problem is not None else str(failure)
+                rescored = {verdict.of.id for verdict in self.view.verdicts}
                 missing = [file for file in group.files if file.id not in rescored]
-                self._update([Verdict(file, task=group.info.task, why_not=why) for file in missing])
+                self._tell([Verdict(file, task=group.info.task, why_not=why) for file in missing])
         if failures and len(failures) == len(groups):
             raise failures[0]
 
     async def _rescore(
-        self, job: Job, group: RescoreGroup, reference: TaskName, use_env_states: bool
+        self, job: Job, group: RescoreGroup, task: TaskName | NotCleared, use_env_states: bool
     ) -> None:
-        process = self._process
-        hidden = await self._aside.run(lambda: hidden_modules_text(reference))
-        warnings = tuple(dict.fromkeys((*self.rescoring.view.warnings, *hidden)))
-        self._update(state="loading", task=_code_text(group), warnings=warnings)
-        # Never patched into the env of the group before.
-        load = Load(reference, group.options, level="rebuilt")
-        try:
-            await process.ensure(job, load, or_else=replace(load, options=with_renderer(group.options)))
-        except JobFailed as failure:
-            if failure.problem is None:
-                raise
-            raise JobFailed(
-                f"{_code_text(group)} cannot be opened. Choose *as recorded*, or start the workbench with --task FILE",
-                failure.problem,
-            ) from failure
-        self._update(state="rescoring")
-        began, before, steps = time.monotonic(), self.rescoring.view.seconds, self.rescoring.view.steps
+        if isinstance(task, NotCleared):
+            raise JobFailed(str(task))
+        began: float | None = None
 
-        def on_part(part: Rescored) -> None:
-            seconds = before + time.monotonic() - began
-            self._update(part.verdicts, steps=steps + part.steps, seconds=seconds)
+        def on_part(done: int, total: int, part: Rescored) -> None:
+            nonlocal began
+            began = began or time.monotonic() - self.view.seconds
+            seconds, steps = time.monotonic() - began, self.view.steps + part.steps
+            self._tell(part.verdicts, state="rescoring", steps=steps, seconds=seconds)
 
-        question = Rescore(group.files, use_env_states)
-        last = await process.ask(question, lambda done, total, part: on_part(part))
-        on_part(last)
+        with ExitStack() as stack:
+            if group.recorded_source:
+                try:
+                    task = await self._aside.run(lambda: _write_text(group.info, stack, job))
+                except CannotEnterRecording as error:
+                    raise JobFailed(str(error)) from error
+            hidden = await self._aside.run(lambda: hidden_modules_text(task))
+            warnings = tuple(dict.fromkeys((*self.view.warnings, *hidden)))
+            self._tell(state="loading", task=_code_text(group), warnings=warnings)
+            or_else = with_renderer(group.options)
+            question = Rescore(task, group.options, or_else, group.files, use_env_states)
+            last = await self._process.ask(question, on_part)
         if last.problem is not None:
-            raise JobFailed(f"the code of {group.info.task} raised", last.problem)
+            why = f"the code of {group.info.task} raised"
+            if began is None:
+                why = f"{_code_text(group)} cannot be opened. Choose *as recorded*, or start the workbench with --task FILE"
+            raise JobFailed(why, last.problem)
 
-    def _update(self, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
-        """Change fields of the view, and add these verdicts."""
-        known = (*self.rescoring.view.verdicts, *verdicts)
-        self.rescoring.update(verdicts=known, done=len(known), **values)
+
+def _write_text(info: EpisodeInfo, stack: ExitStack, job: Job) -> str:
+    """Enter `recorded_source` here, so that the text is removed also if the process is killed. Raises
+    CannotEnterRecording."""
+    reference = stack.enter_context(recorded_source(info))
+    if job.stopped:
+        stack.close()
+    return reference
 
 
 def _code_text(group: RescoreGroup) -> str:

@@ -1,9 +1,10 @@
-"""The rescoring of the history with new code, and how each event changes it."""
+"""The rescoring of the history, or of recordings, as one value, and how each event changes it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from enum import Enum
+from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
 from workbench.commands.command import Command, Refused
@@ -11,8 +12,7 @@ from workbench.commands.timeline import StopRescoring
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.session.events import Asked
 from workbench.session.protocol.messages import Load
-from workbench.session.rescore.background import RUNNING, RescoreView, StoppedBy
-from workbench.session.rescore.past import PastRun, RescoredCurve, RescoredPast
+from workbench.session.rescore.past import RescoredCurve, RescoredPast
 from workbench.session.run.events import FileSaved, VersionLoaded
 from workbench.session.run.run import PastAfterLoad, Run
 
@@ -20,15 +20,76 @@ DOES: frozenset[type[Command]] = frozenset({StopRescoring})
 """Commands that `apply` takes."""
 
 
+class StoppedBy(Enum):
+    """Why a job ended early; the value is the page's text."""
+
+    HAND = "stopped by hand"
+    SAVE = "the file was saved again"
+
+
+RescoreState = Literal["none", "asking", "loading", "rescoring", "done", "stopped", "failed"]
+RUNNING: tuple[RescoreState, ...] = ("asking", "loading", "rescoring")
+
+
 @dataclass(frozen=True)
-class PastRescoring:
-    """The running or the last job that rescores the history."""
+class RescoreView:
+    """State and results of the last rescoring job."""
+
+    state: RescoreState = "none"
+    """``asking``: whether the code may run; ``loading``: the code is loaded in the background process."""
+    serial: int = 0
+    """Grows with every change."""
+    verdicts: tuple[Verdict[Any], ...] = ()
+    """Verdicts so far, including runs that are rescored in part."""
+    done: int = 0
+    total: int = 0
+    unit: str = "steps"
+    """Unit of `done` and `total`: control ``steps`` of the batch, or ``episodes``."""
+    steps: int = 0
+    """Control steps made so far."""
+    seconds: float = 0.0
+    """Seconds that these steps took, without loading."""
+    task: str = ""
+    """The code that rescores."""
+    stopped_by: StoppedBy | None = None
+    why: str = ""
+    """Why the job stopped or failed, as text."""
+    problem: Problem | None = None
+    """What the code raised."""
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """Warnings, a sentence each: state that could not be restored, modules that a library's name hides."""
+    names: tuple[str, ...] = ()
+    """Names for `RescoredPast.curve`: ``reward`` first, then the numbers that differ, then the others."""
+    differing_names: frozenset[str] = frozenset()
+
+    @property
+    def rate(self) -> float:
+        """Control steps per second; 0 while unknown."""
+        return self.steps / self.seconds if self.seconds > 0.5 else 0.0
+
+
+@dataclass(frozen=True)
+class Rescoring:
+    """The running or the last job that rescores the history, or recordings."""
 
     view: RescoreView = RescoreView()
     past: RescoredPast | None = field(default=None, compare=False)
-    """Its scores: a store that is written into in place."""
+    """Scores of the history: a store that is written into in place. None for recordings."""
     job: int = 0
     """Its number."""
+
+    @property
+    def running(self) -> bool:
+        return self.view.state in RUNNING
+
+    def begun(self, view: RescoreView, past: RescoredPast | None = None) -> Rescoring:
+        """The next job, which begins with this view."""
+        return replace(self, past=past, job=self.job + 1).shows(view)
+
+    def shows(self, view: RescoreView) -> Rescoring:
+        """The same job with another view."""
+        return replace(self, view=replace(view, serial=self.view.serial + 1))
 
     def curve(self, name: str, env: int) -> RescoredCurve | None:
         """The curve of `RescoredPast.curve`; None before the first job. Called on the loop."""
@@ -39,58 +100,20 @@ class PastRescoring:
 
 
 @dataclass(frozen=True)
-class CodeLoads:
-    """The background process loads the new code."""
+class RescoringTold:
+    """What a job has come to."""
 
     job: int
-
-
-@dataclass(frozen=True)
-class RescoreSummary:
-    """Verdicts so far, and names as `RescoreView` has them."""
-
-    verdicts: tuple[Verdict[PastRun], ...]
-    names: tuple[str, ...]
-    differing_names: frozenset[str]
-
-
-@dataclass(frozen=True)
-class MomentsRescored:
-    """Some more moments have new scores."""
-
-    job: int
-    done: int
-    """Control steps that have new scores."""
-    seconds: float
-    """Seconds that the new ones of them took."""
-    not_restored: tuple[tuple[str, str], ...] = ()
-    """What of the state could not be restored so far, and why."""
-    summary: RescoreSummary | None = None
-    """None if the last one still stands."""
-
-
-@dataclass(frozen=True)
-class RescoringDone:
-    job: int
-
-
-@dataclass(frozen=True)
-class RescoringFailed:
-    job: int
-    why: str
-    problem: Problem | None
-    """What the code raised."""
-
-
-RescoreEvent = CodeLoads | MomentsRescored | RescoringDone | RescoringFailed
-"""What comes of a job."""
+    view: RescoreView
+    """Its serial counts for nothing."""
 
 
 @dataclass(frozen=True)
 class BeginRescoring:
-    """Begin this job; cancel the one before."""
+    """Begin this job with the history; cancel the one before."""
 
     job: int
+    view: RescoreView
     load: Load
     """The new code."""
     past: RescoredPast = field(compare=False)
@@ -102,14 +125,30 @@ class EndRescoring:
 
 
 RescoreEffect = BeginRescoring | EndRescoring
-Change = tuple[PastRescoring, list[RescoreEffect]]
+Change = tuple[Rescoring, list[RescoreEffect]]
 
 
 # --- apply ------------------------------------------------------------------------------------------
 
 
-def apply(rescoring: PastRescoring, event: object, before: Run, run: Run) -> Change:
-    """The rescoring after an event, and what has to be done.
+def apply_to_job(rescoring: Rescoring, event: object) -> Change:
+    """The rescoring after what a page asks for, or a job tells, and what has to be done.
+
+    Raises:
+        Refused: the command makes no sense now; nothing has changed.
+    """
+    match event:
+        case Asked(command=StopRescoring()):
+            if not rescoring.running:
+                raise Refused("Nothing is being rescored.")
+            return _stop(rescoring, StoppedBy.HAND)
+        case RescoringTold(job=rescoring.job, view=view) if rescoring.running:
+            return rescoring.shows(view), []
+    return rescoring, []
+
+
+def apply(rescoring: Rescoring, event: object, before: Run, run: Run) -> Change:
+    """The rescoring of the history after an event, and what has to be done.
 
     Args:
         before: the run before the event.
@@ -118,32 +157,16 @@ def apply(rescoring: PastRescoring, event: object, before: Run, run: Run) -> Cha
     Raises:
         Refused: the command makes no sense now; nothing has changed.
     """
-    view = rescoring.view
-    runs = view.state in RUNNING
     match event:
-        case Asked(command=StopRescoring()):
-            if not runs:
-                raise Refused("Nothing is being rescored.")
-            return _stop(rescoring, StoppedBy.HAND)
-        case FileSaved() if runs:
+        case FileSaved() if rescoring.running:
             return _stop(rescoring, StoppedBy.SAVE)
         case VersionLoaded():
-            what_to_do = rescore_after_load(run.after_load, view)
+            what_to_do = rescore_after_load(run.after_load, rescoring.view)
             if what_to_do == "forget" and rescoring.past is not None:
-                return PastRescoring(RescoreView(serial=view.serial + 1), None, rescoring.job), [
-                    EndRescoring()
-                ]
+                return replace(rescoring, past=None).shows(RescoreView()), [EndRescoring()]
             if what_to_do == "rescore":
                 return _begin(rescoring, before, run)
-        case CodeLoads(job=rescoring.job) if runs:
-            return replace(rescoring, view=view.changed(state="loading")), []
-        case MomentsRescored(job=rescoring.job) if runs:
-            return replace(rescoring, view=_rescored(view, event)), []
-        case RescoringDone(job=rescoring.job) if runs:
-            return replace(rescoring, view=view.changed(state="done")), []
-        case RescoringFailed(job=rescoring.job, why=why, problem=problem) if runs:
-            return replace(rescoring, view=view.changed(state="failed", why=why, problem=problem)), []
-    return rescoring, []
+    return apply_to_job(rescoring, event)
 
 
 def rescore_after_load(past: PastAfterLoad, view: RescoreView) -> Literal["rescore", "keep", "forget"]:
@@ -160,7 +183,7 @@ def rescore_after_load(past: PastAfterLoad, view: RescoreView) -> Literal["resco
     return "forget"
 
 
-def _begin(rescoring: PastRescoring, before: Run, run: Run) -> Change:
+def _begin(rescoring: Rescoring, before: Run, run: Run) -> Change:
     load = run.running_load()
     if before.past is None or load is None:
         return rescoring, []
@@ -168,28 +191,10 @@ def _begin(rescoring: PastRescoring, before: Run, run: Run) -> Change:
     past = RescoredPast(before.past.history, before.past.at, has_reward)
     if past.steps == 0:
         return rescoring, []
-    view = RescoreView("loading", serial=rescoring.view.serial + 1, total=past.steps, task="the new code")
-    begun = PastRescoring(view, past, rescoring.job + 1)
-    return begun, [BeginRescoring(begun.job, load, past)]
+    begun = rescoring.begun(RescoreView("loading", total=past.steps, task="the new code"), past)
+    return begun, [BeginRescoring(begun.job, begun.view, load, past)]
 
 
-def _stop(rescoring: PastRescoring, why: StoppedBy) -> Change:
-    return replace(rescoring, view=rescoring.view.stopped(why)), [EndRescoring()]
-
-
-def _rescored(view: RescoreView, event: MomentsRescored) -> RescoreView:
-    summary = event.summary
-    if summary is not None:
-        view = replace(
-            view,
-            verdicts=summary.verdicts,
-            names=summary.names,
-            differing_names=summary.differing_names,
-        )
-    return view.changed(
-        state="rescoring",
-        done=event.done,
-        steps=event.done,
-        seconds=view.seconds + event.seconds,
-        warnings=tuple(f"not restored: {what}: {why}" for what, why in event.not_restored),
-    )
+def _stop(rescoring: Rescoring, why: StoppedBy) -> Change:
+    view = replace(rescoring.view, state="stopped", stopped_by=why, why=why.value)
+    return rescoring.shows(view), [EndRescoring()]

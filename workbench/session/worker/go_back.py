@@ -1,4 +1,4 @@
-"""Goes back to a past moment or into a recording, and rescores past moments."""
+"""Goes back to a past moment, or into a recording."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from workbench.jobs.open_task import OpenedTask
 from workbench.jobs.replay import replay_text, replay_to
 from workbench.jobs.task import NO_MOMENT, Restored
 from workbench.session.protocol.messages import EnterRecording, Restore
-from workbench.session.protocol.questions import RescoredMoments, RescoreMoments
 
 MOST_SECONDS = 8.0
 """Longest replay in seconds; a longer one is given up, and the state of the moment is restored instead."""
@@ -141,28 +140,6 @@ def _how(request: Restore, replayed: int, put: int, steps: int) -> str:
 def going_back_text(done: int, total: int) -> str:
     """Text of the status line while going back."""
     return f"going back: step {done} of {total}"
-
-
-def rescore_moments(opened: OpenedTask, request: RescoreMoments) -> RescoredMoments:
-    """Replay the moments of `request` in order; the first that raises ends it, with its problem."""
-    steps: list[StepResult] = []
-    missed: dict[str, str] = {}
-    for moment in request.moments:
-        try:
-            if moment.snapshot is None:
-                with blamed("step", opened.loaded, opened.env):
-                    steps.append(opened.env.step(moment.action))
-                continue
-            snapshot = pickle.loads(moment.snapshot)
-            with blamed("restore", opened.loaded, opened.env):
-                step, report = opened.env.restore(snapshot, moment.env_idx, moment.env_idx)
-        except TaskError as error:
-            return RescoredMoments(tuple(steps), missed, error.problem)
-        steps.append(step)
-        if len(moment.env_idx) == opened.env.num_envs:
-            # A jump of some envs never restores what belongs to the whole batch: it did not then either.
-            missed |= report.not_carried
-    return RescoredMoments(tuple(steps), missed)
 
 
 # --- into a recording ----------------------------------------------------------------------------------

@@ -25,7 +25,8 @@ from workbench.core.env.task_env import TaskEnv
 from workbench.core.maniskill_private import mark_camera_configs
 from workbench.jobs.actions import ActionChooser
 from workbench.jobs.open_task import OpenedTask, Opening, warm_up
-from workbench.jobs.rescore.verdict import Rescore
+from workbench.jobs.rescore.moments import rescore_moments
+from workbench.jobs.rescore.verdict import Rescore, RescoreMoments
 from workbench.jobs.task import Restored, TaskOptions
 from workbench.machine.folders import CurrentFolder
 from workbench.machine.processes.debugger import (
@@ -77,7 +78,6 @@ from workbench.session.protocol.questions import (
     MakeScene,
     PlanActions,
     ProfileStep,
-    RescoreMoments,
     RunCameras,
 )
 from workbench.session.worker.cameras import WorkerCameras
@@ -87,7 +87,6 @@ from workbench.session.worker.go_back import (
     entering_text,
     go_back,
     going_back_text,
-    rescore_moments,
 )
 from workbench.session.worker.guarded_task import REFUSED, GuardedTask, ServerConnection
 from workbench.session.worker.make_scene import SceneEnv, draw_task, registered_ids
@@ -229,6 +228,11 @@ class Worker:
             return registered_ids()
         if isinstance(question, DrawTask):
             return draw_task(question.env_id)
+        if isinstance(question, Rescore):
+            # Imported late: rerun and the readers take a third of a second.
+            from workbench.jobs.rescore import run as rescore_run
+
+            return rescore_run.answer(question, report)
         opened = self._task.opened
         if opened is None:
             raise CannotAnswer("no task is loaded")
@@ -245,14 +249,9 @@ class Worker:
         if isinstance(question, CheckGroup | ProfileStep):
             options = TaskOptions() if self._loaded_by is None else self._loaded_by.options
             return self._checks.answer(opened, options, question, report)
-        if isinstance(question, PlanActions):
-            env_kwargs = {} if self._loaded_by is None else self._loaded_by.options.env_kwargs
-            return self._plans.answer(opened, env_kwargs, question, report)
-        assert isinstance(question, Rescore)
-        # Imported late: rerun and the readers take a third of a second.
-        from workbench.jobs.rescore import run as rescore_run
-
-        return rescore_run.answer(opened, question, report)
+        assert isinstance(question, PlanActions)
+        env_kwargs = {} if self._loaded_by is None else self._loaded_by.options.env_kwargs
+        return self._plans.answer(opened, env_kwargs, question, report)
 
     # --- requests ----------------------------------------------------------------------------------
 
@@ -654,6 +653,7 @@ def _mask(opened: OpenedTask, env_idx: tuple[int, ...] | None) -> np.ndarray:
 _DOING: dict[type, Doing] = {
     Load: "loading",
     RunCameras: "loading",
+    Rescore: "loading",
     SingleStep: "stepping",
     Reset: "resetting",
     Restore: "resetting",

@@ -16,8 +16,8 @@ from workbench.jobs.rescore.verdict import Verdict, by_change
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.rescore import verdict_text
-from workbench.session.rescore.background import RescoreView
 from workbench.session.rescore.past import PastRun, RescoredCurve
+from workbench.session.rescore.rescoring import RescoreView
 from workbench.session.run.events import MomentShown
 from workbench.ui.widgets.fields import by_name, choice
 from workbench.ui.widgets.line_chart import part_round

@@ -20,8 +20,8 @@ from workbench.recording.episode.episode import EpisodeInfo
 from workbench.recording.episode.row import Source
 from workbench.recording.library.library import Library
 from workbench.session.rescore import verdict_text
-from workbench.session.rescore.background import RUNNING
 from workbench.session.rescore.recordings import Rescorer
+from workbench.session.rescore.rescoring import RUNNING
 from workbench.session.review.review import Review
 from workbench.session.review.view import ReviewView
 from workbench.ui.widgets.fields import by_name, choice, tick
@@ -195,7 +195,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
             case RestoreRecordedStates(on=on):
                 self._choices.use_env_states = on
             case StopRescoring():
-                self._rescorer.rescoring.stop()
+                self._rescorer.do(command)
             case _:
                 super().do(command, visitor)
 
@@ -206,7 +206,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
     # --- drawing -----------------------------------------------------------------------------------
 
     def key(self, view: ReviewView) -> object:
-        at = self._rescorer.rescoring.view.serial, view.opened_serial, view.selected
+        at = self._rescorer.view.serial, view.opened_serial, view.selected
         chosen = self._choices.code, self._choices.use_env_states
         return *at, self._pages.first, self._selected, self._codes_are_of(view), chosen
 
@@ -216,7 +216,7 @@ class RescorePanel(RescoredPanel[ReviewView, Source]):
 
     def draw(self, view: ReviewView) -> None:
         self._draw_codes(view)
-        told = self._rescorer.rescoring.view
+        told = self._rescorer.view
         can_begin = bool(view.opened) and told.state not in RUNNING
         begin = tool("Rescore the open recordings", RescoreOpen(), tone="main")
         self._begin.content = tools_html([begin] if can_begin else [])

@@ -12,7 +12,7 @@ from workbench.commands.command import Command
 from workbench.commands.timeline import ShowRescored, StopRescoring, TurnRescored
 from workbench.jobs.rescore.verdict import Verdict
 from workbench.session.rescore import verdict_text
-from workbench.session.rescore.background import RUNNING, RescoreView
+from workbench.session.rescore.rescoring import RUNNING, RescoreView
 from workbench.ui.widgets.line_chart import ChartLine, LineChart, span_of
 from workbench.ui.widgets.paged import Paged
 from workbench.ui.widgets.parts import PagePart

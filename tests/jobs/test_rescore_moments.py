@@ -15,9 +15,9 @@ from workbench.authoring.loading.load import load_task
 from workbench.core.env import actions
 from workbench.core.env.step_result import StepResult
 from workbench.jobs.open_task import OpenedTask, Opening, build_task
+from workbench.jobs.rescore.moments import rescore_moments
+from workbench.jobs.rescore.verdict import MomentToRescore, RescoredMoments, RescoreMoments
 from workbench.jobs.task import TaskOptions
-from workbench.session.protocol.questions import MomentToRescore, RescoredMoments, RescoreMoments
-from workbench.session.worker.go_back import rescore_moments
 
 N = 3
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
