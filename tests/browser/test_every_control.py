@@ -72,6 +72,10 @@ class Board:
 
     def press(self, part: Locator) -> bool:
         """Whether the server was asked for something, or a text was copied."""
+        dialog = self.page.locator(".mantine-Modal-overlay")
+        if dialog.count():
+            self.page.keyboard.press("Escape")
+            expect(dialog).to_have_count(0)
         before = self.page.evaluate("asked")
         # Playwright's own would wait for a picture to be stable, which is drawn anew while it waits.
         part.evaluate("p => p.scrollIntoView({block: 'center'})")
@@ -95,10 +99,7 @@ class Board:
             key, part = found
             what = part.inner_text()[:40]
             # Again: what is drawn anew at that moment moves away from under the mouse.
-            did = any(self.press(part) or not part.is_visible() for _ in range(TRIES))
-            if self.page.locator(".mantine-Modal-overlay").count():
-                self.page.keyboard.press("Escape")
-            if not did:
+            if not any(self.press(part) or not part.is_visible() for _ in range(TRIES)):
                 dead.append(f"{where}: {what!r} ({key[:60]})")
         raise AssertionError(f"{where} has no end of parts to press")
 
