@@ -122,7 +122,9 @@ def scan_folder(folder: Path) -> Scan:
                         _add(names, below, entry)
         except FileNotFoundError:
             if not below:
-                problem = f"{_printable(folder)} is not there. It is made when an episode is recorded into it."
+                problem = (
+                    f"{_printable(folder)} is not there. It is made when an episode is recorded into it."
+                )
         except OSError as error:
             problem = f"{_printable(path)} cannot be looked into: {error.strerror or error}."
         if entries > MOST_ENTRIES:

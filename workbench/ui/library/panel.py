@@ -182,7 +182,6 @@ class LibraryPanel(PagePart[object]):
         self._disk.end()
         self._edits.end()
 
-    @on_loop
     def do(self, command: Command, visitor: Visitor) -> None:
         before = self._listing(self._library.view())
         self._list = apply(before, command)

@@ -13,14 +13,14 @@ from workbench.authoring.templates.new_task import CannotBegin, fill_blank_file,
 from workbench.commands.command import Command, Refused
 from workbench.commands.run import FillEmptyFile, Interrupt, RebuildScene, ReloadFile, RestartWorker
 from workbench.session.live.view import SessionView
-from workbench.session.loop import Aside, begin, post
+from workbench.session.loop import Aside
 from workbench.session.process.heartbeat import Busy
 from workbench.ui.live.timeline import GAP, step_in_words
 from workbench.ui.widgets.editor import LinkTo, no_links
 from workbench.ui.widgets.parts import PagePart
 from workbench.ui.widgets.templates import render
 from workbench.ui.widgets.tools import Tool, tool, tools_html
-from workbench.ui.widgets.visitors import Visitor
+from workbench.ui.widgets.visitors import Done, Visitor
 
 WIDEST, BUSY_WIDEST = 520, 460
 """Maximum width in pixels. The style sheet makes a banner as narrow as the view, so that it does not cover the
@@ -130,17 +130,16 @@ class Banner(PagePart[SessionView]):
             ],
         )
 
-    def do(self, command: Command, visitor: Visitor) -> None:
+    def do(self, command: Command, visitor: Visitor) -> Done:
         if self._blank is None:
             raise Refused("No empty file is open.")
-        filled = self._fill(self._blank, visitor)
-        post(lambda: begin(filled))
+        return self._fill(self._blank)
 
-    async def _fill(self, file: Path, visitor: Visitor) -> None:
+    async def _fill(self, file: Path) -> None:
         try:
             await self._disk.run(partial(fill_blank_file, file))
         except CannotBegin as error:
-            visitor.tell(str(error))
+            raise Refused(str(error)) from None
 
 
 def banner_html(problem: Problem, view: SessionView, link: LinkTo = no_links) -> str:

@@ -321,7 +321,6 @@ class SweepPanel(PagePart[ReviewView]):
 
     # --- presses ---------------------------------------------------------------------------------------
 
-    @on_loop
     def do(self, command: Command, visitor: Visitor) -> None:
         self._shown = apply(self._shown, command, self._read.summaries)
         if isinstance(command, OpenSweepEpisode):
