@@ -27,7 +27,7 @@ from workbench.machine.parse_python import parse_python
 from workbench.machine.processes.watched_thread import report_failure
 from workbench.machine.text import short_line
 from workbench.session.loop import Aside, begin, do, on_loop
-from workbench.session.tasks.recents import RecentTask, RecentTasks
+from workbench.session.tasks.recents import RecentTask, RecentTasks, lasting
 from workbench.session.tasks.registered import RegisteredTasks, RegisteredView
 from workbench.session.tasks.typed import typed_path
 
@@ -72,6 +72,8 @@ class Entry:
     """The id whose picture the row shows; empty for none."""
     blank: str = ""
     """Text in place of the picture."""
+    lasting: str = ""
+    """The reference as `recents.lasting` has it: the same for each row of a task."""
 
     def matches(self, words: list[str]) -> bool:
         """Whether its name has all of these words, in lower case, or a word of its other texts begins with them."""
@@ -294,7 +296,8 @@ def _entry(
     options: TaskOptions | None = None,
     env_id: str = "",
 ) -> Entry:
-    return Entry(0, section, _shown(name), _shown(about), reference, file, gone, options, env_id)
+    known = (reference, file, gone, options, env_id)
+    return Entry(0, section, _shown(name), _shown(about), *known, lasting=lasting(reference))
 
 
 def _about(task: TaskFile) -> str:

@@ -177,13 +177,13 @@ class GoLive:
         Raises:
             CannotEnterRecording, NotCleared: it may not be opened.
         """
-        info = way.info
-        wanted = CodeToRun(reference_of(info), info, recorded_source, followed=not recorded_source)
-        options = options_of(info, NEW_ENVS if self.everywhere else 1, self._base)
+        info, num_envs = way.info, NEW_ENVS if self.everywhere else 1
 
         def open_cleared() -> tuple[Session, Path | None] | None:
+            wanted = CodeToRun(reference_of(info), info, recorded_source, followed=not recorded_source)
+            options = options_of(info, num_envs, self._base)
             folder, reference = None, self._clearances.clear(wanted, lambda: way.given_up)
-            if wanted.recorded_text:
+            if recorded_source:
                 folder, reference = write_source(info)
             if not way.given_up:
                 if self._place.home is not None:

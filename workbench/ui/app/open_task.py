@@ -63,6 +63,9 @@ class OpenTask:
     ) -> None:
         self._place, self._open_session = place, open_session
         self.catalogue, self._clearances = catalogue, clearances
+        home = place.home
+        self._open_reference = "" if home is None else lasting(str(home.reference))
+        """Reference of the task that a person opened, as `Entry.lasting` has it."""
         self._wish: Entry | None = None
         self._opening: asyncio.Task[None] | None = None
         self._aside = Aside("open-task")
@@ -96,8 +99,7 @@ class OpenTask:
 
     def is_open(self, entry: Entry) -> bool:
         """Whether this is the open task."""
-        home = self._place.home
-        return home is not None and lasting(str(home.reference)) == lasting(entry.reference)
+        return self._place.home is not None and self._open_reference == entry.lasting
 
     def close(self) -> None:
         """Withdraw a question and end the thread; a session that is being closed is waited for."""
@@ -154,7 +156,7 @@ class OpenTask:
             NotCleared: it may not run.
         """
         file = entry.file
-        known = lasting(entry.reference) in self._ran or file in example_tasks()
+        known = entry.lasting in self._ran or file in example_tasks()
         if file is None or known or is_below(file, self.catalogue.folder):
             return entry.reference
         return self._clearances.clear_file(file, file_and_class(entry.reference)[1], self._withdrawn)
@@ -164,14 +166,15 @@ class OpenTask:
         place.go_live.let_go()
         if old is not None:
             old.do(PauseRun())
-            self._kept[lasting(str(old.reference))] = old.kept_work()
+            self._kept[self._open_reference] = old.kept_work()
             # Not the texts of a recording, which name a path and are other code.
             if isinstance(old.reference, str):
-                self._ran.add(lasting(old.reference))
-        kept = self._kept.get(lasting(entry.reference))
+                self._ran.add(self._open_reference)
+        kept = self._kept.get(entry.lasting)
         options = entry.options or self.catalogue.options
         session = await self._aside.run(lambda: self._open_session(reference, options, kept))
         place.session = place.home = session
+        self._open_reference = entry.lasting
         # Until then the old page draws the old session.
         shown = asyncio.wrap_future(place.pages.show("live", anew=True))
         await asyncio.wait([shown], timeout=_SHOWN_WITHIN)
