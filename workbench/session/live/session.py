@@ -331,19 +331,19 @@ class Session:
         return self._recorder.finisher.finished.count
 
     def knows_file(self, path: str) -> bool:
-        """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder. Looks at the
-        disk."""
-        run = self._run
-        known = run.own_files
+        """Whether this absolute path is a file of the task, of its policy, or a module in the task's folder. Looks at the disk
+        for the last two."""
+        run, file = self._run, Path(path)
+        if file in [Path(one).absolute() for one in run.own_files]:
+            return True
         if run.policy is not None:
             with contextlib.suppress(NoPolicy):
-                known = [*known, str(find_policy(run.policy, run.folder)[0])]
-        file, folder = Path(path), run.own_folder
+                if file == Path(find_policy(run.policy, run.folder)[0]).absolute():
+                    return True
         # A module that has never loaded is in no `source_files`. Resolved: a path may leave the folder again by "..".
+        folder = run.own_folder
         beside = folder is not None and file.resolve().is_relative_to(folder.resolve())
-        return file in [Path(one).absolute() for one in known] or (
-            beside and file.suffix == ".py" and file.is_file()
-        )
+        return beside and file.suffix == ".py" and file.is_file()
 
     # --- requests ----------------------------------------------------------------------------------
 
