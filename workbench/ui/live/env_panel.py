@@ -273,7 +273,8 @@ class EnvPanel(MomentPart):
         self._session = session
         self._handle = server.gui.add_html("")
         server.gui.add_html(render("tell", command=TellUnfolded(panel=TABLE)))
-        self._column, self._descending = "env", False
+        self._sort = "env", False
+        """Column that a person chose, and whether the order is descending."""
         self._filter: Filter = "all"
         self._pages = Paged(MOST_ROWS)
         self._chosen: dict[str, bool] = {}
@@ -297,8 +298,8 @@ class EnvPanel(MomentPart):
             case NextFlaggedEnv():
                 self._select_next("flagged")
             case SortEnvs(column=column):
-                self._descending = not self._descending if column == self._column else False
-                self._column = column
+                before, descending = self._sort
+                self._sort = column, column == before and not descending
                 self._pages = self._pages.at(0)
             case FilterEnvs(which=which):
                 self._filter = which
@@ -346,9 +347,7 @@ class EnvPanel(MomentPart):
         )
 
     def _html(self, rows: EnvRows, selected: int) -> str:
-        if self._column not in columns(rows, self._chosen):
-            self._column, self._descending = "env", False
-        envs = order(rows, self._column, self._descending, self._filter)
+        envs = order(rows, *self._sorted_by(rows), self._filter)
         places = self._pages.places(len(envs))
         shown = make_rows(rows, envs[places.start : places.stop], self._chosen)
         return render(
@@ -382,15 +381,10 @@ class EnvPanel(MomentPart):
 
     def _head(self, rows: EnvRows) -> list[dict[str, object]]:
         names = entry_names(rows, self._chosen)
+        sorted_by, descending = self._sorted_by(rows)
 
         def sortable(name: str, column: str, hint: str) -> dict[str, object]:
-            arrow = (
-                ""
-                if column != self._column
-                else "\N{NO-BREAK SPACE}↓"
-                if self._descending
-                else "\N{NO-BREAK SPACE}↑"
-            )
+            arrow = "" if column != sorted_by else f"\N{NO-BREAK SPACE}{'↓' if descending else '↑'}"
             return {
                 "name": name,
                 "arrow": arrow,
@@ -411,10 +405,14 @@ class EnvPanel(MomentPart):
         end = [sortable(name, name, HINTS[name]) for name in ("last", "flags")]
         return [*start, plain, *entries, *end]
 
+    def _sorted_by(self, rows: EnvRows) -> tuple[str, bool]:
+        """The chosen order; by number, while the table lacks the column."""
+        return self._sort if self._sort[0] in columns(rows, self._chosen) else ("env", False)
+
     def _measure(self, rows: EnvRows, shown: list[dict[str, Any]]) -> list[EnvColumn]:
         """The columns in the order of `_head`."""
         names = entry_names(rows, self._chosen)
-        ranks = gives_way(names, self._chosen, self._column)
+        ranks = gives_way(names, self._chosen, self._sorted_by(rows)[0])
 
         def longest(texts: Iterable[str]) -> int:
             return max(STEP_CHARACTERS, *map(len, texts), 0)
@@ -465,7 +463,7 @@ class EnvPanel(MomentPart):
     def _toggle_entry(self, name: str) -> None:
         rows = self._session.env_rows()
         if rows is not None:
-            self._chosen[name] = name not in entry_names(rows, self._chosen)
+            self._chosen = {**self._chosen, name: name not in entry_names(rows, self._chosen)}
 
     def _select_first_flagged(self) -> None:
         """Select the first flagged env, at its first outlier."""
