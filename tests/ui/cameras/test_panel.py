@@ -1,4 +1,4 @@
-"""The Cameras tab, drawn from views that are made by hand; of the session it only asks for pictures."""
+"""The Cameras tab, drawn from views that are made by hand."""
 
 from __future__ import annotations
 
@@ -15,16 +15,6 @@ from workbench.session.protocol.messages import CameraRequest
 from workbench.ui.cameras.panel import CamerasPanel
 
 POSE = np.array([0, 0, 1, 1, 0, 0, 0], np.float32)
-
-
-class RequestParts:
-    """Of a session only this is needed: which pictures are wanted."""
-
-    def __init__(self) -> None:
-        self.cameras: tuple[CameraRequest, ...] = ()
-
-    def __call__(self, cameras: tuple[CameraRequest, ...]) -> None:
-        self.cameras = cameras
 
 
 BASE, TOP = "base · sensor", "top · sensor"
@@ -45,19 +35,19 @@ def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) ->
 
 
 def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:
-    asked = RequestParts()
-    panel = CamerasPanel(panels.server, asked, clock=clock)
+    panel = CamerasPanel(panels.server, clock=clock)
     panels.visitors.do = panel.do
     panel.draw(seen(1, (camera("base"), camera("hand"))))
     base = panels.part(BASE)
     base.set("depth", True)
     (image,) = base.images()
     clock.passes()
-    panel.draw(seen(2, (camera("top"), replace(camera("base"), width=640))))
+    both = seen(2, (camera("top"), replace(camera("base"), width=640)))
+    panel.draw(both)
     assert panels.folders() == [TOP, BASE]
     assert base.field("depth").value and base.images() == [image]
     assert "640 × 6" in base.html()
-    assert asked.cameras == (
+    assert panel.wanted(both) == (
         CameraRequest("top", "sensor", ("rgb",)),
         CameraRequest("base", "sensor", ("rgb", "depth")),
     )
@@ -67,30 +57,29 @@ def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: P
 
 
 def test_what_is_ticked_is_asked_for_and_stays_ticked_while_its_camera_is_gone(panels: Panels) -> None:
-    asked = RequestParts()
-    panel = CamerasPanel(panels.server, asked)
+    panel = CamerasPanel(panels.server)
     panels.visitors.do = panel.do
     panel.draw(None)
     assert not panels.shows("Show in 3D view")
     panel.draw(seen(1, (camera("base"),)))
-    assert asked.cameras == (CameraRequest("base", "sensor", ("rgb",)),)
+    assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("rgb",)),)
     base = panels.part(BASE)
     base.set("rgb", False)
     base.set("segmentation", True)
     panels.set("Show in 3D view", False)
     panel.draw(seen(1, (camera("base"),)))
-    assert asked.cameras == (CameraRequest("base", "sensor", ("segmentation",)),)
+    assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("segmentation",)),)
     assert not base.field("rgb").value and not panels.field("Show in 3D view").value
     assert not panel.show_frustums
     panel.draw(seen(2, (camera("top"),)))
     panel.draw(seen(3, (camera("base"),)))
-    assert asked.cameras == (CameraRequest("base", "sensor", ("segmentation",)),)
+    assert panel.wanted(seen(1, (camera("base"),))) == (CameraRequest("base", "sensor", ("segmentation",)),)
     panels.do(ShowPictures(kind="sensor", name="base", modality="albedo", on=True))
     assert panels.client.notices == ["No camera base gives albedo."]
 
 
 def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:
-    panel = CamerasPanel(panels.server, RequestParts())
+    panel = CamerasPanel(panels.server)
     cameras = (camera("base"),)
     panel.draw(seen(1, cameras))
     assert "another moment" not in panels.html()
@@ -103,7 +92,7 @@ def test_pictures_of_another_moment_are_said_to_be_that(panels: Panels) -> None:
 def test_pictures_that_follow_each_other_are_as_wide_as_the_panel_and_the_last_is_whole(
     panels: Panels, clock: Clock
 ) -> None:
-    panel = CamerasPanel(panels.server, RequestParts(), clock=clock)
+    panel = CamerasPanel(panels.server, clock=clock)
 
     moving = seen(1, (camera("base"),))
     assert moving is not None

@@ -34,6 +34,7 @@ from workbench.session.live import state
 from workbench.session.live.session import Session
 from workbench.session.live.view import SessionView
 from workbench.session.loop import Aside, post
+from workbench.session.protocol.messages import CameraRequest
 from workbench.session.run.events import PagesCounted
 from workbench.ui.app.marks import EPISODES, STUDIO, Marks
 from workbench.ui.app.pages import draw_apart
@@ -143,6 +144,8 @@ class Page:
         self._link = partial(editor_link, editor, known=session.knows_file)
         self._on_review, self._on_look = on_review, on_look
         self._visitors_counted = -1
+        self._watched: tuple[CameraRequest, ...] = ()
+        """Pictures that the session was asked for."""
         self._choices = Aside("choices")
         """Keeps what a person chose for later runs."""
         self._panels_due = DrawDue(PANELS_EVERY, clock)
@@ -212,7 +215,6 @@ class Page:
             )
             self._cameras = CamerasPanel(
                 server,
-                lambda cameras: session.change(cameras=cameras),
                 studio_shows=lambda: self._studio.shows,
                 clock=clock,
             )
@@ -289,6 +291,14 @@ class Page:
         view = self._session.view()
         panels = (lambda: self._draw_panels(view)) if self._panels_due.is_due(*_shown_of(view)) else None
         draw_apart(self._server, panels, lambda: self._draw_scene(view))
+        self._watch(view)
+
+    def _watch(self, view: SessionView) -> None:
+        """Ask the session for the pictures that the page shows."""
+        wanted = self._cameras.wanted(view.shown_cameras)
+        if wanted != self._watched:
+            self._watched = wanted
+            self._session.change(cameras=wanted)
 
     def _draw_panels(self, view: SessionView) -> None:
         self._parts.draw(view)

@@ -161,9 +161,7 @@ class ReviewPage:
             self._panel = ReviewPanel(server, review, go_live.go, go_live.going)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras_note = server.gui.add_html("")
-            self._cameras = CamerasPanel(
-                server, self._want, "This recording has no pictures.", clock=self._clock
-            )
+            self._cameras = CamerasPanel(server, "This recording has no pictures.", clock=self._clock)
         with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
             numbers, curves = ReviewNumbers(server), ReviewCurves(server)
         with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
@@ -355,9 +353,6 @@ class ReviewPage:
 
     # --- cameras -----------------------------------------------------------------------------------
 
-    def _want(self, cameras: tuple[CameraRequest, ...]) -> None:
-        self._requests = cameras
-
     def _take_pictures(self, view: ReviewView) -> None:
         chosen = view.chosen
         pictures = (
@@ -375,19 +370,18 @@ class ReviewPage:
     def _draw_cameras(self, view: ReviewView) -> None:
         episode = None if view.chosen is None else view.chosen.episode
         self._cameras_note.content = render("note", text=self._reader.problem) if self._reader.problem else ""
-        self._cameras.draw(
-            episode
-            and ShownCameras(
-                self._reader.cameras(episode),
-                # Each recording brings its own cameras.
-                view.opened_serial * 1000 + view.selected,
-                self._pictures,
-                self._pictures_serial,
-                episode.segmentation,
-                view.selected,
-                hidden=() if episode.geometry is None else episode.geometry.hidden_names,
-            )
+        shown = episode and ShownCameras(
+            self._reader.cameras(episode),
+            # Each recording brings its own cameras.
+            view.opened_serial * 1000 + view.selected,
+            self._pictures,
+            self._pictures_serial,
+            episode.segmentation,
+            view.selected,
+            hidden=() if episode.geometry is None else episode.geometry.hidden_names,
         )
+        self._cameras.draw(shown)
+        self._requests = self._cameras.wanted(shown)
 
     # --- what a person does ------------------------------------------------------------------------
 

@@ -120,7 +120,6 @@ class CamerasPanel:
     rendered.
 
     Args:
-        ask: Asks for exactly these pictures: a session renders them, a review decodes them.
         no_camera: The note where there is no camera.
         studio_shows: The modality that the Studio shows of the camera that is being placed.
     """
@@ -130,20 +129,18 @@ class CamerasPanel:
     def __init__(
         self,
         server: viser.ViserServer,
-        ask: Callable[[tuple[CameraRequest, ...]], None],
         no_camera: str = "This task has no camera yet. Add sensor on the Studio tab makes one.",
         studio_shows: Callable[[], str] = lambda: COLOUR,
         clock: Clock = time.monotonic,
     ) -> None:
         self.show_frustums = True
         self._no_camera, self._studio_shows = no_camera, studio_shows
-        self._server, self._ask_for, self._clock = server, ask, clock
+        self._server, self._clock = server, clock
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._ticked: dict[tuple[CameraKind, str, str], bool] = {}
         """Whether each modality of each camera is ticked; cameras that are gone are kept, since they may come back."""
         self._cameras_serial = -1
         self._due = DrawDue(PICTURE_PERIOD, clock)
-        self._asked: tuple[CameraRequest, ...] | None = None
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task has loaded."))
         hint = "Draw these cameras, with their pictures, in the 3D view."
         self._frustums = tick(server, "Show in 3D view", ShowFrustums, "on", True, hint=hint)
@@ -170,7 +167,7 @@ class CamerasPanel:
             self._cameras_serial = seen.cameras_serial
             self._build(seen)
         self._mark(seen)
-        self._ask(seen)
+        self._draw_places()
         for camera in self._cameras.values():
             for image in camera.images.values():
                 image.settle()
@@ -248,15 +245,18 @@ class CamerasPanel:
         about.content = facts(camera)
         return camera
 
-    def _ask(self, seen: ShownCameras) -> None:
-        wanted = tuple(
+    def wanted(self, seen: ShownCameras | None) -> tuple[CameraRequest, ...]:
+        """The pictures that it shows, as far as it is drawn."""
+        if seen is None:
+            return ()
+        return tuple(
             CameraRequest(camera.info.name, camera.info.kind, modalities)
             for key, camera in self._cameras.items()
             if (modalities := self._wanted_of(key, camera, seen))
         )
-        if wanted != self._asked:
-            self._asked = wanted
-            self._ask_for(wanted)
+
+    def _draw_places(self) -> None:
+        """Show the place of each picture that is ticked."""
         for camera in self._cameras.values():
             ticked = self._wanted(camera)
             for modality in camera.ticks:
