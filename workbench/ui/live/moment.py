@@ -14,4 +14,6 @@ class MomentPart(PagePart[SessionView]):
     """Seconds between two drawings; numbers of many rows cannot be read faster."""
 
     def urgent(self, view: SessionView) -> object:
-        return view.task_serial, view.state, view.playing, view.selected_env, view.timeline.shown
+        # A person waits for a step that they ask for.
+        step = None if view.playing else view.step_serial
+        return view.task_serial, view.state, view.playing, view.selected_env, view.timeline.shown, step
