@@ -17,9 +17,11 @@ from tests.drive.panels import Panels, held_by
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import tabs_of
+from workbench.commands.page import ToggleTable
 from workbench.commands.run import PlayRun
 from workbench.jobs.task import TaskOptions
 from workbench.session.live.session import Session
+from workbench.ui.app.pages import ShownPage, Which
 from workbench.ui.app.workplace import Workplace
 from workbench.ui.server.gated_server import GatedServer
 
@@ -100,6 +102,32 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
         until(lambda: [row.seed for row in place.shelf.library.view().rows] == [8], "its row")
     finally:
         place.close()
+
+
+def test_what_is_pressed_while_another_page_is_built_is_refused_and_nothing_fails(
+    place: Workplace, panels: Panels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panels.come_to(place.visitors)
+    place.pages.start("review")
+    building, go_on = threading.Event(), threading.Event()
+    make = place.pages._make
+
+    def slow(which: Which, dark: bool) -> ShownPage:
+        building.set()
+        assert go_on.wait(60)
+        return make(which, dark)
+
+    monkeypatch.setattr(place.pages, "_make", slow)
+    shown = place.pages.show("live")
+    try:
+        assert building.wait(60)
+        panels.do(ToggleTable())
+        assert len(panels.client.notices) == 1
+    finally:
+        go_on.set()
+    shown.result(60)
+    panels.do(ToggleTable())
+    assert len(panels.client.notices) == 1
 
 
 @pytest.mark.slow

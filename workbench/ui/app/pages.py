@@ -14,6 +14,7 @@ import viser
 
 from workbench.commands.command import Command, Refused
 from workbench.machine.processes.watched_thread import watched_thread
+from workbench.session.loop import do
 from workbench.ui.scene.viewpoint import Stage
 from workbench.ui.server.strangers import RareLog
 from workbench.ui.server.viser_private import wait_until_taken
@@ -123,7 +124,7 @@ class Pages:
         """Let the page that is shown carry out a command."""
         page = self._page
         if page is None:
-            raise Refused("Nothing is shown yet.")
+            raise Refused("Another page is being built; try it again.")
         return page.do(command, visitor)
 
     def stop(self) -> None:
@@ -175,7 +176,6 @@ class Pages:
         except Exception as error:
             # The thread must survive, or no button could show a page again.
             log.exception("The page could not be built.")
-            self._page = None
             for wish in wishes:
                 wish.shown.set_exception(error)
             return
@@ -184,18 +184,23 @@ class Pages:
 
     def _build(self, which: Which) -> None:
         before, self.shown = self._page, None
-        if before is not None:
-            self._dark = before.dark
-            before.close()
         with self._server.atomic():
             if before is not None:
-                # Remove all of the old page: handles, commands, callbacks, nodes.
-                self._stage.clear()
-                self._server.gui.reset()
-            self._page = self._make(which, self._dark)
-            self._draw_or_say(self._page)
+                self._dark = before.dark
+                # On the loop: a command must not meet a page of which half is gone.
+                do(lambda: self._take_down(before))
+            page = self._make(which, self._dark)
+            self._draw_or_say(page)
         self._server.flush()
+        self._page = page
         self.shown = which
+
+    def _take_down(self, page: ShownPage) -> None:
+        """Remove all of a page: handles, commands, callbacks, nodes."""
+        self._page = None
+        page.close()
+        self._stage.clear()
+        self._server.gui.reset()
 
     def _draw_or_say(self, page: ShownPage) -> bool:
         try:
