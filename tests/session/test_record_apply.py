@@ -27,7 +27,7 @@ from workbench.jobs.record.gather import Finished
 from workbench.jobs.task import TaskOptions
 from workbench.session.cameras.state import first_studio
 from workbench.session.events import Asked, Then
-from workbench.session.live.solver import PlannedEpisode, Solving
+from workbench.session.live.solver import RunningEpisode, Solving
 from workbench.session.live.state import Effect, SessionEvent, State, apply
 from workbench.session.process.jobs import JobProgress
 from workbench.session.process.supervisor import End
@@ -264,7 +264,7 @@ def test_episodes_are_saved_once_they_are_solved_and_one_job_at_a_time() -> None
     state, _ = after(loaded(), RESET, STEP)
     with pytest.raises(Refused):
         apply_of_these(state, Asked(SaveSolved()))
-    solved = Solving(episodes={env: PlannedEpisode(solved_at=1) for env in (0, 2)})
+    solved = Solving(episodes={env: RunningEpisode(solved_at=1) for env in (0, 2)})
     state, (begin,) = apply_of_these(replace(state, solving=solved), Asked(SaveSolved()))
     assert isinstance(begin, BeginSaving) and [one.env for one in begin.what.episodes] == [0, 2]
     with pytest.raises(Refused):

@@ -64,7 +64,7 @@ class SolveView:
 
 
 @dataclass(frozen=True)
-class PlannedEpisode:
+class RunningEpisode:
     """What is known of the running episode of an env."""
 
     begins: int = 0
@@ -85,7 +85,7 @@ class Solving:
 
     shared: SolveView = SolveView()
     """The view without the fields of a single env."""
-    episodes: Mapping[int, PlannedEpisode] = field(default_factory=dict)
+    episodes: Mapping[int, RunningEpisode] = field(default_factory=dict)
     """By env."""
 
     @property
@@ -95,7 +95,7 @@ class Solving:
 
     def view(self, env: int) -> SolveView:
         """The view of this env."""
-        episode = self.episodes.get(env, PlannedEpisode())
+        episode = self.episodes.get(env, RunningEpisode())
         predicted, achieved = _curves(episode)
         return replace(
             self.shared,
@@ -208,7 +208,7 @@ def _refuse(solving: Solving, why: str, problem: Problem | None) -> Change:
 def _planned(solving: Solving, made: PlanMade) -> Solving:
     episodes = dict(solving.episodes)
     for one in made.envs:
-        episode = episodes.get(one.env, PlannedEpisode())
+        episode = episodes.get(one.env, RunningEpisode())
         place = len(episode.rewards)
         episodes[one.env] = replace(
             episode,
@@ -229,17 +229,17 @@ def _stepped(solving: Solving, event: Stepped, planned: bool) -> Solving:
     """
     if not planned and not solving.episodes:
         return solving
-    episodes: dict[int, PlannedEpisode] = {}
+    episodes: dict[int, RunningEpisode] = {}
     for env, jumped in enumerate(event.reset_mask if planned else ()):
         known = None if jumped else solving.episodes.get(env)
         episodes[env] = _noted(known, env, event.step)
     return _changed(replace(solving, episodes=episodes))
 
 
-def _noted(episode: PlannedEpisode | None, env: int, step: StepResult) -> PlannedEpisode:
+def _noted(episode: RunningEpisode | None, env: int, step: StepResult) -> RunningEpisode:
     elapsed = int(step.elapsed_steps[env])
     if episode is None:
-        return PlannedEpisode(elapsed)
+        return RunningEpisode(elapsed)
     solved_at, success = episode.solved_at, step.evaluate.get("success")
     if success is not None and bool(np.all(success[env])) and not solved_at:
         solved_at = elapsed
@@ -302,7 +302,7 @@ class PlanJobs:
         self._happen(PlanFailed(str(failure), failure.problem))
 
 
-def _curves(episode: PlannedEpisode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _curves(episode: RunningEpisode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Predicted and achieved reward a step, from each step of the episode on."""
     rewards = np.array(episode.rewards, np.float32)
     count = max(len(rewards), max(episode.predicted, default=-1) + 1)

@@ -37,7 +37,7 @@ DOES: tuple[type[Command], ...] = (
 
 
 @dataclass(frozen=True)
-class Arrangement:
+class RowArrangement:
     """Which rows are listed, and in what order."""
 
     column: Column = "date"
@@ -59,7 +59,7 @@ class LibraryList:
     one on. Rows that are not listed are not selected, or a deletion would take what a filter hides.
     """
 
-    arrangement: Arrangement = Arrangement()
+    arrangement: RowArrangement = RowArrangement()
     pages: Paged = _FIRST_PAGE
     selected: frozenset[str] = frozenset()
     """Ids of the selected rows."""
@@ -167,7 +167,7 @@ def apply(listing: Listing, command: Command) -> LibraryList:
             return listed
 
 
-def _arrange(listed: LibraryList, arrangement: Arrangement) -> LibraryList:
+def _arrange(listed: LibraryList, arrangement: RowArrangement) -> LibraryList:
     return replace(listed, arrangement=arrangement, pages=_FIRST_PAGE)
 
 

@@ -36,7 +36,15 @@ from workbench.recording.episode.row import LibraryRow
 from workbench.recording.library.library import Library, LibraryView
 from workbench.session.loop import Aside, begin, on_loop, post
 from workbench.ui.library.dialogs import LibraryEdits
-from workbench.ui.library.listing import DOES, Action, Arrangement, LibraryList, Listing, apply, make_listing
+from workbench.ui.library.listing import (
+    DOES,
+    Action,
+    LibraryList,
+    Listing,
+    RowArrangement,
+    apply,
+    make_listing,
+)
 from workbench.ui.library.rows import (
     COLUMNS,
     HINTS,
@@ -340,7 +348,7 @@ class LibraryPanel(PagePart[object]):
             ],
         )
 
-    def _none_so(self, view: LibraryView, arranged: Arrangement) -> str:
+    def _none_so(self, view: LibraryView, arranged: RowArrangement) -> str:
         if view.rows:
             return none_like_that(arranged.words, arranged.outcome, arranged.task)
         if view.problem is not None or view.reading is not None:
@@ -419,7 +427,7 @@ class LibraryPanel(PagePart[object]):
         )
 
 
-def _head(column: Column, arranged: Arrangement) -> dict[str, object]:
+def _head(column: Column, arranged: RowArrangement) -> dict[str, object]:
     arrow = "" if column != arranged.column else " ↓" if arranged.descending else " ↑"
     return {
         "name": column,

@@ -189,7 +189,7 @@ def apply(shown: Shown, command: Command, summaries: Sequence[PointSummary]) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class Read:
+class LoadedSweep:
     """What was read of the file."""
 
     results: SweepResults | None = None
@@ -224,7 +224,7 @@ class SweepPanel(PagePart[ReviewView]):
         self._disk = Aside("sweep-results")
         self._seen: tuple[int, int] | None = None
         """Size and time of the file that was read last."""
-        self._read = Read()
+        self._read = LoadedSweep()
         self._shown = Shown()
         library.on_change.add(self._library_changed)
         self._library_changed()
@@ -245,16 +245,16 @@ class SweepPanel(PagePart[ReviewView]):
         try:
             self._read = await self._disk.run(self._read_file)
         except (UnreadableRecording, OSError) as error:
-            self._read = Read(problem=str(error))
+            self._read = LoadedSweep(problem=str(error))
         except Exception as error:
             report_failure("The results of a sweep could not be read", error)
-            self._read = Read(problem="The results could not be read. The reason is in the terminal.")
+            self._read = LoadedSweep(problem="The results could not be read. The reason is in the terminal.")
 
-    def _read_file(self) -> Read:
+    def _read_file(self) -> LoadedSweep:
         folder = self._library.folder
         results = read_sweep(folder / RESULTS)
         point_of = {str(folder / row.recording): row.point for row in results.episodes if row.recording}
-        return Read(results, "", results.summaries(), point_of)
+        return LoadedSweep(results, "", results.summaries(), point_of)
 
     @on_loop
     def end(self) -> None:
@@ -327,7 +327,7 @@ class SweepPanel(PagePart[ReviewView]):
             self._on_open((command.id,))
 
 
-def _note_html(read: Read) -> str:
+def _note_html(read: LoadedSweep) -> str:
     if read.problem:
         return render("note", text=read.problem)
     results = read.results
@@ -339,7 +339,7 @@ def _note_html(read: Read) -> str:
 
 
 def _shown_point(
-    read: Read, shown: Shown, view: ReviewView, library: Sequence[LibraryRow]
+    read: LoadedSweep, shown: Shown, view: ReviewView, library: Sequence[LibraryRow]
 ) -> PointSummary | None:
     """The point whose episodes are listed: the chosen one, else that of the open episode, else the best one. If it is left
     out, the best one that is not."""
