@@ -218,11 +218,11 @@ def nothing_was_chosen_on_a_page_before() -> Iterator[None]:
 def no_process_left_behind() -> Iterator[None]:
     """Workers and browsers that tests started must be gone when the tests are."""
     yield
-    if "workbench.recording.reader.reading" in sys.modules:
+    if "workbench.episodes.reader.reading" in sys.modules:
         # Both serve the whole process, for as long as that lives.
-        sys.modules["workbench.recording.reader.reading"].stop_reading()
-    if "workbench.session.process.worker_start" in sys.modules:
-        sys.modules["workbench.session.process.worker_start"].worker_forks.end()
+        sys.modules["workbench.episodes.reader.reading"].stop_reading()
+    if "workbench.live.process.worker_start" in sys.modules:
+        sys.modules["workbench.live.process.worker_start"].worker_forks.end()
     until(lambda: not _children(), "the end of all processes that tests started", 10, seen=_children)
 
 

@@ -19,8 +19,8 @@ from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import provoke, provoked, write_task
 from tests.ui.tabs import open_deaf_tab, tabs_of
-from workbench.commands.recording import ChooseRecordedEnvs, ToggleRecording
-from workbench.commands.run import PlayRun
+from workbench.live.commands import PlayRun
+from workbench.record.commands import ChooseRecordedEnvs, ToggleRecording
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -33,7 +33,7 @@ NO_PLAN = WITHOUT_REWARD, *OTHER_BODIES_IN_EACH_ENV
 
 @pytest.mark.timeout(300)
 # Some of ManiSkill's own tasks break rules that only warn.
-@pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
 @pytest.mark.parametrize(
     "task", [*QUICK, *(pytest.param(one, marks=pytest.mark.slow) for one in WALKED if one not in QUICK)]
 )

@@ -20,10 +20,10 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 import workbench
 from tests.drive.envs import CPU
-from workbench.authoring.problem import TaskError
-from workbench.core.broken_rule import WrongReturn
-from workbench.core.env.cpu_scene import SIM_BACKEND
-from workbench.core.env.wrong_options import WrongOption
+from workbench.envs.broken_rule import WrongReturn
+from workbench.envs.cpu_scene import SIM_BACKEND
+from workbench.envs.wrong_options import WrongOption
+from workbench.task.problem import TaskError
 
 pytestmark = pytest.mark.thorough
 

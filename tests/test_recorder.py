@@ -18,10 +18,10 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.drive.envs import CPU
+from workbench.episodes.episode import NO_SEED, Episode
+from workbench.episodes.reader.read_episode import read_episode, read_maniskill
+from workbench.episodes.writing.finish import recover
 from workbench.machine.processes.family import children
-from workbench.recording.episode.episode import NO_SEED, Episode
-from workbench.recording.reader.read_episode import read_episode, read_maniskill
-from workbench.recording.writing.finish import recover
 
 TASKS = Path(__file__).parents[1] / "tasks"
 

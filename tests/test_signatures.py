@@ -17,9 +17,9 @@ from mani_skill.envs.scene import ManiSkillScene
 import workbench
 from tests.drive.envs import PUSH_CUBE, batched
 from workbench.checks.evidence.builds import noting_builds, noting_poses
-from workbench.core.env.assets import refuse_downloads
-from workbench.core.env.cpu_scene import BatchedCpuScene
-from workbench.core.maniskill_private import mark_camera_configs, noting_cameras
+from workbench.envs.assets import refuse_downloads
+from workbench.envs.cpu_scene import BatchedCpuScene
+from workbench.envs.maniskill_private import mark_camera_configs, noting_cameras
 
 OURS = str(Path(workbench.__file__).parent)
 Parameters = dict[str, inspect.Parameter]

@@ -20,12 +20,12 @@ import pytest
 from tests.drive.processes import workers_of
 from tests.drive.waiting import until
 from tests.golden.make import GOLDEN
-from workbench.recording.episode.episode import Episode
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import find_all_sources
-from workbench.session.clearance import Clearances
-from workbench.session.rescore.recordings import Rescorer
-from workbench.ui.share.make import MakeRequest, Making
+from workbench.episodes.episode import Episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.reader.reading import find_all_sources
+from workbench.rescore.recording_jobs import Rescorer
+from workbench.share.make import MakeRequest, Making
+from workbench.trust.clearance import Clearances
 
 pytestmark = pytest.mark.usefixtures("child_process")
 PATIENCE = 200.0
@@ -98,7 +98,7 @@ class Filming:
         assert self._making.start(self._wanted)
 
     def pids(self) -> list[int]:
-        return running("workbench.jobs.pool.processes")
+        return running("workbench.jobs.local_processes")
 
     def ended(self) -> bool:
         return not self._making.view().running

@@ -6,14 +6,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from workbench.core.capture.inspect_env import list_contacts as list_contacts
-    from workbench.core.snapshots.snapshot import begin_anew as begin_anew
-    from workbench.core.snapshots.snapshot import restore_snapshot as restore_snapshot
-    from workbench.core.snapshots.snapshot import take_snapshot as take_snapshot
-    from workbench.gym_env import make as make
+    from workbench.envs.inspect_env import list_contacts as list_contacts
+    from workbench.envs.snapshots.snapshot import begin_anew as begin_anew
+    from workbench.envs.snapshots.snapshot import restore_snapshot as restore_snapshot
+    from workbench.envs.snapshots.snapshot import take_snapshot as take_snapshot
+    from workbench.episodes.reader.read_episode import read_episode as read_episode
     from workbench.planning.planner import Planner as Planner
-    from workbench.recorder import Recorder as Recorder
-    from workbench.recording.reader.read_episode import read_episode as read_episode
+    from workbench.record.recorder import Recorder as Recorder
+    from workbench.task.gym_env import make as make
 
 __version__ = "0.1.0"
 __all__ = [
@@ -29,13 +29,13 @@ __all__ = [
 
 _HOMES = {
     "Planner": "planning.planner",
-    "Recorder": "recorder",
-    "begin_anew": "core.snapshots.snapshot",
-    "list_contacts": "core.capture.inspect_env",
-    "make": "gym_env",
-    "read_episode": "recording.reader.read_episode",
-    "restore_snapshot": "core.snapshots.snapshot",
-    "take_snapshot": "core.snapshots.snapshot",
+    "Recorder": "record.recorder",
+    "begin_anew": "envs.snapshots.snapshot",
+    "list_contacts": "envs.inspect_env",
+    "make": "task.gym_env",
+    "read_episode": "episodes.reader.read_episode",
+    "restore_snapshot": "envs.snapshots.snapshot",
+    "take_snapshot": "envs.snapshots.snapshot",
 }
 
 

@@ -10,7 +10,7 @@ from textwrap import dedent
 import pytest
 
 from tests.authoring.registered import TABLES, registered
-from workbench.authoring.loading import load
+from workbench.task import load
 
 HEADER = """\
 from mani_skill.envs.sapien_env import BaseEnv

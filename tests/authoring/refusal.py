@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.loading.load import load_task
-from workbench.authoring.problem import Problem, TaskError
+from workbench.task.load import load_task
+from workbench.task.problem import Problem, TaskError
 
 
 def refused(reference: str | Path, **kwargs: dict[str, str]) -> Problem:

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.authoring.loading.load import LoadedTask, load_task
-from workbench.authoring.problem import Problem, problem_from_exception, shorten
+from workbench.task.load import LoadedTask, load_task
+from workbench.task.problem import Problem, problem_from_exception, shorten
 
 pytestmark = pytest.mark.thorough
 

@@ -11,9 +11,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.authoring.loading.load import LoadedTask, load_task
-from workbench.authoring.problem import Problem, check_step_returns
-from workbench.core.env.evaluate_entries import wrong_reward
+from workbench.envs.evaluate_entries import wrong_reward
+from workbench.task.load import LoadedTask, load_task
+from workbench.task.problem import Problem, check_step_returns
 
 pytestmark = pytest.mark.thorough
 

@@ -26,12 +26,13 @@ import tyro
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.reload import cold_restart
 from tests.drive.page import TASK
-from workbench.core.camera_data import CameraKey, CameraSettings
-from workbench.jobs.task import TaskOptions
-from workbench.session.cameras.events import CameraPlaced
-from workbench.session.live.session import Session
-from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.events import PagesCounted
+from workbench.app.session import Session
+from workbench.cameras.events import CameraPlaced
+from workbench.cameras.view import StudioView
+from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.live.events import PagesCounted
+from workbench.live.messages import CameraRequest
+from workbench.task.description import TaskOptions
 
 BASE: CameraKey = ("sensor", "base_camera")
 BAR = 0.2
@@ -68,7 +69,7 @@ def main(options: Options) -> None:
         )
         try:
             seen = -1
-            while (camera := session.view().studio.camera(BASE)) is None:
+            while (camera := session.view().of(StudioView).camera(BASE)) is None:
                 seen = session.wait(seen, 1.0)
             start = camera.info.settings
             assert start is not None

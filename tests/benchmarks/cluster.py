@@ -25,17 +25,17 @@ from typing import Any
 import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from workbench.jobs.pool.cluster import Cluster, Post
-from workbench.jobs.pool.connect import connected
-from workbench.jobs.pool.deal import Deal, Executor, Work
-from workbench.jobs.pool.job_file import JobFile, JobKey
-from workbench.jobs.pool.processes import Processes
-from workbench.jobs.pool.travel import pack_baggage
-from workbench.jobs.pool.worker import Gives, Listener
-from workbench.jobs.record.episodes import RecordOptions, Written
-from workbench.jobs.record.run import Recorded, record
-from workbench.jobs.task import TaskOptions
+from workbench.jobs.job_file import JobFile, JobKey
+from workbench.jobs.local_processes import Processes
+from workbench.jobs.ray_cluster import Cluster, Post
+from workbench.jobs.ray_connection import connected
+from workbench.jobs.scheduler import Deal, Executor, Work
+from workbench.jobs.worker_files import pack_baggage
+from workbench.jobs.worker_messages import Gives, Listener
 from workbench.machine.processes.wire import Unpacker, pack, pack_message
+from workbench.record.job import Recorded, record
+from workbench.record.job_worker import RecordOptions, Written
+from workbench.task.description import TaskOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "web_assets" / "docs" / "jobs" / "cluster.md"

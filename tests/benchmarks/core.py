@@ -38,7 +38,7 @@ class Options:
     """Of stepping, a turn."""
     turns: int = 3
     most_envs: int = 960
-    """The scaling table doubles from 1 to this; a process has room for a little more (`core/env/cpu_scene.py`)."""
+    """The scaling table doubles from 1 to this; a process has room for a little more (`envs/cpu_scene.py`)."""
     resets: int = 1000
     rebuilds: int = 100
     write: bool = False
@@ -139,7 +139,7 @@ def shares(options: Options) -> Iterator[str]:
 
 
 def scaling(options: Options) -> Iterator[str]:
-    from workbench.core.simulation.stepping import usable_cores
+    from workbench.envs.simulation.stepping import usable_cores
 
     cores = usable_cores()
     threads = sorted({1, *(2**k for k in range(1, 12) if 2**k < cores), cores})
@@ -219,7 +219,7 @@ def memory(options: Options) -> Iterator[str]:
 
 
 def head_lines() -> list[str]:
-    from workbench.core.simulation.stepping import usable_cores
+    from workbench.envs.simulation.stepping import usable_cores
 
     return [
         "# The batched CPU core in figures",

@@ -28,7 +28,7 @@ def make_batched(env_id: str, num_envs: int, **kwargs: Any) -> Any:
     import torch
     from mani_skill.utils.registration import REGISTERED_ENVS
 
-    from workbench.core.env.task_env import EnvOptions, make_env
+    from workbench.envs.task_env import EnvOptions, make_env
 
     torch.set_num_threads(1)
     import mani_skill.envs  # noqa: F401
@@ -187,7 +187,7 @@ def picture_seconds(env_id: str, num_envs: int, seconds: float) -> dict[str, flo
 
 def snapshot_seconds(env_id: str, num_envs: int, rounds: int = 60) -> dict[str, float]:
     """Median seconds of a control step, of a snapshot of all envs after it, and of its two restores."""
-    from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+    from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
 
     env = make_batched(env_id, num_envs)
     step = random_stepper(env)

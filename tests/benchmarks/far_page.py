@@ -39,13 +39,13 @@ from tests.benchmarks.page_bytes import Played, Player, play
 from tests.drive.far_line import FarLine, line_to
 from tests.drive.session import wait_until
 from tests.ui.tabs import camera_message, handshake, messages_in
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.ui.app.live_page import Page
-from workbench.ui.app.pages import Pages
-from workbench.ui.scene.viewpoint import FOV, Stage
-from workbench.ui.server.gated_server import ServerOptions, open_server
-from workbench.ui.widgets.visitors import Visitors
+from workbench.app.live_page import Page
+from workbench.app.pages import Pages
+from workbench.app.session import Session
+from workbench.page.door.gated_server import ServerOptions, open_server
+from workbench.page.scene.viewpoint import FOV, Stage
+from workbench.page.widgets.visitors import Visitors
+from workbench.task.description import TaskOptions
 
 BITS, DELAY = 2e6, 0.04
 COMMAND = "Play or pause"

@@ -26,16 +26,16 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.page import TASK
-from workbench.commands.run import RestartWorker
-from workbench.jobs.task import TaskOptions
+from workbench.app.session import Session
+from workbench.live.commands import RestartWorker
+from workbench.live.events import PagesCounted
+from workbench.live.messages import CameraRequest
+from workbench.live.process import worker_process
+from workbench.live.process.supervisor import WorkerOptions
+from workbench.live.process.worker_start import start_anew, worker_forks
+from workbench.live.view import SessionView
 from workbench.machine.processes.family import proportional_memory
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.process import worker_process
-from workbench.session.process.supervisor import WorkerOptions
-from workbench.session.process.worker_start import start_anew, worker_forks
-from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.events import PagesCounted
+from workbench.task.description import TaskOptions
 
 CAMERAS = (CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human"))
 
@@ -149,12 +149,12 @@ def parts(num_envs: int) -> None:
         with part("import mani_skill.envs, with its tasks"):
             import mani_skill.envs  # noqa: F401
         with part("import the worker"):
-            import workbench.session.worker.loop  # noqa: F401
+            import workbench.app.worker.loop  # noqa: F401
     torch.set_num_threads(1)
-    from workbench.core.cameras.render import take_pictures
-    from workbench.core.scene.read_scene import read_geometry
-    from workbench.core.snapshots.snapshot import begin_anew
-    from workbench.jobs.open_task import open_task
+    from workbench.envs.scene.read_scene import read_geometry
+    from workbench.envs.snapshots.snapshot import begin_anew
+    from workbench.pictures.render import take_pictures
+    from workbench.task.open import open_task
 
     with part("the render device"):
         sapien.render.RenderSystem(sapien.Device("cpu"))

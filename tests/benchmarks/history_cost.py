@@ -25,13 +25,13 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 
-from workbench.core.env import actions
-from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
-from workbench.core.scene.read_scene import read_geometry
-from workbench.core.snapshots.packing import SnapshotPacker
-from workbench.jobs.task import Stepped
-from workbench.session.history.env_table import EnvTable
-from workbench.session.history.history import History
+from workbench.envs import action_vector as actions
+from workbench.envs.scene.read_scene import read_geometry
+from workbench.envs.snapshots.packing import SnapshotPacker
+from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
+from workbench.live.history.env_table import EnvTable
+from workbench.live.history.moments import History
+from workbench.task.description import Stepped
 
 TASKS = {"PickCube-v1": PickCubeEnv, "PushCube-v1": PushCubeEnv}
 """The first asks which bodies touch, the second does not."""

@@ -44,10 +44,10 @@ class Options:
 def write_one(folder: Path) -> Path:
     """A recording of 50 steps of a scene of two bodies with one camera; returns its ``.json``."""
     from tests.drive.rows import EpisodeRow, append
-    from workbench.core.camera_data import CameraInfo, Picture
-    from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
-    from workbench.recording.episode.episode import EpisodeInfo
-    from workbench.recording.writing.episode_writer import EpisodeWriter
+    from workbench.envs.camera_data import CameraInfo, Picture
+    from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
+    from workbench.episodes.episode import EpisodeInfo
+    from workbench.episodes.writing.episode_writer import EpisodeWriter
 
     rng = np.random.default_rng(0)
     corner = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
@@ -103,16 +103,16 @@ def make(folder: Path, count: int) -> None:
 
 
 def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
-    from workbench.recording.reader.reading import start_reading
+    from workbench.episodes.reader.reading import start_reading
 
     # As the command does, before it imports what a page needs.
     start_reading()
     import viser
 
     from tests.drive.panels import Panels
-    from workbench.recording.library.library import Library
-    from workbench.ui.library.listing import MOST_ROWS
-    from workbench.ui.library.panel import LibraryPanel
+    from workbench.library.folder import Library
+    from workbench.library.listing import MOST_ROWS
+    from workbench.library.panel import LibraryPanel
 
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     began = time.perf_counter()
@@ -177,7 +177,7 @@ def main(options: Options) -> None:
         assert options.folder is not None
         print(json.dumps(open_once(options.folder, options.recordings, options.browser)))
         return
-    from workbench.recording.library.index import index_path
+    from workbench.library.index import index_path
 
     with tempfile.TemporaryDirectory() as made:
         folder = options.folder or Path(made) / "recordings"

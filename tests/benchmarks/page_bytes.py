@@ -35,16 +35,16 @@ from tests.drive.panels import Clock
 from tests.drive.scripted import ScriptedWorker, no_success
 from tests.drive.session import wait_until
 from tests.ui.tabs import camera_message, handshake, messages_in
-from workbench.core.env import actions
-from workbench.core.env.step_result import StepResult
-from workbench.jobs.open_task import open_task
-from workbench.jobs.task import Stepped, TaskDescription, TaskOptions
-from workbench.session.live.session import Session
-from workbench.session.protocol.messages import Status
-from workbench.ui.app.live_page import Page
-from workbench.ui.scene.viewpoint import FOV, Stage
-from workbench.ui.server.gated_server import ServerOptions, open_server
-from workbench.ui.widgets.visitors import Visitors
+from workbench.app.live_page import Page
+from workbench.app.session import Session
+from workbench.envs import action_vector as actions
+from workbench.envs.step_result import StepResult
+from workbench.live.messages import Status
+from workbench.page.door.gated_server import ServerOptions, open_server
+from workbench.page.scene.viewpoint import FOV, Stage
+from workbench.page.widgets.visitors import Visitors
+from workbench.task.description import Stepped, TaskDescription, TaskOptions
+from workbench.task.open import open_task
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 HERTZ, SPEED, EPISODE = 30, 4.0, 50

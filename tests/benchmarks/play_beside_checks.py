@@ -19,10 +19,10 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.drive.session import TASKS, live_session, wait_until
-from workbench.commands.checks import CheckNow, StopChecks
-from workbench.commands.run import PlayRun
-from workbench.session.checks.checks import RUNNING
-from workbench.session.live.session import Session
+from workbench.app.session import Session
+from workbench.checks.commands import CheckNow, StopChecks
+from workbench.checks.state import RUNNING, ChecksView
+from workbench.live.commands import PlayRun
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def steps_a_second(session: Session, seconds: float, checking: bool) -> float:
     """Of all envs together as one step; while rules are checked, until the last is."""
     first, begun = session.view().timeline.last, time.perf_counter()
     while time.perf_counter() - begun < seconds:
-        if checking and session.view().checks.state != "checking":
+        if checking and session.view().of(ChecksView).state != "checking":
             break
         time.sleep(0.02)
     return (session.view().timeline.last - first) / (time.perf_counter() - begun)
@@ -49,14 +49,14 @@ def steps_a_second(session: Session, seconds: float, checking: bool) -> float:
 
 def begin_check(session: Session) -> None:
     session.do(CheckNow())
-    wait_until(session, lambda view: view.checks.state != "loading", "the begin of the checks")
+    wait_until(session, lambda view: view.of(ChecksView).state != "loading", "the begin of the checks")
 
 
 def whole_check(session: Session) -> float:
     """Seconds of all rules, once the version is loaded there."""
     begin_check(session)
-    wait_until(session, lambda view: view.checks.state not in RUNNING, "the end of the checks")
-    return session.view().checks.seconds
+    wait_until(session, lambda view: view.of(ChecksView).state not in RUNNING, "the end of the checks")
+    return session.view().of(ChecksView).seconds
 
 
 def main(options: Options) -> None:
@@ -75,7 +75,7 @@ def main(options: Options) -> None:
             begin_check(session)
             beside.append(steps_a_second(session, options.seconds, checking=True))
         took = whole_check(session)
-        rules = len(session.view().checks.results)
+        rules = len(session.view().of(ChecksView).results)
     one, other = statistics.median(without), statistics.median(beside)
     print(
         f"{Path(options.task).name}, {options.num_envs} envs, speed {options.speed:g}, {options.windows} windows of each kind"

@@ -36,8 +36,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 import workbench
-from workbench import recorder as recorder_module
-from workbench.recording.writing import finish as make_files
+from workbench.episodes.writing import finish as make_files
+from workbench.record import recorder as recorder_module
 
 SIDES = ("RecordEpisode", "Recorder")
 THREAD = "on a thread"

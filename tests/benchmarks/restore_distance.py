@@ -9,8 +9,8 @@ not interrupted: of any number of the state (velocities included), and of any jo
     warmed          put there some steps earlier, the steps made again, then put at the moment quickly
     lived through   the run's first moment put there, and every action up to the moment made again
 
-The run begins as a live page's does: a reset that is an exact point (`core.snapshots.snapshot.begin_anew`). A page goes back in the
-last way (`session.worker.go_back`), and in the first where that does not come out to the last byte, takes too long, or begins
+The run begins as a live page's does: a reset that is an exact point (`envs.snapshots.snapshot.begin_anew`). A page goes back in the
+last way (`live.worker.go_back`), and in the first where that does not come out to the last byte, takes too long, or begins
 before what is kept.
 """
 
@@ -35,9 +35,9 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from workbench.core.env import actions
-from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
-from workbench.core.snapshots.snapshot import Snapshot, begin_anew
+from workbench.envs import action_vector as actions
+from workbench.envs.snapshots.snapshot import Snapshot, begin_anew
+from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
 
 AFTER = (1, 5, 20)
 """Control steps after which the runs are compared."""

@@ -38,7 +38,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 import workbench
-from workbench.core.maniskill_private import open_env
+from workbench.envs.maniskill_private import open_env
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import RolloutPlanner, make_rollout_env
 

@@ -16,8 +16,8 @@ from tests.drive.page import page_at
 from tests.drive.panels import Clock
 from tests.drive.waiting import until
 from tests.ui.scenes import running, step_of
-from workbench.session.history.curves import Curves, StepCurves
-from workbench.ui.live.reward import CurvesPanel
+from workbench.live.history.curves import Curves, StepCurves
+from workbench.live.panels.reward_panel import CurvesPanel
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 ENVS = 3

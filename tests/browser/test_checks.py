@@ -53,7 +53,7 @@ def test_a_broken_save_is_found_with_its_line_and_mending_it_clears_the_list(des
 
 BREAKS = """
 import os, signal
-from workbench.checks.by_hook.run import GROUPS
+from workbench.checks.run_rules import GROUPS
 
 def crashes(checkup):
     raise KeyError("our own mistake")

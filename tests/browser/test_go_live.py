@@ -11,9 +11,9 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.page import TASK, open_workbench, page_at
 from tests.drive.waiting import until
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record
-from workbench.jobs.task import TaskOptions
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.browser
 PATIENT = 120_000

@@ -10,8 +10,8 @@ from playwright.sync_api import Browser, expect
 
 from tests.browser.conftest import At
 from tests.drive.page import page_at
-from workbench.ui.app import help_pages
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.app import help_pages
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
 BROKEN = (
     "[...document.images].filter(one => !one.complete || one.naturalWidth < 20).map(one => one.currentSrc)"

@@ -15,18 +15,18 @@ from tests.drive.far_line import FarLine, line_to
 from tests.drive.page import page_at
 from tests.drive.panels import drop_viser
 from tests.drive.waiting import until
-from workbench.commands.cameras import PickPixel
-from workbench.commands.command import Command, Refused
-from workbench.commands.envs import SelectEnv
-from workbench.commands.library import OpenRow, PressRow
-from workbench.commands.page import FrameScene
-from workbench.commands.run import PauseLog, ResetAll, SetSeed, Step, TogglePlay
-from workbench.commands.timeline import Seek
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
-from workbench.ui.widgets.fields import Field, tick
-from workbench.ui.widgets.hotkeys import register
-from workbench.ui.widgets.templates import asks
-from workbench.ui.widgets.visitors import PATH, Visitor, Visitors
+from workbench.cameras.commands import PickPixel
+from workbench.library.commands import OpenRow, PressRow
+from workbench.live.commands import PauseLog, ResetAll, SetSeed, Step, TogglePlay
+from workbench.live.env_commands import SelectEnv
+from workbench.live.timeline_commands import Seek
+from workbench.page.command import Command, Refused
+from workbench.page.commands import FrameScene
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.widgets.fields import Field, tick
+from workbench.page.widgets.hotkeys import register
+from workbench.page.widgets.templates import asks
+from workbench.page.widgets.visitors import PATH, Visitor, Visitors
 
 pytestmark = pytest.mark.browser
 ROWS = 12

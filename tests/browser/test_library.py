@@ -12,13 +12,13 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
-from workbench.commands.command import Command
-from workbench.commands.page import CloseDialog
-from workbench.recording.library.library import Library
-from workbench.ui.library.panel import LibraryPanel
-from workbench.ui.server.gated_server import ServerOptions, open_server
-from workbench.ui.widgets.hotkeys import register
-from workbench.ui.widgets.visitors import PATH, Visitor, Visitors
+from workbench.library.folder import Library
+from workbench.library.panel import LibraryPanel
+from workbench.page.command import Command
+from workbench.page.commands import CloseDialog
+from workbench.page.door.gated_server import ServerOptions, open_server
+from workbench.page.widgets.hotkeys import register
+from workbench.page.widgets.visitors import PATH, Visitor, Visitors
 
 pytestmark = pytest.mark.browser
 COUNT = 60

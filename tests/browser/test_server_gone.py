@@ -11,8 +11,8 @@ from playwright.sync_api import Browser, expect
 
 from tests.drive.far_line import line_to
 from tests.drive.page import TASK, new_page, open_tab, open_workbench
-from workbench.ui.server.gated_server import ServerOptions, open_server
-from workbench.ui.widgets.visitors import PATH, Visitors
+from workbench.page.door.gated_server import ServerOptions, open_server
+from workbench.page.widgets.visitors import PATH, Visitors
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

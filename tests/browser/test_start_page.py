@@ -16,10 +16,10 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.drive.page import TASK, Opened, close_notice, open_workbench, page_at, picture_of_view
 from tests.drive.waiting import until
-from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.machine.maniskill_installed import installed_maniskills
-from workbench.session.tasks.registered import LIST_FILE
-from workbench.ui.app.trust_dialog import DO_NOT, ONCE
+from workbench.start.registered import LIST_FILE
+from workbench.task.new_task import TEMPLATES
+from workbench.trust.dialog import DO_NOT, ONCE
 
 # The first begins at the start page, which is gone once a task is open.
 pytestmark = [pytest.mark.browser, pytest.mark.random_order(disabled=True)]

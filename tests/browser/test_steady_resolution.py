@@ -13,12 +13,12 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.waiting import until
 from tests.ui.scenes import table_scene
-from workbench.core.scene.shapes import Mesh
-from workbench.ui.scene.bodies import Looks
-from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.scene.in_software import InSoftware
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
-from workbench.ui.widgets.visitors import PATH, Visitors
+from workbench.envs.scene.shapes import Mesh
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.scene.bodies import Looks
+from workbench.page.scene.env_grid import lay_out
+from workbench.page.scene.software_rendering import InSoftware
+from workbench.page.widgets.visitors import PATH, Visitors
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 A_CARD = """

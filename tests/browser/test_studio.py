@@ -25,7 +25,7 @@ from tests.drive.studio import (
     view,
 )
 from tests.drive.waiting import until
-from workbench.ui.cameras.studio import NO_CAMERA
+from workbench.cameras.studio_panel import NO_CAMERA
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 FILE = "push_cube.py"

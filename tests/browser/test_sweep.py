@@ -12,11 +12,11 @@ from playwright.sync_api import Browser, Page, expect
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
-from workbench.recording.library.library import Library
-from workbench.session.review.view import ReviewView
-from workbench.ui.review.sweep import SweepPanel
-from workbench.ui.server.gated_server import ServerOptions, open_server
-from workbench.ui.widgets.visitors import PATH, Visitors
+from workbench.library.folder import Library
+from workbench.page.door.gated_server import ServerOptions, open_server
+from workbench.page.widgets.visitors import PATH, Visitors
+from workbench.review.view import ReviewView
+from workbench.sweep.panel import SweepPanel
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, Locator, expect
 from tests.browser.conftest import At
 from tests.drive.desk import Desk
 from tests.drive.waiting import until
-from workbench.ui.live.timeline import RANGE_EVERY
+from workbench.live.panels.timeline_panel import RANGE_EVERY
 
 pytestmark = pytest.mark.browser
 STEPS = 8

@@ -10,10 +10,10 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.drive.page import TASK, open_workbench, page_at
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record
-from workbench.jobs.task import TaskOptions
-from workbench.ui.app.trust_dialog import DO_NOT, ONCE
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions
+from workbench.task.description import TaskOptions
+from workbench.trust.dialog import DO_NOT, ONCE
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 PATIENT = 120_000

@@ -10,11 +10,11 @@ from playwright.sync_api import Browser, expect
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
-from workbench.commands.run import Step
-from workbench.commands.timeline import StepBack
-from workbench.ui.server.gated_server import ServerOptions, open_server
-from workbench.ui.widgets.hotkeys import register
-from workbench.ui.widgets.visitors import PATH, Visitors
+from workbench.live.commands import Step
+from workbench.live.timeline_commands import StepBack
+from workbench.page.door.gated_server import ServerOptions, open_server
+from workbench.page.widgets.hotkeys import register
+from workbench.page.widgets.visitors import PATH, Visitors
 
 pytestmark = pytest.mark.browser
 

@@ -11,12 +11,12 @@ import gymnasium
 import pytest
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from workbench.authoring.loading.load import load_task, undo_load
-from workbench.checks.by_hook import run
+from workbench.checks import run_rules as run
 from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.results import RuleResult, by_rule
 from workbench.checks.rules import CHECK_RULES, RULES
-from workbench.core.rules import Finding
+from workbench.envs.gpu_rules import Finding
+from workbench.task.load import load_task, undo_load
 
 EXAMPLE = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 Edits = tuple[tuple[str, str], ...]

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from tests.checks.checked import EXAMPLE, Checked, check_rules, results_of, the_finding
-from workbench.authoring.loading.load import load_task, undo_load
 from workbench.checks.evidence.checkup import Checkup
 from workbench.checks.rules import RULES
+from workbench.task.load import load_task, undo_load
 
 
 def test_a_task_that_cannot_be_built_without_a_renderer_gets_one(renderer: None) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from workbench.checks.comments import comments_without_effect
 from workbench.checks.results import RuleResult, Silenced
-from workbench.core.rules import Finding
+from workbench.checks.silencing import comments_without_effect
+from workbench.envs.gpu_rules import Finding
 
 FILE = "/home/me/task.py"
 TASKS = """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.checks.checked import Checked, the_finding
-from workbench.checks.by_hook.run import RuleResult
+from workbench.checks.run_rules import RuleResult
 
 pytestmark = pytest.mark.thorough
 

@@ -6,10 +6,10 @@ from typing import Literal
 
 import pytest
 
-from workbench.authoring.problem import Problem
-from workbench.checks.by_hook.run import RULES_OVER_SEEDS, over_seeds, result_of
 from workbench.checks.evidence.checkup import Found, Note, NotKnown
 from workbench.checks.results import RuleResult, Seen
+from workbench.checks.run_rules import RULES_OVER_SEEDS, over_seeds, result_of
+from workbench.task.problem import Problem
 
 PLACE = "task.py", 12, "evaluate"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.checks.checked import check_rule
+from workbench.checks.job_items import CheckOptions, count_rules, degrees_of_request
 from workbench.checks.rules import CHECK_RULES, SOLVE_RULES, degree_of_each
-from workbench.jobs.check.plan import CheckOptions, count_rules, degrees_of_request
 from workbench.planning.verdicts import RULES as VERDICTS
 
 TASKS = Path(__file__).parents[2] / "tasks"

@@ -8,7 +8,7 @@ import pytest
 
 from tests.checks.checked import EXAMPLE, Checked, check_rules, the_finding
 from workbench.checks.results import RuleResult
-from workbench.core.rules import Finding
+from workbench.envs.gpu_rules import Finding
 
 REGISTERED = '@register_env("WorkbenchPushCube-v1", max_episode_steps=50)'
 RESET = "            b = len(env_idx)\n"

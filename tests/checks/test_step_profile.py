@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests.checks.checked import EXAMPLE
-from workbench.authoring.loading.load import load_task, undo_load
 from workbench.checks.evidence.checkup import Checkup
-from workbench.checks.evidence.step_profile import StepProfile, profile_step
+from workbench.checks.evidence.time_step import StepProfile, profile_step
+from workbench.task.load import load_task, undo_load
 
 pytestmark = pytest.mark.thorough
 

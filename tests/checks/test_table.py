@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from tests.checks.checked import EXAMPLE
-from workbench.authoring.loading.load import LoadedTask, load_task, undo_load
-from workbench.checks.by_hook.run import GROUPS
-from workbench.checks.evidence.places import rules_of_outliers
 from workbench.checks.rules import CHECK_RULES, RULES
-from workbench.core import rules as core_rules
-from workbench.core.capture.outliers import OUTLIER_RULES, OutlierKind
+from workbench.checks.run_rules import GROUPS
+from workbench.envs import gpu_rules as core_rules
+from workbench.envs.outliers import OUTLIER_RULES, OutlierKind
+from workbench.task.load import LoadedTask, load_task, undo_load
+from workbench.task.outlier_rules import rules_of_outliers
 
 SILENCED = (
     "    def evaluate(self) -> dict[str, torch.Tensor]:",
@@ -57,4 +57,4 @@ def test_each_rule_of_the_table_has_one_check_and_each_check_is_of_the_table() -
 
 def test_each_outlier_is_of_a_rule_that_is_checked_but_an_action_which_no_task_makes() -> None:
     without = {kind for kind in OutlierKind if kind.rule is None}
-    assert without == {OutlierKind.ACTION_NOT_FINITE} and set(CHECK_RULES) >= OUTLIER_RULES
+    assert without == {OutlierKind.ACTION_NOT_FINITE} and set(CHECK_RULES) >= set(OUTLIER_RULES)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from workbench.cli import main
-from workbench.cli.terminal.arguments import EnvArguments, history_bytes
+from workbench.cli.arguments import EnvArguments, history_bytes
 
 
 @pytest.mark.parametrize(

@@ -335,7 +335,7 @@ def test_reports_hold_whatever_a_task_says(place: Path, capsys: pytest.CaptureFi
 
 BREAKS = """
 import os, signal
-from workbench.checks.by_hook.run import GROUPS
+from workbench.checks.run_rules import GROUPS
 
 def crashes(checkup):
     raise KeyError("our own mistake")

@@ -15,9 +15,9 @@ import pytest
 from tests.drive.episodes import made, write
 from tests.recording.foreign_h5 import write as write_foreign
 from workbench.cli.main import main
-from workbench.recording.library.library import Library
-from workbench.recording.reader.reading import find_all_sources
-from workbench.ui.share.make import MakeRequest, make
+from workbench.episodes.reader.reading import find_all_sources
+from workbench.library.folder import Library
+from workbench.share.make import MakeRequest, make
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

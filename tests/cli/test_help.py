@@ -12,10 +12,10 @@ import termios
 
 import pytest
 
+from workbench.app.help_pages import Topic, topics
 from workbench.cli import main
-from workbench.cli.terminal.output import Exit
+from workbench.cli.output import Exit
 from workbench.machine.processes.child_python import python_command
-from workbench.ui.app.help_pages import Topic, topics
 
 pytestmark = pytest.mark.thorough
 

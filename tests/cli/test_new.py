@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.templates.new_task import TEMPLATES
 from workbench.cli.main import main
+from workbench.task.new_task import TEMPLATES
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from workbench.cli.main import main
-from workbench.core.backends import why_no_ray_tracing
+from workbench.envs.backends import why_no_ray_tracing
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from workbench.cli.jobs.rescore import print_verdicts
-from workbench.jobs.rescore.verdict import Verdict
-from workbench.recording.episode.row import Source
+from workbench.cli.rescore import print_verdicts
+from workbench.episodes.row import Source
+from workbench.rescore.verdict import Verdict
 
 NAME = "WorkbenchPushCube-v1_seed626610453_env00_2026-11-22T01-07-22"
 VERDICTS = [

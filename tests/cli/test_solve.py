@@ -19,19 +19,19 @@ from xml.etree import ElementTree
 import pytest
 
 from tests.drive.waiting import until
+from workbench.checks.job import CheckReport
+from workbench.checks.job_items import CheckedTask
 from workbench.checks.results import RuleResult
-from workbench.cli.jobs.solve import SolveOutput, as_junit
 from workbench.cli.main import main
-from workbench.core.rules import FailOn, Finding
-from workbench.jobs.check.plan import CheckedTask
-from workbench.jobs.check.run import CheckReport
-from workbench.jobs.record.run import RecordProgress
-from workbench.jobs.record.solve import SolveOptions, solve
-from workbench.jobs.task import TaskOptions
+from workbench.cli.solve import SolveOutput, as_junit
+from workbench.envs.gpu_rules import FailOn, Finding
+from workbench.episodes.reader.read_episode import read_episode
 from workbench.planning.options import PlanOptions
-from workbench.planning.report import SolvedSeed, SolveReport
+from workbench.planning.seeds_report import SolvedSeed, SolveReport
 from workbench.planning.verdicts import RewardVerdict
-from workbench.recording.reader.read_episode import read_episode
+from workbench.record.job import RecordProgress
+from workbench.solve.job import SolveOptions, solve
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from workbench.cli.main import main
-from workbench.recording.sweeps import RESULTS, SweepResults, read_results
+from workbench.episodes.sweep_results import RESULTS, SweepResults, read_results
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -32,12 +32,12 @@ from rich.text import Text
 from tests.drive.episodes import made, write
 from tests.drive.waiting import until
 from tests.ui.tabs import handshake
-from workbench.authoring.problem import Problem
-from workbench.cli.terminal.output import SafeConsole, print_line, print_problem, print_text, refuse, warn
+from workbench.cli.output import SafeConsole, print_line, print_problem, print_text, refuse, warn
+from workbench.library.folder import Library
+from workbench.library.rows import cells
+from workbench.live.process.captured_output import PrintedLine, StyledText
 from workbench.machine.text import guard_terminal
-from workbench.recording.library.library import Library
-from workbench.session.process.captured_output import PrintedLine, StyledText
-from workbench.ui.library.rows import cells
+from workbench.task.problem import Problem
 
 TITLE = "\x1b]0;owned\x07"
 CLIPBOARD = "\x1b]52;c;aGk=\x1b\\"

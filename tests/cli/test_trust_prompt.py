@@ -6,8 +6,8 @@ import io
 
 from rich.console import Console
 
-from workbench.cli.terminal.output import print_question, print_texts
-from workbench.session.clearance import CodeFile, Since, TrustQuestion
+from workbench.cli.output import print_question, print_texts
+from workbench.trust.clearance import CodeFile, Since, TrustQuestion
 
 MANY = tuple(CodeFile(f"m{k}.py", f"{k:012}", "") for k in range(60))
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.core.env.cpu_scene import batched_class
+from workbench.envs.cpu_scene import batched_class
 
 STATE_ONLY = {"obs_mode": "none", "reward_mode": "none", "render_backend": "none"}
 

@@ -12,8 +12,8 @@ import sapien
 import sapien.render
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
-from workbench.core import backends
-from workbench.core.backends import give_brdf_table
+from workbench.envs import backends
+from workbench.envs.backends import give_brdf_table
 
 SHADERS = Path(sapien.__file__).parent / "vulkan_shader"
 DRAWN = "outColor.rgb = mix(bg, color.rgb, color.a);"

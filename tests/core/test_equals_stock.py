@@ -16,12 +16,12 @@ from mani_skill.envs.sapien_env import BaseEnv
 
 from tests.sweeps import follow_stock
 from tests.sweeps.follow_stock import MOVED_BY_THE_TASK, batch_of, compare, packed, take_over, touching
-from workbench.core.env import actions
+from workbench.envs import action_vector as actions
 
 pytestmark = [
     pytest.mark.thorough,
     # ManiSkill's own tasks break some: `env/test_strict.py` lists them.
-    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
+    pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 
 CASES = (

@@ -17,7 +17,7 @@ from tests.drive.envs import batched
 from tests.sweeps.exercise_task import exercise
 from tests.sweeps.task_ids import PAGE, page, registered_ids, sweep
 from tests.sweeps.upstream_faults import FAULTS, Fault, where_it_fails
-from workbench.core.env.task_env import TaskEnv
+from workbench.envs.task_env import TaskEnv
 
 ROOT = Path(__file__).parents[2]
 

@@ -14,8 +14,8 @@ import torch
 
 import workbench
 from tests.core.drawn_envs import batched
-from workbench.core.cameras.render import take_pictures
-from workbench.core.maniskill_private import camera_components
+from workbench.envs.maniskill_private import camera_components
+from workbench.pictures.render import take_pictures
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

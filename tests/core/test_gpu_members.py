@@ -11,7 +11,7 @@ import torch
 
 from tests.core.collision import Collision
 from tests.core.stock_env import batch_of
-from workbench.core.broken_rule import NeedsOneEnv
+from workbench.envs.broken_rule import NeedsOneEnv
 
 MEMBERS = sorted(name for name in dir(physx.PhysxGpuSystem) if not name.startswith("_"))
 REFUSED = {"device", "gpu_set_cuda_stream", "set_scene_offset"}
@@ -58,7 +58,7 @@ def test_what_belongs_to_the_whole_batch_is_there(px: Any) -> None:
     assert px.cuda_rigid_dynamic_force.shape == px.cuda_rigid_body_force.shape
 
 
-@pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
 def test_of_one_env_the_members_of_its_system_are_there() -> None:
     env = batch_of(Collision, 1)
     env.reset(seed=[0])

@@ -9,16 +9,16 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.articulation_joint import ArticulationJoint
 
-from workbench.authoring.camera_source.run_hooks import run_hooks
-from workbench.authoring.source.text import RefusedEdit
-from workbench.core import maniskill_private
-from workbench.core.backends import BackendUnavailable
-from workbench.core.cameras.place import PlacedCameras, settings_of
-from workbench.core.capture.state_columns import flat_names
-from workbench.core.env.hot_swap import can_exchange_cameras
-from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
+from workbench.cameras.edit.run_hooks import run_hooks
+from workbench.envs import maniskill_private
+from workbench.envs.backends import BackendUnavailable
+from workbench.envs.hot_swap import can_exchange_cameras
+from workbench.envs.state_columns import flat_names
+from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
 from workbench.machine import versions
 from workbench.machine.versions import PrivateName, command_for_tested_versions
+from workbench.pictures.placed_cameras import PlacedCameras, settings_of
+from workbench.source.parsed import RefusedEdit
 
 FEATURES = sorted({name.disables for name in maniskill_private.PRIVATE_NAMES if name.disables})
 

@@ -17,7 +17,7 @@ from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
 from tests.core.collision import Collision
 from tests.core.stock_env import batch_of, follow
-from workbench.core.broken_rule import RuleWarning
+from workbench.envs.broken_rule import RuleWarning
 
 pytestmark = pytest.mark.thorough
 

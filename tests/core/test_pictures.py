@@ -14,9 +14,9 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs import Pose
 
 from tests.core.drawn_envs import batched, stock
-from workbench.core.camera_data import Picture
-from workbench.core.cameras.render import list_cameras, segmentation_names, take_pictures
-from workbench.core.scene.scene_index import scene_index
+from workbench.envs.camera_data import Picture
+from workbench.envs.scene.scene_index import scene_index
+from workbench.pictures.render import list_cameras, segmentation_names, take_pictures
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

@@ -15,8 +15,8 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import CPU, PICK_CUBE, batched
-from workbench.core.broken_rule import MOST_ROWS, BrokenRule, BrokenRules, RuleWarning
-from workbench.core.rules import Finding, degrees_of
+from workbench.envs.broken_rule import MOST_ROWS, BrokenRule, BrokenRules, RuleWarning
+from workbench.envs.gpu_rules import Finding, degrees_of
 
 N = 3
 

@@ -12,7 +12,7 @@ import sapien
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 
-from workbench.core import maniskill_private
+from workbench.envs import maniskill_private
 
 
 def test_a_config_knows_where_it_was_made(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,7 @@ import workbench
 pytestmark = [
     pytest.mark.thorough,
     # ManiSkill's own tasks break some: `env/test_strict.py` lists them.
-    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
+    pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 
 N = 4

@@ -23,7 +23,7 @@ from tests.core.written import ThrowsAFreeChain, Written
 
 pytestmark = [
     pytest.mark.thorough,
-    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
+    pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 STEPS = 4
 

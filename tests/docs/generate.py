@@ -2,7 +2,7 @@
 
     python -m tests.docs.generate          # `test_generated.py` fails where a page says something else
 
-Keys are those of the list of commands, commands what ``--help`` prints, rules what `checks.rules` and `core.rules`
+Keys are those of the list of commands, commands what ``--help`` prints, rules what `checks.rules` and `envs.gpu_rules`
 list.
 """
 
@@ -17,12 +17,13 @@ from pathlib import Path
 from unittest.mock import patch
 
 from tests.docs.pages import DOCS
+from workbench.cameras import commands as cameras
 from workbench.checks.rules import CHECK_RULES
 from workbench.cli import main
-from workbench.commands import COMMANDS, cameras
-from workbench.commands.command import Command
-from workbench.core.rules import RULES, Rule
-from workbench.ui.widgets.hotkeys import key_rows
+from workbench.commands import COMMANDS
+from workbench.envs.gpu_rules import RULES, Rule
+from workbench.page.command import Command
+from workbench.page.widgets.hotkeys import key_rows
 
 KEYS = DOCS / "reference" / "keys.md"
 CLI = DOCS / "reference" / "cli.md"

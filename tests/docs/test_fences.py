@@ -25,8 +25,8 @@ import yaml
 
 from tests.docs.commands import OPENS_A_PAGE, commands, opens
 from tests.docs.pages import PAGES, ROOT, Fence, fences, without_fences
+from workbench.cli import job_commands as jobs
 from workbench.cli import main
-from workbench.cli.jobs import commands as jobs
 
 KINDS = {
     *(("python", mark) for mark in ("", "slow", "fragment", "wrong")),

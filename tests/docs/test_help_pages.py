@@ -7,9 +7,9 @@ from html.parser import HTMLParser
 
 import pytest
 
+from workbench.app import help_pages
+from workbench.app.help_pages import ADDRESS, Topic, find_topic, html_of, reply, topics
 from workbench.machine.folders import web_assets_folder
-from workbench.ui.app import help_pages
-from workbench.ui.app.help_pages import ADDRESS, Topic, find_topic, html_of, reply, topics
 
 pytestmark = pytest.mark.thorough
 

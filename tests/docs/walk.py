@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.docs.pages import DOCS, Fence, fences
-from workbench.authoring.templates.new_task import write_new_task
+from workbench.task.new_task import write_new_task
 
 PAGE = DOCS / "tutorial.md"
 FILE = "push_it.py"

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Page
 
-from workbench.ui.widgets.line_chart import SELECTED_COLOUR
+from workbench.page.widgets.line_chart import SELECTED_COLOUR
 
 COLUMNS_OF = """([colour]) => {
     const canvas = document.querySelector(".uplot canvas");

@@ -10,9 +10,9 @@ import mani_skill.envs  # noqa: F401  registers the ids
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from workbench.core.broken_rule import warn_of
-from workbench.core.env.task_env import EnvOptions, make_env
-from workbench.core.rules import Degree, Finding
+from workbench.envs.broken_rule import warn_of
+from workbench.envs.gpu_rules import Degree, Finding
+from workbench.envs.task_env import EnvOptions, make_env
 
 CPU: Any = {"backend": "cpu", "render_backend": "none"}
 """For `workbench.make`, without a renderer."""

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from tests.drive.rows import EpisodeRow, append
 from tests.ui.scenes import camera, table_scene
-from workbench.core.camera_data import CameraInfo, Picture
-from workbench.core.scene.shapes import SceneGeometry
-from workbench.recording.episode.episode import Episode, EpisodeInfo
-from workbench.recording.writing.episode_writer import SCENE_SUFFIX, EpisodeFiles, EpisodeWriter
-from workbench.recording.writing.from_journal import Header, read_header
-from workbench.recording.writing.journal import Journal, JournalEntry, JournalReader, read_visuals
+from workbench.envs.camera_data import CameraInfo, Picture
+from workbench.envs.scene.shapes import SceneGeometry
+from workbench.episodes.episode import Episode, EpisodeInfo
+from workbench.episodes.writing.episode_writer import SCENE_SUFFIX, EpisodeFiles, EpisodeWriter
+from workbench.episodes.writing.from_journal import Header, read_header
+from workbench.episodes.writing.journal import Journal, JournalEntry, JournalReader, read_visuals
 
 BODY = {"ground": 0, "table": 1, "arm/hand": 2, "cube": 3}
 

@@ -14,10 +14,10 @@ import viser
 
 from tests.drive.panels import Clock, Panels, forget_what_was_drawn
 from tests.ui.scenes import EMPTY
-from workbench.commands.command import Command
-from workbench.session.history.env_table import EnvRows
-from workbench.session.live.view import SessionView
-from workbench.ui.app.live_page import Page
+from workbench.app.live_page import Page
+from workbench.live.history.env_table import EnvRows
+from workbench.live.view import SessionView
+from workbench.page.command import Command
 
 FILE = "push.py"
 

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 from typing import Any
 
 from workbench.commands import COMMANDS
-from workbench.commands.command import Command
+from workbench.page.command import Command
 
 _VOID = {"input", "br", "hr", "img", "meta"}
 

@@ -20,12 +20,12 @@ from markupsafe import escape
 from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage
 
 from tests.drive.own_controls import Controls, SeenButton, SeenField
-from workbench.commands.command import Command, Refused
-from workbench.session.loop import result_of
-from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.widgets.parts import Parts
-from workbench.ui.widgets.templates import asks
-from workbench.ui.widgets.visitors import PATH, Visitor, Visitors
+from workbench.machine.loop import result_of
+from workbench.page.command import Command, Refused
+from workbench.page.door.gated_server import GatedServer
+from workbench.page.widgets.parts import Parts
+from workbench.page.widgets.templates import asks
+from workbench.page.widgets.visitors import PATH, Visitor, Visitors
 
 Kind = Literal["button", "field"]
 """Of an input. A button and what it is for may have the same label."""

@@ -13,8 +13,8 @@ def workers_of(server: psutil.Process) -> list[psutil.Process]:
             command = " ".join(child.cmdline())
         except psutil.NoSuchProcess:  # it has ended, and is waited for or not
             continue
-        if "workbench.session.worker.start" in command:
+        if "workbench.app.worker.start" in command:
             keepers.append(child)
-        elif "workbench.session.worker.fork_server" in command:
+        elif "workbench.app.worker.fork_workers" in command:
             keepers += child.children()
     return sorted(keepers, key=lambda process: process.create_time())

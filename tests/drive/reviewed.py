@@ -10,13 +10,13 @@ import viser
 
 from tests.drive.panels import Clock, Panels, forget_what_was_drawn
 from tests.drive.waiting import until
-from workbench.commands.review import SelectRecording
-from workbench.commands.timeline import Seek
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.ui.app.review_page import ReviewPage
-from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import GatedServer
+from workbench.app.review_page import ReviewPage
+from workbench.app.server import Workplace
+from workbench.app.session import Session
+from workbench.live.timeline_commands import Seek
+from workbench.page.door.gated_server import GatedServer
+from workbench.review.commands import SelectRecording
+from workbench.task.description import TaskOptions
 
 
 def no_session(*_: object) -> Session:

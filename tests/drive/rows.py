@@ -9,10 +9,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import Picture
-from workbench.core.env.step_result import OtherEntry
-from workbench.recording.episode.columns import BATCH, EVALUATE, OBS, STATE, BatchPacker, Layout
-from workbench.recording.writing.episode_writer import EpisodeWriter
+from workbench.envs.camera_data import Picture
+from workbench.envs.step_result import OtherEntry
+from workbench.episodes.columns import BATCH, EVALUATE, OBS, STATE, BatchPacker, Layout
+from workbench.episodes.writing.episode_writer import EpisodeWriter
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,9 @@ from typing import Any
 import numpy as np
 
 from tests.ui.scenes import camera, description, step_of, table_scene
-from workbench.core.camera_data import CameraInfo, Picture
-from workbench.core.env.step_result import StepResult
-from workbench.jobs.task import Restored, Stepped, TaskDescription
-from workbench.session.process.heartbeat import Busy
-from workbench.session.process.supervisor import Death, Supervisor, Vitals, WorkerOptions
-from workbench.session.process.worker_process import Output
-from workbench.session.protocol.messages import (
+from workbench.envs.camera_data import CameraInfo, Picture
+from workbench.envs.step_result import StepResult
+from workbench.live.messages import (
     EnterRecording,
     Event,
     Load,
@@ -33,6 +29,10 @@ from workbench.session.protocol.messages import (
     Status,
     WarmUp,
 )
+from workbench.live.process.heartbeat import Busy
+from workbench.live.process.supervisor import Death, Supervisor, Vitals, WorkerOptions
+from workbench.live.process.worker_process import Output
+from workbench.task.description import Restored, Stepped, TaskDescription
 
 STEP_SECONDS = 0.02
 """Between two steps while it plays."""

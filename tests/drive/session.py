@@ -19,22 +19,22 @@ from numpy.typing import NDArray
 from tests.drive.waiting import until
 from tests.ui.scenes import camera as scene_camera
 from tests.ui.scenes import description, step_of, table_scene
-from workbench.commands.run import PauseRun, SetSeed, Step
-from workbench.commands.timeline import StepBack, StepForward
-from workbench.core.camera_data import CameraKey
-from workbench.core.env.step_result import StepResult
-from workbench.jobs.task import Restored, Stepped, TaskDescription, TaskOptions
-from workbench.session.cameras.view import StudioCamera, StudioView
-from workbench.session.checks.checks import CheckJobs
-from workbench.session.checks.profile import ProfileJobs
-from workbench.session.history.history import History, Moment
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.process.supervisor import Death, End, Supervisor, Vitals, WorkerOptions
-from workbench.session.protocol.messages import Event, Inspect, Loaded, ReloadReport, Request, Status
-from workbench.session.rescore.recordings import Rescorer
-from workbench.session.rescore.rescoring import BeginRescoring, RescoreEffect, RescoreView
-from workbench.session.run.events import MomentShown, PastPicturesWanted
+from workbench.app.session import Session
+from workbench.cameras.view import StudioCamera, StudioView
+from workbench.checks.profile import ProfileJobs
+from workbench.checks.state import CheckJobs
+from workbench.envs.camera_data import CameraKey
+from workbench.envs.step_result import StepResult
+from workbench.live.commands import PauseRun, SetSeed, Step
+from workbench.live.events import MomentShown, PastPicturesWanted
+from workbench.live.history.moments import History, Moment
+from workbench.live.messages import Event, Inspect, Loaded, ReloadReport, Request, Status
+from workbench.live.process.supervisor import Death, End, Supervisor, Vitals, WorkerOptions
+from workbench.live.timeline_commands import StepBack, StepForward
+from workbench.live.view import SessionView
+from workbench.rescore.recording_jobs import Rescorer
+from workbench.rescore.state import BeginRescoring, RescoreEffect, RescoreView
+from workbench.task.description import Restored, Stepped, TaskDescription, TaskOptions
 
 TASKS = Path(__file__).parents[2] / "tasks"
 BASE: CameraKey = ("sensor", "base_camera")
@@ -398,17 +398,17 @@ def background_pid(session: Session) -> int | None:
 
 def moved(view: SessionView) -> set[CameraKey]:
     """Cameras that are placed otherwise than in the file."""
-    return {camera.key for camera in view.studio.cameras if camera.moved}
+    return {camera.key for camera in view.of(StudioView).cameras if camera.moved}
 
 
 def camera(session: Session, key: CameraKey) -> StudioCamera:
-    found = session.view().studio.camera(key)
+    found = session.view().of(StudioView).camera(key)
     assert found is not None
     return found
 
 
 def in_studio(what: Callable[[StudioView], object]) -> Callable[[SessionView], object]:
-    return lambda view: what(view.studio)
+    return lambda view: what(view.of(StudioView))
 
 
 def rescored(rescorer: Rescorer, *states: str) -> RescoreView:

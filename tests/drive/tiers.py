@@ -36,7 +36,7 @@ def child_process() -> None:
 @pytest.fixture(scope="session")
 def renderer() -> None:
     """For whatever renders in the tests' process. The device is kept: with the last one go its shaders, 5 s an env."""
-    from workbench.core.backends import keep_render_device
+    from workbench.envs.backends import keep_render_device
 
     keep_render_device("cpu")
 
@@ -73,7 +73,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     if not session.config.getoption("fast") and any(
         item.get_closest_marker("render") for item in session.items
     ):
-        from workbench.core.backends import find_renderer, keep_render_device
+        from workbench.envs.backends import find_renderer, keep_render_device
 
         if find_renderer() is not None:  # else each test that renders fails, with the reason
             keep_render_device("cpu")

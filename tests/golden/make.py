@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from workbench.recording.episode.episode import Episode
-from workbench.recording.library.library import Library
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import recover_confined
+from workbench.episodes.episode import Episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.reader.reading import recover_confined
+from workbench.library.folder import Library
 
 GOLDEN = Path(__file__).parent
 PLACE = Path("/tmp/golden")

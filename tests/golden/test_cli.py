@@ -18,7 +18,7 @@ import pytest
 
 from tests.golden.make import GOLDEN
 from workbench.cli import main
-from workbench.cli.terminal.output import Exit
+from workbench.cli.output import Exit
 
 SHAPES = Path(__file__).parent / "cli"
 WRONG_CALLS = {

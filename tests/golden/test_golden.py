@@ -16,15 +16,15 @@ import pytest
 
 from tests.drive.session import live_session, wait_until
 from tests.golden.make import GOLDEN, expected_of, read_folder
+from workbench.app.session import Session
 from workbench.cli.main import main
-from workbench.cli.terminal.output import Exit
-from workbench.commands.run import Step
-from workbench.jobs.from_recording import run_of
-from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.library.library import Library
-from workbench.recording.reader.read_episode import read_episode
-from workbench.session.live.session import Session
-from workbench.session.run.events import ActionTold
+from workbench.cli.output import Exit
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.recorded_source import run_of
+from workbench.episodes.row import UnreadableRecording
+from workbench.library.folder import Library
+from workbench.live.commands import Step
+from workbench.live.events import ActionTold
 
 # Recordings are read, recovered and gone into in processes of their own; one is recorded in this one, which asks for a renderer.
 pytestmark = pytest.mark.usefixtures("child_process", "renderer")

@@ -7,7 +7,7 @@ from typing import Literal
 
 import pytest
 
-from workbench.core.backends import find_renderer, why_no_gpu_simulation
+from workbench.envs.backends import find_renderer, why_no_gpu_simulation
 
 Simulation = Literal["cpu", "gpu"]
 

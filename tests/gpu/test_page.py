@@ -12,11 +12,11 @@ import pytest
 
 from tests.drive.session import wait_until
 from tests.gpu.conftest import Simulation, Told
-from workbench.commands.run import PlayRun
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.events import PagesCounted
+from workbench.app.session import Session
+from workbench.live.commands import PlayRun
+from workbench.live.events import PagesCounted
+from workbench.live.messages import CameraRequest
+from workbench.task.description import TaskOptions
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 STEPS, PICTURES = 100, 5

@@ -16,14 +16,14 @@ from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.structs.pose import Pose
 
 from tests.gpu.conftest import Simulation
-from workbench.core.cameras.render import take_pictures
-from workbench.core.env.task_env import EnvOptions, make_env
+from workbench.envs.task_env import EnvOptions, make_env
+from workbench.pictures.render import take_pictures
 
 N = 2
 MODE = "rgb+depth+segmentation"
 SENSOR = ("base_camera", "sensor", ("rgb", "depth", "segmentation"))
 
-pytestmark = pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.gpu.conftest import Simulation
-from workbench.recording.reader.read_episode import read_episode
+from workbench.episodes.reader.read_episode import read_episode
 
 
 def test_every_step_and_reward_is_in_the_file(tmp_path: Path, simulation: Simulation) -> None:

@@ -18,12 +18,12 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 from tests.gpu.conftest import Simulation
-from workbench.core.capture.inspect_env import list_contacts
-from workbench.core.env import actions
-from workbench.core.env.assets import MissingAssets
-from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
-from workbench.core.scene.scene_index import scene_index
-from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs import action_vector as actions
+from workbench.envs.assets import MissingAssets
+from workbench.envs.inspect_env import list_contacts
+from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
 
 N = 4
 SEEDS = [40, 41, 42, 43]
@@ -145,7 +145,7 @@ def test_what_follows_a_restore_is_what_followed_before(picks: tuple[TaskEnv, Ta
     np.testing.assert_allclose(again.poses[..., :3], first.poses[..., :3], atol=0.005)
 
 
-@pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
 def test_a_pose_that_was_set_and_not_applied_is_read_and_not_simulated(
     picks: tuple[TaskEnv, TaskEnv],
 ) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS
-from workbench.authoring.problem import TaskError
-from workbench.jobs.open_task import open_task
-from workbench.jobs.task import TaskOptions
-from workbench.session.protocol.messages import Load
-from workbench.session.worker.reload import load_version
+from workbench.live.messages import Load
+from workbench.live.worker.reload import load_version
+from workbench.task.description import TaskOptions
+from workbench.task.open import open_task
+from workbench.task.problem import TaskError
 
 pytestmark = pytest.mark.thorough
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tests.drive.episodes import made
-from workbench.jobs.from_recording import changed_on_disk, changed_since
+from workbench.episodes.recorded_source import changed_on_disk, changed_since
 
 THEN = "import numpy as np\n\nSIZE = 1\n\n\nclass Push:\n    def evaluate(self):\n        return {}\n"
 NOW = THEN.replace("SIZE = 1", "SIZE = 2  # larger").replace("return {}", "return {'success': 1}")

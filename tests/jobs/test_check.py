@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from mani_skill.utils import assets
 
-from workbench.authoring.problem import TaskError
+from workbench.checks.job import CheckReport, check, report_of
+from workbench.checks.job_items import CheckOptions, ItemOutcome
 from workbench.checks.results import RuleResult, merged
 from workbench.checks.rules import RULES
-from workbench.core.rules import Finding
-from workbench.jobs.check.plan import CheckOptions, ItemOutcome
-from workbench.jobs.check.run import CheckReport, check, report_of
-from workbench.jobs.pool.deal import Shard, ThisProcess
-from workbench.jobs.pool.job_file import JobFile, Kept, job_of, read_parts
-from workbench.jobs.pool.processes import Processes
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record
-from workbench.jobs.task import TaskOptions
+from workbench.envs.gpu_rules import Finding
+from workbench.jobs.job_file import JobFile, Kept, job_of, read_parts
+from workbench.jobs.local_processes import Processes
+from workbench.jobs.scheduler import Shard, ThisProcess
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions
+from workbench.task.description import TaskOptions
+from workbench.task.problem import TaskError
 
 pytestmark = pytest.mark.thorough
 

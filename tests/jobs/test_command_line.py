@@ -10,8 +10,8 @@ import tyro
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workbench.cli.terminal.arguments import EnvArguments
-from workbench.jobs.task import TaskOptions, changed_options, command_line
+from workbench.cli.arguments import EnvArguments
+from workbench.task.description import TaskOptions, changed_options, command_line
 
 pytestmark = pytest.mark.thorough
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 import workbench
-from workbench.authoring.problem import TaskError
-from workbench.core.broken_rule import RuleWarning
-from workbench.jobs.open_task import open_task
-from workbench.jobs.task import TaskOptions
+from workbench.envs.broken_rule import RuleWarning
+from workbench.task.description import TaskOptions
+from workbench.task.open import open_task
+from workbench.task.problem import TaskError
 
 HEADER = """
 from mani_skill.agents.registration import register_agent

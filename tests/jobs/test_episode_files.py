@@ -6,8 +6,8 @@ import shutil
 from pathlib import Path
 
 from tests.drive.episodes import appended, made
-from workbench.jobs.record.gather import EpisodeFinisher, GatheredEpisode
-from workbench.recording.writing.episode_writer import EpisodeFiles
+from workbench.episodes.writing.episode_writer import EpisodeFiles
+from workbench.record.gather import EpisodeFinisher, GatheredEpisode
 
 
 def test_why_one_could_not_be_written_is_not_lost_to_the_next(tmp_path: Path) -> None:

@@ -14,19 +14,14 @@ import pytest
 
 from tests.drive.session import TASKS, live_session, step, wait_until
 from tests.session.recorded_runs import opened, reaching, record
-from workbench.commands.timeline import UndoReset
-from workbench.core.capture.recorded_run import RecordedRun
-from workbench.jobs.from_recording import (
-    CannotEnterRecording,
-    options_of,
-    recorded_source,
-    reference_of,
-)
-from workbench.jobs.task import TaskOptions
-from workbench.recording.episode.episode import EpisodeInfo
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.run.events import ActionTold
+from workbench.app.session import Session
+from workbench.envs.recorded_run import RecordedRun
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.recorded_source import CannotEnterRecording, options_of, recorded_source, reference_of
+from workbench.live.events import ActionTold
+from workbench.live.timeline_commands import UndoReset
+from workbench.live.view import SessionView
+from workbench.task.description import TaskOptions
 
 N, STEPS, ENV = 3, 40, 1
 

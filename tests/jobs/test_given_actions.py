@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.drive.episodes import made, write
-from workbench.jobs.actions import read_actions
+from workbench.actions.choose import read_actions
 
 
 def npy(shape: tuple[int, ...], content: bytes, dtype: str = "<f8") -> bytes:

@@ -7,7 +7,7 @@ from pathlib import Path
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from workbench.jobs.policy import find_policy, list_policies
+from workbench.actions.policy import find_policy, list_policies
 
 POLICIES = """
 raise RuntimeError("reading runs nothing")

@@ -15,15 +15,15 @@ from tests.drive.session import live_session, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.odd_entries import write_task
 from tests.session.recorded_runs import opened
-from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
-from workbench.commands.run import PauseRun, PlayRun
-from workbench.core.env.step_result import OtherEntry, StepResult
-from workbench.jobs.from_recording import run_of
-from workbench.jobs.replay import replay_to
-from workbench.recording.episode.episode import Episode
-from workbench.recording.reader.read_episode import read_episode
-from workbench.session.live.session import Session
-from workbench.session.record.recording import RecordingWanted
+from workbench.app.session import Session
+from workbench.cli.rescore import RescoreOptions, rescore_all
+from workbench.envs.step_result import OtherEntry, StepResult
+from workbench.episodes.episode import Episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.recorded_source import run_of
+from workbench.episodes.replay import replay_to
+from workbench.live.commands import PauseRun, PlayRun
+from workbench.record.state import RecordingStatus, RecordingWanted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -128,7 +128,7 @@ def test_the_page_plays_and_records_it(session: Session, file: Path) -> None:
     session.do(PlayRun())
     view = wait_until(session, lambda view: shown(view.step), "a later step")
     assert view.problem is None and view.step.others["phase"].texts == ("push",)
-    wait_until(session, lambda view: view.recording.episodes_written >= 2, "recordings")
+    wait_until(session, lambda view: view.of(RecordingStatus).episodes_written >= 2, "recordings")
     session.do(PauseRun())
     rows = session.view()
     assert rows.problem is None

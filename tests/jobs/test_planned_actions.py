@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workbench.authoring.problem import TaskError
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import Recorded, record
-from workbench.jobs.task import TaskOptions
+from workbench.episodes.reader.read_episode import read_episode
 from workbench.planning.options import PlanOptions
-from workbench.recording.reader.read_episode import read_episode
+from workbench.record.job import Recorded, record
+from workbench.record.job_worker import RecordOptions
+from workbench.task.description import TaskOptions
+from workbench.task.problem import TaskError
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

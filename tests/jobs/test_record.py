@@ -25,16 +25,16 @@ from hypothesis import strategies as st
 
 from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
-from workbench.authoring.problem import TaskError
-from workbench.cli.jobs.record import record_in_terminal
-from workbench.jobs.from_recording import options_of
-from workbench.jobs.pool.deal import Deal, Executor, Work
-from workbench.jobs.pool.processes import Processes
-from workbench.jobs.record.episodes import RecordOptions, Written
-from workbench.jobs.record.run import Recorded, RecordProgress, record
-from workbench.jobs.task import TaskOptions
-from workbench.recording.episode.episode import Episode
-from workbench.recording.reader.read_episode import read_episode
+from workbench.cli.record import record_in_terminal
+from workbench.episodes.episode import Episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.recorded_source import options_of
+from workbench.jobs.local_processes import Processes
+from workbench.jobs.scheduler import Deal, Executor, Work
+from workbench.record.job import Recorded, RecordProgress, record
+from workbench.record.job_worker import RecordOptions, Written
+from workbench.task.description import TaskOptions
+from workbench.task.problem import TaskError
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -155,7 +155,7 @@ def test_processes_that_are_killed_cost_no_episode_and_double_none(workers: int,
         for child in psutil.Process().children(recursive=True) if len(killed) < 2 else ():
             with suppress(psutil.Error):  # it has ended meanwhile
                 words = child.cmdline()
-                if progress.over and "workbench.jobs.pool.processes" in words and child.children() == []:
+                if progress.over and "workbench.jobs.local_processes" in words and child.children() == []:
                     child.kill()
                     killed.add(child.pid)
                     return

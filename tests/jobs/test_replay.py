@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from tests.session.recorded_runs import Recorded, opened, reaching, record
-from workbench.authoring.problem import TaskError
-from workbench.core.capture.recorded_state import read_states, state_distance
-from workbench.jobs.open_task import OpenedTask
-from workbench.jobs.replay import replay_to
+from workbench.episodes.recorded_state import read_states, state_distance
+from workbench.episodes.replay import replay_to
+from workbench.task.open import OpenedTask
+from workbench.task.problem import TaskError
 
 pytestmark = pytest.mark.thorough
 

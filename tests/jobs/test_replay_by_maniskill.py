@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record
-from workbench.jobs.task import TaskOptions
-from workbench.recording.episode.episode import Episode
-from workbench.recording.reader.read_episode import read_episode, read_maniskill
+from workbench.episodes.episode import Episode
+from workbench.episodes.reader.read_episode import read_episode, read_maniskill
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

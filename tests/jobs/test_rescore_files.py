@@ -21,27 +21,27 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.drive.episodes import made, write
 from tests.drive.session import rescored
-from workbench.authoring.problem import TaskError
-from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
+from workbench.actions.choose import read_actions
+from workbench.cli.arguments import JobArguments
 from workbench.cli.main import main
+from workbench.cli.rescore import RescoreOptions, rescore_all
 from workbench.cli.share import export_in_terminal
-from workbench.cli.terminal.arguments import JobArguments
-from workbench.commands.timeline import StopRescoring
-from workbench.jobs.actions import read_actions
-from workbench.jobs.pool.deal import Deal, ThisProcess, Work
-from workbench.jobs.pool.travel import pack_baggage, relocated
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record
-from workbench.jobs.rescore.job import Recording, rescore_recordings, setup_of
-from workbench.jobs.rescore.run import RescoredBy, answer
-from workbench.jobs.rescore.verdict import Rescore
-from workbench.jobs.task import TaskOptions
-from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.lerobot.export import ExportOptions
-from workbench.recording.reader.reading import find_all_sources
-from workbench.session.clearance import Clearances
-from workbench.session.rescore import verdict_text
-from workbench.session.rescore.recordings import Rescorer
+from workbench.episodes.lerobot.export import ExportOptions
+from workbench.episodes.reader.reading import find_all_sources
+from workbench.episodes.row import UnreadableRecording
+from workbench.jobs.scheduler import Deal, ThisProcess, Work
+from workbench.jobs.worker_files import pack_baggage, relocated
+from workbench.live.timeline_commands import StopRescoring
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions
+from workbench.rescore import verdict_text
+from workbench.rescore.job import Recording, rescore_recordings, setup_of
+from workbench.rescore.recording_jobs import Rescorer
+from workbench.rescore.replay_recordings import RescoredBy, answer
+from workbench.rescore.verdict import Rescore
+from workbench.task.description import TaskOptions
+from workbench.task.problem import TaskError
+from workbench.trust.clearance import Clearances
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -240,7 +240,9 @@ def test_each_verdict_is_told_once_however_often_progress_is(
     author: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = itertools.count()
-    monkeypatch.setattr("workbench.jobs.rescore.run.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    monkeypatch.setattr(
+        "workbench.rescore.replay_recordings.time", SimpleNamespace(monotonic=lambda: next(clock))
+    )
     files, said = find_all_sources((author / "recordings",)), []
     options = TaskOptions(1, env_kwargs={"render_backend": "none"})
     question = Rescore(str(author / "push_cube.py"), options, options, tuple(files), False)
@@ -287,7 +289,7 @@ def test_recordings_travel_to_other_machines_unless_they_are_large(
     os.chdir(here)
     assert relocated(source.path, places).is_file() and len(places) == 1
 
-    monkeypatch.setattr("workbench.jobs.rescore.job.MOST_BYTES", 0)
+    monkeypatch.setattr("workbench.rescore.job.MOST_BYTES", 0)
     (result,) = rescore_recordings(setup, executor)
     assert not result.verdict.why_not and list(executor.work.files) == []
     assert executor.work.setup.items[0].travels is None

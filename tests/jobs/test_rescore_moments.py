@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from tests.drive.session import TASKS
-from workbench.authoring.loading.load import load_task
-from workbench.core.env import actions
-from workbench.core.env.step_result import StepResult
-from workbench.jobs.open_task import OpenedTask, Opening, build_task
-from workbench.jobs.rescore.moments import rescore_moments
-from workbench.jobs.rescore.verdict import MomentToRescore, RescoredMoments, RescoreMoments
-from workbench.jobs.task import TaskOptions
+from workbench.envs import action_vector as actions
+from workbench.envs.step_result import StepResult
+from workbench.rescore.replay_past import rescore_moments
+from workbench.rescore.verdict import MomentToRescore, RescoredMoments, RescoreMoments
+from workbench.task.description import TaskOptions
+from workbench.task.load import load_task
+from workbench.task.open import OpenedTask, Opening, build_task
 
 N = 3
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'

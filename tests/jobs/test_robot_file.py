@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workbench.core.env import actions
-from workbench.jobs.open_task import open_task
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record
-from workbench.jobs.rescore.run import rescore
-from workbench.jobs.task import TaskOptions
-from workbench.recording.reader import reading
-from workbench.recording.reader.scan import scan_folder
-from workbench.session.protocol.messages import Load
-from workbench.session.worker.reload import Running, load_version
+from workbench.envs import action_vector as actions
+from workbench.episodes.reader import reading
+from workbench.episodes.reader.scan import scan_folder
+from workbench.live.messages import Load
+from workbench.live.worker.reload import Running, load_version
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions
+from workbench.rescore.replay_recordings import rescore
+from workbench.task.description import TaskOptions
+from workbench.task.open import open_task
 
 ROBOT = """
 from mani_skill.agents.registration import register_agent

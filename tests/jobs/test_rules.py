@@ -14,18 +14,18 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.session import wait_until
-from workbench.authoring.problem import Problem, TaskError
-from workbench.commands.run import PauseRun, PlayRun
-from workbench.core.env.actions import hold_action
-from workbench.core.rules import Finding
-from workbench.jobs.open_task import OpenedTask, Opening, open_task
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record
-from workbench.jobs.task import TaskOptions
-from workbench.recording.reader.read_episode import read_episode
-from workbench.session.live.session import Session
-from workbench.session.protocol.messages import Event, Load, RulesBroken
-from workbench.session.worker.reload import Running, load_version
+from workbench.app.session import Session
+from workbench.envs.action_vector import hold_action
+from workbench.envs.gpu_rules import Finding
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.live.commands import PauseRun, PlayRun
+from workbench.live.messages import Event, Load, RulesBroken
+from workbench.live.worker.reload import Running, load_version
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions
+from workbench.task.description import TaskOptions
+from workbench.task.open import OpenedTask, Opening, open_task
+from workbench.task.problem import Problem, TaskError
 
 pytestmark = pytest.mark.thorough
 

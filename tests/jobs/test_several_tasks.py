@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS, wait_until
-from workbench.authoring.problem import TaskError
-from workbench.commands.run import ChooseClass
-from workbench.jobs.open_task import open_task
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.session.protocol.messages import Load
-from workbench.session.worker.reload import load_version
+from workbench.app.session import Session
+from workbench.live.commands import ChooseClass
+from workbench.live.messages import Load
+from workbench.live.worker.reload import load_version
+from workbench.task.description import TaskOptions
+from workbench.task.open import open_task
+from workbench.task.problem import TaskError
 
 OPTIONS = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})
 BROKEN = '    def _load_scene(self, options):\n        raise ValueError("no cubes")\n'

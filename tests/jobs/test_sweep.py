@@ -10,19 +10,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from workbench.cli.jobs.sweep import parse_settings
-from workbench.jobs.pool.deal import Executor
-from workbench.jobs.pool.processes import Processes
-from workbench.jobs.record.run import RecordProgress
-from workbench.jobs.record.sweep import (
-    Setting,
-    SweepOptions,
-    SweepReport,
-    recordings_of,
-    sweep,
-)
-from workbench.jobs.task import TaskOptions
-from workbench.recording.reader.read_episode import read_episode
+from workbench.cli.sweep import parse_settings
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.jobs.local_processes import Processes
+from workbench.jobs.scheduler import Executor
+from workbench.record.job import RecordProgress
+from workbench.sweep.job import Setting, SweepOptions, SweepReport, recordings_of, sweep
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from workbench.jobs.rescore.verdict import (
+from workbench.episodes.equal_numbers import gap
+from workbench.rescore import verdict_text
+from workbench.rescore.verdict import (
     DOUBTFUL_METRES,
     DOUBTFUL_RADIANS,
     Scores,
     Verdict,
     by_change,
     compare,
-    gap,
     scalar_entries,
 )
-from workbench.session.rescore import verdict_text
 
 REWARD = [0.0, 1.0, 2.0, 3.0]
 

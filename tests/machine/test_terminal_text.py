@@ -10,8 +10,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rich.style import Style
 
+from workbench.live.process.captured_output import PLAIN, StyledText, coloured_runs, for_terminal
 from workbench.machine.text import only_colours, plain_text
-from workbench.session.process.captured_output import PLAIN, StyledText, coloured_runs, for_terminal
 
 COLOURS = re.compile("\x1b\\[[0-9;:]*m")
 DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}

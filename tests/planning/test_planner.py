@@ -14,7 +14,7 @@ import torch
 
 import workbench
 from tests.planning.walking import MADE, SMALL, walk
-from workbench.core.snapshots.cpu_state import CpuState
+from workbench.envs.snapshots.cpu_state import CpuState
 from workbench.planning.rollouts import NotAlike
 
 TASKS = Path(__file__).parents[2] / "tasks"

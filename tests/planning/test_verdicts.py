@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from workbench.planning.episodes import PlannedEpisode
+from workbench.planning.planned_episodes import PlannedEpisode
 from workbench.planning.verdicts import in_the_way, of_episodes
 
 STEPS, HORIZON = 20, 10

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import workbench
-from workbench.core.maniskill_private import open_env
+from workbench.envs.maniskill_private import open_env
 
 SMALL: dict[str, Any] = {"rollouts": 8, "horizon": 0.2}
 MADE: dict[str, Any] = {"control_mode": "pd_ee_delta_pose", "render_backend": "none", "backend": "cpu"}

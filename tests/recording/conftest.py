@@ -10,8 +10,8 @@ import pytest
 import rerun as rr
 
 from tests.drive.episodes import Made
-from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
-from workbench.recording.episode.episode import EpisodeInfo
+from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.episodes.episode import EpisodeInfo
 
 if TYPE_CHECKING:
     from tests.recording.stock import Recorded

@@ -16,7 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
-from workbench.recording.rerun.chunks import STEP
+from workbench.episodes.rerun.chunks import STEP
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.drive.episodes import Made, Track
-from workbench.core.camera_data import CameraInfo
-from workbench.core.scene.read_scene import read_geometry
-from workbench.core.scene.scene_index import read_poses
-from workbench.recording.episode.episode import EpisodeInfo
+from workbench.envs.camera_data import CameraInfo
+from workbench.envs.scene.read_scene import read_geometry
+from workbench.envs.scene.scene_index import read_poses
+from workbench.episodes.episode import EpisodeInfo
 
 STEPS = 8
 SEED = 3

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from tests.recording.library_files import describe
-from workbench.recording.sweeps import RESULTS, SweepEpisode, SweepResults, write_results
+from workbench.episodes.sweep_results import RESULTS, SweepEpisode, SweepResults, write_results
 
 SEEDS = 12
 WEIGHTS = (0.5, 1, 2)

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workbench.recording.episode.encoded_pictures import EncodedPictures, encode_jpeg
-from workbench.recording.episode.episode import Episode
-from workbench.recording.films import (
+from workbench.episodes.encoded_pictures import EncodedPictures, encode_jpeg
+from workbench.episodes.episode import Episode
+from workbench.episodes.films import (
     FilmEye,
     camera_of,
     chosen_states,
@@ -26,7 +26,7 @@ from workbench.recording.films import (
     frames,
     write_mp4,
 )
-from workbench.recording.reader.read_episode import read_episode
+from workbench.episodes.reader.read_episode import read_episode
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -60,7 +60,7 @@ def test_a_film_holds_every_frame_in_order_at_its_rate(tmp_path: Path) -> None:
 def test_a_full_disk_ends_a_film_with_a_sentence_and_leaves_nothing(tmp_path: Path) -> None:
     # In a process of its own: the limit on the size of files cannot be taken back by everybody.
     noise = (
-        "import numpy as np, sys, pathlib; from workbench.recording.films import write_mp4\n"
+        "import numpy as np, sys, pathlib; from workbench.episodes.films import write_mp4\n"
         "rng = np.random.default_rng(0)\n"
         "frames = (rng.integers(0, 255, (240, 320, 3), np.uint8) for _ in range(60))\n"
         "try: write_mp4(pathlib.Path(sys.argv[1]), frames, 20)\n"
@@ -86,7 +86,7 @@ def test_a_state_without_a_picture_shows_the_one_before(episode: Episode) -> Non
 
 def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Episode) -> None:
     """From the recorded place of a camera the drawn scene and the camera's picture are of the same things."""
-    from workbench.core.cameras.render_recorded import RecordedScene
+    from workbench.pictures.render_recorded import RecordedScene
 
     camera = camera_of(episode, "base_camera")
     assert episode.geometry is not None and episode.poses is not None and camera.rgb is not None

@@ -16,10 +16,10 @@ import json, sys, time
 from pathlib import Path
 import numpy as np
 from tests.drive.rows import EpisodeRow, append
-from workbench.core.scene.shapes import SceneGeometry
-from workbench.core.camera_data import CameraInfo, Picture
-from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.writing.episode_writer import EpisodeWriter
+from workbench.envs.scene.shapes import SceneGeometry
+from workbench.envs.camera_data import CameraInfo, Picture
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.writing.episode_writer import EpisodeWriter
 
 def peak():
     # Not getrusage, whose peak is that of the parent where this process was forked from a larger one.
@@ -71,7 +71,7 @@ READER = """
 import json, sys, time
 from pathlib import Path
 import rerun.chunk  # noqa: F401  (not what is measured)
-from workbench.recording.reader.read_episode import read_episode
+from workbench.episodes.reader.read_episode import read_episode
 
 def peak():
     (line,) = [line for line in open("/proc/self/status") if line.startswith("VmHWM")]

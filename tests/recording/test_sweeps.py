@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from workbench.recording.sweeps import (
+from workbench.episodes.sweep_results import (
     NoSweep,
     SweepEpisode,
     SweepResults,

@@ -6,7 +6,7 @@ import os
 import subprocess
 from pathlib import Path
 
-from workbench.recording.rerun.viewer import quiet_environment, rerun_command
+from workbench.episodes.rerun.viewer import quiet_environment, rerun_command
 
 
 def verify_rrd(path: Path, timeout: float = 60.0) -> str | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import Told, live_session, told_session
-from workbench.session.live.session import Session
+from workbench.app.session import Session
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from tests.drive.session import TASKS
-from workbench.core.env.step_result import StepResult
-from workbench.jobs.task import Stepped
+from workbench.envs.step_result import StepResult
 from workbench.machine.processes.wire import pack, pack_message
+from workbench.task.description import Stepped
 
 _MISCHIEF = """
 import ctypes as _ctypes, os as _os, signal as _signal, socket as _socket, sys as _sys, threading as _threading, time as _time

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.core.capture.recorded_run import RecordedRun
-from workbench.core.capture.recorded_state import read_states
-from workbench.core.env import actions
-from workbench.core.env.step_result import StepResult
-from workbench.jobs.open_task import OpenedTask, open_task
-from workbench.jobs.task import TaskOptions
+from workbench.envs import action_vector as actions
+from workbench.envs.recorded_run import RecordedRun
+from workbench.envs.step_result import StepResult
+from workbench.episodes.recorded_state import read_states
+from workbench.task.description import TaskOptions
+from workbench.task.open import OpenedTask, open_task
 
 States = dict[str, np.ndarray]
 

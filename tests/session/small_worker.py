@@ -16,20 +16,13 @@ import time
 import types
 from typing import Any, get_args
 
-from workbench.authoring.problem import Interrupted
+from workbench.app.worker.questions import QUESTIONS
+from workbench.app.worker.start import main
+from workbench.cameras.questions import RunCameras
+from workbench.live.messages import Answer, ListenForDebugger, Load, Loaded, Loading, Quit, Request
+from workbench.live.process.heartbeat import INTERRUPT_SIGNAL, STACK_SIGNAL, HeartbeatWriter, Interrupts
 from workbench.machine.processes.wire import Call, Unpacker, pack_message
-from workbench.session.process.heartbeat import INTERRUPT_SIGNAL, STACK_SIGNAL, HeartbeatWriter, Interrupts
-from workbench.session.protocol.messages import (
-    Answer,
-    ListenForDebugger,
-    Load,
-    Loaded,
-    Loading,
-    Quit,
-    Request,
-)
-from workbench.session.protocol.questions import QUESTIONS, RunCameras
-from workbench.session.worker.start import main
+from workbench.task.problem import Interrupted
 
 
 class SmallWorker:
@@ -153,9 +146,9 @@ class SmallWorker:
 
 
 if __name__ == "__main__":
-    instead: Any = types.ModuleType("workbench.session.worker.loop")
+    instead: Any = types.ModuleType("workbench.app.worker.loop")
     instead.work = lambda fd, heartbeat: SmallWorker(
         multiprocessing.connection.Connection(fd), heartbeat
     ).run()
-    sys.modules["workbench.session.worker.loop"] = instead
+    sys.modules["workbench.app.worker.loop"] = instead
     main()

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from tests.drive.session import DEATH, moment
 from tests.ui.scenes import PLAN, description, problem, step_of, table_scene
-from workbench.authoring.loading.reference import RecordedTask
-from workbench.checks.results import HookTime, RuleResult, StepProfile
-from workbench.commands.checks import (
+from workbench.checks import profile
+from workbench.checks import state as checks
+from workbench.checks.commands import (
     CheckAfterSave,
     CheckNow,
     ChooseSeeds,
@@ -25,16 +25,18 @@ from workbench.commands.checks import (
     StopSolving,
     TimeStep,
 )
-from workbench.commands.command import Refused
-from workbench.core.rules import Finding
-from workbench.jobs.task import TaskOptions
-from workbench.planning.report import SolveReport
-from workbench.session.checks import checks, profile, solve_seeds
-from workbench.session.events import Asked
-from workbench.session.live import solver
-from workbench.session.protocol.messages import Loaded, PlanDropped, PlanWanted, Settings
-from workbench.session.run.events import FileSaved, LoadDone, VersionLoaded, WorkerDied
-from workbench.session.run.run import Run, first_run
+from workbench.checks.results import HookTime, RuleResult, StepProfile
+from workbench.envs.gpu_rules import Finding
+from workbench.live.effects import Asked
+from workbench.live.events import FileSaved, LoadDone, VersionLoaded, WorkerDied
+from workbench.live.messages import Loaded, PlanDropped, PlanWanted, Settings
+from workbench.live.run import Run, first_run
+from workbench.page.command import Refused
+from workbench.planning.seeds_report import SolveReport
+from workbench.solve import seeds as solve_seeds
+from workbench.solve import state as solver
+from workbench.task.description import TaskOptions
+from workbench.task.reference import RecordedTask
 
 ENVS = 2
 GEOMETRY, POSES = table_scene(ENVS)

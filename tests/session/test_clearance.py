@@ -13,18 +13,18 @@ from typing import Any
 import pytest
 
 from tests.drive.episodes import begin, made, write
-from workbench.authoring.loading.reference import RecordedTask
-from workbench.authoring.loading.task_content import read_content
-from workbench.authoring.loading.trust import STORE_FILE, TrustStore
-from workbench.jobs.from_recording import recorded_source, reference_of
+from workbench.episodes.document import write_into_description
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.recorded_source import recorded_source, reference_of
+from workbench.episodes.seal import KEY_FILE, MadeHere, made_here
+from workbench.episodes.writing.finish import recover
 from workbench.machine.folders import user_folder
-from workbench.recording.episode.document import write_into_description
-from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.episode.made_here import KEY_FILE, MadeHere, made_here
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing.finish import recover
-from workbench.session.clearance import Clearances, CodeToRun, Consent, NotCleared, Since, TrustQuestion
-from workbench.session.review.recorded_scene import SceneError, SceneProcess
+from workbench.review.recorded_scene import SceneError, SceneProcess
+from workbench.task.content import read_content
+from workbench.task.reference import RecordedTask
+from workbench.trust.clearance import Clearances, CodeToRun, Consent, NotCleared, Since, TrustQuestion
+from workbench.trust.store import STORE_FILE, TrustStore
 
 pytestmark = pytest.mark.thorough
 

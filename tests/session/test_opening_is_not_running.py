@@ -22,22 +22,22 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.drive.session import rescored
 from tests.drive.waiting import until
-from workbench.cli.jobs.rescore import RescoreOptions, rescore_all
 from workbench.cli.main import main
-from workbench.cli.terminal.output import Exit
-from workbench.commands.timeline import StopRescoring
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import record
-from workbench.jobs.task import TaskOptions
-from workbench.recording.library.library import Library
-from workbench.recording.reader.reading import find_all_sources
-from workbench.session.clearance import Clearances, Consent, NotTrusted, TrustQuestion
-from workbench.session.protocol.questions import MakeScene
-from workbench.session.rescore.recordings import Rescorer
-from workbench.session.review.recorded_scene import SceneProcess
-from workbench.session.review.review import Review
-from workbench.session.worker.make_scene import make
-from workbench.ui.widgets.rescored import status_html
+from workbench.cli.output import Exit
+from workbench.cli.rescore import RescoreOptions, rescore_all
+from workbench.episodes.reader.reading import find_all_sources
+from workbench.library.folder import Library
+from workbench.live.questions import MakeScene
+from workbench.live.timeline_commands import StopRescoring
+from workbench.live.worker.make_scene import make
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions
+from workbench.rescore.recording_jobs import Rescorer
+from workbench.rescore.result_parts import status_html
+from workbench.review.playback import Review
+from workbench.review.recorded_scene import SceneProcess
+from workbench.task.description import TaskOptions
+from workbench.trust.clearance import Clearances, Consent, NotTrusted, TrustQuestion
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -12,29 +12,39 @@ from hypothesis import strategies as st
 
 from tests.drive.session import DEATH, moment
 from tests.ui.scenes import camera, description, step_of, table_scene
-from workbench.commands.command import Command, Refused
-from workbench.commands.recording import (
+from workbench.app.state import Effect, SessionEvent, State, apply
+from workbench.cameras.state import first_studio
+from workbench.live.effects import Asked, Then
+from workbench.live.events import (
+    EnvsReset,
+    FileSaved,
+    LoadDone,
+    Now,
+    RunEffect,
+    Send,
+    VersionLoaded,
+    WorkerDied,
+)
+from workbench.live.messages import Loaded, Reset, SetCapture, Settings
+from workbench.live.messages import ReloadReport as Report
+from workbench.live.process.background_jobs import JobProgress, StoppedBy
+from workbench.live.process.supervisor import End
+from workbench.live.run import first_run
+from workbench.live.timeline_commands import StopRescoring
+from workbench.page.command import Command, Refused
+from workbench.record import state as of_recording
+from workbench.record.commands import (
     ChooseRecordedEnvs,
     RecordNextEpisode,
     SavePreviousEpisode,
+    SaveSolved,
     StopRecording,
     ToggleRecording,
     ToggleSavePast,
 )
-from workbench.commands.solve import SaveSolved
-from workbench.commands.timeline import StopRescoring
-from workbench.jobs.record.gather import Finished
-from workbench.jobs.task import TaskOptions
-from workbench.session.cameras.state import first_studio
-from workbench.session.events import Asked, Then
-from workbench.session.live.solver import RunningEpisode, Solving
-from workbench.session.live.state import Effect, SessionEvent, State, apply
-from workbench.session.process.jobs import JobProgress
-from workbench.session.process.supervisor import End
-from workbench.session.protocol.messages import Loaded, Reset, SetCapture, Settings
-from workbench.session.protocol.messages import ReloadReport as Report
-from workbench.session.record import recording as of_recording
-from workbench.session.record.recording import (
+from workbench.record.gather import Finished
+from workbench.record.saving_state import BeginSaving, EpisodesSaved, SaveFailed, SaveProgressed, SaveWanted
+from workbench.record.state import (
     BeginEpisodes,
     EndEpisodes,
     EpisodeEnded,
@@ -47,33 +57,10 @@ from workbench.session.record.recording import (
     TakeStep,
     UnderWay,
 )
-from workbench.session.record.saving import (
-    BeginSaving,
-    EpisodesSaved,
-    SaveFailed,
-    SaveProgressed,
-    SaveWanted,
-)
-from workbench.session.rescore import rescoring as of_rescoring
-from workbench.session.rescore.rescoring import (
-    BeginRescoring,
-    EndRescoring,
-    RescoreEffect,
-    RescoreView,
-    RescoringTold,
-    StoppedBy,
-)
-from workbench.session.run.events import (
-    EnvsReset,
-    FileSaved,
-    LoadDone,
-    Now,
-    RunEffect,
-    Send,
-    VersionLoaded,
-    WorkerDied,
-)
-from workbench.session.run.run import first_run
+from workbench.rescore import state as of_rescoring
+from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreEffect, RescoreView, RescoringTold
+from workbench.solve.state import RunningEpisode, Solving
+from workbench.task.description import TaskOptions
 
 ENVS = 3
 NOW = Now(5.0, 1e9)

@@ -49,7 +49,7 @@ def sweep(
         os.environ["MS_ASSET_DIR"] = nothing_downloaded
         # Forked from a process that has imported all, which takes ten seconds, and has used nothing.
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["mani_skill.envs", "workbench.jobs.check.run"])
+        context.set_forkserver_preload(["mani_skill.envs", "workbench.checks.job"])
         for done in as_completed([pool.submit(_row, context, env_id, limit, select) for env_id in ids]):
             yield done.result()
 
@@ -96,8 +96,8 @@ def _needs(env_id: str) -> dict[str, Any] | None:
     import mani_skill.envs  # noqa: F401  registers the ids
     from mani_skill.utils.registration import REGISTERED_ENVS
 
-    from workbench.core.env.assets import MissingAssets
-    from workbench.core.env.task_env import EnvOptions, make_env
+    from workbench.envs.assets import MissingAssets
+    from workbench.envs.task_env import EnvOptions, make_env
 
     spec = REGISTERED_ENVS[env_id]
     options = EnvOptions(1, "cpu", render=False, rules="off")
@@ -114,9 +114,9 @@ def _needs(env_id: str) -> dict[str, Any] | None:
 
 
 def _checked(env_id: str, select: tuple[str, ...]) -> dict[str, Any]:
-    from workbench.jobs.check.plan import CheckOptions
-    from workbench.jobs.check.run import check
-    from workbench.jobs.task import TaskOptions
+    from workbench.checks.job import check
+    from workbench.checks.job_items import CheckOptions
+    from workbench.task.description import TaskOptions
 
     what = CheckOptions(env_id, TaskOptions(num_envs=NUM_ENVS), seeds=SEEDS, select=select, workers=1)
     report = check(what)

@@ -28,14 +28,14 @@ from typing import Any
 from tests.drive.session import live_session, step
 from tests.drive.waiting import until
 from tests.sweeps.upstream_faults import faults_of
-from workbench.authoring.loading.load import undo_load
-from workbench.authoring.templates.new_task import TEMPLATES
+from workbench.checks.commands import CheckNow
+from workbench.checks.state import RUNNING, ChecksView
 from workbench.cli.main import main as workbench
-from workbench.commands.checks import CheckNow
-from workbench.core.env.actions import hold_action
-from workbench.jobs.open_task import open_task
-from workbench.jobs.task import TaskOptions
-from workbench.session.checks.checks import RUNNING
+from workbench.envs.action_vector import hold_action
+from workbench.task.description import TaskOptions
+from workbench.task.load import undo_load
+from workbench.task.new_task import TEMPLATES
+from workbench.task.open import open_task
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = tuple(sorted(file.stem for file in (ROOT / "tasks").glob("*.py")))
@@ -176,12 +176,12 @@ def opened(task: str, reference: Path | str, folder: Path, num_envs: int, checks
             return Ran(task, "open", 0, round(time.monotonic() - began, 1), None)
         session.do(CheckNow())
         until(
-            lambda: session.view().checks.state not in RUNNING,
+            lambda: session.view().of(ChecksView).state not in RUNNING,
             "the end of the checks",
             SECONDS,
-            seen=lambda: session.view().checks,
+            seen=lambda: session.view().of(ChecksView),
         )
-        looked = session.view().checks
+        looked = session.view().of(ChecksView)
     rules = [{"rule": one.rule, "state": one.state, "why": one.why} for one in looked.results]
     told = {"state": looked.state, "why": looked.why, "total": looked.total, "rules": rules}
     return Ran(task, "open", 0 if looked.state == "done" else 2, round(time.monotonic() - began, 1), told)

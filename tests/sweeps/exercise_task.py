@@ -20,12 +20,12 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from torch.utils import _pytree as pytree
 
 from tests.sweeps.upstream_faults import Fault, faults_of, where_it_fails
-from workbench.core.cameras.render import Request, list_cameras, take_pictures
-from workbench.core.env import actions
-from workbench.core.env.assets import MissingAssets, robots_of
-from workbench.core.env.evaluate_entries import wrong_evaluate
-from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
-from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs import action_vector as actions
+from workbench.envs.assets import MissingAssets, robots_of
+from workbench.envs.evaluate_entries import wrong_evaluate
+from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
+from workbench.pictures.render import Request, list_cameras, take_pictures
 
 NUM_ENVS = 4
 SEEDS = [11, 12, 13, 14]

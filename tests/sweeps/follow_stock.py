@@ -24,9 +24,9 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs import Pose
 from torch.utils import _pytree as pytree
 
-from workbench.core.env import actions
-from workbench.core.env.partial_reset import active_controllers
-from workbench.core.env.task_env import EnvOptions, default_reward_mode, make_env
+from workbench.envs import action_vector as actions
+from workbench.envs.partial_reset import active_controllers
+from workbench.envs.task_env import EnvOptions, default_reward_mode, make_env
 
 NUM_ENVS, PLACE = 4, 3
 """RotateValveLevel1 builds its valves by the env's index, three kinds in turn: env 3 has the kind of env 0."""

@@ -23,11 +23,11 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.session.hazards import calm, provoke, write_task
-from workbench.commands.run import Step
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.process.supervisor import WorkerOptions
+from workbench.app.session import Session
+from workbench.live.commands import Step
+from workbench.live.process.supervisor import WorkerOptions
+from workbench.live.view import SessionView
+from workbench.task.description import TaskOptions
 
 DEATHS = ("segfault", "exit", "kill", "abort", "children")
 PATIENCE = 120.0

@@ -31,7 +31,7 @@ import numpy as np
 import tyro
 
 from workbench.machine.files import replace_file
-from workbench.planning.episodes import PlannedEpisode
+from workbench.planning.planned_episodes import PlannedEpisode
 from workbench.planning.verdicts import in_the_way, of_episodes
 
 FILE = Path("solve_tasks.json")
@@ -87,8 +87,8 @@ def tasks() -> list[str]:
     from mani_skill.envs.sapien_env import BaseEnv
     from mani_skill.utils.registration import REGISTERED_ENVS
 
-    from workbench.core.env.assets import MissingAssets, require_assets, robots_of
-    from workbench.core.env.task_env import default_reward_mode
+    from workbench.envs.assets import MissingAssets, require_assets, robots_of
+    from workbench.envs.task_env import default_reward_mode
 
     found: dict[str, list[str]] = {"tabletop": [], "control": []}
     for env_id, spec in REGISTERED_ENVS.items():
@@ -135,11 +135,11 @@ class Known:
 
 def run(row: Row, options: Options, known: Known) -> None:
     """The episodes that a row lacks; each is saved as soon as those before it are there."""
-    from workbench.jobs.record.episodes import RecordOptions
-    from workbench.jobs.record.run import RecordProgress, record
-    from workbench.jobs.record.solve import SolveOptions
-    from workbench.jobs.task import TaskOptions
-    from workbench.recording.reader.read_episode import read_episode
+    from workbench.episodes.reader.read_episode import read_episode
+    from workbench.record.job import RecordProgress, record
+    from workbench.record.job_worker import RecordOptions
+    from workbench.solve.job import SolveOptions
+    from workbench.task.description import TaskOptions
 
     control, task = is_control(row.task), row.task
     steps = (CARTPOLE_STEPS if "Cartpole" in task else CONTROL_STEPS) if task.startswith("MS-") else None

@@ -164,7 +164,7 @@ it nothing can be downloaded, and nothing can be asked on standard input.
   and `evaluate()` were equal to the last digit.
 * **restored**: the largest difference of any number of the state {again} control steps after a restore, from the run that
   was not interrupted, and in brackets from the run after a second restore. PhysX does not give out its contact
-  caches, so bodies that push each other go on a little differently; see the text of `workbench/core/snapshots/snapshot.py`.
+  caches, so bodies that push each other go on a little differently; see the text of `workbench/envs/snapshots/snapshot.py`.
 * **seconds**: the whole row but for *like stock*, on {cores} CPU cores that also drew the pictures in software; only good for
   comparing rows.
 

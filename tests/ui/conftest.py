@@ -10,10 +10,10 @@ from tests.drive.live import Live
 from tests.drive.panels import Clock, Panels
 from tests.drive.scripted import Evaluate, no_success, scripted
 from tests.drive.session import wait_until
-from workbench.core.camera_data import CameraInfo
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.app.session import Session
+from workbench.envs.camera_data import CameraInfo
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.task.description import TaskOptions
 
 
 @pytest.fixture

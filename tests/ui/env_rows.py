@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from workbench.core.capture.outliers import Outlier, OutlierKind
-from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
+from workbench.envs.outliers import Outlier, OutlierKind
+from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
 
 FELL = Outlier(OutlierKind.DROPPED, 12, "cube dropped 0.90 m")
 

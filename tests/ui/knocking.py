@@ -14,8 +14,8 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 from tests.drive.waiting import until
-from workbench.ui.server.access import cookie_name
-from workbench.ui.server.gated_server import GatedServer
+from workbench.page.door.access import cookie_name
+from workbench.page.door.gated_server import GatedServer
 
 PROTOCOL = f"viser-v{viser.__version__}"
 CAMERA = {

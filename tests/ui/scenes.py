@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import trimesh
 
-from workbench.authoring.problem import Problem
-from workbench.core.camera_data import CameraInfo, CameraKind
-from workbench.core.capture.outliers import OUTLIER_RULES
-from workbench.core.env.step_result import StepResult
-from workbench.core.rules import Finding
-from workbench.core.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual
-from workbench.jobs.task import ActionDimension, TaskDescription
-from workbench.session.live.view import SessionView
-from workbench.session.protocol.messages import Settings
-from workbench.session.protocol.questions import PlannedEnv
-from workbench.session.record.recording import RecordingStatus
+from workbench.envs.camera_data import CameraInfo, CameraKind
+from workbench.envs.gpu_rules import Finding
+from workbench.envs.outliers import OUTLIER_RULES
+from workbench.envs.scene.shapes import BodyKind, Material, Mesh, SceneGeometry, Visual
+from workbench.envs.step_result import StepResult
+from workbench.live.messages import Settings
+from workbench.live.view import SessionView
+from workbench.record.state import RecordingStatus
+from workbench.solve.questions import PlannedEnv
+from workbench.task.description import ActionDimension, TaskDescription
+from workbench.task.problem import Problem
 
 
 def box_mesh(size: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Mesh:
@@ -112,7 +113,9 @@ def description(geometry: SceneGeometry, cameras: tuple[CameraInfo, ...] = ()) -
     )
 
 
-EMPTY = SessionView(activity="a worker process", recording=RecordingStatus(folder="recordings"))
+EMPTY = SessionView(
+    activity="a worker process", features={RecordingStatus: RecordingStatus(folder="recordings")}
+)
 """A session that has just begun."""
 
 
@@ -149,7 +152,14 @@ def running(num_envs: int, *, selected_env: int = 0, speed: float = 1.0, **chang
         steps_per_second=20.0,
         real_time_factor=1.0,
     )
-    return replace(view, **changes)  # type: ignore[arg-type]
+    return changed(view, **changes)
+
+
+def changed(view: SessionView, **changes: Any) -> SessionView:
+    """The view with other fields, and with other views of features, by any name."""
+    own = {name: value for name, value in changes.items() if hasattr(EMPTY, name)}
+    features = {type(value): value for name, value in changes.items() if name not in own}
+    return replace(view, features={**view.features, **features}, **own)
 
 
 def problem(message: str = "KeyError: 'goal'") -> Problem:

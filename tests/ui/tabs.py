@@ -27,9 +27,9 @@ import zstandard
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
-from workbench.commands.command import Command
-from workbench.ui.server.access import cookie_name
-from workbench.ui.widgets.visitors import PATH
+from workbench.page.command import Command
+from workbench.page.door.access import cookie_name
+from workbench.page.widgets.visitors import PATH
 
 
 def handshake(url: str) -> tuple[str, dict[str, Any]]:

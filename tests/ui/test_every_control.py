@@ -15,16 +15,16 @@ from tests.drive.panels import inputs_of
 from tests.drive.scripted import scripted
 from tests.drive.session import wait_until
 from tests.ui.knocking import client
+from workbench.app.server import Workplace
+from workbench.app.session import Session
 from workbench.commands import COMMANDS
-from workbench.commands.command import Command, Refused, name_of
-from workbench.commands.library import OpenRow
-from workbench.commands.page import ShowLive, ShowRecordings
-from workbench.commands.review import ContinueLive
-from workbench.commands.tasks import CreateTask, OpenFoundTask, OpenListedTask
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import ServerOptions, open_server
+from workbench.library.commands import OpenRow
+from workbench.page.command import Command, Refused, name_of
+from workbench.page.commands import ShowLive, ShowRecordings
+from workbench.page.door.gated_server import ServerOptions, open_server
+from workbench.review.commands import ContinueLive
+from workbench.start.commands import CreateTask, OpenFoundTask, OpenListedTask
+from workbench.task.description import TaskOptions
 
 NASTY = (
     *(None, False, True, 0, 1, 2, 0.5, -1, 1e30, 2**63, -(2**63), 1e308, float("nan"), float("inf")),

@@ -1,1 +1,1 @@
-"""Checks of a task: what is wrong with it is said before a cluster says it."""
+"""Checks a task against rules, on the page and in jobs, and times a control step."""

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-from workbench.authoring.problem import Problem
-from workbench.core.rules import Finding
+from workbench.envs.gpu_rules import Finding
+from workbench.task.problem import Problem
 
 State = Literal["broken", "failed", "silenced", "not_known", "kept", "not_applicable"]
 """What a rule came to; where it came to several in one check, the first of these counts.

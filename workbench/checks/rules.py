@@ -5,8 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Collection, Mapping
 
-from workbench.core import rules as core_rules
-from workbench.core.rules import Degree, Rule
+from workbench.envs import gpu_rules as core_rules
+from workbench.envs.gpu_rules import Degree, Rule
+from workbench.envs.outliers import OUTLIER_RULES
 
 _TABLE = (
     # --- the class and its file -----------------------------------------------------------------------
@@ -228,13 +229,7 @@ _TABLE = (
         "Quaternions are in the order w, x, y, z.",
         "Bodies lie on their sides or upside down (x, y, z, w is SciPy's and ROS's order).",
     ),
-    Rule(
-        "bodies-stay",
-        "warn",
-        "While the task runs, bodies neither fly off nor fall out of the scene.",
-        "An episode without the body cannot be solved, and its numbers leave the range of all others.",
-        "step",
-    ),
+    OUTLIER_RULES["bodies-stay"],
     # --- evaluate --------------------------------------------------------------------------------------------
     Rule(
         "success-at-reset",
@@ -278,21 +273,9 @@ _TABLE = (
         "Vectorised wrappers and loggers cannot slice it by env, and fail or drop it.",
         "evaluate",
     ),
-    Rule(
-        "entries-finite",
-        "warn",
-        "Numbers that evaluate() returns are finite.",
-        "A mean over envs or episodes is NaN as soon as one of them is, and a comparison with NaN is false.",
-        "evaluate",
-    ),
+    OUTLIER_RULES["entries-finite"],
     # --- rewards ---------------------------------------------------------------------------------------------
-    Rule(
-        "reward-finite",
-        "stop",
-        "Rewards are finite, also at the edges of joints and table.",
-        "One NaN makes the whole network NaN.",
-        "compute_dense_reward",
-    ),
+    OUTLIER_RULES["reward-finite"],
     Rule(
         "reward-changes",
         "warn",
@@ -300,13 +283,7 @@ _TABLE = (
         "There is nothing to learn from.",
         "compute_dense_reward",
     ),
-    Rule(
-        "reward-normalized",
-        "warn",
-        "The normalized dense reward and the sparse one lie within -1 and 1.",
-        "Learning rates and clipping of trainers expect that range.",
-        "compute_normalized_dense_reward",
-    ),
+    OUTLIER_RULES["reward-normalized"],
     Rule(
         "reward-ratio",
         "warn",
@@ -357,13 +334,7 @@ _TABLE = (
         "step",
     ),
     # --- observations ----------------------------------------------------------------------------------------
-    Rule(
-        "observation-finite",
-        "stop",
-        "Observations are finite.",
-        "One NaN makes the whole network NaN.",
-        "_get_obs_extra",
-    ),
+    OUTLIER_RULES["observation-finite"],
     Rule(
         "observation-constant",
         "warn",

@@ -1,1 +1,1 @@
-"""The commands in a terminal."""
+"""The commands of the terminal, one module each."""

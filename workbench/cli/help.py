@@ -11,9 +11,9 @@ from rich.markdown import Markdown
 from rich.markup import escape
 from rich.table import Table
 
-from workbench.cli.terminal.output import Exit, out, refuse
+from workbench.app.help_pages import GROUPS, RULE_PAGES, Topic, by_path, find_topic, topics, topics_about
+from workbench.cli.output import Exit, out, refuse
 from workbench.machine.text import plain_text
-from workbench.ui.app.help_pages import GROUPS, RULE_PAGES, Topic, by_path, find_topic, topics, topics_about
 
 WIDEST = 100
 """Maximum width of the text in columns: longer lines are hard to read."""

@@ -13,8 +13,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from workbench.cli.jobs import commands as jobs
-from workbench.cli.terminal.arguments import (
+from workbench.cli import job_commands as jobs
+from workbench.cli.arguments import (
     EnvArguments,
     Imports,
     PageArguments,
@@ -24,11 +24,11 @@ from workbench.cli.terminal.arguments import (
     imported,
     with_new_names,
 )
-from workbench.cli.terminal.output import Exit, end_quietly, interrupted, lacks_maniskill, refuse, warn
-from workbench.jobs.task import ShownPictures
+from workbench.cli.output import Exit, end_quietly, interrupted, lacks_maniskill, refuse, warn
 from workbench.machine.processes.time_limit import end_after, end_limit
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.machine.text import guard_terminal
+from workbench.task.description import ShownPictures
 
 app = tyro.extras.SubcommandApp()
 # Commands import what they need when they are chosen, so that ``--help`` and a mistyped option answer at once.
@@ -62,10 +62,10 @@ def start(
             as of open.
     """
     from workbench.cli.page import start_in_terminal
-    from workbench.session.process.memory_limit import parse_memory
-    from workbench.session.process.supervisor import WorkerOptions
-    from workbench.ui.server.gated_server import ServerOptions
-    from workbench.ui.widgets.editor import parse_editor
+    from workbench.live.process.memory_limit import parse_memory
+    from workbench.live.process.supervisor import WorkerOptions
+    from workbench.page.door.gated_server import ServerOptions
+    from workbench.page.widgets.editor_links import parse_editor
 
     try:
         options = envs.options()
@@ -121,16 +121,16 @@ def open_page(
     """
     if lacks_maniskill("open"):
         return Exit.REFUSED
-    from workbench.authoring.loading.reference import why_missing
+    from workbench.task.reference import why_missing
 
     if (why := why_missing(task)) is not None:
         return refuse(why)
     from workbench.cli.page import open_in_terminal
+    from workbench.live.process.memory_limit import parse_memory
+    from workbench.live.process.supervisor import WorkerOptions
     from workbench.machine.processes.debugger import port_for_debugger
-    from workbench.session.process.memory_limit import parse_memory
-    from workbench.session.process.supervisor import WorkerOptions
-    from workbench.ui.server.gated_server import ServerOptions
-    from workbench.ui.widgets.editor import parse_editor
+    from workbench.page.door.gated_server import ServerOptions
+    from workbench.page.widgets.editor_links import parse_editor
 
     try:
         options = envs.options()
@@ -204,16 +204,16 @@ def review(
     for file in task:
         if not file.is_file():
             return refuse(f"there is no file {file}")
-    from workbench.recording.reader.reading import start_reading
+    from workbench.episodes.reader.reading import start_reading
 
     # Meanwhile the page is imported.
     start_reading()
     from workbench.cli.page import review_in_terminal
-    from workbench.jobs.task import TaskOptions
-    from workbench.session.process.memory_limit import parse_memory
-    from workbench.session.process.supervisor import WorkerOptions
-    from workbench.ui.server.gated_server import ServerOptions
-    from workbench.ui.widgets.editor import parse_editor
+    from workbench.live.process.memory_limit import parse_memory
+    from workbench.live.process.supervisor import WorkerOptions
+    from workbench.page.door.gated_server import ServerOptions
+    from workbench.page.widgets.editor_links import parse_editor
+    from workbench.task.description import TaskOptions
 
     try:
         at = ServerOptions(**vars(page))
@@ -291,8 +291,8 @@ def export(
         assert maniskill is not None
         return demonstrations_in_terminal(files, maniskill, only_successes, only_fitting)
     from workbench.cli.share import export_in_terminal
-    from workbench.recording.lerobot.export import ExportOptions
-    from workbench.recording.lerobot.format import Choice
+    from workbench.episodes.lerobot.export import ExportOptions
+    from workbench.episodes.lerobot.format import Choice
 
     choice = Choice(state, environment_state, cameras)
     return export_in_terminal(files, lerobot, ExportOptions(choice, only_successes, only_fitting, task, fps))

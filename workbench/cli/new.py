@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from workbench.authoring.templates.new_task import TEMPLATES, CannotBegin, why_not_name, write_new_task
-from workbench.cli.terminal.output import Exit, can_ask, out, print_text, refuse
+from workbench.cli.output import Exit, can_ask, out, print_text, refuse
 from workbench.machine.text import plain_text
+from workbench.task.new_task import TEMPLATES, CannotBegin, why_not_name, write_new_task
 
 
 def new_in_terminal(name: str, origin: str) -> int:

@@ -16,31 +16,23 @@ from typing import NoReturn
 from rich.markup import escape
 
 import workbench
-from workbench.authoring.loading.reference import TaskName, named_file
-from workbench.cli.terminal.output import (
-    out,
-    print_addresses,
-    print_event,
-    print_line,
-    print_text,
-    refuse,
-    warn,
-)
-from workbench.core.capture.recorded_run import HOW_IT_IS_RUN
-from workbench.jobs.task import ShownPictures, TaskOptions
+from workbench.app.open_task import Choices
+from workbench.app.pages import Which
+from workbench.app.server import Workplace
+from workbench.app.session import HISTORY_BYTES, KeptWork, Session
+from workbench.cli.output import out, print_addresses, print_event, print_line, print_text, refuse, warn
+from workbench.envs.recorded_run import HOW_IT_IS_RUN
+from workbench.episodes.reader.reading import start_reading
+from workbench.live.messages import Event, Loaded, LoadFailed
+from workbench.live.process.supervisor import WorkerOptions
 from workbench.machine.kept_choices import kept_choices
+from workbench.machine.loop import Aside, loop_in_main, on_signal
 from workbench.machine.software_vulkan import use_private_driver
-from workbench.recording.reader.reading import start_reading
-from workbench.session.live.session import HISTORY_BYTES, KeptWork, Session
-from workbench.session.loop import Aside, loop_in_main, on_signal
-from workbench.session.process.supervisor import WorkerOptions
-from workbench.session.protocol.messages import Event, Loaded, LoadFailed
-from workbench.session.tasks.recents import RecentTasks
-from workbench.ui.app.open_task import Choices
-from workbench.ui.app.pages import Which
-from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
-from workbench.ui.server.listening import ServerError
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.listening_socket import ServerError
+from workbench.start.recents import RecentTasks
+from workbench.task.description import ShownPictures, TaskOptions
+from workbench.task.reference import TaskName, named_file
 
 _CLOSING_SECONDS = 1.4
 """Seconds without a written episode after which closing is given up: a disk may hang."""

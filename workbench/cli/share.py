@@ -11,20 +11,12 @@ from typing import TYPE_CHECKING
 
 from rich.progress import TimeRemainingColumn
 
-from workbench.cli.terminal.output import (
-    Exit,
-    interrupted,
-    print_addresses,
-    print_text,
-    progress_bar,
-    refuse,
-    warn,
-)
+from workbench.cli.output import Exit, interrupted, print_addresses, print_text, progress_bar, refuse, warn
 
 if TYPE_CHECKING:
-    from workbench.recording.episode.row import Source
-    from workbench.recording.lerobot.export import ExportOptions
-    from workbench.ui.share.make import Made, MakeRequest
+    from workbench.episodes.lerobot.export import ExportOptions
+    from workbench.episodes.row import Source
+    from workbench.share.make import Made, MakeRequest
 
 SCENE, CAMERAS = "scene", "cameras"
 
@@ -37,7 +29,7 @@ def share_in_terminal(
     out: Path,
 ) -> int:
     """Make films, pages and sheets of recordings; returns the exit code."""
-    from workbench.ui.share.make import EVERY_CAMERA, MakeRequest
+    from workbench.share.make import EVERY_CAMERA, MakeRequest
 
     def requests(sources: tuple[Source, ...]) -> list[MakeRequest]:
         films = [
@@ -59,7 +51,7 @@ def share_in_terminal(
 
 def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptions) -> int:
     """Make a LeRobot dataset of recordings; returns the exit code."""
-    from workbench.ui.share.make import MakeRequest
+    from workbench.share.make import MakeRequest
 
     return _make_all(files, lambda sources: [MakeRequest("lerobot", sources, folder, export=options)])
 
@@ -68,19 +60,19 @@ def demonstrations_in_terminal(
     files: Sequence[Path], file: Path, only_successes: bool, only_fitting: bool
 ) -> int:
     """Make one file of ManiSkill's demonstrations of recordings; returns the exit code."""
-    from workbench.recording.lerobot.export import ExportOptions
-    from workbench.ui.share.make import MakeRequest
+    from workbench.episodes.lerobot.export import ExportOptions
+    from workbench.share.make import MakeRequest
 
     options = ExportOptions(only_successes=only_successes, only_fitting=only_fitting)
     return _make_all(files, lambda sources: [MakeRequest("maniskill", sources, file, export=options)])
 
 
 def _make_all(files: Sequence[Path], requests_of: Callable[[tuple[Source, ...]], list[MakeRequest]]) -> int:
-    from workbench.recording.episode.row import UnreadableRecording
-    from workbench.recording.lerobot.export import DoesNotFit
-    from workbench.recording.maniskill.export import OtherDemonstration
-    from workbench.recording.reader.reading import find_all_sources
-    from workbench.ui.share.make import make
+    from workbench.episodes.lerobot.export import DoesNotFit
+    from workbench.episodes.maniskill.export import OtherDemonstration
+    from workbench.episodes.reader.reading import find_all_sources
+    from workbench.episodes.row import UnreadableRecording
+    from workbench.share.make import make
 
     try:
         requests = requests_of(find_all_sources(files))
@@ -132,7 +124,7 @@ def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> 
 
     In a window, or with `web` or without a screen in a page.
     """
-    from workbench.recording.rerun.viewer import has_screen, open_window, resolve_recordings
+    from workbench.episodes.rerun.viewer import has_screen, open_window, resolve_recordings
 
     try:
         if web or not has_screen(os.environ):
@@ -152,10 +144,10 @@ def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> 
 
 
 def _in_page(files: Sequence[Path], host: str, port: int) -> int:
-    from workbench.recording.rerun.viewer import web_viewer_folder
-    from workbench.ui.server.file_response import Downloads
-    from workbench.ui.server.gated_server import ServerOptions, open_server
-    from workbench.ui.share.rerun_view import RerunPages
+    from workbench.episodes.rerun.viewer import web_viewer_folder
+    from workbench.page.door.file_response import Downloads
+    from workbench.page.door.gated_server import ServerOptions, open_server
+    from workbench.share.rerun_panel import RerunPages
 
     web_viewer_folder()
     gated_server = open_server(ServerOptions(host=host, port=port))

@@ -1,1 +1,1 @@
-"""Work that needs no page: a task opened, recorded, replayed and rescored, in one process or several."""
+"""Deals the items of a job to workers in this process, in others, or on a Ray cluster."""

@@ -38,7 +38,7 @@ CHILD_TIMEOUT_S = 120
 
 GPU_QUESTIONS = """
 import json, torch
-from workbench.core.backends import gpu_library_path, why_no_gpu_simulation
+from workbench.envs.backends import gpu_library_path, why_no_gpu_simulation
 cuda = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
 print(json.dumps({"built": torch.version.cuda, "cuda": cuda,
                   "why_not": why_no_gpu_simulation(), "library": str(gpu_library_path())}))

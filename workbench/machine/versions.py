@@ -183,3 +183,16 @@ def moved_text(moved: Iterable[PrivateName]) -> str:
         lacking.setdefault(each.disables or "opening a task", []).append(each.dotted)
     features = "; ".join(f"{feature} (needs {', '.join(names)})" for feature, names in lacking.items())
     return f"Not possible with the installed versions: {features}." if features else ""
+
+
+def rerun_notice() -> str:
+    """Notice of what a rerun version without tests does not allow; empty if nothing."""
+    if not untested(["rerun-sdk"]):
+        return ""  # rerun is not imported to open a task: it takes 0.3 s
+    try:
+        import rerun.blueprint  # noqa: F401
+        from rerun.chunk import Chunk, LazyStore, RrdReader  # noqa: F401
+        from rerun.error_utils import RerunWarning, catch_and_log_exceptions  # noqa: F401
+    except ImportError as error:
+        return f"Recordings are not possible: {error}. {untested_text()}"
+    return ""

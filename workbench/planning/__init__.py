@@ -1,1 +1,1 @@
-"""Plans actions by rollouts of the author's own task, and says what the rollouts tell of its reward."""
+"""Plans actions by rollouts of the author's own task, and reports what the rollouts show about its reward."""

@@ -10,10 +10,10 @@ import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.core.env import actions
-from workbench.core.env_numbers import envs_of_batch
-from workbench.core.maniskill_private import episode_seeds, open_env
-from workbench.core.snapshots.snapshot import take_snapshot
+from workbench.envs import action_vector as actions
+from workbench.envs.indices import envs_of_batch
+from workbench.envs.maniskill_private import episode_seeds, open_env
+from workbench.envs.snapshots.snapshot import take_snapshot
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import Plan, RolloutPlanner, make_rollout_env, require_plannable
 

@@ -14,13 +14,13 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController, PDJ
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.core.env import actions
-from workbench.core.env.keywords import control_mode_of
-from workbench.core.env.task_env import EnvOptions, build_env
-from workbench.core.maniskill_private import task_class
-from workbench.core.scene.scene_index import once_a_scene, read_poses, scene_index
-from workbench.core.snapshots.rng import read_shared_rng, write_shared_rng
-from workbench.core.snapshots.snapshot import Snapshot, restore_snapshot
+from workbench.envs import action_vector as actions
+from workbench.envs.keywords import control_mode_of
+from workbench.envs.maniskill_private import task_class
+from workbench.envs.scene.scene_index import once_a_scene, read_poses, scene_index
+from workbench.envs.snapshots.rng import read_shared_rng, write_shared_rng
+from workbench.envs.snapshots.snapshot import Snapshot, restore_snapshot
+from workbench.envs.task_env import EnvOptions, build_env
 from workbench.planning.options import PlanOptions
 from workbench.planning.sampling import Sampler
 
@@ -208,7 +208,7 @@ class RolloutPlanner:
         The process's random generators are left as they were.
 
         Args:
-            traced: the body, by its place in `core.scene.scene_index.SceneIndex.names`, that `Plan.paths` follows.
+            traced: the body, by its place in `envs.scene.scene_index.SceneIndex.names`, that `Plan.paths` follows.
 
         Raises:
             KeyError: the env's episode was not begun.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.planning.episodes import PlannedEpisode
+from workbench.planning.planned_episodes import PlannedEpisode
 
 _SAME = 0.002
 """Rewards count as equal if they differ by less than this fraction of the range of all rewards seen."""

@@ -17,13 +17,13 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 
-from workbench.authoring.camera_source.cameras import HOOKS as KINDS
-from workbench.authoring.camera_source.cameras import HookCameras, RunHooks
-from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.authoring.camera_source.run_hooks import hook_camera, owners, recording_calls
-from workbench.authoring.source.text import RefusedEdit
-from workbench.core.camera_data import CameraKey, CameraSettings
-from workbench.core.maniskill_private import parse_cameras
+from workbench.cameras.edit.hook_cameras import HOOKS as KINDS
+from workbench.cameras.edit.hook_cameras import HookCameras, RunHooks
+from workbench.cameras.edit.run_hooks import hook_camera, owners, recording_calls
+from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.envs.maniskill_private import parse_cameras
+from workbench.source.parsed import RefusedEdit
+from workbench.task.apply_edits import SourceEdit
 
 FILE = "/author/task.py"
 HEADER = """\

@@ -13,16 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from workbench.authoring.camera_source.calibration_files import (
+from workbench.cameras.calibration_files import (
     CameraToExport,
     camera_pose,
     cameras_as_json,
     cameras_as_opencv_yaml,
     find_poses,
 )
-from workbench.core.camera_data import CameraSettings
-from workbench.core.cameras import conventions as frames
-from workbench.core.cameras.conventions import LookAt
+from workbench.envs.camera_data import CameraSettings
+from workbench.pictures import camera_conventions as frames
+from workbench.pictures.camera_conventions import LookAt
 
 POSE = frames.pose_from_look_at(LookAt((0.5, -0.4, 0.7), (0.0, 0.1, 0.05), 0.2))
 PLAIN = CameraSettings((0, 0, 0), (1, 0, 0, 0), 0.9, None, 320, 240, 0.01, 10.0, "minimal")

@@ -13,10 +13,10 @@ import pytest
 
 from tests.authoring.camera_source.real_cameras import FILE, real_settings, run_class
 from tests.authoring.camera_source.shapes import WRITTEN
-from workbench.authoring.camera_source.disk import FileChange, SourceEdit, apply, revert
-from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.loading.modules import exact_text
-from workbench.authoring.source.text import RefusedEdit, plain_line_ends
+from workbench.cameras.edit.plan import plan_edit
+from workbench.source.parsed import RefusedEdit, plain_line_ends
+from workbench.task.apply_edits import FileChange, SourceEdit, apply, revert
+from workbench.task.modules import exact_text
 
 SOURCE = WRITTEN["an argument a line, with remarks"]
 

@@ -28,14 +28,14 @@ from tests.authoring.camera_source.real_cameras import (
 )
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
 from tests.drive.tiers import tries
-from workbench.authoring.camera_source.cameras import HOOKS as KINDS
-from workbench.authoring.camera_source.cameras import changed_fields
-from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.authoring.camera_source.members import plan_add, plan_duplicate, plan_remove, plan_rename
-from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.source.text import RefusedEdit
-from workbench.core.camera_data import CameraKey, CameraKind, CameraSettings
-from workbench.core.cameras.conventions import angle_between
+from workbench.cameras.edit.hook_cameras import HOOKS as KINDS
+from workbench.cameras.edit.hook_cameras import changed_fields
+from workbench.cameras.edit.members import plan_add, plan_duplicate, plan_remove, plan_rename
+from workbench.cameras.edit.plan import plan_edit
+from workbench.envs.camera_data import CameraKey, CameraKind, CameraSettings
+from workbench.pictures.camera_conventions import angle_between
+from workbench.source.parsed import RefusedEdit
+from workbench.task.apply_edits import SourceEdit
 
 NEW = CameraSettings((0.1, 0.25, 1.5), (0.5, 0.5, 0.5, -0.5), 1.25, None, 64, 48, 0.02, 12.0, "default")
 HUMAN = "_default_human_render_camera_configs"

@@ -14,12 +14,12 @@ import pytest
 from mani_skill.sensors.camera import CameraConfig
 
 from tests.authoring.camera_source.real_cameras import close, looking, settings_of
-from workbench.authoring.camera_source.cameras import HOOKS, HookCameras
-from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.camera_source.run_hooks import hook_camera, recording_calls
-from workbench.core.camera_data import CameraKey
-from workbench.core.maniskill_private import parse_cameras
+from workbench.cameras.edit.hook_cameras import HOOKS, HookCameras
+from workbench.cameras.edit.plan import plan_edit
+from workbench.cameras.edit.run_hooks import hook_camera, recording_calls
+from workbench.envs.camera_data import CameraKey
+from workbench.envs.maniskill_private import parse_cameras
+from workbench.task.apply_edits import SourceEdit
 
 pytestmark = pytest.mark.thorough
 

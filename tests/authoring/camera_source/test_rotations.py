@@ -12,9 +12,9 @@ from mani_skill.utils import sapien_utils
 from transforms3d.euler import euler2quat
 from transforms3d.quaternions import quat2mat
 
-from workbench.authoring.camera_source.write_pose import look_at, to_euler
-from workbench.authoring.source.changes import quaternion_texts
-from workbench.core.cameras.conventions import angle_between
+from workbench.cameras.edit.write_pose import look_at, to_euler
+from workbench.pictures.camera_conventions import angle_between
+from workbench.source.traced_edits import quaternion_texts
 
 turns = st.floats(-2 * math.pi, 2 * math.pi)
 parts = st.floats(-1, 1)

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from tests.authoring.camera_source.real_cameras import FILE, HEADER, planned, real_settings, run_as, run_class
-from workbench.authoring.camera_source.cameras import HookCameras, RunHooks
-from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.authoring.camera_source.plan import plan_edit
-from workbench.authoring.source.text import Place, Read, RefusedEdit
-from workbench.core.camera_data import CameraKey, CameraSettings
+from workbench.cameras.edit.hook_cameras import HookCameras, RunHooks
+from workbench.cameras.edit.plan import plan_edit
+from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.source.parsed import Place, Read, RefusedEdit
+from workbench.task.apply_edits import SourceEdit
 
 TWO = HEADER + dedent(
     """\

@@ -8,7 +8,7 @@ from pathlib import Path
 import mani_skill.envs.tasks
 import pytest
 
-from workbench.authoring.loading.copy_task import CannotCopy, copied_text, copy_task
+from workbench.task.copy import CannotCopy, copied_text, copy_task
 
 TASKS = Path(mani_skill.envs.tasks.__path__[0])
 TEXT = '''"""A task."""

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workbench.authoring.loading.find_tasks import find_task_files, is_below, read_task_file
+from workbench.task.find import find_task_files, is_below, read_task_file
 
 REGISTERED = (
     'open({mark!r}, "w")\n@register_env("Push-v1", max_episode_steps=50)\nclass PushEnv(BaseEnv):\n    pass\n'

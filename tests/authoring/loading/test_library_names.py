@@ -8,9 +8,9 @@ import sys
 import pytest
 
 from tests.authoring.conftest import Write
-from workbench.authoring.loading.load import load_task
-from workbench.authoring.problem import TaskError
-from workbench.jobs.policy import load_policy
+from workbench.actions.policy import load_policy
+from workbench.task.load import load_task
+from workbench.task.problem import TaskError
 
 pytestmark = pytest.mark.thorough
 

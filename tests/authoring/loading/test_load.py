@@ -19,11 +19,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.authoring.refusal import refused
 from tests.authoring.registered import registered
-from workbench.authoring.loading.load import (
-    load_task,
-    undo_load,
-    with_late_imports,
-)
+from workbench.task.load import load_task, undo_load, with_late_imports
 
 pytestmark = pytest.mark.thorough
 

@@ -11,16 +11,16 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.authoring.conftest import Write
 from tests.authoring.refusal import refused
-from workbench.authoring.loading import library_names
-from workbench.authoring.loading.load import class_of_module, import_modules, load_task, undo_load
-from workbench.authoring.loading.reference import (
+from workbench.task import library_names
+from workbench.task.load import class_of_module, import_modules, load_task, undo_load
+from workbench.task.problem import TaskError
+from workbench.task.reference import (
     RecordedTask,
     followed_folder,
     named_file,
     reference_to_class,
     why_missing,
 )
-from workbench.authoring.problem import TaskError
 
 TASK = """
 from lab_of_mine.robots.arm import REACH

@@ -15,7 +15,7 @@ from mani_skill.utils import assets
 from mani_skill.utils import registration as env_registration
 
 from tests.authoring.registered import TABLES, registered
-from workbench.authoring.loading import registry
+from workbench.task import registry
 
 THIS_FILE = __file__
 

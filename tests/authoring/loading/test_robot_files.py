@@ -6,7 +6,7 @@ import pytest
 
 from tests.authoring.conftest import Write
 from tests.authoring.refusal import refused
-from workbench.authoring.loading.load import load_task, undo_load
+from workbench.task.load import load_task, undo_load
 
 ROBOTS = """
 from mani_skill.agents.registration import register_agent

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.loading.load import load_task
-from workbench.authoring.loading.reference import RecordedTask
-from workbench.authoring.loading.task_content import CannotRead, read_content
-from workbench.authoring.problem import TaskError
+from workbench.task.content import CannotRead, read_content
+from workbench.task.load import load_task
+from workbench.task.problem import TaskError
+from workbench.task.reference import RecordedTask
 
 TASK = "from mani_skill.envs.sapien_env import BaseEnv\nclass Lift(BaseEnv):\n    pass\n"
 

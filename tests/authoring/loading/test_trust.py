@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.loading import trust
-from workbench.authoring.loading.task_content import TaskContent
-from workbench.authoring.loading.trust import STORE_FILE, TrustStore
+from workbench.task.content import TaskContent
+from workbench.trust import store as trust
+from workbench.trust.store import STORE_FILE, TrustStore
 
 
 def content(text: str = "a", file: str = "/author/push.py") -> TaskContent:

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.loading import watch
-from workbench.authoring.loading.watch import SourceWatcher
+from workbench.task import watch
+from workbench.task.watch import SourceWatcher
 
 pytestmark = pytest.mark.thorough
 

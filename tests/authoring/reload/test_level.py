@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.reload.level import Change, Inherited, find_change, removed_effects
+from workbench.task.reload_level import Change, Inherited, find_change, removed_effects
 
 FILE = "/author/task.py"
 PUSH_CUBE = (Path(__file__).parents[3] / "tasks" / "push_cube.py").read_text()

@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drive.session import TASKS
-from workbench.authoring.reload.level import Inherited, find_change
-from workbench.core.env.step_result import StepResult
-from workbench.core.env.task_env import TaskEnv
-from workbench.jobs.open_task import open_task
-from workbench.jobs.task import TaskOptions
-from workbench.session.protocol.messages import Load
-from workbench.session.worker.reload import Running, load_version
+from workbench.envs.step_result import StepResult
+from workbench.envs.task_env import TaskEnv
+from workbench.live.messages import Load
+from workbench.live.worker.reload import Running, load_version
+from workbench.task.description import TaskOptions
+from workbench.task.open import open_task
+from workbench.task.reload_level import Inherited, find_change
 
 pytestmark = pytest.mark.thorough
 

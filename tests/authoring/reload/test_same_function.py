@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from workbench.authoring.reload.call_graph import line_in
+from workbench.task.call_graph import line_in
 
 OLD = '''
 LIMIT = 3

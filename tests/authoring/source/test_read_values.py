@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tests.authoring.camera_source.real_cameras import FILE, modules
-from workbench.authoring.source.names import Project
-from workbench.authoring.source.read_values import DEGREE, trace_call
-from workbench.authoring.source.text import Trace, TracedValue
+from workbench.source.definitions import Project
+from workbench.source.parsed import Trace, TracedValue
+from workbench.source.read_values import DEGREE, trace_call
 
 HEAD = """\
 import math

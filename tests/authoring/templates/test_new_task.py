@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.loading.find_tasks import TaskFile, read_task_file
-from workbench.authoring.loading.load import load_task
-from workbench.authoring.templates.new_task import (
+from workbench.machine.folders import example_tasks
+from workbench.task.find import TaskFile, read_task_file
+from workbench.task.load import load_task
+from workbench.task.new_task import (
     LONGEST_NAME,
     TEMPLATES,
     CannotBegin,
@@ -20,7 +21,6 @@ from workbench.authoring.templates.new_task import (
     why_not_name,
     write_new_task,
 )
-from workbench.machine.folders import example_tasks
 
 pytestmark = pytest.mark.thorough
 

@@ -17,8 +17,8 @@ from mani_skill.utils import sapien_utils
 from numpy.testing import assert_allclose
 
 from tests.core.stock_env import Bare, batch_of
-from workbench.core.cameras import conventions as frames
-from workbench.core.cameras.conventions import LookAt
+from workbench.pictures import camera_conventions as frames
+from workbench.pictures.camera_conventions import LookAt
 
 fewer = settings(max_examples=50)
 numbers = st.floats(-10, 10, allow_subnormal=False)

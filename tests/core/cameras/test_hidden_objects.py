@@ -19,9 +19,9 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.stock_env import Bare, batch_of, single
 from tests.core.watched import RENDERED, pictures
-from workbench.core.cameras.render import take_pictures
-from workbench.core.scene.scene_index import read_poses, scene_index
-from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.scene.scene_index import read_poses, scene_index
+from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.pictures.render import take_pictures
 
 N = 3
 SENSOR, PEOPLE = ("beside", "sensor", ("rgb", "segmentation")), ("people", "human", ("rgb",))

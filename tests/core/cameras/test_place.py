@@ -16,11 +16,11 @@ from mani_skill.sensors.camera import CameraConfig
 
 from tests.core.stock_env import batch_of
 from tests.core.watched import RENDERED, Watched, pictures
-from workbench.core.camera_data import CameraKey, CameraSettings
-from workbench.core.cameras.place import PlacedCameras
-from workbench.core.cameras.render import list_cameras, segmentation_names, take_pictures
-from workbench.core.env.hot_swap import exchange_cameras
-from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.envs.hot_swap import exchange_cameras
+from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.pictures.placed_cameras import PlacedCameras
+from workbench.pictures.render import list_cameras, segmentation_names, take_pictures
 
 N = 2
 SEEDS = [4, 5]

@@ -19,9 +19,9 @@ from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import REGISTERED_ENVS, register_env
 
 import workbench
-from workbench.core import camera_shader
-from workbench.core.backends import why_no_ray_tracing
-from workbench.core.cameras.render import list_cameras, take_pictures
+from workbench.envs.backends import why_no_ray_tracing
+from workbench.envs.rendering import camera_shader
+from workbench.pictures.render import list_cameras, take_pictures
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

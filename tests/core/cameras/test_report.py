@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from workbench.core.cameras.report import (
-    CameraReport,
-    DepthReport,
-    ObjectSeen,
-    join_reports,
-)
+from workbench.pictures.camera_report import CameraReport, DepthReport, ObjectSeen, join_reports
 
 NAN = float("nan")
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tests.drive.envs import batched
-from workbench.core.camera_data import CameraSettings
-from workbench.core.cameras.conventions import axes_of
-from workbench.core.cameras.render import segmentation_names
-from workbench.core.cameras.report import CameraReport, SearchSpace, join_reports
-from workbench.core.cameras.search import score_of, suggest_cameras
-from workbench.core.cameras.visibility import Placement, measure_placement, objects_to_see
+from workbench.envs.camera_data import CameraSettings
+from workbench.pictures.camera_conventions import axes_of
+from workbench.pictures.camera_report import CameraReport, SearchSpace, join_reports
+from workbench.pictures.camera_search import score_of, suggest_cameras
+from workbench.pictures.render import segmentation_names
+from workbench.pictures.visibility import Placement, measure_placement, objects_to_see
 
 N = 2
 LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 0.9, None, 96, 64, 0.01, 100, "minimal")

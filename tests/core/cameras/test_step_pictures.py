@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.core.drawn_envs import batched
-from workbench.core.cameras import render as module
-from workbench.core.cameras.render import list_cameras, recorded_pictures, step_pictures, take_pictures
-from workbench.core.env.task_env import TaskEnv
+from workbench.envs.task_env import TaskEnv
+from workbench.pictures import render as module
+from workbench.pictures.render import list_cameras, recorded_pictures, step_pictures, take_pictures
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

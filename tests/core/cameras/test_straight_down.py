@@ -15,9 +15,9 @@ from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import REGISTERED_ENVS, register_env
 
 import workbench
-from workbench.core.cameras.render import take_pictures
-from workbench.core.cameras.visibility import picture_of, placement_of
-from workbench.core.scene.scene_index import read_poses
+from workbench.envs.scene.scene_index import read_poses
+from workbench.pictures.render import take_pictures
+from workbench.pictures.visibility import picture_of, placement_of
 
 ID = "SeenFromAbove-v1"
 

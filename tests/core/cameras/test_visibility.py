@@ -13,18 +13,18 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.drive.envs import batched
-from workbench.core.camera_data import CameraKey, CameraSettings
-from workbench.core.cameras.conventions import LookAt, compose, pose_from_look_at, relative_to, with_pose
-from workbench.core.cameras.render import cameras_of, segmentation_names, take_pictures
-from workbench.core.cameras.report import CameraReport, ObjectSeen, join_reports
-from workbench.core.cameras.visibility import (
+from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.envs.scene.scene_index import read_poses, scene_index
+from workbench.pictures.camera_conventions import LookAt, compose, pose_from_look_at, relative_to, with_pose
+from workbench.pictures.camera_report import CameraReport, ObjectSeen, join_reports
+from workbench.pictures.render import cameras_of, segmentation_names, take_pictures
+from workbench.pictures.visibility import (
     Placement,
     measure_placement,
     placement_of,
     present_settings,
     small_size,
 )
-from workbench.core.scene.scene_index import read_poses, scene_index
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

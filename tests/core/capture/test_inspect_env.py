@@ -14,13 +14,13 @@ import pytest
 import torch
 
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core import maniskill_private
-from workbench.core.capture.inspect_env import inspect_env
-from workbench.core.capture.inspection import SECTIONS
-from workbench.core.env import actions
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.scene.scene_index import scene_index
-from workbench.core.simulation.cpu_system import batched_system
+from workbench.envs import action_vector as actions
+from workbench.envs import maniskill_private
+from workbench.envs.inspect_env import inspect_env
+from workbench.envs.inspection import SECTIONS
+from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.simulation.cpu_system import batched_system
+from workbench.envs.task_env import TaskEnv
 
 
 def opened(task: str | type, num_envs: int = 3, steps: int = 4, **kwargs: Any) -> TaskEnv:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.ui.scenes import step_of, table_scene
-from workbench.core.capture.outliers import OutlierKind, OutlierWatch, lowest_still_point
+from workbench.envs.outliers import OutlierKind, OutlierWatch, lowest_still_point
 
 
 def watched(num_envs: int, reward_mode: str = "dense") -> tuple[OutlierWatch, np.ndarray]:

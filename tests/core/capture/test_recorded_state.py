@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from workbench.core.capture.recorded_state import state_distance
+from workbench.episodes.recorded_state import state_distance
 
 
 def test_a_state_is_as_far_as_its_furthest_body_and_joint() -> None:

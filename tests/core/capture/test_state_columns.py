@@ -11,10 +11,10 @@ import torch
 from mani_skill.utils import common
 
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core.capture.recorded_run import states_of
-from workbench.core.capture.state_columns import StateReading, read_state_columns
-from workbench.core.env.hot_swap import put_class
-from workbench.core.env.task_env import TaskEnv
+from workbench.envs.hot_swap import put_class
+from workbench.envs.recorded_run import states_of
+from workbench.envs.state_columns import StateReading, read_state_columns
+from workbench.envs.task_env import TaskEnv
 
 
 def made(env_id: str, num_envs: int = 3, **kwargs: Any) -> TaskEnv:

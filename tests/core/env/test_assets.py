@@ -15,7 +15,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import assets, download_asset
 
 from tests.drive.envs import batched
-from workbench.core.env.assets import MissingAssets, assets_at, refuse_downloads, require_assets
+from workbench.envs.assets import MissingAssets, assets_at, refuse_downloads, require_assets
 
 NOT_HERE = "anymal_c"
 
@@ -71,7 +71,7 @@ def test_a_question_and_a_download_become_errors_and_are_given_back(
 def test_a_file_that_a_download_would_bring_is_looked_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.core.env.assets.ASSET_DIR", tmp_path)
+    monkeypatch.setattr("workbench.envs.assets.ASSET_DIR", tmp_path)
     missing = tmp_path / "scene_datasets" / "ai2thor" / "some.json"
     with pytest.raises(MissingAssets, match="download_asset AI2THOR") as caught, refuse_downloads("Some"):
         missing.read_text()

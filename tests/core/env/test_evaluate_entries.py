@@ -18,10 +18,10 @@ import workbench
 from tests.drive.entries import ENTRIES, Mute
 from tests.drive.envs import CPU, batched
 from tests.session.odd_entries import write_task
-from workbench.authoring.loading.load import load_task
-from workbench.core.env.evaluate_entries import MOST_ENTRIES, MOST_LETTERS, split_entries
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.maniskill_private import open_env
+from workbench.envs.evaluate_entries import MOST_ENTRIES, MOST_LETTERS, split_entries
+from workbench.envs.maniskill_private import open_env
+from workbench.envs.task_env import TaskEnv
+from workbench.task.load import load_task
 
 N = 4
 EACH = torch.arange(float(N))

@@ -12,11 +12,11 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PUSH_CUBE, batched
-from workbench.core.env.hot_swap import put_class, rehearse_hooks
+from workbench.envs.hot_swap import put_class, rehearse_hooks
 
 pytestmark = [
     pytest.mark.thorough,
-    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
+    pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 N = 3
 HOOKS = ["_initialize_episode", "evaluate"]

@@ -19,9 +19,9 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core import draws_goals
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core.broken_rule import BrokenRule
-from workbench.core.env.hot_swap import put_class
-from workbench.core.rules import Finding
+from workbench.envs.broken_rule import BrokenRule
+from workbench.envs.gpu_rules import Finding
+from workbench.envs.hot_swap import put_class
 
 pytestmark = pytest.mark.thorough
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.core.env.keywords import (
+from workbench.envs.keywords import (
     Keyword,
     as_json,
     constructor_arguments,

@@ -6,7 +6,7 @@ import mani_skill.envs  # noqa: F401  registers the ids
 import pytest
 import sapien.physx as physx
 
-from workbench.core.env.cpu_scene import free_thread_keys, require_scenes
+from workbench.envs.cpu_scene import free_thread_keys, require_scenes
 
 
 def test_each_physx_scene_takes_a_key_and_gives_it_back() -> None:

@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from workbench.core.env.step_result import OtherEntry, StepResult
+from workbench.envs.step_result import OtherEntry, StepResult
 
 
 def test_every_field_counts() -> None:

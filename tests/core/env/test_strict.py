@@ -22,9 +22,9 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core.broken_rule import BrokenRule, NeedsOneEnv, RuleWarning, WrongReturn
-from workbench.core.env.task_env import EnvOptions, make_env
-from workbench.core.snapshots.cpu_state import renew_physics
+from workbench.envs.broken_rule import BrokenRule, NeedsOneEnv, RuleWarning, WrongReturn
+from workbench.envs.snapshots.cpu_state import renew_physics
+from workbench.envs.task_env import EnvOptions, make_env
 
 pytestmark = pytest.mark.thorough
 

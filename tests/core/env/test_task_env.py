@@ -19,11 +19,11 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.core.stock_env import Bare
 from tests.drive.envs import PUSH_CUBE, batched, stock
-from workbench.core import backends
-from workbench.core.backends import choose_backend
-from workbench.core.env import actions
-from workbench.core.env.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
-from workbench.core.scene.scene_index import scene_index
+from workbench.envs import action_vector as actions
+from workbench.envs import backends
+from workbench.envs.backends import choose_backend
+from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
 
 pytestmark = pytest.mark.thorough
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import workbench
-from workbench.core.env.wrong_options import WrongOption
+from workbench.envs.wrong_options import WrongOption
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

@@ -10,7 +10,7 @@ import sapien
 import sapien.render
 
 from tests.ui.scenes import box_mesh
-from workbench.core.scene.in_view import cut_to_view, is_outside, outside_and_inside, planes_of
+from workbench.envs.rendering.in_view import cut_to_view, is_outside, outside_and_inside, planes_of
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ import sapien.render
 from numpy.typing import NDArray
 
 from tests.core.drawn_envs import batched
-from workbench.core.maniskill_private import camera_components
-from workbench.core.scene.fast_shapes import shown
-from workbench.core.scene.lean_materials import LeanBody, LeanMaterials
+from workbench.envs.maniskill_private import camera_components
+from workbench.envs.rendering.fast_shapes import shown
+from workbench.envs.rendering.lean_materials import LeanBody, LeanMaterials
 
 SPOTS = np.zeros((4, 4, 4), np.uint8)
 SPOTS[1, 2] = 255

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from workbench.core.scene.mesh_levels import deviation, from_afar, reduced_mesh
-from workbench.core.scene.shapes import Mesh
+from workbench.envs.scene.mesh_levels import deviation, from_afar, reduced_mesh
+from workbench.envs.scene.shapes import Mesh
 
 
 def test_a_reduced_mesh_is_read_from_disk_the_next_time_and_made_again_from_a_broken_file(

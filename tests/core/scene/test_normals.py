@@ -6,8 +6,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from workbench.core.scene.normals import ShadedSurface, with_normals
-from workbench.core.scene.shapes import Mesh
+from workbench.envs.scene.normals import ShadedSurface, with_normals
+from workbench.envs.scene.shapes import Mesh
 
 
 def shared(mesh: trimesh.Trimesh) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:

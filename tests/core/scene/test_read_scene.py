@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from tests.core.drawn_envs import batched, stock
-from workbench.core.cameras.render import list_cameras, segmentation_names, take_pictures
-from workbench.core.scene.read_scene import read_geometry
-from workbench.core.scene.scene_index import read_poses, scene_index
-from workbench.core.scene.shapes import SceneGeometry, Visual
+from workbench.envs.scene.read_scene import read_geometry
+from workbench.envs.scene.scene_index import read_poses, scene_index
+from workbench.envs.scene.shapes import SceneGeometry, Visual
+from workbench.pictures.render import list_cameras, segmentation_names, take_pictures
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

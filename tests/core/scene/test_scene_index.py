@@ -15,7 +15,7 @@ from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.structs import Actor, Pose
 
 from tests.drive.envs import batched, stock
-from workbench.core.scene.scene_index import read_poses, scene_index
+from workbench.envs.scene.scene_index import read_poses, scene_index
 
 TASKS = ["PickCube-v1", "PegInsertionSide-v1"]
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from workbench.core.scene.normals import with_normals
-from workbench.core.scene.shapes import Mesh
-from workbench.core.scene.simplify import flat_rectangle, reduce_mesh
+from workbench.envs.scene.normals import with_normals
+from workbench.envs.scene.shapes import Mesh
+from workbench.envs.scene.simplify import flat_rectangle, reduce_mesh
 
 
 def soup(mesh: trimesh.Trimesh) -> Mesh:

@@ -18,8 +18,8 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.stock_env import batch_of
 from tests.core.written import ThrowsAFreeChain
-from workbench.core.env.cpu_scene import batched_class
-from workbench.core.rules import Degree
+from workbench.envs.cpu_scene import batched_class
+from workbench.envs.gpu_rules import Degree
 
 STATE_ONLY = {"obs_mode": "state", "render_backend": "none"}
 
@@ -106,7 +106,7 @@ def test_every_env_has_its_own_ground() -> None:
     env.close()
 
 
-@pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
 def test_what_is_written_into_the_tensors_and_applied_is_what_physx_has() -> None:
     env = batch_of(ThrowsAFreeChain, 3)
     env.reset(seed=[0, 1, 2])

@@ -17,12 +17,12 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.by_hand import box
 from tests.core.stock_env import Bare, batch_of, put_in_same_state, single
-from workbench.core.capture.inspect_env import Contact, list_contacts
+from workbench.envs.inspect_env import Contact, list_contacts
 
 pytestmark = [
     pytest.mark.thorough,
     # ManiSkill's own tasks break some: `env/test_strict.py` lists them.
-    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
+    pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 
 N = 3

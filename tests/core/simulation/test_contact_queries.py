@@ -12,7 +12,7 @@ import pytest
 import sapien
 import sapien.physx as physx
 
-from workbench.core.simulation.contact_queries import ContactReader
+from workbench.envs.simulation.contact_queries import ContactReader
 
 
 @dataclass(frozen=True)

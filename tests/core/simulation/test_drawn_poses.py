@@ -18,15 +18,15 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.pose import Pose
 
 from tests.core.drawn_envs import batched
-from workbench.core.cameras.render import step_pictures, take_pictures
-from workbench.core.cameras.report import join_reports
-from workbench.core.cameras.visibility import measure_placement, placement_of
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.scene.scene_index import read_poses, scene_index
+from workbench.envs.scene.scene_index import read_poses, scene_index
+from workbench.envs.task_env import TaskEnv
+from workbench.pictures.camera_report import join_reports
+from workbench.pictures.render import step_pictures, take_pictures
+from workbench.pictures.visibility import measure_placement, placement_of
 
 pytestmark = [
     pytest.mark.usefixtures("renderer"),
-    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
+    pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 MODE = "rgb+segmentation"
 N = 2

@@ -10,8 +10,8 @@ import torch
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 
 from tests.drive.envs import batched
-from workbench.core.broken_rule import RuleWarning
-from workbench.core.env.task_env import TaskEnv
+from workbench.envs.broken_rule import RuleWarning
+from workbench.envs.task_env import TaskEnv
 
 pytestmark = pytest.mark.thorough
 
@@ -77,7 +77,7 @@ def test_a_target_that_is_set_while_the_scene_is_built_is_told_with_the_hooks_to
         made(where="_load_scene", one_joint=one_joint, velocity=velocity).close()
 
 
-@pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning")
+@pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning")
 @pytest.mark.parametrize("one_joint", [True, False])
 @pytest.mark.parametrize("where", ["_load_scene", "_after_reconfigure", "_initialize_episode"])
 def test_wherever_it_is_set_it_drives(where: str, one_joint: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sapien
 import sapien.physx as physx
 
-from workbench.core.simulation import stepping
+from workbench.envs.simulation import stepping
 
 
 def falling_box() -> sapien.Scene:

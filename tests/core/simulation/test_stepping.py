@@ -13,7 +13,7 @@ import pytest
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from workbench.core.env.cpu_scene import batched_class
+from workbench.envs.cpu_scene import batched_class
 
 pytestmark = pytest.mark.thorough
 

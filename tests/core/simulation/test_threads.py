@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workbench.core.simulation.stepping import EnvThreads, env_threads
+from workbench.envs.simulation.stepping import EnvThreads, env_threads
 
 shared = EnvThreads()
 

@@ -19,14 +19,14 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.by_hand import box, by_hand
 from tests.core.stock_env import Bare, batch_of
-from workbench.core.capture.inspect_env import inspect_env
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.scene.scene_index import joint_names, read_joints, read_poses, scene_index
-from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.inspect_env import inspect_env
+from workbench.envs.scene.scene_index import joint_names, read_joints, read_poses, scene_index
+from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.task_env import TaskEnv
 
 pytestmark = [
     pytest.mark.thorough,
-    pytest.mark.filterwarnings("ignore::workbench.core.broken_rule.RuleWarning"),
+    pytest.mark.filterwarnings("ignore::workbench.envs.broken_rule.RuleWarning"),
 ]
 N = 4
 

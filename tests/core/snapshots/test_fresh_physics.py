@@ -19,8 +19,8 @@ from mani_skill.utils.building import actors
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core.snapshots.cpu_state import renew_physics
-from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.snapshots.cpu_state import renew_physics
+from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
 
 
 def packs(env: BaseEnv) -> list[bytes]:

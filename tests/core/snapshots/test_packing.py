@@ -14,11 +14,11 @@ import pytest
 import torch
 
 from tests.drive.envs import batched
-from workbench.core.env import actions
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.snapshots.cpu_state import CpuState
-from workbench.core.snapshots.packing import PackedSnapshot, SnapshotPacker, WholeSnapshot, unpack_snapshot
-from workbench.core.snapshots.snapshot import Snapshot
+from workbench.envs import action_vector as actions
+from workbench.envs.snapshots.cpu_state import CpuState
+from workbench.envs.snapshots.packing import PackedSnapshot, SnapshotPacker, WholeSnapshot, unpack_snapshot
+from workbench.envs.snapshots.snapshot import Snapshot
+from workbench.envs.task_env import TaskEnv
 
 N = 4
 

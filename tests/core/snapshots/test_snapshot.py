@@ -21,9 +21,8 @@ from mani_skill.utils.building import actors
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.snapshots.cpu_state import CpuState
-from workbench.core.snapshots.snapshot import (
+from workbench.envs.snapshots.cpu_state import CpuState
+from workbench.envs.snapshots.snapshot import (
     begin_anew,
     in_this_state,
     read_gpu_state,
@@ -32,6 +31,7 @@ from workbench.core.snapshots.snapshot import (
     take_snapshot,
     write_gpu_state,
 )
+from workbench.envs.task_env import TaskEnv
 
 pytestmark = pytest.mark.thorough
 

@@ -16,8 +16,8 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PUSH_CUBE, batched
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.snapshots.snapshot import restore_snapshot, take_snapshot
+from workbench.envs.task_env import TaskEnv
 
 N = 4
 

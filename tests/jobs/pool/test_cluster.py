@@ -16,15 +16,15 @@ import psutil
 import pytest
 
 from tests.jobs.pool.work import Run, Setup
-from workbench.jobs.pool import cluster as seam
-from workbench.jobs.pool.cluster import Cluster
-from workbench.jobs.pool.connect import connected
-from workbench.jobs.pool.deal import PoolError
-from workbench.jobs.pool.job_file import JobFile, Kept, job_of
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.record.run import Recorded, record
-from workbench.jobs.task import TaskOptions
-from workbench.recording.reader.read_episode import read_episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.jobs import ray_cluster as seam
+from workbench.jobs.job_file import JobFile, Kept, job_of
+from workbench.jobs.ray_cluster import Cluster
+from workbench.jobs.ray_connection import connected
+from workbench.jobs.scheduler import PoolError
+from workbench.record.job import Recorded, record
+from workbench.record.job_worker import RecordOptions
+from workbench.task.description import TaskOptions
 
 pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240), pytest.mark.slow]
 PLAIN = {"render_backend": "none"}

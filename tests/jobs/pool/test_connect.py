@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.usefixtures("child_process"), pytest.mark.timeout(240)
 STARTS = """
 import os
 import psutil
-from workbench.jobs.pool.connect import connected
+from workbench.jobs.ray_connection import connected
 
 with connected("local") as ray:
     family = [psutil.Process(), *psutil.Process().children(recursive=True)]
@@ -33,7 +33,7 @@ print(len(alive))
 
 
 FINDS_NONE = """
-from workbench.jobs.pool.connect import NoCluster, connected
+from workbench.jobs.ray_connection import NoCluster, connected
 
 try:
     with connected("127.0.0.1:1"):

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from workbench.jobs.pool.deal import Deal, ItemQueue, Shard, ThisProcess, Work
-from workbench.jobs.pool.job_file import JobFile, JobFileError, JobKey, Kept, job_of, read_parts, write_whole
-from workbench.jobs.record.episodes import RecordOptions
-from workbench.jobs.task import TaskOptions
+from workbench.jobs.job_file import JobFile, JobFileError, JobKey, Kept, job_of, read_parts, write_whole
+from workbench.jobs.scheduler import Deal, ItemQueue, Shard, ThisProcess, Work
+from workbench.record.job_worker import RecordOptions
+from workbench.task.description import TaskOptions
 
 WHOLE = Shard()
 JOB = JobKey("square", {"command": "square", "seeds": "9"}, b"")

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from tests.drive.waiting import until
 from tests.jobs.pool.work import BEGUN, PROBLEM, Run, Setup, Squared
-from workbench.authoring.problem import Problem, TaskError
-from workbench.jobs.pool.deal import (
+from workbench.jobs.local_processes import Processes
+from workbench.jobs.scheduler import (
     FIRST_ALIKE,
     LATER_ALIKE,
     Chunk,
@@ -28,7 +28,7 @@ from workbench.jobs.pool.deal import (
     ThisProcess,
     parse_shard,
 )
-from workbench.jobs.pool.processes import Processes
+from workbench.task.problem import Problem, TaskError
 
 
 @pytest.fixture(autouse=True)
@@ -184,7 +184,7 @@ def test_who_does_not_want_to_wait_ends_processes_that_hang(tmp_path: Path) -> N
 def test_a_process_that_does_not_stop_is_not_waited_for_for_ever(
     how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.jobs.pool.processes._END_SECONDS", 0.2)
+    monkeypatch.setattr("workbench.jobs.local_processes._END_SECONDS", 0.2)
     run = Run(Setup(how, 0, folder=tmp_path), range(8), stop=lambda: (tmp_path / "hangs").exists())
     with pytest.raises(PoolError, match="that squares did not end in time"):
         run.by(Processes(1))

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from msgspec import convert, inspect
 
 from tests.drive.messages import of_schema, same
-from workbench.checks.by_hook.run import as_sent
+from workbench.checks.job_items import CheckUpdate, ItemOutcome
 from workbench.checks.results import RuleResult, Seen
-from workbench.jobs.check.plan import CheckUpdate, ItemOutcome
-from workbench.jobs.pool.deal import Deal, Work
-from workbench.jobs.pool.worker import MESSAGES, Listener, Message, WorkerQueue
-from workbench.jobs.record.episodes import RecordUpdate, Written
-from workbench.jobs.rescore.job import RescoredRecording, RescoreUpdate
+from workbench.checks.run_rules import as_sent
+from workbench.jobs.scheduler import Deal, Work
+from workbench.jobs.worker_messages import MESSAGES, Listener, Message, WorkerQueue
 from workbench.machine.processes.wire import MessageSocket, Unreadable
-from workbench.planning.report import SolveReport
+from workbench.planning.seeds_report import SolveReport
+from workbench.record.job_worker import RecordUpdate, Written
+from workbench.rescore.job import RescoredRecording, RescoreUpdate
 
 pytestmark = pytest.mark.thorough
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from workbench.jobs.actions import needed_by
-from workbench.jobs.pool import travel
-from workbench.jobs.pool.travel import TooMuch, files_below, pack_baggage, relocated
+from workbench.actions.choose import needed_by
+from workbench.jobs import worker_files as travel
+from workbench.jobs.worker_files import TooMuch, files_below, pack_baggage, relocated
 
 
 @pytest.fixture

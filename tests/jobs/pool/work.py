@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from workbench.authoring.problem import Problem, TaskError
-from workbench.jobs.pool.deal import Deal, Executor, Failure, ItemQueue, Work
+from workbench.jobs.scheduler import Deal, Executor, Failure, ItemQueue, Work
+from workbench.task.problem import Problem, TaskError
 
 PROBLEM = Problem("step", "it broke", "task.py", 3, "1 / 0", "Traceback")
 

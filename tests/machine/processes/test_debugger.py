@@ -15,17 +15,17 @@ import pytest
 
 from tests.drive.session import wait_until
 from tests.session.debug_client import DebugClient
+from workbench.app.session import Session
+from workbench.app.status_line import status_values
 from workbench.cli.main import main
-from workbench.commands.run import Interrupt, RestartWorker, Step
-from workbench.jobs.task import TaskOptions
+from workbench.live.commands import Interrupt, RestartWorker, Step
+from workbench.live.panels.banners import is_busy_for_long
+from workbench.live.process import supervisor
+from workbench.live.process.supervisor import WorkerOptions
+from workbench.live.view import SessionView
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.debugger import port_for_debugger
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.process import supervisor
-from workbench.session.process.supervisor import WorkerOptions
-from workbench.ui.live.banners import is_busy_for_long
-from workbench.ui.live.status_line import status_values
+from workbench.task.description import TaskOptions
 
 HANGS = 0.3
 """Seconds; as short as the worker's ordinary work allows."""

@@ -18,8 +18,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.drive.waiting import until
+from workbench.live.messages import Event, Loading
 from workbench.machine.processes.wire import MOST_BYTES, MessageSocket, Unreadable, pack, pack_message
-from workbench.session.protocol.messages import Event, Loading
 
 
 class Ends:

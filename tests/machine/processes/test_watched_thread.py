@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.drive.waiting import until
-from workbench.authoring.loading.watch import SourceWatcher
 from workbench.machine.processes.watched_thread import listen, report_failure, stop_listening, watched_thread
+from workbench.task.watch import SourceWatcher
 
 
 @pytest.fixture

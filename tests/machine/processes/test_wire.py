@@ -18,13 +18,13 @@ from msgspec import inspect
 
 from tests.drive.messages import ARRAYS, of_schema, same
 from tests.ui.scenes import camera, description, step_of, table_scene
-from workbench.core.capture.inspection import Inspection
-from workbench.jobs.rescore.verdict import Rescore
-from workbench.jobs.task import Stepped, TaskOptions
+from workbench.app.worker.questions import QUESTIONS
+from workbench.envs.inspection import Inspection
+from workbench.episodes.row import Source
+from workbench.live.messages import Answer, Event, Load, Loaded, Loading, Status
 from workbench.machine.processes.wire import Call, Unpacker, Unreadable, pack, pack_message, value_type
-from workbench.recording.episode.row import Source
-from workbench.session.protocol.messages import Answer, Event, Load, Loaded, Loading, Status
-from workbench.session.protocol.questions import QUESTIONS
+from workbench.rescore.verdict import Rescore
+from workbench.task.description import Stepped, TaskOptions
 
 EVENTS: tuple[type, ...] = get_args(Event)
 

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drive.episodes import Made
-from workbench.recording.episode.document import write_into_description
-from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.read_rows import read_found
-from workbench.recording.reader.scan import scan_folder
-from workbench.recording.writing.finish import EpisodeFiles
+from workbench.episodes.document import write_into_description
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.reader.read_rows import read_found
+from workbench.episodes.reader.scan import scan_folder
+from workbench.episodes.row import UnreadableRecording
+from workbench.episodes.writing.finish import EpisodeFiles
 
 pytestmark = pytest.mark.thorough
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from tests.drive.rows import EpisodeRow, packed
-from workbench.core.env.step_result import OtherEntry, StepResult
-from workbench.jobs.record.gather import batch_columns
-from workbench.recording.episode.columns import BatchPacker, assemble, layout_type
+from workbench.envs.step_result import OtherEntry, StepResult
+from workbench.episodes.columns import BatchPacker, assemble, layout_type
+from workbench.record.gather import batch_columns
 
 
 def row(action: Any = (0.0, 0.0), **evaluate: Any) -> EpisodeRow:

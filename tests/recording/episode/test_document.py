@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.recording.library_files import describe
-from workbench.recording.episode.document import (
+from workbench.episodes.document import (
     Document,
     EpisodeJson,
     WrongDocument,

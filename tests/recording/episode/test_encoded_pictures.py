@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from workbench.recording.episode.encoded_pictures import EncodedPictures, encode
+from workbench.episodes.encoded_pictures import EncodedPictures, encode
 
 SHAPE = hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=9)
 

@@ -17,18 +17,12 @@ from tests.drive.episodes import Made, journal_of
 from tests.drive.rows import append
 from tests.recording.read_rrd import read_rrd
 from tests.recording.verify_rrd import verify_rrd
-from workbench.core.env.evaluate_entries import split_entries
-from workbench.core.env.step_result import OtherEntry
-from workbench.recording.episode.columns import (
-    CUT_MESSAGE,
-    MOST_BYTES,
-    TextEntry,
-    TextWriter,
-    text_tracks,
-)
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing.episode_writer import EpisodeFiles
-from workbench.recording.writing.finish import recover
+from workbench.envs.evaluate_entries import split_entries
+from workbench.envs.step_result import OtherEntry
+from workbench.episodes.columns import CUT_MESSAGE, MOST_BYTES, TextEntry, TextWriter, text_tracks
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.writing.episode_writer import EpisodeFiles
+from workbench.episodes.writing.finish import recover
 
 Maker = Callable[..., Made]
 Others = Mapping[str, OtherEntry]

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from workbench.core.camera_data import CameraInfo
-from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
-from workbench.machine.processes.wire import Unpacker, pack_message
-from workbench.recording.episode.columns import MOST_LINES, TextEntry
-from workbench.recording.episode.encoded_pictures import EncodedPictures, Modality, encode
-from workbench.recording.episode.episode import BrokenFile, CameraTrack, Episode, EpisodeInfo
-from workbench.recording.reader.episode_wire import (
+from workbench.envs.camera_data import CameraInfo
+from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, SharedShapes, Visual
+from workbench.episodes.columns import MOST_LINES, TextEntry
+from workbench.episodes.encoded_pictures import EncodedPictures, Modality, encode
+from workbench.episodes.episode import BrokenFile, CameraTrack, Episode, EpisodeInfo
+from workbench.episodes.reader.episode_wire import (
     InvalidEpisode,
     KnownShapes,
     SentShapes,
     pack_episode,
     unpack_episode,
 )
-from workbench.recording.reader.requests import EpisodeRead, PictureRead, RowsRead
+from workbench.episodes.reader.requests import EpisodeRead, PictureRead, RowsRead
+from workbench.machine.processes.wire import Unpacker, pack_message
 
 T, B = 3, 2
 PICTURE = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)

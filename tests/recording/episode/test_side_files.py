@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from tests.drive.episodes import Made
-from workbench.recording.episode.side_files import side_files, side_files_text
-from workbench.recording.reader.read_episode import read_episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.side_files import side_files, side_files_text
 
 TEXT = """
 '''See notes.txt.'''

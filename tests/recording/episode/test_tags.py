@@ -11,7 +11,7 @@ import pytest
 
 from tests.recording.library_files import describe
 from tests.recording.refused_calls import descriptors, refused
-from workbench.recording.episode.document import read_notes, write_into_description, write_notes
+from workbench.episodes.document import read_notes, write_into_description, write_notes
 
 
 def of_ours(folder: Path) -> tuple[Path, Callable[[], None]]:

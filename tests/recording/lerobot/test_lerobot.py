@@ -13,14 +13,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from workbench.recording.episode.episode import BrokenFile, Episode
-from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.lerobot.export import ExportOptions, export_lerobot
-from workbench.recording.lerobot.format import Choice, frames_of
-from workbench.recording.lerobot.read import lerobot_rows, read_lerobot
-from workbench.recording.library.library import Library, LibraryError
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import read_recording
+from workbench.episodes.episode import BrokenFile, Episode
+from workbench.episodes.lerobot.export import ExportOptions, export_lerobot
+from workbench.episodes.lerobot.format import Choice, frames_of
+from workbench.episodes.lerobot.read import lerobot_rows, read_lerobot
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.reader.reading import read_recording
+from workbench.episodes.row import UnreadableRecording
+from workbench.library.folder import Library, LibraryError
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -71,7 +71,7 @@ def test_what_was_exported_is_read_back(
     episode: Episode, limits: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, limit in limits.items():
-        monkeypatch.setattr(f"workbench.recording.lerobot.format.{name}", limit)
+        monkeypatch.setattr(f"workbench.episodes.lerobot.format.{name}", limit)
     made = export(tmp_path / "set", shorter(episode, 5), shorter(episode, 4), episode)
     assert (made.episodes, made.frames) == (3, 9 + episode.length)
     files = [

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from workbench.recording.episode.row import Facts
-from workbench.recording.library import index as library_index
-from workbench.recording.library.index import LibraryIndex, index_path
-from workbench.recording.reader.scan import RecordingFiles
+from workbench.episodes.reader.scan import RecordingFiles
+from workbench.episodes.row import Facts
+from workbench.library import index as library_index
+from workbench.library.index import LibraryIndex, index_path
 
 
 def found(key: str, size: int = 5) -> RecordingFiles:

@@ -14,19 +14,13 @@ from hypothesis import strategies as st
 
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
-from workbench.cli.jobs.run_by import told_in_folder
-from workbench.cli.terminal.arguments import JobArguments
-from workbench.jobs.record.run import RecordProgress
-from workbench.recording.library.jobs import (
-    SILENT_SECONDS,
-    JobFailure,
-    JobStatus,
-    StatusFile,
-    read_jobs,
-)
-from workbench.recording.library.library import Library
-from workbench.ui.library.rows import job_text
-from workbench.ui.widgets.templates import render
+from workbench.cli.arguments import JobArguments
+from workbench.cli.run_by import told_in_folder
+from workbench.library.folder import Library
+from workbench.library.job_status import SILENT_SECONDS, JobFailure, JobStatus, StatusFile, read_jobs
+from workbench.library.rows import job_text
+from workbench.page.widgets.templates import render
+from workbench.record.job import RecordProgress
 
 RUNS = JobStatus("record", "my_task.py", 40, 100, rate=2.0)
 
@@ -49,7 +43,7 @@ def test_the_rate_of_a_job_that_goes_on_is_that_of_this_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = SimpleNamespace(monotonic=lambda: now)
-    monkeypatch.setattr("workbench.cli.jobs.run_by.time", clock)
+    monkeypatch.setattr("workbench.cli.run_by.time", clock)
     with told_in_folder(JobArguments(), "record", "my_task.py", tmp_path, 100, str) as told:
         tell = told.beside(lambda progress: None)
         now = 50.0

@@ -25,13 +25,13 @@ from PIL import Image
 from tests.drive.episodes import Made
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
-from workbench.recording.episode.row import Facts, LibraryEntry, LibraryRow, clean_facts
-from workbench.recording.library.index import index_path
-from workbench.recording.library.library import Library, LibraryError
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.read_rows import read_found
-from workbench.recording.reader.reading import read_rows
-from workbench.recording.reader.scan import RecordingFiles, scan_folder
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.reader.read_rows import read_found
+from workbench.episodes.reader.reading import read_rows
+from workbench.episodes.reader.scan import RecordingFiles, scan_folder
+from workbench.episodes.row import Facts, LibraryEntry, LibraryRow, clean_facts
+from workbench.library.folder import Library, LibraryError
+from workbench.library.index import index_path
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -234,7 +234,7 @@ def test_only_what_changed_is_read_again(
         read_keys.extend(found.key for found in wanted)
         return read_rows(folder, wanted)
 
-    monkeypatch.setattr("workbench.recording.library.library.read_rows", spy)
+    monkeypatch.setattr("workbench.library.folder.read_rows", spy)
     library.refresh()
     assert read_keys == []
     describe(tmp_path, "b", note="changed")
@@ -424,7 +424,7 @@ def test_a_note_that_cannot_be_kept_is_an_error_and_nothing_is_half_written(
 def test_a_scan_that_is_asked_for_is_made_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not when its time comes, which here is in an hour."""
     for name in ("SCAN_SECONDS", "LONGEST_PAUSE"):
-        monkeypatch.setattr(f"workbench.recording.library.library.{name}", 3600.0)
+        monkeypatch.setattr(f"workbench.library.folder.{name}", 3600.0)
     library = Library(tmp_path)
     library.watch()
     try:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.recording.refused_calls import refused
-from workbench.recording.library.trash import (
+from workbench.library.trash import (
     TRASH,
     Trash,
     TrashError,

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from tests.recording.foreign_h5 import write
-from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.maniskill.safe_h5 import DEEPEST
-from workbench.recording.reader.read_episode import read_maniskill
-from workbench.recording.reader.read_rows import read_found
-from workbench.recording.reader.scan import scan_folder
+from workbench.episodes.maniskill.safe_h5 import DEEPEST
+from workbench.episodes.reader.read_episode import read_maniskill
+from workbench.episodes.reader.read_rows import read_found
+from workbench.episodes.reader.scan import scan_folder
+from workbench.episodes.row import UnreadableRecording
 
 SECRET = b"the secret of another file, thirty-two bytes and more of it......"
 
@@ -156,7 +156,7 @@ def test_what_stands_in_its_own_file_is_read_also_by_soft_links_and_packed(tmp_p
 def test_one_dataset_under_many_names_is_not_read_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.recording.maniskill.safe_h5.MOST_BYTES", 1 << 20)
+    monkeypatch.setattr("workbench.episodes.maniskill.safe_h5.MOST_BYTES", 1 << 20)
 
     def spoil(group: h5py.Group) -> None:
         group["obs/0"] = np.arange(30_000, dtype=np.float32)
@@ -170,7 +170,7 @@ def test_one_dataset_under_many_names_is_not_read_for_ever(
 PLUGINS = """
 import ctypes, os, re
 before = dict(os.environ)
-import workbench.recording.maniskill.safe_h5
+import workbench.episodes.maniskill.safe_h5
 assert dict(os.environ) == before
 (hdf5,) = set(re.findall(r"/.*libhdf5[-.].*", open("/proc/self/maps").read()))
 state = ctypes.c_uint(99)

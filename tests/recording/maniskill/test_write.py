@@ -18,9 +18,9 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from numpy.typing import NDArray
 
 from tests.drive.episodes import Made
-from workbench.core.scene.shapes import SceneGeometry
-from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.reader.read_episode import read_episode, read_maniskill
+from workbench.envs.scene.shapes import SceneGeometry
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.reader.read_episode import read_episode, read_maniskill
 
 STEPS = 6
 SEED = 4

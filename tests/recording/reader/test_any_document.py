@@ -15,7 +15,10 @@ from hypothesis import strategies as st
 
 from tests.drive.episodes import made, write
 from tests.recording.foreign_h5 import write as write_foreign
-from workbench.jobs.from_recording import (
+from workbench.episodes.episode import Episode
+from workbench.episodes.maniskill.write import maniskill_json
+from workbench.episodes.reader.reading import find_all_sources, read_recording
+from workbench.episodes.recorded_source import (
     CannotEnterRecording,
     changed_on_disk,
     options_of,
@@ -24,17 +27,14 @@ from workbench.jobs.from_recording import (
     run_of,
     write_source,
 )
+from workbench.episodes.row import UnreadableRecording
+from workbench.episodes.seal import made_here
+from workbench.episodes.side_files import side_files_text
 from workbench.machine.processes.wire import Unpacker, pack
-from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.made_here import made_here
-from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.episode.side_files import side_files_text
-from workbench.recording.maniskill.write import maniskill_json
-from workbench.recording.reader.reading import find_all_sources, read_recording
-from workbench.session.clearance import Clearances, NotCleared
-from workbench.session.rescore.recordings import group_episodes
-from workbench.session.review.view import Opened, find_events
-from workbench.ui.review.panel import facts_html
+from workbench.rescore.recording_jobs import group_episodes
+from workbench.review.panel import facts_html
+from workbench.review.view import Opened, find_events
+from workbench.trust.clearance import Clearances, NotCleared
 
 LONG = "LONG"
 """Stands for 5,000 characters."""

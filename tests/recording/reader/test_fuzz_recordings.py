@@ -23,16 +23,16 @@ import pytest
 
 from tests.drive.rows import EpisodeRow, append
 from tests.recording.foreign_h5 import write as write_h5
-from workbench.core.camera_data import CameraInfo, Picture
-from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
-from workbench.recording.episode.episode import Episode, EpisodeInfo
-from workbench.recording.episode.row import Source, UnreadableRecording
-from workbench.recording.lerobot.export import export_lerobot
-from workbench.recording.reader import reading
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.scan import scan_folder
-from workbench.recording.writing.episode_writer import EpisodeWriter
-from workbench.session.review.view import find_events
+from workbench.envs.camera_data import CameraInfo, Picture
+from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.episodes.episode import Episode, EpisodeInfo
+from workbench.episodes.lerobot.export import export_lerobot
+from workbench.episodes.reader import reading
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.reader.scan import scan_folder
+from workbench.episodes.row import Source, UnreadableRecording
+from workbench.episodes.writing.episode_writer import EpisodeWriter
+from workbench.review.view import find_events
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

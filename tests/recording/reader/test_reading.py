@@ -17,12 +17,12 @@ import pytest
 
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
+from workbench.episodes.reader import reading
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.reader.scan import scan_folder
+from workbench.episodes.row import Facts, Source, UnreadableRecording
 from workbench.machine.processes.child_python import child_environment, python_command
 from workbench.machine.processes.confinement import landlock_version
-from workbench.recording.episode.row import Facts, Source, UnreadableRecording
-from workbench.recording.reader import reading
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.scan import scan_folder
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -152,7 +152,7 @@ def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
     program = (
         "import sys, os, pathlib, time\n"
         "from workbench.recording.reader import reading\n"
-        "from workbench.recording.reader.scan import scan_folder\n"
+        "from workbench.episodes.reader.scan import scan_folder\n"
         "folder = pathlib.Path(sys.argv[1])\n"
         "list(reading.read_rows(folder, scan_folder(folder).found.values()))\n"
         "print('read', flush=True)\n"

@@ -8,8 +8,8 @@ import pytest
 
 from tests.recording.foreign_h5 import write as write_h5
 from tests.recording.library_files import describe
-from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.reader.reading import find_all_sources
+from workbench.episodes.reader.reading import find_all_sources
+from workbench.episodes.row import UnreadableRecording
 
 
 def test_each_is_found_once_by_name_whatever_names_it(child_process: None, tmp_path: Path) -> None:

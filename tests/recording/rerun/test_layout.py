@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from workbench.core.scene.shapes import SceneGeometry
-from workbench.recording.rerun.layout import body_entities
+from workbench.envs.scene.shapes import SceneGeometry
+from workbench.episodes.rerun.layout import body_entities
 
 NAME = st.text(st.sampled_from("ab/ c.ä"), max_size=6) | st.sampled_from(["cameras", "cameras/a", "a/b", "a"])
 

@@ -10,10 +10,10 @@ import pytest
 
 from tests.drive.episodes import made, write
 from tests.recording.refused_calls import descriptors
-from workbench.recording.episode.episode import CameraTrack, Episode
-from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun import layout, read
+from workbench.episodes.episode import CameraTrack, Episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.rerun import layout, read
+from workbench.episodes.row import UnreadableRecording
 
 
 def camera_of(episode: Episode, rgb: bool = True) -> CameraTrack:

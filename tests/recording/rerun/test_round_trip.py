@@ -21,11 +21,11 @@ from PIL import Image
 from tests.drive.episodes import Made, Track
 from tests.recording.read_rrd import Column, read_rrd
 from tests.recording.verify_rrd import verify_rrd
-from workbench.core.camera_data import CameraInfo
-from workbench.recording.episode.episode import Episode
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun.layout import VIEWER_TEXELS, body_entities
-from workbench.recording.rerun.read import read_properties
+from workbench.envs.camera_data import CameraInfo
+from workbench.episodes.episode import Episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.rerun.layout import VIEWER_TEXELS, body_entities
+from workbench.episodes.rerun.read import read_properties
 
 Entities = dict[str, dict[str, Column]]
 

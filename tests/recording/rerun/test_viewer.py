@@ -15,7 +15,7 @@ from PIL import Image
 from rerun.experimental import ViewerClient
 
 from tests.recording.verify_rrd import verify_rrd
-from workbench.recording.rerun.viewer import (
+from workbench.episodes.rerun.viewer import (
     await_port,
     end,
     free_port,

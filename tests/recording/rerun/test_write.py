@@ -24,13 +24,13 @@ from tests.drive.rows import append
 from tests.drive.waiting import until
 from tests.recording.read_rrd import read_rrd
 from tests.recording.verify_rrd import verify_rrd
-from workbench.recording.episode.episode import Episode
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun import layout
-from workbench.recording.rerun import write as rrd
-from workbench.recording.rerun.viewer import quiet_environment, rerun_command
-from workbench.recording.writing.from_journal import episode_in
-from workbench.recording.writing.journal import JournalReader
+from workbench.episodes.episode import Episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.rerun import layout
+from workbench.episodes.rerun import write as rrd
+from workbench.episodes.rerun.viewer import quiet_environment, rerun_command
+from workbench.episodes.writing.from_journal import episode_in
+from workbench.episodes.writing.journal import JournalReader
 
 Maker = Callable[..., Made]
 

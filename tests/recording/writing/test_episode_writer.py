@@ -20,14 +20,14 @@ from hypothesis import strategies as st
 
 from tests.drive.episodes import Made, Track, journal_of
 from tests.drive.rows import EpisodeRow, append
-from workbench.core.camera_data import CameraInfo, Picture
-from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.rerun.read import read_properties
-from workbench.recording.writing.episode_writer import EpisodeFiles
-from workbench.recording.writing.finish import episode_stem, recover
-from workbench.recording.writing.journal import FOLDER
-from workbench.recording.writing.publish import RecordingError
+from workbench.envs.camera_data import CameraInfo, Picture
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.rerun.read import read_properties
+from workbench.episodes.writing.episode_writer import EpisodeFiles
+from workbench.episodes.writing.finish import episode_stem, recover
+from workbench.episodes.writing.journal import FOLDER
+from workbench.episodes.writing.publish import RecordingError
 
 Maker = Callable[..., Made]
 

@@ -20,14 +20,14 @@ import pytest
 from tests.drive.episodes import appended, header_of, journal_of, made
 from tests.drive.waiting import until
 from tests.recording.read_rrd import read_rrd
-from workbench.jobs.record.gather import EpisodeFinisher, GatheredEpisode
-from workbench.recording.episode.made_here import MadeHere, made_here
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing.episode_writer import EpisodeWriter
-from workbench.recording.writing.files_process import FilesProcess
-from workbench.recording.writing.finish import make_files
-from workbench.recording.writing.journal import claim
-from workbench.recording.writing.publish import RecordingError
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.seal import MadeHere, made_here
+from workbench.episodes.writing.episode_writer import EpisodeWriter
+from workbench.episodes.writing.files_process import FilesProcess
+from workbench.episodes.writing.finish import make_files
+from workbench.episodes.writing.journal import claim
+from workbench.episodes.writing.publish import RecordingError
+from workbench.record.gather import EpisodeFinisher, GatheredEpisode
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -182,7 +182,7 @@ def written(folder: Path) -> EpisodeWriter:
 def test_it_ends_with_the_program_that_started_it(tmp_path: Path) -> None:
     program = (
         "import os, time\n"
-        "from workbench.recording.writing.files_process import FilesProcess\n"
+        "from workbench.episodes.writing.files_process import FilesProcess\n"
         "process = FilesProcess()\n"
         "while not process.is_ready: time.sleep(0.01)\n"
         "print(process._process.pid, flush=True)\n"

@@ -12,11 +12,11 @@ import pytest
 from tests.drive.episodes import Made
 from tests.drive.rows import append
 from tests.recording.refused_calls import descriptors, refused
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing.episode_writer import EpisodeWriter
-from workbench.recording.writing.finish import SUFFIXES, recover
-from workbench.recording.writing.journal import FOLDER
-from workbench.recording.writing.publish import RecordingError
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.writing.episode_writer import EpisodeWriter
+from workbench.episodes.writing.finish import SUFFIXES, recover
+from workbench.episodes.writing.journal import FOLDER
+from workbench.episodes.writing.publish import RecordingError
 
 pytestmark = pytest.mark.thorough
 

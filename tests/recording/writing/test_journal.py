@@ -14,8 +14,8 @@ import pytest
 from tests.drive.episodes import entries_of
 from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
-from workbench.recording.writing import journal as journals
-from workbench.recording.writing.journal import Journal, JournalEntry, claim
+from workbench.episodes.writing import journal as journals
+from workbench.episodes.writing.journal import Journal, JournalEntry, claim
 
 
 @pytest.fixture(autouse=True)

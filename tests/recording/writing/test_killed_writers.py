@@ -16,11 +16,11 @@ import pytest
 from tests.drive.episodes import begin
 from tests.drive.episodes import made as small
 from tests.recording.verify_rrd import verify_rrd
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.reader.reading import recover_confined
+from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.journal import FOLDER
 from workbench.machine.processes.confinement import landlock_version
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.reader.reading import recover_confined
-from workbench.recording.writing.finish import recover
-from workbench.recording.writing.journal import FOLDER
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -29,10 +29,10 @@ import sys, time
 from pathlib import Path
 import numpy as np
 from tests.drive.rows import EpisodeRow, append
-from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
-from workbench.core.camera_data import CameraInfo, Picture
-from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.writing.episode_writer import EpisodeWriter
+from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.envs.camera_data import CameraInfo, Picture
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.writing.episode_writer import EpisodeWriter
 
 folder, steps = Path(sys.argv[1]), int(sys.argv[2])
 mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))

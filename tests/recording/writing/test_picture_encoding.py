@@ -14,11 +14,11 @@ import pytest
 from tests.drive.episodes import Made, Track
 from tests.drive.rows import append
 from tests.drive.waiting import until
-from workbench.core.camera_data import CameraInfo
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing import episode_writer
-from workbench.recording.writing.finish import recover
-from workbench.recording.writing.publish import RecordingError
+from workbench.envs.camera_data import CameraInfo
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.writing import episode_writer
+from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.publish import RecordingError
 
 Maker = Callable[..., Made]
 STATES = 7

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.recording.refused_calls import descriptors, left_open, refused
-from workbench.recording.writing.publish import publish, sync_files
+from workbench.episodes.writing.publish import publish, sync_files
 
 SUFFIXES = (".rrd", ".h5", ".json")
 

@@ -20,11 +20,11 @@ from tests.drive.episodes import Made, entries_of, journal_of
 from tests.drive.rows import append
 from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
-from workbench.core.scene.shapes import Mesh
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing.finish import recover
-from workbench.recording.writing.journal import FOLDER, Journal, JournalEntry
-from workbench.recording.writing.publish import RecordingError
+from workbench.envs.scene.shapes import Mesh
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.journal import FOLDER, Journal, JournalEntry
+from workbench.episodes.writing.publish import RecordingError
 
 Maker = Callable[..., Made]
 

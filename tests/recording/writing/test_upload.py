@@ -13,14 +13,14 @@ import fsspec
 import pytest
 from moto.server import ThreadedMotoServer
 
-from workbench.jobs.pool.deal import Deal, ThisProcess, Work
-from workbench.jobs.record.episodes import RecordOptions, episode_id
-from workbench.jobs.record.run import record
-from workbench.jobs.task import TaskOptions
-from workbench.recording.reader.read_episode import read_episode
-from workbench.recording.writing.finish import EpisodeFiles
-from workbench.recording.writing.publish import RecordingError
-from workbench.recording.writing.upload import remove_uploaded_id, upload_episode
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.episodes.writing.finish import EpisodeFiles
+from workbench.episodes.writing.publish import RecordingError
+from workbench.episodes.writing.upload import remove_uploaded_id, upload_episode
+from workbench.jobs.scheduler import Deal, ThisProcess, Work
+from workbench.record.job import record
+from workbench.record.job_worker import RecordOptions, episode_id
+from workbench.task.description import TaskOptions
 
 
 @pytest.fixture(scope="module")

@@ -12,19 +12,19 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import BASE, camera, in_studio, step, wait_until
-from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.commands.cameras import (
+from workbench.app.session import Session
+from workbench.cameras import edit_jobs as file_edits
+from workbench.cameras.commands import (
     DropCameraChange,
     PutMovedCamerasBack,
     RevertCameraChange,
     SaveCameraChange,
 )
-from workbench.core.camera_data import CameraKey, CameraSettings
-from workbench.jobs.task import TaskOptions
-from workbench.session.cameras import file_edits
-from workbench.session.cameras.events import CameraPlaced, EditWanted
-from workbench.session.cameras.view import EditRequest, EditState
-from workbench.session.live.session import Session
+from workbench.cameras.events import CameraPlaced, EditWanted
+from workbench.cameras.view import EditRequest, EditState, StudioView
+from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.task.apply_edits import SourceEdit
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -61,8 +61,8 @@ def session(task_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 def planned(session: Session) -> EditState:
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
-    assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
-    return view.studio.edit_state
+    assert view.of(StudioView).edit_state.stage == "planned", view.of(StudioView).edit_state.message
+    return view.of(StudioView).edit_state
 
 
 def written(session: Session, stage: str = "checked") -> EditState:
@@ -70,8 +70,8 @@ def written(session: Session, stage: str = "checked") -> EditState:
     session.do(SaveCameraChange())
     ended = ("checked", "mismatch", "refused")
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ended), "the check")
-    assert view.studio.edit_state.stage == stage, view.studio.edit_state.message
-    return view.studio.edit_state
+    assert view.of(StudioView).edit_state.stage == stage, view.of(StudioView).edit_state.message
+    return view.of(StudioView).edit_state
 
 
 def there(session: Session, key: CameraKey) -> CameraSettings:
@@ -99,7 +99,7 @@ def test_while_the_disk_hangs_under_an_edit_the_session_answers(
     try:
         assert hangs.wait(60)
         step(session)
-        assert session.view().studio.edit_state.loading
+        assert session.view().of(StudioView).edit_state.loading
     finally:
         goes_on.set()
     wait_until(session, in_studio(lambda s: s.edit_state.stage == "checked"), "the check")
@@ -133,8 +133,8 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
         session, in_studio(lambda s: "Before it: base_camera" in s.edit_state.message), "the change before it"
     )
     # It can be reverted at once.
-    assert view.studio.edit_state.stage == "checked"
-    assert view.studio.edit_state.message.startswith(f"Edit reverted in {task_file.name}.")
+    assert view.of(StudioView).edit_state.stage == "checked"
+    assert view.of(StudioView).edit_state.message.startswith(f"Edit reverted in {task_file.name}.")
     assert task_file.read_text() == texts[1]
     session.do(RevertCameraChange())
     wait_until(
@@ -158,11 +158,16 @@ def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session
     task_file.write_text(edited)
     session.do(RevertCameraChange())
     view = wait_until(session, in_studio(lambda s: s.edit_state.message.startswith("Not done")), "why not")
-    assert "was edited since" in view.studio.edit_state.message and view.studio.edit_state.stage == "checked"
+    assert (
+        "was edited since" in view.of(StudioView).edit_state.message
+        and view.of(StudioView).edit_state.stage == "checked"
+    )
     assert task_file.read_text() == edited
     session.do(DropCameraChange())
     task_file.write_text(before)
-    wait_until(session, lambda v: v.studio.camera(BASE).info.settings.fov == 1.0, "the file of before")
+    wait_until(
+        session, lambda v: v.of(StudioView).camera(BASE).info.settings.fov == 1.0, "the file of before"
+    )
 
 
 def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
@@ -198,7 +203,10 @@ def test_a_change_that_the_hook_itself_makes_another_of_is_refused_before_it_is_
     session.happen(CameraPlaced(BASE, replace(there(session, BASE), fov=fov)))
     session.happen(EditWanted(EditRequest("edit", BASE)))
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage == "refused"), "the refusal")
-    assert why in view.studio.edit_state.message and f"fov={fov}" in view.studio.edit_state.snippet
+    assert (
+        why in view.of(StudioView).edit_state.message
+        and f"fov={fov}" in view.of(StudioView).edit_state.snippet
+    )
     assert task_file.read_text() == before and there(session, BASE).fov == 1.0
     session.do(DropCameraChange())
     session.do(PutMovedCamerasBack())
@@ -214,9 +222,11 @@ def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
     planned(session)
     session.do(SaveCameraChange())
     view = wait_until(session, in_studio(lambda s: "does not load" in s.edit_state.message), "the failure")
-    assert "revert it if that is the reason" in view.studio.edit_state.message
+    assert "revert it if that is the reason" in view.of(StudioView).edit_state.message
     assert view.problem is not None and "too narrow" in view.problem.message
     assert there(session, BASE).fov == 1.0, "the version before goes on"
     session.do(RevertCameraChange())
-    wait_until(session, lambda v: v.problem is None and v.studio.edit_state.stage == "undone", "it back")
+    wait_until(
+        session, lambda v: v.problem is None and v.of(StudioView).edit_state.stage == "undone", "it back"
+    )
     assert task_file.read_text() == before

@@ -18,18 +18,18 @@ from hypothesis import strategies as st
 from tests.drive.session import BASE, Told, camera, moved, told_session
 from tests.drive.waiting import until
 from tests.ui.scenes import camera as scene_camera
-from workbench.commands.cameras import PickPixel, PutMovedCamerasBack, RedoCamera, ScalePreview, UndoCamera
-from workbench.commands.command import Refused
-from workbench.core.camera_data import CameraSettings
-from workbench.core.cameras.conventions import LookAt, pose_from_look_at, target_of, with_pose
+from workbench.cameras.commands import PickPixel, PutMovedCamerasBack, RedoCamera, ScalePreview, UndoCamera
+from workbench.cameras.events import CameraChosen, CameraPlaced, EditWanted
+from workbench.cameras.placements import Placements
+from workbench.cameras.questions import RunCameras
+from workbench.cameras.view import EditRequest, StudioView
+from workbench.envs.camera_data import CameraSettings
+from workbench.live.events import PagesCounted
+from workbench.live.messages import PlaceCamera, Placed
 from workbench.machine.processes.wire import Call
-from workbench.session.cameras.events import CameraChosen, CameraPlaced, EditWanted
-from workbench.session.cameras.placements import Placements
-from workbench.session.cameras.view import EditRequest
-from workbench.session.protocol.messages import PlaceCamera, Placed
-from workbench.session.protocol.questions import RunCameras
-from workbench.session.record.recording import RecordingWanted
-from workbench.session.run.events import PagesCounted
+from workbench.page.command import Refused
+from workbench.pictures.camera_conventions import LookAt, pose_from_look_at, target_of, with_pose
+from workbench.record.state import RecordingWanted
 
 pytestmark = pytest.mark.thorough
 
@@ -83,7 +83,10 @@ def test_what_is_placed_is_asked_of_the_worker_and_what_stands_so_already_is_not
         session.do(command)
         assert one.asked(PlaceCamera) == [PlaceCamera(BASE, settings)]
     session.happen(CameraPlaced(NOTHING, MOVED))
-    assert one.asked(PlaceCamera) == [] and "there is no sensor camera nothing" in one.view.studio.problem
+    assert (
+        one.asked(PlaceCamera) == []
+        and "there is no sensor camera nothing" in one.view.of(StudioView).problem
+    )
 
 
 def test_one_that_could_not_be_placed_is_asked_for_where_it_stood_once_each_time(one: Told) -> None:
@@ -93,7 +96,7 @@ def test_one_that_could_not_be_placed_is_asked_for_where_it_stood_once_each_time
         one.tell(Placed(BASE, at(height), None, why_not="it is far away"))
         assert (
             one.asked(PlaceCamera) == [PlaceCamera(BASE, None)]
-            and "it is far away" in one.view.studio.problem
+            and "it is far away" in one.view.of(StudioView).problem
         )
         one.tell(Placed(BASE, None, None, why_not="nor can this"))
         assert one.asked(PlaceCamera) == [] and not moved(one.view)
@@ -105,25 +108,25 @@ def test_placements_are_sent_again_to_each_version_and_worker_until_the_file_say
     session = one.session
     session.happen(CameraChosen(BASE))
     session.happen(CameraPlaced(NOTHING, MOVED))
-    assert one.view.studio.problem
+    assert one.view.of(StudioView).problem
     session.happen(CameraPlaced(BASE, MOVED))
     for level in ("patched", "rebuilt", None):
         one.asked(object)
         loaded(one, level=level)
-        assert one.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)] and one.view.studio.problem == ""
-        assert one.view.studio.selected == BASE
+        assert one.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)] and one.view.of(StudioView).problem == ""
+        assert one.view.of(StudioView).selected == BASE
     loaded(one, at(0.9), "cameras")
     assert one.asked(PlaceCamera) == [PlaceCamera(BASE, None)] and now(one) == at(0.9)
-    assert "base_camera" in one.view.studio.problem
+    assert "base_camera" in one.view.of(StudioView).problem
     session.do(UndoCamera())
     assert now(one) == MOVED
     kept = one.session.kept_work()
     loaded(one, None, "cameras")
-    assert one.view.studio.selected is None and one.view.studio.cameras == ()
+    assert one.view.of(StudioView).selected is None and one.view.of(StudioView).cameras == ()
     with told_session(Path("nowhere"), kept=kept) as later:
         loaded(later, at(0.9))
         assert later.asked(PlaceCamera) == [PlaceCamera(BASE, MOVED)]
-        assert later.view.studio.selected == BASE and now(later) == MOVED
+        assert later.view.of(StudioView).selected == BASE and now(later) == MOVED
 
 
 # --- undo ------------------------------------------------------------------------------------------------
@@ -204,7 +207,7 @@ def test_what_was_taken_back_can_be_made_again_until_something_else_is_done(one:
     session = one.session
 
     def labels() -> tuple[str | None, str | None]:
-        return one.view.studio.undo, one.view.studio.redo
+        return one.view.of(StudioView).undo, one.view.of(StudioView).redo
 
     for command in (UndoCamera(), RedoCamera()):
         with pytest.raises(Refused):
@@ -236,7 +239,9 @@ def test_the_target_is_the_one_that_the_file_gives_and_follows_it(one: Told) -> 
 def test_moved_it_looks_as_far_as_it_did_and_back_in_its_place_at_what_the_file_gives(one: Told) -> None:
     session = one.session
     session.happen(CameraPlaced(BASE, replace(FILE, distance=0.2)))
-    assert now(one).distance == 0.2 and not moved(one.view) and one.view.studio.undo is None, "no placement"
+    assert now(one).distance == 0.2 and not moved(one.view) and one.view.of(StudioView).undo is None, (
+        "no placement"
+    )
     session.happen(CameraPlaced(BASE, FILE))
     session.happen(CameraPlaced(BASE, MOVED))
     assert looks_at(one) == (0.08, 0.3, 0.2)
@@ -321,10 +326,10 @@ def test_the_end_of_a_session_ends_what_waits_for_its_worker_and_begins_nothing_
     closing.start()
     closing.join(20)
     assert not closing.is_alive(), "it waits for an answer that nobody gives"
-    state = told.view.studio.edit_state
+    state = told.view.of(StudioView).edit_state
     assert state.stage == "refused" and state.request is not None and state.request.what == "add"
     told.session.happen(EditWanted(EditRequest("edit", BASE, MOVED)))
-    assert told.asked(Call) == [] and told.view.studio.edit_state == state
+    assert told.asked(Call) == [] and told.view.of(StudioView).edit_state == state
 
 
 def test_a_save_and_a_death_end_what_waits_for_the_worker_and_the_next_is_asked(
@@ -334,11 +339,11 @@ def test_a_save_and_a_death_end_what_waits_for_the_worker_and_the_next_is_asked(
     for end in (told.die, lambda: file.write_text(file.read_text() + "\n")):
         call = asks(told)
         end()
-        until(lambda: told.view.studio.edit_state.stage == "refused", "the end of the plan")
-        assert "did not answer" in told.view.studio.edit_state.message
+        until(lambda: told.view.of(StudioView).edit_state.stage == "refused", "the end of the plan")
+        assert "did not answer" in told.view.of(StudioView).edit_state.message
         assert asks(told).number != call.number
         told.die()
-        until(lambda: told.view.studio.edit_state.stage == "refused", "the end of the second")
+        until(lambda: told.view.of(StudioView).edit_state.stage == "refused", "the end of the second")
 
 
 def test_no_thread_of_a_session_is_left_when_it_is_closed_whatever_waited(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from tests.drive.session import BASE, camera, in_studio, moved, start_over, step, wait_until
-from workbench.commands.cameras import (
+from workbench.app.session import Session
+from workbench.cameras.commands import (
     CopyTask,
     DropCameraChange,
     PickPixel,
@@ -23,10 +24,7 @@ from workbench.commands.cameras import (
     UndoCamera,
     UsePlacement,
 )
-from workbench.commands.run import PauseRun
-from workbench.core.camera_data import CameraKey, CameraSettings, differences
-from workbench.jobs.task import TaskOptions
-from workbench.session.cameras.events import (
+from workbench.cameras.events import (
     CameraChosen,
     CameraPlaced,
     ComparisonWanted,
@@ -35,11 +33,13 @@ from workbench.session.cameras.events import (
     SheetWanted,
     SuggestionsWanted,
 )
-from workbench.session.cameras.view import EditRequest, StudioView
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.events import EnvsReset, FileOpened, MomentShown, PagesCounted
+from workbench.cameras.view import EditRequest, StudioView
+from workbench.envs.camera_data import CameraKey, CameraSettings, differences
+from workbench.live.commands import PauseRun
+from workbench.live.events import EnvsReset, FileOpened, MomentShown, PagesCounted
+from workbench.live.messages import CameraRequest
+from workbench.live.view import SessionView
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -151,17 +151,19 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     session.happen(CameraPlaced(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2)))
     session.happen(EditWanted(EditRequest("edit", BASE)))
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
-    assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
-    assert task_file.read_bytes() == before and "+" in view.studio.edit_state.edit.diff
+    assert view.of(StudioView).edit_state.stage == "planned", view.of(StudioView).edit_state.message
+    assert task_file.read_bytes() == before and "+" in view.of(StudioView).edit_state.edit.diff
     session.do(SaveCameraChange())
     view = wait_until(
         session, in_studio(lambda s: s.edit_state.stage in ("checked", "mismatch")), "the check"
     )
-    assert view.studio.edit_state.stage == "checked", view.studio.edit_state.message
+    assert view.of(StudioView).edit_state.stage == "checked", view.of(StudioView).edit_state.message
     assert view.reload.level == "cameras" and not moved(view)
     now = camera(session, BASE)
-    assert now.now == now.info.settings and not differences(now.now, view.studio.edit_state.edit.settings)
-    assert task_file.read_bytes() == view.studio.edit_state.edit.new_text.encode()
+    assert now.now == now.info.settings and not differences(
+        now.now, view.of(StudioView).edit_state.edit.settings
+    )
+    assert task_file.read_bytes() == view.of(StudioView).edit_state.edit.new_text.encode()
     session.do(RevertCameraChange())
     view = wait_until(
         session,
@@ -171,15 +173,18 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     assert task_file.read_bytes() == before
     task_file.write_bytes(saved)
     # Taken back is the placement too, and one step of undo brings it again.
-    assert not moved(view) and view.studio.camera(BASE).now == view.studio.camera(BASE).info.settings == start
-    assert view.studio.edit_state.message.endswith(
+    assert (
+        not moved(view)
+        and view.of(StudioView).camera(BASE).now == view.of(StudioView).camera(BASE).info.settings == start
+    )
+    assert view.of(StudioView).edit_state.message.endswith(
         "base_camera is where the file places it; Undo restores your placement."
     )
     wait_until(session, seen_from(BASE, start), "the camera where the file has it")
-    assert view.studio.undo == "reverted the change of base_camera"
+    assert view.of(StudioView).undo == "reverted the change of base_camera"
     session.do(UndoCamera())
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
-    assert not differences(view.studio.camera(BASE).now, now.now)
+    assert not differences(view.of(StudioView).camera(BASE).now, now.now)
 
 
 def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
@@ -190,7 +195,7 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     session.happen(CameraPlaced(BASE, there))
     session.happen(EditWanted(EditRequest("remove", BASE)))
     view = wait_until(session, in_studio(lambda s: s.edit_state.stage in ("planned", "refused")), "the plan")
-    assert view.studio.edit_state.stage == "planned", view.studio.edit_state.message
+    assert view.of(StudioView).edit_state.stage == "planned", view.of(StudioView).edit_state.message
     session.do(SaveCameraChange())
     wait_until(session, in_studio(lambda s: s.edit_state.stage == "checked"), "the version without it")
     session.do(RevertCameraChange())
@@ -210,14 +215,14 @@ def settled(session: Session, reached: Callable[[StudioView], bool], what: str) 
     view = wait_until(
         session, in_studio(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what
     )
-    assert not view.studio.problem, view.studio.problem
-    return view.studio
+    assert not view.of(StudioView).problem, view.of(StudioView).problem
+    return view.of(StudioView)
 
 
 def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
     session.happen(MeasureWanted("envs"))
     report = settled(session, lambda s: s.results.report_of == BASE, "the judgement").results.report
-    assert sorted(report.envs) == [0, 1] and not session.view().studio.report_stale
+    assert sorted(report.envs) == [0, 1] and not session.view().of(StudioView).report_stale
     (cube,) = report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
     session.happen(SheetWanted())
@@ -227,7 +232,7 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
     start = camera(session, BASE).now
     away = replace(start, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
     session.happen(CameraPlaced(BASE, away))
-    assert session.view().studio.report_stale
+    assert session.view().of(StudioView).report_stale
     session.happen(MeasureWanted("envs"))
     studio = settled(session, lambda s: s.results.report is not report, "the judgement of the placement")
     assert (
@@ -282,7 +287,7 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
 @pytest.mark.slow
 def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session: Session) -> None:
     session.happen(MeasureWanted("resets", 3))
-    assert session.view().studio.progress is not None
+    assert session.view().of(StudioView).progress is not None
     found = settled(session, lambda s: s.results.report_seeds == 3, "three seeds")
     assert (
         len(found.results.report.envs) == 3
@@ -314,14 +319,18 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
 ) -> None:
     _, copied = opened
     view = copied.refused
-    assert view.studio.edit_state.can_copy and "is installed" in view.studio.edit_state.message
+    assert (
+        view.of(StudioView).edit_state.can_copy and "is installed" in view.of(StudioView).edit_state.message
+    )
     view, file = copied.planned, copied.folder / "push_cube_2.py"
-    assert view.task.file == str(file) == view.studio.edit_state.edit.file
+    assert view.task.file == str(file) == view.of(StudioView).edit_state.edit.file
     assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
     assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
-    assert view.studio.edit_state.message.startswith(f"This is your copy of the task, {file}. This changes")
+    assert view.of(StudioView).edit_state.message.startswith(
+        f"This is your copy of the task, {file}. This changes"
+    )
     assert moved(view) == {BASE}, "the placement is lost"
     assert copied.named.startswith(str(file)), "its command line opens the copy"
     view = copied.ended
-    assert view.studio.edit_state.stage == "checked", view.studio.edit_state.message
+    assert view.of(StudioView).edit_state.stage == "checked", view.of(StudioView).edit_state.message
     assert (copied.folder / "push_cube.py").read_text() == "somebody's own"

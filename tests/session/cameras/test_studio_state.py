@@ -19,8 +19,9 @@ from hypothesis import strategies as st
 from tests.drive.session import BASE, DEATH, PEOPLE, Told, told_session
 from tests.ui.scenes import camera as scene_camera
 from tests.ui.scenes import problem
-from workbench.authoring.camera_source.disk import SourceEdit
-from workbench.commands.cameras import (
+from workbench.cameras import events as of
+from workbench.cameras.apply import apply
+from workbench.cameras.commands import (
     CopyTask,
     DropCameraChange,
     PickPixel,
@@ -35,17 +36,16 @@ from workbench.commands.cameras import (
     UndoCamera,
     UsePlacement,
 )
-from workbench.commands.command import Command, Refused
-from workbench.commands.run import Step
-from workbench.core.camera_data import CameraKey, CameraSettings, Picture
-from workbench.session.cameras import events as of
-from workbench.session.cameras.state import Change, Studio, placed_cameras, view_of
-from workbench.session.cameras.studio import apply
-from workbench.session.cameras.view import EditRequest, EditState, PickedPixel
-from workbench.session.events import Asked
-from workbench.session.protocol.messages import Loaded, LoadFailed, PlaceCamera, Placed
-from workbench.session.run.events import FileSaved, MomentShown, Now, Send, VersionLoaded, WorkerDied
-from workbench.session.run.run import Run
+from workbench.cameras.state import Change, Studio, placed_cameras, view_of
+from workbench.cameras.view import EditRequest, EditState, PickedPixel
+from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
+from workbench.live.commands import Step
+from workbench.live.effects import Asked
+from workbench.live.events import FileSaved, MomentShown, Now, Send, VersionLoaded, WorkerDied
+from workbench.live.messages import Loaded, LoadFailed, PlaceCamera, Placed
+from workbench.live.run import Run
+from workbench.page.command import Command, Refused
+from workbench.task.apply_edits import SourceEdit
 
 FILE = "/home/me/push.py"
 SETTINGS = CameraSettings((0.4, 0.0, 0.6), (1, 0, 0, 0), 1.0, None, 8, 6, 0.01, 10.0, "minimal")

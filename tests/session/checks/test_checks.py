@@ -12,21 +12,21 @@ import pytest
 
 from tests.drive.session import Told, live_session, told_session, wait_until, work_with
 from tests.drive.waiting import until
+from workbench.checks.commands import CheckAfterSave, CheckNow, StopChecks
+from workbench.checks.questions import CheckedGroup, CheckGroup, RuleProgress
 from workbench.checks.results import RuleResult
-from workbench.commands.checks import CheckAfterSave, CheckNow, StopChecks
-from workbench.commands.command import Refused
-from workbench.commands.run import PlayRun
-from workbench.core.rules import Finding
-from workbench.jobs.task import TaskOptions
+from workbench.checks.state import RUNNING, ChecksView
+from workbench.envs.gpu_rules import Finding
+from workbench.live.commands import PlayRun
+from workbench.live.events import FileSaved
+from workbench.live.messages import Load
+from workbench.live.process.ask import GaveWay
+from workbench.live.process.background_jobs import Job, JobFailed, ProcessDied, StoppedBy
 from workbench.machine.kept_choices import kept_choices
-from workbench.session.checks.checks import RUNNING, ChecksView
-from workbench.session.process.askers import GaveWay
-from workbench.session.process.jobs import Job, JobFailed, ProcessDied
-from workbench.session.protocol.messages import Load
-from workbench.session.protocol.questions import CheckedGroup, CheckGroup, RuleProgress
-from workbench.session.record.saving import SaveWanted
-from workbench.session.rescore.rescoring import StoppedBy
-from workbench.session.run.events import FileSaved
+from workbench.page.command import Refused
+from workbench.record.saving_state import SaveWanted
+from workbench.record.state import RecordingStatus
+from workbench.task.description import TaskOptions
 
 FIRST, SECOND = "success-at-reset", "reward-changes"
 GROUPS = ((FIRST,), (SECOND,))
@@ -112,9 +112,11 @@ def load(told: Told, text: str = FIRST_TEXT, **changes: Any) -> None:
 
 def ended(told: Told) -> ChecksView:
     until(
-        lambda: told.view.checks.state not in RUNNING, "the end of the checks", seen=lambda: told.view.checks
+        lambda: told.view.of(ChecksView).state not in RUNNING,
+        "the end of the checks",
+        seen=lambda: told.view.of(ChecksView),
     )
-    return told.view.checks
+    return told.view.of(ChecksView)
 
 
 def rules_of(view: ChecksView) -> list[str]:
@@ -172,13 +174,13 @@ def test_findings_of_the_version_before_stay_until_their_rule_is_checked(
     background.hold()
     checks.session.happen(FileSaved())
     load(checks, NEXT_TEXT)
-    assert [one.rule for one in checks.view.checks.before] == [
+    assert [one.rule for one in checks.view.of(ChecksView).before] == [
         FIRST,
         SECOND,
-    ] and checks.view.checks.findings == ()
+    ] and checks.view.of(ChecksView).findings == ()
     background.let.release()
-    until(lambda: len(checks.view.checks.results) == 1, "the first rule")
-    assert [one.rule for one in checks.view.checks.before] == [SECOND]
+    until(lambda: len(checks.view.of(ChecksView).results) == 1, "the first rule")
+    assert [one.rule for one in checks.view.of(ChecksView).before] == [SECOND]
     background.let.release()
     view = ended(checks)
     assert view.before == () and [one.rule for one in view.findings] == [SECOND]
@@ -190,7 +192,7 @@ def test_a_finding_goes_with_the_line_that_it_is_about(checks: Told, background:
     ended(checks)
     background.hold()
     load(checks, MENDED_TEXT)
-    assert checks.view.checks.before == () and checks.view.checks.findings == ()
+    assert checks.view.of(ChecksView).before == () and checks.view.of(ChecksView).findings == ()
 
 
 def test_another_task_has_no_findings_of_the_one_before(checks: Told, background: ScriptedBackground) -> None:
@@ -199,17 +201,20 @@ def test_another_task_has_no_findings_of_the_one_before(checks: Told, background
     ended(checks)
     background.hold()
     load(checks, env_id="Pull-v1")
-    assert checks.view.checks.before == () and checks.view.checks.findings == ()
+    assert checks.view.of(ChecksView).before == () and checks.view.of(ChecksView).findings == ()
 
 
 def test_a_save_stops_it_and_what_is_known_stays(checks: Told, background: ScriptedBackground) -> None:
     background.hold()
     load(checks)
     background.let.release()
-    until(lambda: len(checks.view.checks.results) == 1, "the first rule")
+    until(lambda: len(checks.view.of(ChecksView).results) == 1, "the first rule")
     checks.session.happen(FileSaved())
-    assert (checks.view.checks.state, checks.view.checks.stopped_by) == ("stopped", StoppedBy.SAVE)
-    assert rules_of(checks.view.checks) == [FIRST]
+    assert (checks.view.of(ChecksView).state, checks.view.of(ChecksView).stopped_by) == (
+        "stopped",
+        StoppedBy.SAVE,
+    )
+    assert rules_of(checks.view.of(ChecksView)) == [FIRST]
     # The same text again, or what could not be loaded taken back.
     background.let = threading.Semaphore(10)
     load(checks)
@@ -246,7 +251,7 @@ def test_without_checks_after_each_save_a_load_leaves_the_findings_as_old(
     ended(checks)
     checks.session.do(CheckAfterSave(on=False))
     load(checks, NEXT_TEXT)
-    view = checks.view.checks
+    view = checks.view.of(ChecksView)
     assert view.state == "none" and [one.rule for one in view.before] == [FIRST] and not view.results
     assert len(background.asked) == 2
 
@@ -258,7 +263,7 @@ def test_the_choice_is_kept_and_what_was_not_checked_is_checked_as_soon_as_it_is
         checks.session.do(CheckNow())
     for wanted in (True, False):
         checks.session.do(CheckAfterSave(on=wanted))
-        assert kept_choices().check_after_save == wanted == checks.view.checks.after_each_save
+        assert kept_choices().check_after_save == wanted == checks.view.of(ChecksView).after_each_save
     load(checks)
     assert background.asked == []
     checks.session.do(CheckAfterSave(on=True))
@@ -269,10 +274,10 @@ def test_what_is_stopped_by_hand_says_so(checks: Told, background: ScriptedBackg
     background.hold()
     load(checks)
     checks.session.do(StopChecks())
-    view = checks.view.checks
+    view = checks.view.of(ChecksView)
     assert (view.state, view.stopped_by) == ("stopped", StoppedBy.HAND)
     checks.session.do(StopChecks())
-    assert checks.view.checks == view
+    assert checks.view.of(ChecksView) == view
 
 
 # --- with processes -----------------------------------------------------------------------------------
@@ -294,16 +299,16 @@ def test_a_broken_save_is_found_at_its_line_while_the_env_plays_and_mending_it_c
             return lambda view: any(one.rule == rule for one in view.checks.findings)
 
         view = wait_until(session, found(FIRST), "the finding")
-        (one,) = (each for each in view.checks.findings if each.rule == FIRST)
+        (one,) = (each for each in view.of(ChecksView).findings if each.rule == FIRST)
         assert (one.file, one.line, one.degree) == (str(task_file), line, "stop") and bad in one.code
         assert view.playing
         # Somebody waits for this: the checks give way, and go on.
         session.happen(SaveWanted((0,)))
-        wait_until(session, lambda view: view.recording.saving.message != "", "the saved episode")
+        wait_until(session, lambda view: view.of(RecordingStatus).saving.message != "", "the saved episode")
         task_file.write_text(text)
         wait_until(
             session,
-            lambda view: FIRST in rules_of(view.checks) and not found(FIRST)(view),
+            lambda view: FIRST in rules_of(view.of(ChecksView)) and not found(FIRST)(view),
             "the rule checked anew",
         )
-        assert all(one.rule != FIRST for one in session.view().checks.before)
+        assert all(one.rule != FIRST for one in session.view().of(ChecksView).before)

@@ -11,10 +11,11 @@ import pytest
 from tests.drive.session import Told, work_with
 from tests.drive.waiting import until
 from tests.ui.scenes import problem
+from workbench.checks.commands import StopProfile, TimeStep
+from workbench.checks.profile import ProfileView
 from workbench.checks.results import HookTime, StepProfile
-from workbench.commands.checks import StopProfile, TimeStep
-from workbench.commands.command import Refused
-from workbench.session.process.jobs import JobFailed
+from workbench.live.process.background_jobs import JobFailed
+from workbench.page.command import Refused
 
 PROFILE = StepProfile(3, 20, 1.0, (HookTime("evaluate", 1.0, 1.0),), ())
 
@@ -54,12 +55,12 @@ def test_a_step_is_timed_and_its_profile_is_old_as_soon_as_another_version_runs(
         told.session.do(TimeStep())
     told.load()
     told.session.do(TimeStep())
-    assert told.view.profile.state == "running"
+    assert told.view.of(ProfileView).state == "running"
     timer.let = True
-    until(lambda: told.view.profile.state == "done", "the profile")
-    assert told.view.profile.profile == PROFILE and not told.view.profile.stale
+    until(lambda: told.view.of(ProfileView).state == "done", "the profile")
+    assert told.view.of(ProfileView).profile == PROFILE and not told.view.of(ProfileView).stale
     told.load("patched")
-    assert told.view.profile.profile == PROFILE and told.view.profile.stale
+    assert told.view.of(ProfileView).profile == PROFILE and told.view.of(ProfileView).stale
 
 
 def test_a_load_and_a_person_end_it(told: Told, timer: Timer) -> None:
@@ -67,12 +68,12 @@ def test_a_load_and_a_person_end_it(told: Told, timer: Timer) -> None:
     for end in (lambda: told.load("patched"), lambda: told.session.do(StopProfile())):
         told.session.do(TimeStep())
         end()
-        assert told.view.profile.state == "stopped"
+        assert told.view.of(ProfileView).state == "stopped"
 
 
 def test_what_the_code_raises_is_shown(told: Told, timer: Timer) -> None:
     told.load()
     timer.let, timer.fails = True, JobFailed("it cannot be timed", problem())
     told.session.do(TimeStep())
-    until(lambda: told.view.profile.state == "failed", "the failure")
-    assert told.view.profile.problem == problem()
+    until(lambda: told.view.of(ProfileView).state == "failed", "the failure")
+    assert told.view.of(ProfileView).problem == problem()

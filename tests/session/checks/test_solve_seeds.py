@@ -10,12 +10,12 @@ import pytest
 
 from tests.drive.session import TASKS, Told, told_session
 from tests.drive.waiting import until
-from workbench.authoring.loading.reference import RecordedTask
-from workbench.commands.checks import ChooseSeeds, SolveSeeds, StopSolving
-from workbench.commands.command import Refused
-from workbench.jobs.task import TaskOptions
+from workbench.checks.commands import ChooseSeeds, SolveSeeds, StopSolving
+from workbench.page.command import Refused
 from workbench.planning.options import PlanOptions
-from workbench.session.checks.solve_seeds import RUNNING, SeedsView
+from workbench.solve.seeds import RUNNING, SeedsView
+from workbench.task.description import TaskOptions
+from workbench.task.reference import RecordedTask
 
 FEW = PlanOptions(rollouts=16, horizon=0.3, noise=0.8)
 MADE = TaskOptions(
@@ -34,7 +34,7 @@ def solving(task: object, recordings: Path) -> Iterator[Told]:
 def solve(told: Told, seeds: int) -> SeedsView:
     told.session.do(ChooseSeeds(seeds=seeds))
     told.session.do(SolveSeeds())
-    return told.view.seeds
+    return told.view.of(SeedsView)
 
 
 @pytest.mark.slow
@@ -45,16 +45,19 @@ def test_each_seed_is_solved_recorded_and_told_and_what_is_done_stays_when_it_is
         view = solve(told, 200)
         assert view.state == "starting" and view.total == 200
         until(
-            lambda: told.view.seeds.report is not None, "the first seed", 120.0, seen=lambda: told.view.seeds
+            lambda: told.view.of(SeedsView).report is not None,
+            "the first seed",
+            120.0,
+            seen=lambda: told.view.of(SeedsView),
         )
         told.session.do(StopSolving())
-        view = told.view.seeds
+        view = told.view.of(SeedsView)
         assert view.state == "stopped" and view.report is not None
         first = view.report.seeds[0]
         assert first.seed == 0 and bool(first.solved_at) != bool(first.in_the_way)
         assert first.path.is_file() and first.path.parent == tmp_path / "recordings"
         told.load("patched")
-        assert told.view.seeds.stale and told.view.seeds.report is view.report
+        assert told.view.of(SeedsView).stale and told.view.of(SeedsView).report is view.report
 
 
 @pytest.mark.slow
@@ -63,8 +66,13 @@ def test_a_task_that_fails_says_where(child_process: None, tmp_path: Path) -> No
     file.write_text("raise KeyError('goal')\n")
     with solving(str(file), tmp_path / "recordings") as told:
         solve(told, 2)
-        until(lambda: told.view.seeds.state not in RUNNING, "the end", 120.0, seen=lambda: told.view.seeds)
-        view = told.view.seeds
+        until(
+            lambda: told.view.of(SeedsView).state not in RUNNING,
+            "the end",
+            120.0,
+            seen=lambda: told.view.of(SeedsView),
+        )
+        view = told.view.of(SeedsView)
     assert view.state == "failed" and view.problem is not None and view.problem.line == 1
     assert "KeyError" in view.problem.message and view.report is None
 
@@ -78,4 +86,4 @@ def test_a_task_that_a_recording_names_is_not_run_from_the_disk(tmp_path: Path) 
 def test_without_a_task_there_is_nothing_to_solve(told: Told) -> None:
     with pytest.raises(Refused):
         solve(told, 2)
-    assert (told.view.seeds.state, told.view.seeds.chosen) == ("none", 2)
+    assert (told.view.of(SeedsView).state, told.view.of(SeedsView).chosen) == ("none", 2)

@@ -12,8 +12,8 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from tests.drive.session import moment
-from workbench.core.env.step_result import OtherEntry, StepResult
-from workbench.session.history.curves import (
+from workbench.envs.step_result import OtherEntry, StepResult
+from workbench.live.history.curves import (
     MOST,
     REWARD,
     SUCCESS,

@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drive.session import Told, told_session
-from workbench.core.capture.outliers import OutlierKind
-from workbench.session.history.env_table import KEPT_REWARDS, Outcome
-from workbench.session.history.history import FAIL, SUCCESS
-from workbench.session.run.events import MomentShown
+from workbench.envs.outliers import OutlierKind
+from workbench.live.events import MomentShown
+from workbench.live.history.env_table import KEPT_REWARDS, Outcome
+from workbench.live.history.moments import FAIL, SUCCESS
 
 N = 3
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from tests.drive.session import Told, moment, moments_of, told_session
-from workbench.commands.timeline import Seek
-from workbench.core.camera_data import CameraKind, Picture
-from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
-from workbench.session.protocol.messages import CameraRequest, PastPictures, Pictures
-from workbench.session.run.events import MomentShown
+from workbench.envs.camera_data import CameraKind, Picture
+from workbench.live.events import MomentShown
+from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.live.messages import CameraRequest, PastPictures, Pictures
+from workbench.live.timeline_commands import Seek
 
 EYE = CameraRequest("eye", "sensor")
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import live_session, wait_until
-from workbench.commands.run import Step
-from workbench.core.capture.outliers import OUTLIER_RULES, OutlierKind
-from workbench.session.history.env_table import Outcome
-from workbench.session.live.session import Session
-from workbench.session.run.events import EnvsReset
+from workbench.app.session import Session
+from workbench.envs.outliers import OUTLIER_RULES, OutlierKind
+from workbench.live.commands import Step
+from workbench.live.events import EnvsReset
+from workbench.live.history.env_table import Outcome
 
 BROKEN = '''
 import sapien

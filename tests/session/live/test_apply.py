@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from tests.drive.session import DEATH, moment
 from tests.ui.scenes import camera, description, step_of, table_scene
-from workbench.authoring.problem import Problem
-from workbench.commands.command import Refused
-from workbench.commands.envs import NextEnv, PreviousEnv, SelectEnv
-from workbench.commands.run import (
+from workbench.app.state import State, apply
+from workbench.cameras.state import first_studio
+from workbench.envs.inspection import Inspection
+from workbench.live.commands import (
     ChooseActions,
     PauseRun,
     PlayRun,
@@ -30,25 +30,9 @@ from workbench.commands.run import (
     TogglePlay,
     UseControlMode,
 )
-from workbench.commands.timeline import ContinueFromHere, GoToLast, NextEvent, Seek, StepBack, UndoReset
-from workbench.core.capture.inspection import Inspection
-from workbench.jobs.task import Stepped, TaskOptions
-from workbench.session.cameras.state import first_studio
-from workbench.session.events import Asked, Later
-from workbench.session.live.state import State, apply
-from workbench.session.live.view import view_of
-from workbench.session.process.supervisor import End
-from workbench.session.protocol.messages import (
-    Load,
-    Loaded,
-    LoadFailed,
-    Loading,
-    ReloadReport,
-    Settings,
-    Status,
-)
-from workbench.session.record.recording import LiveRecording
-from workbench.session.run.events import (
+from workbench.live.effects import Asked, Later
+from workbench.live.env_commands import NextEnv, PreviousEnv, SelectEnv
+from workbench.live.events import (
     FileSaved,
     MomentShown,
     Now,
@@ -62,8 +46,16 @@ from workbench.session.run.events import (
     VersionLoaded,
     WorkerDied,
 )
-from workbench.session.run.reading import READ_EVERY
-from workbench.session.run.run import first_run
+from workbench.live.messages import Load, Loaded, LoadFailed, Loading, ReloadReport, Settings, Status
+from workbench.live.process.supervisor import End
+from workbench.live.reading import READ_EVERY
+from workbench.live.run import first_run
+from workbench.live.timeline_commands import ContinueFromHere, GoToLast, NextEvent, Seek, StepBack, UndoReset
+from workbench.live.view import view_of
+from workbench.page.command import Refused
+from workbench.record.state import LiveRecording
+from workbench.task.description import Stepped, TaskOptions
+from workbench.task.problem import Problem
 
 ENVS = 3
 PROBLEM = Problem("step", "KeyError: 'goal'", "push.py", 7, None, "Traceback")

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import save, step, wait_until
-from workbench.commands.run import ReloadFile
-from workbench.session.live.session import Session
+from workbench.app.session import Session
+from workbench.live.commands import ReloadFile
 
 
 def edited(text: str, hook: str, line: str) -> tuple[str, int]:

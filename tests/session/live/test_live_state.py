@@ -16,15 +16,12 @@ import pytest
 from tests.drive.session import DEATH, Told, ToldWorker, told_session
 from tests.drive.waiting import until
 from tests.ui.scenes import problem
-from workbench.authoring.loading.reference import RecordedTask
-from workbench.commands.command import Refused
-from workbench.commands.run import ChooseClass, PauseRun, PlayRun, ReloadFile, SetSeed
-from workbench.core.camera_data import Picture
-from workbench.core.capture.inspection import Inspection
-from workbench.core.rules import Finding
-from workbench.jobs.task import TaskOptions
-from workbench.session.process.supervisor import End
-from workbench.session.protocol.messages import (
+from workbench.envs.camera_data import Picture
+from workbench.envs.gpu_rules import Finding
+from workbench.envs.inspection import Inspection
+from workbench.live.commands import ChooseClass, PauseRun, PlayRun, ReloadFile, SetSeed
+from workbench.live.events import MomentShown, OptionsApplied, PagesCounted, ReadingChosen
+from workbench.live.messages import (
     CameraFailed,
     CameraRequest,
     Inspect,
@@ -38,11 +35,14 @@ from workbench.session.protocol.messages import (
     Settings,
     Status,
 )
-from workbench.session.protocol.messages import Told as ToldRobots
-from workbench.session.rescore.rescoring import RescoreView, RescoringTold
-from workbench.session.run.events import MomentShown, OptionsApplied, PagesCounted, ReadingChosen
-from workbench.session.run.reading import READ_EVERY
-from workbench.session.run.run import Run
+from workbench.live.messages import Told as ToldRobots
+from workbench.live.process.supervisor import End
+from workbench.live.reading import READ_EVERY
+from workbench.live.run import Run
+from workbench.page.command import Refused
+from workbench.rescore.state import RescoreView, RescoringTold
+from workbench.task.description import TaskOptions
+from workbench.task.reference import RecordedTask
 
 EYE = CameraRequest("eye", "sensor")
 GONE_WRONG = Finding("r", "warn", "m", None, None, "", "", 1, 0)
@@ -107,10 +107,10 @@ def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_show
     session = played.session
     session.change(selected_env=2, cameras=(EYE,))
     played.load("patched", source_hash="b")
-    assert played.view.rescored.state == "loading" and played.view.rescored.total == 3
+    assert played.view.of(RescoreView).state == "loading" and played.view.of(RescoreView).total == 3
     session.happen(RescoringTold(1, RescoreView("rescoring", done=3)))
     session.happen(RescoringTold(1, RescoreView("done", done=3)))
-    assert (played.view.rescored.state, played.view.rescored.done) == ("done", 3)
+    assert (played.view.of(RescoreView).state, played.view.of(RescoreView).done) == ("done", 3)
     session.happen(MomentShown(1))
     session.happen(MomentShown(None))
     told = np.ones((3, 2), np.float32)
@@ -130,7 +130,7 @@ def test_another_scene_begins_another_past_and_nothing_of_the_one_before_is_show
     assert (after.scene_serial, after.cameras_serial) == (before.scene_serial + 1, before.cameras_serial + 1)
     assert after.pictures_serial > before.pictures_serial and after.rules_serial > before.rules_serial
     assert (after.pictures, after.told, after.inspection, after.rules) == ({}, None, None, None)
-    assert after.rescored.state == "none" and after.rescored.total == 0
+    assert after.of(RescoreView).state == "none" and after.of(RescoreView).total == 0
     assert not after.failed_cameras and after.selected_env == 1 and after.timeline_cleared
     assert (after.timeline.first, after.timeline.moments) == (4, 1) and after.curves.serial == 0
 

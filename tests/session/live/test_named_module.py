@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS, wait_until
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
+from workbench.app.session import Session
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

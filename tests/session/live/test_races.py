@@ -9,10 +9,10 @@ import pytest
 
 from tests.drive.session import ToldWorker, told_session
 from tests.drive.waiting import until
-from workbench.commands.run import PauseRun, ResetAll, Step
-from workbench.commands.timeline import Seek
+from workbench.live.commands import PauseRun, ResetAll, Step
+from workbench.live.messages import Play, Request, Reset, Settings, SingleStep
+from workbench.live.timeline_commands import Seek
 from workbench.machine.processes.watched_thread import listen, stop_listening
-from workbench.session.protocol.messages import Play, Request, Reset, Settings, SingleStep
 
 
 class FailsOnce(ToldWorker):

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from tests.drive.session import live_session, save, start_over, step, wait_until
-from workbench.commands.recording import StopRecording
-from workbench.commands.run import PlayRun, Step
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.record.recording import RecordingWanted
-from workbench.session.run.events import EnvsReset
+from workbench.app.session import Session
+from workbench.live.commands import PlayRun, Step
+from workbench.live.events import EnvsReset
+from workbench.live.view import SessionView
+from workbench.record.commands import StopRecording
+from workbench.record.state import RecordingStatus, RecordingWanted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -176,13 +176,15 @@ def test_recording_and_playing_go_on_after_a_refused_version(
         session.change(speed=8.0)
         session.happen(RecordingWanted((0,)))
         session.do(PlayRun())
-        wait_until(session, lambda v: v.recording.steps > 3, "some recorded steps")
+        wait_until(session, lambda v: v.of(RecordingStatus).steps > 3, "some recorded steps")
         file.write_text(in_evaluate(good, "raise ValueError('enough')"))
         wait_until(session, lambda v: v.problem is not None, "the refusal")
         again = wait_until(session, lambda v: v.problem is not None and v.state == "running", "playing again")
-        assert again.recording.active and again.recording.env_idx == (0,)
-        wait_until(session, lambda v: v.recording.episodes_written >= 1, "the episode that was running")
+        assert again.of(RecordingStatus).active and again.of(RecordingStatus).env_idx == (0,)
+        wait_until(
+            session, lambda v: v.of(RecordingStatus).episodes_written >= 1, "the episode that was running"
+        )
         session.happen(EnvsReset((0,)))
-        wait_until(session, lambda v: v.recording.steps > 3, "steps of the next episode")
+        wait_until(session, lambda v: v.of(RecordingStatus).steps > 3, "steps of the next episode")
         session.do(StopRecording())
-        wait_until(session, lambda v: v.recording.episodes_written >= 2, "both episodes")
+        wait_until(session, lambda v: v.of(RecordingStatus).episodes_written >= 2, "both episodes")

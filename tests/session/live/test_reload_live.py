@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from tests.drive.session import heard, runs, save, wait_until
-from workbench.commands.command import Refused
-from workbench.commands.recording import StopRecording
-from workbench.commands.run import ChooseClass, PauseRun, PlayRun, RebuildScene, ReloadFile, Step
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.record.recording import RecordingWanted
-from workbench.session.run.events import EnvsReset
+from workbench.app.session import Session
+from workbench.live.commands import ChooseClass, PauseRun, PlayRun, RebuildScene, ReloadFile, Step
+from workbench.live.events import EnvsReset
+from workbench.live.view import SessionView
+from workbench.page.command import Refused
+from workbench.record.commands import StopRecording
+from workbench.record.state import RecordingStatus, RecordingWanted
 
 DRAWS = True
 
@@ -204,12 +204,14 @@ def test_recording_goes_on_with_the_next_episode_and_the_moment_stays(
 ) -> None:
     session.happen(RecordingWanted((0,)))
     before = played(session, 5)
-    assert before.recording.steps > 0
+    assert before.of(RecordingStatus).steps > 0
     view = save(session, task_file, reward_plus(good, 41))
     np.testing.assert_array_equal(view.step.poses, before.step.poses)
-    view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the episode of the old version")
-    assert view.recording.active and view.recording.steps == 0
+    view = wait_until(
+        session, lambda v: v.of(RecordingStatus).episodes_written == 1, "the episode of the old version"
+    )
+    assert view.of(RecordingStatus).active and view.of(RecordingStatus).steps == 0
     session.happen(EnvsReset((0,)))
     played(session, 3)
-    assert session.view().recording.steps >= 3
+    assert session.view().of(RecordingStatus).steps >= 3
     session.do(StopRecording())

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from tests.drive.session import Told, heard, live_session, start_over, step, wait_until
-from workbench.commands.run import PauseRun, PlayRun, Step
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.protocol.messages import CameraRequest, EnterRecording
-from workbench.session.run.events import ActionTold, EnvsReset, PagesCounted
+from workbench.app.session import Session
+from workbench.live.commands import PauseRun, PlayRun, Step
+from workbench.live.events import ActionTold, EnvsReset, PagesCounted
+from workbench.live.messages import CameraRequest, EnterRecording
+from workbench.live.view import SessionView
 
 pytestmark = pytest.mark.thorough
 

@@ -11,13 +11,13 @@ import pytest
 
 from tests.drive.session import Told, told_session
 from tests.drive.waiting import until
-from workbench.authoring.loading.watch import SourceWatcher
-from workbench.authoring.problem import Problem
-from workbench.commands.recording import StopRecording
-from workbench.commands.run import Step
-from workbench.session.live import session
-from workbench.session.protocol.messages import LoadFailed, SingleStep
-from workbench.session.record.recording import RecordingWanted
+from workbench.app import session
+from workbench.live.commands import Step
+from workbench.live.messages import LoadFailed, SingleStep
+from workbench.record.commands import StopRecording
+from workbench.record.state import RecordingStatus, RecordingWanted
+from workbench.task.problem import Problem
+from workbench.task.watch import SourceWatcher
 
 
 @pytest.fixture
@@ -101,10 +101,12 @@ def test_a_recording_that_cannot_be_written_keeps_no_step(
         told.reset((0,))
         told.step(3)
         assert hangs.wait(60)
-        assert answers(told) and told.view.recording.active
+        assert answers(told) and told.view.of(RecordingStatus).active
         told.session.do(StopRecording())
         assert answers(told)
         disk.set()
         until(
-            lambda: told.view.recording.episodes_written == 1, "the episode", seen=lambda: told.view.recording
+            lambda: told.view.of(RecordingStatus).episodes_written == 1,
+            "the episode",
+            seen=lambda: told.view.of(RecordingStatus),
         )

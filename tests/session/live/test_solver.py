@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from tests.drive.session import TASKS, Told, heard, live_session, start_over, step, wait_until
-from workbench.commands.run import Interrupt, PauseRun, PlayRun, Step
+from workbench.app.session import Session
+from workbench.live.commands import Interrupt, PauseRun, PlayRun, Step
+from workbench.live.messages import PlanDropped, PlanWanted, Play
 from workbench.planning.options import PlanOptions
-from workbench.session.live.session import Session
-from workbench.session.protocol.messages import PlanDropped, PlanWanted, Play
-from workbench.session.record.saving import SaveWanted
+from workbench.record.saving_state import SaveWanted
+from workbench.record.state import RecordingStatus
+from workbench.solve.state import SolveView
 
 FEW = PlanOptions(rollouts=16, horizon=0.3, noise=0.8)
 """Enough for a cube that is pushed."""
@@ -42,26 +44,26 @@ def test_what_an_episode_came_to_is_kept_until_it_is_over(played: Told) -> None:
     played.reset()
     played.step()
     played.step(2, success=(0,))
-    solve = played.view.solve
+    solve = played.view.of(SolveView)
     assert (solve.solved_at, solve.solved, solve.achieved.tolist()) == (2, ((0, 2),), [1, 2, 3])
     change(selected_env=1)
-    assert played.view.solve.solved_at == 0 and played.view.solve.solved == ((0, 2),)
+    assert played.view.of(SolveView).solved_at == 0 and played.view.of(SolveView).solved == ((0, 2),)
     change(selected_env=0)
     played.reset((0,))
-    assert played.view.solve.solved == () and len(played.view.solve.achieved) == 0
+    assert played.view.of(SolveView).solved == () and len(played.view.of(SolveView).achieved) == 0
     played.step(success=(0,))
-    assert played.view.solve.solved == ((0, 1),), "and of the next episode the same"
+    assert played.view.of(SolveView).solved == ((0, 1),), "and of the next episode the same"
     played.session.do(PlayRun())
     played.asked(object)
     played.tell(PlanWanted(5, (0,), why_not="it cannot be copied"))
-    solve = played.view.solve
+    solve = played.view.of(SolveView)
     assert solve.state == "failed" and "cannot be copied" in solve.why
     assert played.asked(Play) == [Play(False)] and not played.view.playing
     played.tell(PlanDropped())
-    assert played.view.solve.state == "failed", "it is said until something is planned"
+    assert played.view.of(SolveView).state == "failed", "it is said until something is planned"
     change(action_source="random")
     played.step()
-    assert played.view.solve.solved == () and len(played.view.solve.achieved) == 0
+    assert played.view.of(SolveView).solved == () and len(played.view.of(SolveView).achieved) == 0
 
 
 @pytest.mark.slow
@@ -69,25 +71,29 @@ def test_it_plays_until_the_selected_env_is_solved_and_the_others_hold_still(ses
     start_over(session, 3)
     before = session.view().step
     session.do(PlayRun())
-    view = wait_until(session, lambda view: bool(view.solve.solved_at) and not view.playing, "a success")
+    view = wait_until(
+        session, lambda view: bool(view.of(SolveView).solved_at) and not view.playing, "a success"
+    )
     step = view.step
     assert step is not None and before is not None
-    assert view.solve.solved == ((0, view.solve.solved_at),)
+    assert view.of(SolveView).solved == ((0, view.of(SolveView).solved_at),)
     assert step.evaluate["success"].tolist() == [True, False]
-    assert step.elapsed_steps[0] == view.solve.solved_at == len(view.solve.achieved)
+    assert step.elapsed_steps[0] == view.of(SolveView).solved_at == len(view.of(SolveView).achieved)
     # The cube of the other env lies where it lay.
     assert view.task is not None
     cube = view.task.geometry.body_names.index("cube")
     assert np.abs(step.poses[1, cube] - before.poses[1, cube]).max() < 1e-3
-    plan = view.solve.plan
+    plan = view.of(SolveView).plan
     assert plan is not None and plan.horizon == 6 and plan.actions.shape == (1, 7)
     assert len(plan.returns) == 16 and (np.diff(plan.returns) <= 0).all()
     assert plan.paths.shape == (16, 7, 3) and plan.traced == "panda/panda_hand_tcp"
     # What is predicted and what comes is of one size: the best of the last plan is a success.
-    assert np.isfinite(view.solve.predicted).all() and view.solve.predicted[-1] == pytest.approx(1, abs=0.6)
+    assert np.isfinite(view.of(SolveView).predicted).all() and view.of(SolveView).predicted[
+        -1
+    ] == pytest.approx(1, abs=0.6)
     session.happen(SaveWanted((0,)))
-    view = wait_until(session, lambda view: bool(view.recording.saving.message), "the recording")
-    assert view.recording.episodes_written == 1 and not view.recording.saving.failed, (
+    view = wait_until(session, lambda view: bool(view.of(RecordingStatus).saving.message), "the recording")
+    assert view.of(RecordingStatus).episodes_written == 1 and not view.of(RecordingStatus).saving.failed, (
         "it is kept like any other"
     )
 
@@ -99,10 +105,12 @@ def test_a_pressed_step_takes_one_planned_step_and_a_pause_ends_the_planning(ses
     session.do(PlayRun())
     wait_until(session, lambda view: view.step is not None and view.step.elapsed_steps[0] >= 2, "two steps")
     session.do(PauseRun())
-    view = wait_until(session, lambda view: not view.playing and view.solve.state == "none", "the pause")
+    view = wait_until(
+        session, lambda view: not view.playing and view.of(SolveView).state == "none", "the pause"
+    )
     serial = session.view().step_serial
     view = heard(session)
-    assert view.step_serial - serial <= 1 and view.solve.state == "none"
+    assert view.step_serial - serial <= 1 and view.of(SolveView).state == "none"
 
 
 def test_a_wish_that_comes_after_the_pause_was_sent_is_not_planned_for(session: Session) -> None:
@@ -113,14 +121,14 @@ def test_a_wish_that_comes_after_the_pause_was_sent_is_not_planned_for(session: 
         time.sleep(after)
         session.do(PauseRun())
         time.sleep(0.1)
-        wait_until(session, lambda view: not view.playing and view.solve.state == "none", "the end")
+        wait_until(session, lambda view: not view.playing and view.of(SolveView).state == "none", "the end")
 
 
 def test_a_pressed_step_is_made_also_if_another_env_is_selected_while_it_is_planned(session: Session) -> None:
     start_over(session, 4)
     last = session.view().timeline.last
     session.do(Step())
-    wait_until(session, lambda view: view.solve.state in ("starting", "planning"), "the planning")
+    wait_until(session, lambda view: view.of(SolveView).state in ("starting", "planning"), "the planning")
     session.change(selected_env=1)
     wait_until(session, lambda view: view.timeline.last > last, "the step")
     session.change(selected_env=0)
@@ -156,8 +164,8 @@ def test_another_body_is_traced_and_all_envs_are_planned_for_in_turn(session: Se
     session.change(solve_all=True, traced="cube", plan=replace(FEW, every=2))
     session.do(PlayRun())
     session.change(selected_env=1)
-    view = wait_until(session, lambda view: view.solve.plan is not None, "a plan of the other env")
-    plan = view.solve.plan
+    view = wait_until(session, lambda view: view.of(SolveView).plan is not None, "a plan of the other env")
+    plan = view.of(SolveView).plan
     assert plan is not None and plan.env == 1 and plan.traced == "cube" and plan.actions.shape == (2, 7)
     session.do(PauseRun())
     session.change(solve_all=False, traced="", plan=FEW, selected_env=0)
@@ -175,11 +183,11 @@ def test_a_save_is_planned_with_and_one_that_fails_in_a_rollout_says_where(
     file.write_text(text.replace("        return reward\n", broken))
     wait_until(session, lambda view: view.task_serial > serial, "the version")
     session.do(PlayRun())
-    view = wait_until(session, lambda view: view.solve.state == "failed", "the failure")
+    view = wait_until(session, lambda view: view.of(SolveView).state == "failed", "the failure")
     wait_until(session, lambda view: not view.playing, "the pause")
-    assert view.solve.problem is not None and view.solve.problem.message == "ValueError: too far"
-    assert view.solve.problem.file == str(file)
+    problem = view.of(SolveView).problem
+    assert problem is not None and problem.message == "ValueError: too far" and problem.file == str(file)
     file.write_text(text)
     wait_until(session, lambda view: view.task_serial > serial + 1, "the mended version")
     step(session)
-    assert session.view().solve.state == "planning"
+    assert session.view().of(SolveView).state == "planning"

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from tests.drive.session import draw_past, jump, live_session, moment_at, start_over, step, wait_until
-from workbench.commands.recording import StopRecording
-from workbench.commands.run import PauseRun, RestartWorker
-from workbench.commands.timeline import ContinueFromHere, UndoReset
-from workbench.session.live.session import Session
-from workbench.session.protocol.messages import CameraRequest
-from workbench.session.record.recording import RecordingWanted
-from workbench.session.run.events import ActionTold, EnvsReset, MomentShown, PagesCounted
+from workbench.app.session import Session
+from workbench.live.commands import PauseRun, RestartWorker
+from workbench.live.events import ActionTold, EnvsReset, MomentShown, PagesCounted
+from workbench.live.messages import CameraRequest
+from workbench.live.timeline_commands import ContinueFromHere, UndoReset
+from workbench.record.commands import StopRecording
+from workbench.record.state import RecordingWanted
 
 N = 3
 

@@ -14,22 +14,15 @@ import pytest
 
 from tests.drive.session import Told, camera, draw_past, seek, seek_by, told_session
 from tests.drive.waiting import until
-from workbench.commands.command import Refused
-from workbench.commands.run import PlayRun, ResetAll, Step
-from workbench.commands.timeline import ContinueFromHere, NextEvent, PreviousEvent, Seek, UndoReset
-from workbench.core.camera_data import CameraKind, Picture
-from workbench.session.history.history import RESET, SUCCESS, WENT_BACK
-from workbench.session.protocol.messages import (
-    CameraRequest,
-    DrawPast,
-    PastPictures,
-    Pictures,
-    Placed,
-    Restore,
-)
-from workbench.session.run.events import EpisodeStepShown, MomentShown, PagesCounted
-from workbench.session.run.past import Strip
-from workbench.session.run.run import Run
+from workbench.envs.camera_data import CameraKind, Picture
+from workbench.live.commands import PlayRun, ResetAll, Step
+from workbench.live.events import EpisodeStepShown, MomentShown, PagesCounted
+from workbench.live.history.moments import RESET, SUCCESS, WENT_BACK
+from workbench.live.messages import CameraRequest, DrawPast, PastPictures, Pictures, Placed, Restore
+from workbench.live.past import Strip
+from workbench.live.run import Run
+from workbench.live.timeline_commands import ContinueFromHere, NextEvent, PreviousEvent, Seek, UndoReset
+from workbench.page.command import Refused
 
 EYE, HAND = CameraRequest("base_camera", "sensor", ("rgb",)), CameraRequest("hand", "sensor", ("rgb",))
 PEOPLE = CameraRequest("base_camera", "human", ("rgb",))

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from tests.drive.session import DEATH, Told, stop_watching, told_session
 from tests.drive.waiting import until
 from tests.ui.scenes import description, problem, table_scene
-from workbench.commands.run import PlayRun, RebuildScene, ReloadFile, RestartWorker
-from workbench.session.process.supervisor import End
-from workbench.session.protocol.messages import Load, LoadFailed, Loading, NewProcessNeeded, Play, Settings
-from workbench.session.run import recovery
-from workbench.session.run.recovery import Recovery
+from workbench.live import recovery
+from workbench.live.commands import PlayRun, RebuildScene, ReloadFile, RestartWorker
+from workbench.live.messages import Load, LoadFailed, Loading, NewProcessNeeded, Play, Settings
+from workbench.live.process.supervisor import End
+from workbench.live.recovery import Recovery
 
 GOOD, NEW = "x = 1\n", "x = 2\n"
 FILE_WAITS = replace(DEATH, end=End.FILE_WAITS)

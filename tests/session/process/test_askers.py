@@ -18,16 +18,17 @@ import pytest
 
 from tests.drive.waiting import PATIENCE, until
 from tests.session.hazards import calm, provoke, provoked, write_task
-from workbench.authoring.problem import Problem
-from workbench.jobs.task import TaskOptions
+from workbench.cameras.questions import MeasureCamera
+from workbench.live.messages import Answer, Load, Progress, Request, Reset
+from workbench.live.process import ask as askers
+from workbench.live.process.ask import Asker, Background, OnProgress, Priority
+from workbench.live.process.background_jobs import Job, JobFailed, ProcessDied
+from workbench.live.questions import MakeScene
+from workbench.machine import loop
+from workbench.machine.loop import do
 from workbench.machine.processes.wire import Call, Question, pack
-from workbench.session import loop
-from workbench.session.loop import do
-from workbench.session.process import askers
-from workbench.session.process.askers import Asker, Background, OnProgress, Priority
-from workbench.session.process.jobs import Job, JobFailed, ProcessDied
-from workbench.session.protocol.messages import Answer, Load, Progress, Request, Reset
-from workbench.session.protocol.questions import MakeScene, MeasureCamera
+from workbench.task.description import TaskOptions
+from workbench.task.problem import Problem
 
 Work = Callable[[], Awaitable[Any]]
 BASE = ("sensor", "base_camera")

@@ -5,8 +5,8 @@ import unicodedata
 from hypothesis import given
 from hypothesis import strategies as st
 
+from workbench.live.process.captured_output import PrintedLine, PrintedLog
 from workbench.machine.text import plain_text
-from workbench.session.process.captured_output import PrintedLine, PrintedLog
 
 
 def a_log() -> tuple[PrintedLog, list[PrintedLine]]:

@@ -12,9 +12,9 @@ from collections.abc import Awaitable, Callable, Iterator
 import pytest
 
 from tests.drive.waiting import until
+from workbench.live.process.background_jobs import Job, JobFailed, JobProgress, Jobs
+from workbench.machine import loop
 from workbench.machine.processes.watched_thread import listen, stop_listening
-from workbench.session import loop
-from workbench.session.process.jobs import Job, JobFailed, JobProgress, Jobs
 
 
 class Seen:
@@ -164,7 +164,7 @@ def test_a_command_may_block_while_the_loop_and_its_signals_are_in_the_main_thre
 ) -> None:
     script = f"""
 import os, signal, threading
-from workbench.session.loop import do, loop_in_main, on_signal
+from workbench.machine.loop import do, loop_in_main, on_signal
 
 def is_main():
     return threading.current_thread() is threading.main_thread()

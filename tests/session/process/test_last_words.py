@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.session.process.heartbeat import author_place, death_problem, fatal_error, hook_of, parse_stack
+from workbench.live.process.heartbeat import author_place, death_problem, fatal_error, hook_of, parse_stack
 
 TASK = """import faulthandler, sys, ctypes
 def deep():

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from workbench.session.process.memory_limit import parse_memory, total_memory
+from workbench.live.process.memory_limit import parse_memory, total_memory
 
 
 @pytest.mark.parametrize(

@@ -15,13 +15,13 @@ from types import SimpleNamespace
 import pytest
 
 from tests.drive.waiting import until
-from workbench.jobs.task import TaskOptions
+from workbench.cameras.questions import RunCameras
+from workbench.live.messages import Event, Load, Loading, Request, WarmUp
+from workbench.live.process import supervisor, worker_process, worker_start
+from workbench.live.process.heartbeat import Busy
+from workbench.live.process.supervisor import Death, End, SpareWorker, Supervisor, WorkerOptions
 from workbench.machine.processes.wire import Call
-from workbench.session.process import supervisor, worker_process, worker_start
-from workbench.session.process.heartbeat import Busy
-from workbench.session.process.supervisor import Death, End, SpareWorker, Supervisor, WorkerOptions
-from workbench.session.protocol.messages import Event, Load, Loading, Request, WarmUp
-from workbench.session.protocol.questions import RunCameras
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
 SMALL_WORKER = Path(__file__).parents[1] / "small_worker.py"
@@ -104,7 +104,7 @@ def minded(options: WorkerOptions | None = None) -> Iterator[Minded]:
 @pytest.fixture(autouse=True)
 def small_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     def command(dash_m: str, module: str, *arguments: str) -> list[str]:
-        assert (dash_m, module) == ("-m", "workbench.session.worker.start")
+        assert (dash_m, module) == ("-m", "workbench.app.worker.start")
         return [sys.executable, "-P", str(SMALL_WORKER), *arguments]
 
     monkeypatch.setattr(worker_start, "python_command", command)

@@ -20,19 +20,19 @@ import pytest
 from tests.drive.session import live_session, runs, save, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import calm, edit, line_of, provocation, provoke, write_task
-from workbench.commands.recording import StopRecording
-from workbench.commands.run import Interrupt, PauseRun, PlayRun, ReloadFile, ResetAll, RestartWorker, Step
-from workbench.commands.timeline import ContinueFromHere
-from workbench.jobs.task import TaskOptions
-from workbench.recording.rerun.read import read_properties
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.process import supervisor
-from workbench.session.process.heartbeat import INTERRUPT_SIGNAL
-from workbench.session.process.supervisor import WorkerOptions
-from workbench.session.process.worker_process import signal_main_thread
-from workbench.session.record.recording import RecordingWanted
-from workbench.session.run.events import EnvsReset, MomentShown
+from workbench.app.session import Session
+from workbench.episodes.rerun.read import read_properties
+from workbench.live.commands import Interrupt, PauseRun, PlayRun, ReloadFile, ResetAll, RestartWorker, Step
+from workbench.live.events import EnvsReset, MomentShown
+from workbench.live.process import supervisor
+from workbench.live.process.heartbeat import INTERRUPT_SIGNAL
+from workbench.live.process.supervisor import WorkerOptions
+from workbench.live.process.worker_process import signal_main_thread
+from workbench.live.timeline_commands import ContinueFromHere
+from workbench.live.view import SessionView
+from workbench.record.commands import StopRecording
+from workbench.record.state import RecordingWanted
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

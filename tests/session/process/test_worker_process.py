@@ -7,9 +7,9 @@ import signal
 import time
 from pathlib import Path
 
-from workbench.jobs.task import TaskOptions
-from workbench.session.process.worker_process import WorkerProcess
-from workbench.session.protocol.messages import Event, Load, Loaded, SingleStep
+from workbench.live.messages import Event, Load, Loaded, SingleStep
+from workbench.live.process.worker_process import WorkerProcess
+from workbench.task.description import TaskOptions
 
 TASK = Path(__file__).parents[3] / "tasks" / "minimal.py"
 

@@ -15,9 +15,9 @@ from tests.drive.processes import workers_of
 from tests.drive.session import live_session, wait_until
 from tests.drive.waiting import PATIENCE, until
 from tests.session.hazards import write_task
-from workbench.session.process import worker_process, worker_start
-from workbench.session.process.worker_process import WorkerProcess
-from workbench.session.process.worker_start import WorkerForks
+from workbench.live.process import worker_process, worker_start
+from workbench.live.process.worker_process import WorkerProcess
+from workbench.live.process.worker_start import WorkerForks
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

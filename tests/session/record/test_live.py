@@ -14,21 +14,21 @@ import numpy as np
 import pytest
 
 from tests.drive.session import BASE, TASKS, camera, live_session, moved, step, wait_until
-from workbench.authoring.loading.load import load_task
-from workbench.commands.cameras import PutMovedCamerasBack
-from workbench.commands.recording import StopRecording
-from workbench.commands.run import Step
-from workbench.recording.episode.episode import Episode
-from workbench.recording.lerobot.export import ExportOptions, export_lerobot
-from workbench.recording.lerobot.format import WORKBENCH_FILE
-from workbench.recording.maniskill.export import export_maniskill
-from workbench.recording.reader.read_episode import read_episode
-from workbench.session.cameras.events import CameraPlaced
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.record.recording import RecordingWanted
-from workbench.session.record.saving import SaveWanted
-from workbench.session.run.events import EnvsReset
+from workbench.app.session import Session
+from workbench.cameras.commands import PutMovedCamerasBack
+from workbench.cameras.events import CameraPlaced
+from workbench.episodes.episode import Episode
+from workbench.episodes.lerobot.export import ExportOptions, export_lerobot
+from workbench.episodes.lerobot.format import WORKBENCH_FILE
+from workbench.episodes.maniskill.export import export_maniskill
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.live.commands import Step
+from workbench.live.events import EnvsReset
+from workbench.live.view import SessionView
+from workbench.record.commands import StopRecording
+from workbench.record.saving_state import SaveWanted
+from workbench.record.state import RecordingStatus, RecordingWanted
+from workbench.task.load import load_task
 
 STEPS = 4
 EYE = "eye=[0.45, 0, 0.6]"
@@ -49,9 +49,11 @@ def elapsed(view: SessionView) -> int:
 
 def written(session: Session, count: int) -> list[Episode]:
     """The episodes that there are, oldest first, once there are so many."""
-    view = wait_until(session, lambda view: view.recording.episodes_written >= count, "the files")
-    paths = sorted(Path(view.recording.folder).glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
-    assert len(paths) == count and view.recording.problem is None
+    view = wait_until(session, lambda view: view.of(RecordingStatus).episodes_written >= count, "the files")
+    paths = sorted(
+        Path(view.of(RecordingStatus).folder).glob("*.json"), key=lambda path: path.stat().st_mtime_ns
+    )
+    assert len(paths) == count and view.of(RecordingStatus).problem is None
     return [read_episode(path) for path in paths]
 
 
@@ -80,16 +82,20 @@ def assert_same(one: Episode, other: Episode) -> None:
 @pytest.mark.slow
 def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session) -> None:
     session.happen(RecordingWanted())
-    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
+    wait_until(
+        session,
+        lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
+        "the recording",
+    )
     step(session, STEPS)
-    view = wait_until(session, lambda view: view.recording.steps == 2 * STEPS, "the steps")
-    assert view.recording.bytes_written > 0
+    view = wait_until(session, lambda view: view.of(RecordingStatus).steps == 2 * STEPS, "the steps")
+    assert view.of(RecordingStatus).bytes_written > 0
     session.do(StopRecording())
     live = written(session, 2)
     session.happen(SaveWanted())
-    wait_until(session, lambda view: bool(view.recording.saving.message), "the keeping")
+    wait_until(session, lambda view: bool(view.of(RecordingStatus).saving.message), "the keeping")
     said = f"saved 2 episodes, {2 * STEPS} steps; none of them had ended"
-    assert session.view().recording.saving.message == said
+    assert session.view().of(RecordingStatus).saving.message == said
     every = written(session, 4)
     kept = {episode.info.env_index: episode for episode in every[2:]}
     assert kept.keys() == {0, 1}
@@ -109,7 +115,7 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
 
 @pytest.mark.slow
 def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> None:
-    count = session.view().recording.episodes_written
+    count = session.view().of(RecordingStatus).episodes_written
     for steps in (3, 1):
         session.happen(EnvsReset())
         for made in range(steps):
@@ -120,14 +126,16 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
     kept = written(session, count + 1)[-1]
     assert kept.length == 3 and kept.info.env_index == 0
     # Nobody recorded, so both envs were reset at once: the first of them as alone, and the other otherwise.
-    said = session.view().recording.saving.message
+    said = session.view().of(RecordingStatus).saving.message
     assert kept.info.seed == 5 and "seed" not in said
     session.happen(SaveWanted((1,), before=True))
     kept = written(session, count + 2)[-1]
     assert kept.info.env_index == 1 and kept.info.seed == -1
-    said = wait_until(
-        session, lambda view: bool(view.recording.saving.message), "what came of it"
-    ).recording.saving.message
+    said = (
+        wait_until(session, lambda view: bool(view.of(RecordingStatus).saving.message), "what came of it")
+        .of(RecordingStatus)
+        .saving.message
+    )
     assert "without a seed" in said
     assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
     session.change(action_source="random")
@@ -135,7 +143,7 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
 
 @pytest.mark.slow
 def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it(session: Session) -> None:
-    count = session.view().recording.episodes_written
+    count = session.view().of(RecordingStatus).episodes_written
     session.happen(EnvsReset())
     wait_until(session, lambda view: elapsed(view) == 0, "a reset")
     step(session, 2)
@@ -155,7 +163,7 @@ def test_an_episode_of_an_earlier_version_is_kept_with_the_source_that_played_it
     assert kept.info.source_hash == version.source_hash
     assert list(kept.info.source.values()) == list(version.source.values())
     np.testing.assert_array_equal(kept.reward[-1], played.step.reward[0])
-    assert "an earlier version" in session.view().recording.saving.message
+    assert "an earlier version" in session.view().of(RecordingStatus).saving.message
     # What its source does not say of the pictures.
     now = session.view().task
     assert now is not None and kept.info.observed_by == now.source_hash
@@ -172,9 +180,13 @@ def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_
     session: Session,
 ) -> None:
     session.happen(RecordingWanted((0,)))
-    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
+    wait_until(
+        session,
+        lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
+        "the recording",
+    )
     step(session, 3)
-    count = session.view().recording.episodes_written
+    count = session.view().of(RecordingStatus).episodes_written
     before = wait_until(session, lambda view: elapsed(view) == 3, "the steps").task
     assert before is not None and before.file is not None
     file, text = Path(before.file), Path(before.file).read_text()
@@ -182,8 +194,8 @@ def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_
     view = wait_until(session, lambda v: v.reload is not None and v.reload.level == "rebuilt", "the rebuild")
     assert elapsed(view) == 3
     assert len(written(session, count + 1)[-1].action) == 3
-    view = wait_until(session, lambda view: view.recording.active, "it to go on")
-    assert view.recording.waiting == 1 and elapsed(view) == 3
+    view = wait_until(session, lambda view: view.of(RecordingStatus).active, "it to go on")
+    assert view.of(RecordingStatus).waiting == 1 and elapsed(view) == 3
     session.do(StopRecording())
     file.write_text(text)
     wait_until(
@@ -193,18 +205,18 @@ def test_a_rebuild_while_it_records_leaves_every_env_where_it_was_and_waits_for_
 
 @pytest.mark.slow
 def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:
-    before = session.view().recording.episodes_written
+    before = session.view().of(RecordingStatus).episodes_written
     session.happen(RecordingWanted((1,), next_episode=True))
     step(session, 1)
-    view = wait_until(session, lambda view: view.recording.waiting == 1, "the waiting")
-    assert view.recording.active and view.recording.steps == 0
+    view = wait_until(session, lambda view: view.of(RecordingStatus).waiting == 1, "the waiting")
+    assert view.of(RecordingStatus).active and view.of(RecordingStatus).steps == 0
     session.happen(EnvsReset((1,)))
-    wait_until(session, lambda view: view.recording.waiting == 0, "the reset")
+    wait_until(session, lambda view: view.of(RecordingStatus).waiting == 0, "the reset")
     step(session, 1)
     session.change(action_source="zero")
     step(session, 1)
     session.happen(EnvsReset((1,)))
-    wait_until(session, lambda view: not view.recording.active, "its end")
+    wait_until(session, lambda view: not view.of(RecordingStatus).active, "its end")
     session.change(action_source="random")
     step(session, 1)
     (*_, episode) = written(session, before + 1)
@@ -216,20 +228,24 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
     session: Session, tmp_path: Path
 ) -> None:
     view = session.view()
-    folder = Path(view.recording.folder)
+    folder = Path(view.of(RecordingStatus).folder)
     folder.mkdir(exist_ok=True)  # nothing may have been recorded yet
     aside = folder.rename(folder.with_name("aside"))
     folder.write_text("in the way")
     session.happen(RecordingWanted((0,)))
-    view = wait_until(session, lambda view: view.recording.problem is not None, "the problem")
-    assert not view.recording.active and "is not a folder" in str(view.recording.problem)
+    view = wait_until(session, lambda view: view.of(RecordingStatus).problem is not None, "the problem")
+    assert not view.of(RecordingStatus).active and "is not a folder" in str(view.of(RecordingStatus).problem)
     step(session, 2)
     assert session.view().problem is None
     folder.unlink()
     aside.rename(folder)
     session.happen(RecordingWanted((0,)))
-    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
-    assert session.view().recording.problem is None
+    wait_until(
+        session,
+        lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
+        "the recording",
+    )
+    assert session.view().of(RecordingStatus).problem is None
     session.do(StopRecording())
 
 
@@ -241,19 +257,23 @@ def test_what_is_recorded_says_where_a_moved_camera_was_and_where_the_file_has_i
     in_file = camera(session, BASE).now
     assert in_file is not None
     there = replace(in_file, position=(0.31, 0.02, 0.55))
-    count = session.view().recording.episodes_written
+    count = session.view().of(RecordingStatus).episodes_written
     session.happen(CameraPlaced(BASE, there))
     wait_until(session, lambda view: moved(view) == {BASE}, "the placement")
     session.happen(RecordingWanted((0,)))
-    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
+    wait_until(
+        session,
+        lambda view: view.of(RecordingStatus).active and view.of(RecordingStatus).waiting == 0,
+        "the recording",
+    )
     step(session, 2)
     session.happen(SaveWanted((0,)))
     past = written(session, count + 1)[-1]
     session.do(PutMovedCamerasBack())
     wait_until(session, lambda view: not moved(view), "the file's placement")
     step(session, 2)
-    view = wait_until(session, lambda view: view.recording.steps == 4, "the steps")
-    assert view.recording.episodes == 0 and time.time() - view.recording.since < 600
+    view = wait_until(session, lambda view: view.of(RecordingStatus).steps == 4, "the steps")
+    assert view.of(RecordingStatus).episodes == 0 and time.time() - view.of(RecordingStatus).since < 600
     session.do(StopRecording())
     live = written(session, count + 2)[-1]
     assert [(m.state, m.name, m.used, m.in_file) for m in live.info.moved_cameras] == [

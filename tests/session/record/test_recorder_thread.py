@@ -13,14 +13,15 @@ import pytest
 from tests.drive.episodes import begin, made
 from tests.drive.session import Told, moment, moment_at, told_session
 from tests.drive.waiting import until
-from workbench.commands.command import Refused
-from workbench.commands.recording import StopRecording
+from workbench.episodes.reader.read_episode import read_episode
+from workbench.live.messages import Reset, SetCapture
 from workbench.machine.processes.watched_thread import listen, stop_listening
-from workbench.recording.reader.read_episode import read_episode
-from workbench.session.protocol.messages import Reset, SetCapture
-from workbench.session.record import live, recording
-from workbench.session.record.recording import RecordingWanted
-from workbench.session.record.saving import SaveWanted
+from workbench.page.command import Refused
+from workbench.record import live_recorder as live
+from workbench.record import state as recording
+from workbench.record.commands import StopRecording
+from workbench.record.saving_state import SaveWanted
+from workbench.record.state import RecordingStatus, RecordingWanted
 
 
 def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
@@ -32,7 +33,7 @@ def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
         until(lambda: said, "a word of it")
         (rrd,) = tmp_path.glob("*.rrd")
         assert len(said) == 1 and str(rrd) in said[0]
-        assert told.view.recording.recovered == (str(rrd),)
+        assert told.view.of(RecordingStatus).recovered == (str(rrd),)
 
 
 def test_what_is_stopped_or_dies_in_the_middle_of_an_episode_is_written(
@@ -53,7 +54,9 @@ def test_what_is_stopped_or_dies_in_the_middle_of_an_episode_is_written(
             told.step()
             end()
             status = until(
-                lambda count=count: s if (s := told.view.recording).episodes_written == count else None,
+                lambda count=count: (
+                    s if (s := told.view.of(RecordingStatus)).episodes_written == count else None
+                ),
                 "the file",
             )
             assert (status.active, status.problem, status.being_written) == (False, None, 0)
@@ -69,13 +72,13 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
     try:
         for _ in range(2):
             played.session.happen(RecordingWanted((0,)))
-            assert played.view.recording.problem is None, "that of the one before is forgotten"
+            assert played.view.of(RecordingStatus).problem is None, "that of the one before is forgotten"
             played.reset((0,))
             now: Any = played.view.step
             bad: Any = {"state": SimpleNamespace(nbytes=0)}  # what is no array
             played.tell(replace(moment(now.elapsed_steps + 1), columns=bad))
-            until(lambda: played.view.recording.problem is not None, "the problem")
-            assert not played.view.recording.active
+            until(lambda: played.view.of(RecordingStatus).problem is not None, "the problem")
+            assert not played.view.of(RecordingStatus).active
         assert said
     finally:
         stop_listening(said.append)
@@ -84,28 +87,28 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
 def test_what_cannot_be_saved_of_the_past_is_refused_for_what_is_shown_alone(tmp_path: Path) -> None:
     with told_session(tmp_path, history_bytes=20_000) as told:
         told.session.happen(SaveWanted((0,)))
-        assert told.view.recording.saving.failed, "no task"
+        assert told.view.of(RecordingStatus).saving.failed, "no task"
         told.play(0)
         told.session.happen(SaveWanted((0,)))
-        assert told.view.recording.saving.failed, "no step"
+        assert told.view.of(RecordingStatus).saving.failed, "no step"
         told.step(100)
-        assert told.view.timeline.first > 0 and not told.view.recording.saving.message
+        assert told.view.timeline.first > 0 and not told.view.of(RecordingStatus).saving.message
         told.session.happen(SaveWanted((0,)))
-        refused = told.view.recording.saving
+        refused = told.view.of(RecordingStatus).saving
         assert refused.failed and "no longer in memory" in refused.message and refused.progress is None
         told.session.change(selected_env=1)
-        assert not told.view.recording.saving.message, "it is of env 0"
+        assert not told.view.of(RecordingStatus).saving.message, "it is of env 0"
         told.session.change(selected_env=0)
-        assert told.view.recording.saving.failed
+        assert told.view.of(RecordingStatus).saving.failed
         told.step()
-        assert not told.view.recording.saving.message, "it is of the moment before"
+        assert not told.view.of(RecordingStatus).saving.message, "it is of the moment before"
         told.reset()
         told.step(2)
         told.reset()
         told.session.happen(SaveWanted((0,), before=True))
-        assert told.view.recording.saving.failed, "the one before began earlier than what is kept"
+        assert told.view.of(RecordingStatus).saving.failed, "the one before began earlier than what is kept"
         told.session.happen(RecordingWanted())
-        assert not told.view.recording.saving.message, "something else is recorded"
+        assert not told.view.of(RecordingStatus).saving.message, "something else is recorded"
         assert moment_at(told.session, 0) is None
 
 
@@ -131,14 +134,22 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
                 for _ in range(3):
                     told.step(at_once - 1, snapshot=b"")
                     given += at_once - 1
-                    until(lambda given=given: told.view.recording.steps == given, "the steps to be taken")
-                    assert told.view.recording.problem is None and told.view.recording.active
+                    until(
+                        lambda given=given: told.view.of(RecordingStatus).steps == given,
+                        "the steps to be taken",
+                    )
+                    assert (
+                        told.view.of(RecordingStatus).problem is None and told.view.of(RecordingStatus).active
+                    )
                 taker.disk.clear()
                 told.step(at_once, snapshot=b"")
                 given += at_once
-                assert told.view.recording.active
+                assert told.view.of(RecordingStatus).active
                 told.step(snapshot=b"")
-                assert not told.view.recording.active and told.view.recording.problem is not None
+                assert (
+                    not told.view.of(RecordingStatus).active
+                    and told.view.of(RecordingStatus).problem is not None
+                )
                 taker.disk.set()
         finally:
             taker.disk.set()

@@ -14,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.drive.session import Told, history_of, told_session
-from workbench.core.env.step_result import StepResult
-from workbench.jobs.task import Stepped, TaskOptions
-from workbench.session import loop
-from workbench.session.history.history import History
-from workbench.session.process.askers import Background
-from workbench.session.process.jobs import Job
-from workbench.session.protocol.messages import Load
-from workbench.session.rescore.past import RescoredPast
-from workbench.session.rescore.past_rescorer import PastRescorer
-from workbench.session.rescore.rescoring import BeginRescoring, EndRescoring, RescoreView
+from workbench.envs.step_result import StepResult
+from workbench.live.history.moments import History
+from workbench.live.messages import Load
+from workbench.live.process.ask import Background
+from workbench.live.process.background_jobs import Job
+from workbench.machine import loop
+from workbench.rescore.past_jobs import PastRescorer
+from workbench.rescore.past_scores import RescoredPast
+from workbench.rescore.state import BeginRescoring, EndRescoring, RescoreView
+from workbench.task.description import Stepped, TaskOptions
 
 BODIES = 4
 

@@ -17,14 +17,15 @@ import pytest
 
 from tests.drive.session import TASKS, background_pid, live_session, moments_of, wait_until
 from tests.drive.waiting import until
-from workbench.commands.command import Refused
-from workbench.commands.run import PauseRun, PlayRun, RebuildScene
-from workbench.commands.timeline import StopRescoring
-from workbench.session.history.history import Moment
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.rescore.rescoring import RescoreView, StoppedBy
-from workbench.session.run.events import EnvsReset
+from workbench.app.session import Session
+from workbench.live.commands import PauseRun, PlayRun, RebuildScene
+from workbench.live.events import EnvsReset
+from workbench.live.history.moments import Moment
+from workbench.live.process.background_jobs import StoppedBy
+from workbench.live.timeline_commands import StopRescoring
+from workbench.live.view import SessionView
+from workbench.page.command import Refused
+from workbench.rescore.state import RescoreView
 
 N = 3
 ORIGINAL = (
@@ -73,15 +74,17 @@ class Desk:
         before = self.serial
 
         def reached(view: SessionView) -> bool:
-            return view.rescored.serial > before and view.rescored.state in (states or ("done",))
+            return view.of(RescoreView).serial > before and view.of(RescoreView).state in (
+                states or ("done",)
+            )
 
-        return wait_until(self.session, reached, f"a judgement that is {states or 'done'}").rescored
+        return wait_until(self.session, reached, f"a judgement that is {states or 'done'}").of(RescoreView)
 
     serial = 0
 
     def note(self) -> None:
         """From here on `rescored` waits for something new."""
-        self.serial = self.session.view().rescored.serial
+        self.serial = self.session.view().of(RescoreView).serial
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +185,7 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
     session.do(PlayRun())
     last = session.view().timeline.last
     view = wait_until(session, lambda v: v.timeline.last > last + 10, "the worker that plays")
-    assert view.rescored.state == "rescoring"
+    assert view.of(RescoreView).state == "rescoring"
     session.do(PauseRun())
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 4")

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tests.session.recorded_runs import Recorded, opened, reaching, record
-from workbench.core.capture.recorded_run import RecordedRun
-from workbench.core.capture.recorded_state import read_states
-from workbench.jobs.open_task import OpenedTask
-from workbench.jobs.rescore.run import rescore
-from workbench.jobs.rescore.verdict import Verdict
-from workbench.recording.episode.episode import Episode, EpisodeInfo
+from workbench.envs.recorded_run import RecordedRun
+from workbench.episodes.episode import Episode, EpisodeInfo
+from workbench.episodes.recorded_state import read_states
+from workbench.rescore.replay_recordings import rescore
+from workbench.rescore.verdict import Verdict
+from workbench.task.open import OpenedTask
 
 pytestmark = pytest.mark.thorough
 

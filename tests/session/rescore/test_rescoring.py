@@ -6,17 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from workbench.commands.command import Refused
-from workbench.commands.timeline import StopRescoring
-from workbench.session.events import Asked
-from workbench.session.rescore.rescoring import (
-    EndRescoring,
-    RescoreView,
-    Rescoring,
-    RescoringTold,
-    StoppedBy,
-    apply_to_job,
-)
+from workbench.live.effects import Asked
+from workbench.live.process.background_jobs import StoppedBy
+from workbench.live.timeline_commands import StopRescoring
+from workbench.page.command import Refused
+from workbench.rescore.state import EndRescoring, RescoreView, Rescoring, RescoringTold, apply_to_job
 
 BEGUN = Rescoring().begun(RescoreView("loading", total=2, unit="episodes"))
 HALF = RescoringTold(BEGUN.job, replace(BEGUN.view, state="rescoring", done=1))

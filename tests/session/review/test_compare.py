@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.drive.episodes import BODY, geometry_of, made, poses_of
-from workbench.session.review.compare import ARM, Difference, difference, distances, source_changes
+from workbench.review.differences import ARM, Difference, difference, distances, source_changes
 
 
 def parts_at(found: Difference) -> int | None:

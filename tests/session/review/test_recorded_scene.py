@@ -13,10 +13,10 @@ import pytest
 from mani_skill.utils.wrappers.record import RecordEpisode
 from numpy.typing import NDArray
 
-from workbench.core.scene.scene_index import read_poses, scene_index
-from workbench.recording.episode.episode import Episode
-from workbench.recording.reader.read_episode import read_maniskill
-from workbench.session.review.recorded_scene import SceneError, SceneProcess
+from workbench.envs.scene.scene_index import read_poses, scene_index
+from workbench.episodes.episode import Episode
+from workbench.episodes.reader.read_episode import read_maniskill
+from workbench.review.recorded_scene import SceneError, SceneProcess
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -17,8 +17,14 @@ from hypothesis import strategies as st
 
 from tests.drive.episodes import made, poses_of, write
 from tests.drive.waiting import until
-from workbench.commands.command import Refused
-from workbench.commands.review import (
+from workbench.episodes.episode import Episode
+from workbench.episodes.row import UnreadableRecording
+from workbench.library.folder import Library
+from workbench.live.commands import TogglePlay
+from workbench.live.messages import CameraRequest
+from workbench.live.timeline_commands import NextEvent, PreviousEvent, Seek, StepForward
+from workbench.page.command import Refused
+from workbench.review.commands import (
     AlignRecordings,
     ChoosePlaybackSpeed,
     CloseRecording,
@@ -27,14 +33,8 @@ from workbench.commands.review import (
     SelectRecording,
     SwapWithFirst,
 )
-from workbench.commands.run import TogglePlay
-from workbench.commands.timeline import NextEvent, PreviousEvent, Seek, StepForward
-from workbench.recording.episode.episode import Episode
-from workbench.recording.episode.row import UnreadableRecording
-from workbench.recording.library.library import Library
-from workbench.session.protocol.messages import CameraRequest
-from workbench.session.review.review import Review
-from workbench.session.review.view import PictureReader, ReviewView, column_at, curves, find_events
+from workbench.review.playback import Review
+from workbench.review.view import PictureReader, ReviewView, column_at, curves, find_events
 
 
 @dataclass(frozen=True)
@@ -164,9 +164,7 @@ def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
 
 
 def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "workbench.session.review.state.FIRST_SHOWN", 0.0
-    )  # it is seen before the other is read
+    monkeypatch.setattr("workbench.review.state.FIRST_SHOWN", 0.0)  # it is seen before the other is read
     review, _ = review_of(
         new=made(4, written_at="2026-11-22T10:00:00+00:00"),
         old=made(6, written_at="2026-11-21T10:00:00+00:00"),
@@ -247,7 +245,7 @@ def test_what_is_open_at_once_may_take_so_much_memory_and_no_more() -> None:
 def test_files_that_change_or_go_are_said_and_stay_open(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.session.review.review.CHECK_SECONDS", 0.01)
+    monkeypatch.setattr("workbench.review.playback.CHECK_SECONDS", 0.01)
     changed, gone = tmp_path / "a.rrd", tmp_path / "a.h5"
     changed.write_text("1")
     gone.write_text("1")
@@ -268,7 +266,7 @@ def test_files_that_change_or_go_are_said_and_stay_open(
 def test_what_changed_of_the_selected_recordings_task_is_told_at_once_and_again_after_a_save(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.session.review.review.CHECK_SECONDS", 0.01)
+    monkeypatch.setattr("workbench.review.playback.CHECK_SECONDS", 0.01)
     task = tmp_path / "push.py"
     task.write_text("SIZE = 2\nMASS = 1\n")
 
@@ -350,7 +348,7 @@ def test_nothing_is_opened_library_stays_after_a_person_has_opened_a_recording(
 
 
 def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workbench.session.review.state.FIRST_SHOWN", 0.0)
+    monkeypatch.setattr("workbench.review.state.FIRST_SHOWN", 0.0)
     review, shelf = review_of(a=made(10), b=made(20), c=made(10), d=made(30, success_from=9), e=made(10))
     reached, go_on = threading.Event(), threading.Event()
 
@@ -384,7 +382,7 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
 
 
 def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("workbench.session.review.state.FIRST_SHOWN", 0.0)
+    monkeypatch.setattr("workbench.review.state.FIRST_SHOWN", 0.0)
     shelf = Shelf({"a": made(10), "b": made(20), "c": made(30)})
     reached, go_on = threading.Event(), threading.Event()
     readers: list[threading.Thread] = []

@@ -9,14 +9,14 @@ import pytest
 
 from tests.drive.session import Told
 from tests.drive.waiting import until
-from workbench.commands.run import ChooseActions, SetPolicy
-from workbench.jobs.task import TaskOptions
+from workbench.live import policies
+from workbench.live.commands import ChooseActions, SetPolicy
+from workbench.live.events import FileSaved, PagesCounted
+from workbench.live.messages import Settings
+from workbench.live.policies import KnownPolicies, ListPolicies, PoliciesListed, Wanted, apply
+from workbench.live.run import first_run
 from workbench.machine.kept_choices import used_policies
-from workbench.session.protocol.messages import Settings
-from workbench.session.run import policies
-from workbench.session.run.events import FileSaved, PagesCounted
-from workbench.session.run.policies import KnownPolicies, ListPolicies, PoliciesListed, Wanted, apply
-from workbench.session.run.run import first_run
+from workbench.task.description import TaskOptions
 
 ACT = "def act(obs):\n    pass\n"
 

@@ -17,14 +17,14 @@ import pytest
 from PIL import Image
 
 from tests.drive.waiting import PATIENCE, until
-from workbench.jobs.task import TaskOptions
-from workbench.session.loop import do, result_of
-from workbench.session.tasks import catalogue as catalogue_module
-from workbench.session.tasks import registered as registered_module
-from workbench.session.tasks.catalogue import Catalogue, Entry, Section
-from workbench.session.tasks.recents import RecentTasks
-from workbench.session.tasks.registered import LIST_FILE, RegisteredTasks
-from workbench.session.tasks.typed import NotAPath
+from workbench.machine.loop import do, result_of
+from workbench.start import catalogue as catalogue_module
+from workbench.start import registered as registered_module
+from workbench.start.catalogue import Catalogue, Entry, Section
+from workbench.start.recents import RecentTasks
+from workbench.start.registered import LIST_FILE, RegisteredTasks
+from workbench.start.typed_path import NotAPath
+from workbench.task.description import TaskOptions
 
 TASK = "class Task(BaseEnv): pass\n"
 

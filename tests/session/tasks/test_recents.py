@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from workbench.jobs.task import TaskOptions
-from workbench.session.tasks.recents import MOST_KEPT, RECENT_FILE, RecentTasks, lasting
+from workbench.start.recents import MOST_KEPT, RECENT_FILE, RecentTasks
+from workbench.task.description import TaskOptions
+from workbench.task.reference import lasting
 
 
 @pytest.fixture

@@ -16,12 +16,11 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from workbench.core.camera_data import CameraKey, CameraSettings
-from workbench.jobs.open_task import OpenedTask, open_task
-from workbench.jobs.task import TaskOptions
-from workbench.machine.processes.wire import MessageSocket
-from workbench.session.process.heartbeat import HeartbeatReader, HeartbeatWriter, Interrupts
-from workbench.session.protocol.messages import (
+from workbench.app.worker.questions import QUESTIONS
+from workbench.cameras import worker as under_test
+from workbench.cameras.worker import WorkerCameras
+from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.live.messages import (
     CameraRequest,
     DrawPast,
     Event,
@@ -31,11 +30,14 @@ from workbench.session.protocol.messages import (
     PlaceCamera,
     Placed,
 )
-from workbench.session.protocol.questions import CaptureMoment
-from workbench.session.worker import cameras as under_test
-from workbench.session.worker.cameras import WorkerCameras
-from workbench.session.worker.guarded_task import GuardedTask, ServerConnection
-from workbench.session.worker.step_events import StepEvents
+from workbench.live.process.heartbeat import HeartbeatReader, HeartbeatWriter, Interrupts
+from workbench.live.worker.connection import ServerConnection
+from workbench.live.worker.guarded_task import GuardedTask
+from workbench.live.worker.step_events import StepEvents
+from workbench.machine.processes.wire import MessageSocket
+from workbench.record.questions import CaptureMoment
+from workbench.task.description import TaskOptions
+from workbench.task.open import OpenedTask, open_task
 
 pytestmark = pytest.mark.usefixtures("renderer")
 
@@ -65,7 +67,7 @@ class Desk:
         heartbeat = os.memfd_create("pulse")
         os.ftruncate(heartbeat, mmap.PAGESIZE)
         self.heartbeat, interrupts = HeartbeatReader(heartbeat), Interrupts()
-        line = ServerConnection(theirs.detach(), interrupts)
+        line = ServerConnection(theirs.detach(), interrupts, QUESTIONS)
         self.held = GuardedTask(line, interrupts, HeartbeatWriter(heartbeat), StepEvents(), lambda: None)
         os.close(heartbeat)
         self.held.opened = opened

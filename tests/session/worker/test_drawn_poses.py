@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import draw_past, live_session, wait_until
-from workbench.commands.run import Step
-from workbench.commands.timeline import ContinueFromHere
-from workbench.session.live.view import SessionView
-from workbench.session.protocol.messages import CameraRequest
-from workbench.session.run.events import MomentShown, PagesCounted
+from workbench.live.commands import Step
+from workbench.live.events import MomentShown, PagesCounted
+from workbench.live.messages import CameraRequest
+from workbench.live.timeline_commands import ContinueFromHere
+from workbench.live.view import SessionView
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import TASKS, live_session, step, wait_until
-from workbench.commands.recording import StopRecording
-from workbench.core.camera_data import CameraKey
-from workbench.session.protocol.messages import CameraRequest
-from workbench.session.record.recording import RecordingWanted
-from workbench.session.run.events import PagesCounted
+from workbench.envs.camera_data import CameraKey
+from workbench.live.events import PagesCounted
+from workbench.live.messages import CameraRequest
+from workbench.record.commands import StopRecording
+from workbench.record.state import RecordingStatus, RecordingWanted
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -78,10 +78,10 @@ def test_a_texture_that_the_shader_lacks(tmp_path: Path) -> None:
         # Of the recording it is left out.
         session.happen(RecordingWanted())
         step(session, 3)
-        wait_until(session, lambda v: v.recording.steps > 0, "recorded steps")
+        wait_until(session, lambda v: v.of(RecordingStatus).steps > 0, "recorded steps")
         session.do(StopRecording())
-        view = wait_until(session, lambda v: v.recording.episodes_written == 2, "the files")
-        assert view.recording.problem is None and view.problem is None
+        view = wait_until(session, lambda v: v.of(RecordingStatus).episodes_written == 2, "the files")
+        assert view.of(RecordingStatus).problem is None and view.problem is None
         # What it can give it gives.
         session.change(cameras=(CameraRequest(HUMAN[1], "human"),))
         session.change(

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import torch
 
-from workbench.authoring.loading.load import load_task
-from workbench.authoring.problem import Interrupted, TaskError
-from workbench.core.env import actions
-from workbench.core.snapshots.snapshot import Snapshot
-from workbench.jobs.open_task import OpenedTask, Opening, build_task
-from workbench.jobs.task import TaskOptions
-from workbench.session.protocol.messages import ReplayPath, Restore
-from workbench.session.worker import go_back
+from workbench.envs import action_vector as actions
+from workbench.envs.snapshots.snapshot import Snapshot
+from workbench.live.messages import ReplayPath, Restore
+from workbench.live.worker import go_back
+from workbench.task.description import TaskOptions
+from workbench.task.load import load_task
+from workbench.task.open import OpenedTask, Opening, build_task
+from workbench.task.problem import Interrupted, TaskError
 
 N = 3
 T = 12

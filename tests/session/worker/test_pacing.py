@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.session.worker.pacing import Pacer, Rate
+from workbench.live.worker.pacing import Pacer, Rate
 
 
 def steps_taken(pacer: Pacer, moments: list[float]) -> int:

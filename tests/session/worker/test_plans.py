@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from tests.drive.session import TASKS
-from workbench.authoring.loading.load import load_task
-from workbench.jobs.open_task import OpenedTask, Opening, build_task
-from workbench.jobs.task import TaskOptions
+from workbench.live.messages import FollowPlan, PlanDropped, PlanWanted, Settings
 from workbench.planning.options import PlanOptions
 from workbench.planning.rollouts import bodies_of
-from workbench.session.protocol.messages import FollowPlan, PlanDropped, PlanWanted, Settings
-from workbench.session.protocol.questions import PlanActions, PlannedEnv
-from workbench.session.worker.plans import MOST_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
+from workbench.solve.questions import PlanActions, PlannedEnv
+from workbench.solve.worker import MOST_PATHS, FollowedPlan, WorkerPlans, envs_to_plan
+from workbench.task.description import TaskOptions
+from workbench.task.load import load_task
+from workbench.task.open import OpenedTask, Opening, build_task
 
 MADE: dict[str, object] = {"render_backend": "none", "control_mode": "pd_ee_delta_pose"}
 SMALL = PlanOptions(rollouts=6, horizon=0.2)

@@ -17,15 +17,15 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from workbench.authoring.problem import TaskError
-from workbench.core.cameras.render import take_pictures
-from workbench.core.env import actions
-from workbench.core.env.step_result import StepResult
-from workbench.core.env.task_env import TaskEnv
-from workbench.jobs.open_task import OpenedTask, open_task
-from workbench.jobs.task import TaskOptions
-from workbench.session.protocol.messages import Load, LoadLevel, ReloadReport
-from workbench.session.worker.reload import Running, load_version
+from workbench.envs import action_vector as actions
+from workbench.envs.step_result import StepResult
+from workbench.envs.task_env import TaskEnv
+from workbench.live.messages import Load, LoadLevel, ReloadReport
+from workbench.live.worker.reload import Running, load_version
+from workbench.pictures.render import take_pictures
+from workbench.task.description import TaskOptions
+from workbench.task.open import OpenedTask, open_task
+from workbench.task.problem import TaskError
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

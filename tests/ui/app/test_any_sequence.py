@@ -18,17 +18,18 @@ from hypothesis import strategies as st
 from tests.drive.live import Live
 from tests.drive.panels import Clock
 from tests.drive.session import BASE, Told, seek_by, told_session
-from workbench.authoring.problem import Problem
-from workbench.commands.cameras import UndoCamera
-from workbench.commands.command import Refused
-from workbench.commands.page import TellUnfolded
-from workbench.commands.run import PauseRun, PlayRun, ReloadFile, SetSeed, Step
-from workbench.commands.timeline import ContinueFromHere, UndoReset
-from workbench.session.cameras.events import CameraPlaced
-from workbench.session.live.view import SessionView
-from workbench.session.protocol.messages import CameraRequest, LoadFailed, Loading, Status
-from workbench.session.run.events import MomentShown
-from workbench.ui.live.env_panel import TABLE
+from workbench.cameras.commands import UndoCamera
+from workbench.cameras.events import CameraPlaced
+from workbench.cameras.view import StudioView
+from workbench.live.commands import PauseRun, PlayRun, ReloadFile, SetSeed, Step
+from workbench.live.events import MomentShown
+from workbench.live.messages import CameraRequest, LoadFailed, Loading, Status
+from workbench.live.panels.env_panel import TABLE
+from workbench.live.timeline_commands import ContinueFromHere, UndoReset
+from workbench.live.view import SessionView
+from workbench.page.command import Refused
+from workbench.page.commands import TellUnfolded
+from workbench.task.problem import Problem
 
 PROBLEM = Problem("step", "KeyError: 'goal'", "push.py", 7, None, "Traceback")
 Act = Callable[[Told], object]
@@ -44,7 +45,7 @@ def fails(kept: bool, at_run: bool) -> Act:
 
 def places(told: Told) -> None:
     """A camera somewhere else, if there is one that can be placed."""
-    camera = told.view.studio.camera(BASE)
+    camera = told.view.of(StudioView).camera(BASE)
     if camera is not None and camera.now is not None:
         x, y, z = camera.now.position
         told.session.happen(CameraPlaced(BASE, replace(camera.now, position=(x + 0.1, y, z))))

@@ -9,10 +9,10 @@ import viser
 
 from tests.drive.panels import Clock, Panels
 from tests.drive.session import wait_until
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.ui.app.live_page import Page
-from workbench.ui.live.banners import FILL
+from workbench.app.live_page import Page
+from workbench.app.session import Session
+from workbench.live.panels.banners import FILL
+from workbench.task.description import TaskOptions
 
 
 @pytest.mark.slow

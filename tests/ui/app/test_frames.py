@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.ui.app.pages import FRAME, next_frame
+from workbench.app.pages import FRAME, next_frame
 
 CLOSE = 1e-9
 

@@ -15,18 +15,18 @@ from tests.drive.episodes import made, write
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
 from tests.ui.scenes import problem
-from workbench.authoring.loading.reference import TaskName
-from workbench.commands.review import ReturnToFirstTask
-from workbench.commands.run import PlayRun
-from workbench.jobs.task import TaskOptions
-from workbench.session.clearance import Clearances, CodeToRun, NotCleared
-from workbench.session.live.session import Session
-from workbench.session.loop import do
-from workbench.session.protocol.messages import LoadFailed
-from workbench.ui.app.go_live import GoLive, GoLivePart
-from workbench.ui.app.pages import Which
-from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import GatedServer
+from workbench.app.go_live import GoLive, GoLivePart
+from workbench.app.pages import Which
+from workbench.app.server import Workplace
+from workbench.app.session import Session
+from workbench.live.commands import PlayRun
+from workbench.live.messages import LoadFailed
+from workbench.machine.loop import do
+from workbench.page.door.gated_server import GatedServer
+from workbench.review.commands import ReturnToFirstTask
+from workbench.task.description import TaskOptions
+from workbench.task.reference import TaskName
+from workbench.trust.clearance import Clearances, CodeToRun, NotCleared
 
 
 class Person(Clearances):

@@ -13,12 +13,12 @@ import websockets.sync.client
 from tests.drive.panels import Clock, Panels
 from tests.drive.session import TASKS, wait_until
 from tests.ui.tabs import handshake, messages_in
-from workbench.commands.envs import ToggleOnlySelected
-from workbench.commands.run import PauseRun, PlayRun, ResetAll, Step
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.ui.app.live_page import Page
+from workbench.app.live_page import Page
+from workbench.app.session import Session
+from workbench.live.commands import PauseRun, PlayRun, ResetAll, Step
+from workbench.live.env_commands import ToggleOnlySelected
+from workbench.live.view import SessionView
+from workbench.task.description import TaskOptions
 
 WAITS = """
 
@@ -141,7 +141,7 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
 ) -> None:
     # A browser applies a batch with anything of the view in it at its next frame of the view, which may take long.
     opened.load()
-    monkeypatch.setattr("workbench.ui.app.pages.SENT_WITHIN", 10.0)
+    monkeypatch.setattr("workbench.app.pages.SENT_WITHIN", 10.0)
     opened.session.change(selected_env=0)
     opened.draw()
     address, options = handshake(f"http://127.0.0.1:{opened.panels.server.get_port()}")

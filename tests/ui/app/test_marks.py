@@ -7,14 +7,15 @@ from typing import Any, cast
 
 from tests.drive.panels import Panels
 from tests.ui.env_rows import rows_of
-from tests.ui.scenes import running
-from workbench.commands.envs import ShowFirstFlagged
-from workbench.core.capture.outliers import Outlier, OutlierKind
-from workbench.session.history.env_table import EnvRows
-from workbench.session.process.jobs import JobProgress
-from workbench.session.record.saving import SaveStatus
-from workbench.ui.app.marks import Marks
-from workbench.ui.widgets.open_tabs import OpenTabs
+from tests.ui.scenes import changed, running
+from workbench.app.marks import Marks
+from workbench.envs.outliers import Outlier, OutlierKind
+from workbench.live.env_commands import ShowFirstFlagged
+from workbench.live.history.env_table import EnvRows
+from workbench.live.process.background_jobs import JobProgress
+from workbench.page.widgets.open_tabs import OpenTabs
+from workbench.record.saving_state import SaveStatus
+from workbench.record.state import RecordingStatus
 
 
 @dataclass
@@ -48,7 +49,7 @@ def test_flagged_envs_are_in_sight_and_a_press_leads_to_the_first(panels: Panels
 def test_what_is_saved_of_the_past_is_in_sight_until_it_is_saved(panels: Panels) -> None:
     row, view = marks(panels, rows_of(outliers={})), running(6)
     saves = SaveStatus(progress=JobProgress("replaying", 3, 20))
-    saving = replace(view, recording=replace(view.recording, saving=saves))
+    saving = changed(view, recording=replace(view.of(RecordingStatus), saving=saves))
     assert row.urgent(saving) != row.urgent(view)
     row.draw(saving)
     assert "wb-sight-saving" in panels.html()

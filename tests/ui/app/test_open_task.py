@@ -13,22 +13,23 @@ from tests.drive.scripted import scripted
 from tests.drive.session import camera, moved, wait_until
 from tests.drive.waiting import until
 from tests.ui.scenes import camera as camera_info
-from workbench.authoring.loading.reference import TaskName
-from workbench.commands.cameras import UndoCamera
-from workbench.commands.run import PauseRun, PlayRun
-from workbench.core.camera_data import CameraKey, CameraSettings
-from workbench.jobs.task import TaskOptions
-from workbench.session.cameras.events import CameraChosen, CameraPlaced
-from workbench.session.live.session import KeptWork, Session
-from workbench.session.loop import do, result_of
-from workbench.session.tasks.catalogue import Entry, Section
-from workbench.session.tasks.recents import RecentTasks
-from workbench.session.tasks.registered import RegisteredTasks
-from workbench.ui.app import workplace
-from workbench.ui.app.open_task import Choices
-from workbench.ui.app.trust_dialog import ALWAYS, DO_NOT, ONCE
-from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import GatedServer
+from workbench.app import server as workplace
+from workbench.app.open_task import Choices
+from workbench.app.server import Workplace
+from workbench.app.session import KeptWork, Session
+from workbench.cameras.commands import UndoCamera
+from workbench.cameras.events import CameraChosen, CameraPlaced
+from workbench.cameras.view import StudioView
+from workbench.envs.camera_data import CameraKey, CameraSettings
+from workbench.live.commands import PauseRun, PlayRun
+from workbench.machine.loop import do, result_of
+from workbench.page.door.gated_server import GatedServer
+from workbench.start.catalogue import Entry, Section
+from workbench.start.recents import RecentTasks
+from workbench.start.registered import RegisteredTasks
+from workbench.task.description import TaskOptions
+from workbench.task.reference import TaskName
+from workbench.trust.dialog import ALWAYS, DO_NOT, ONCE
 
 TASK = "@register_env('Push-v1')\nclass Push(BaseEnv): pass\n"
 CAMERA: CameraKey = ("sensor", "base_camera")
@@ -134,7 +135,7 @@ def test_what_a_person_did_comes_back_with_the_task(desk: Desk) -> None:
     now = camera(again, CAMERA).now
     assert now is not None and now.position == (1.0, 2.0, 3.0)
     view = again.view()
-    assert (view.selected_env, view.settings.speed, view.studio.selected) == (1, 2.0, CAMERA)
+    assert (view.selected_env, view.settings.speed, view.of(StudioView).selected) == (1, 2.0, CAMERA)
     again.do(UndoCamera())
     assert not moved(again.view()), "the way back is kept too"
 

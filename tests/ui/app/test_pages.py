@@ -17,13 +17,13 @@ from tests.drive.panels import Panels, held_by
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import tabs_of
-from workbench.commands.page import ToggleTable
-from workbench.commands.run import PlayRun
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.ui.app.pages import ShownPage, Which
-from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import GatedServer
+from workbench.app.pages import ShownPage, Which
+from workbench.app.server import Workplace
+from workbench.app.session import Session
+from workbench.live.commands import PlayRun
+from workbench.page.commands import ToggleTable
+from workbench.page.door.gated_server import GatedServer
+from workbench.task.description import TaskOptions
 
 SWAPS = 20
 

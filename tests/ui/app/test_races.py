@@ -16,16 +16,16 @@ from tests.drive.panels import Panels
 from tests.drive.session import wait_until
 from tests.drive.waiting import PATIENCE, until
 from tests.ui.tabs import handshake, tabs_of
-from workbench.commands.command import Command
-from workbench.commands.envs import SelectEnv
-from workbench.commands.run import PauseRun, PlayRun, Step
-from workbench.commands.timeline import Seek
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.ui.app.live_page import Page
-from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.widgets.visitors import PATH
+from workbench.app.live_page import Page
+from workbench.app.server import Workplace
+from workbench.app.session import Session
+from workbench.live.commands import PauseRun, PlayRun, Step
+from workbench.live.env_commands import SelectEnv
+from workbench.live.timeline_commands import Seek
+from workbench.page.command import Command
+from workbench.page.door.gated_server import GatedServer
+from workbench.page.widgets.visitors import PATH
+from workbench.task.description import TaskOptions
 
 
 @pytest.fixture

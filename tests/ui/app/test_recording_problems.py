@@ -11,15 +11,15 @@ from tests.drive.scripted import scripted
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import camera_message, handshake, messages_in
-from workbench.commands.run import Step
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.session.record.recording import RecordingWanted
-from workbench.session.record.saving import SaveWanted
-from workbench.session.run.events import EnvsReset
-from workbench.ui.app.pages import Which
-from workbench.ui.app.workplace import Workplace
-from workbench.ui.server.gated_server import GatedServer
+from workbench.app.pages import Which
+from workbench.app.server import Workplace
+from workbench.app.session import Session
+from workbench.live.commands import Step
+from workbench.live.events import EnvsReset
+from workbench.page.door.gated_server import GatedServer
+from workbench.record.saving_state import SaveWanted
+from workbench.record.state import RecordingStatus, RecordingWanted
+from workbench.task.description import TaskOptions
 
 
 @pytest.mark.usefixtures("child_process")
@@ -62,9 +62,9 @@ def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServ
         session.happen(EnvsReset())
         wait_until(session, lambda view: view.timeline.moments > begun, "the reset")
         session.happen(SaveWanted(before=True))
-        assert session.view().recording.saving.failed
+        assert session.view().of(RecordingStatus).saving.failed
         session.do(Step())
-        wait_until(session, lambda view: not view.recording.saving.message, "the message's end")
+        wait_until(session, lambda view: not view.of(RecordingStatus).saving.message, "the message's end")
     assert len(told) == 2
     place.close()
     session.close()

@@ -17,8 +17,12 @@ from tests.drive.panels import difference
 from tests.drive.reviewed import Reviewed, review_of
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
-from workbench.commands.command import Command
-from workbench.commands.review import (
+from workbench.episodes.columns import TextEntry
+from workbench.live.commands import TogglePlay
+from workbench.live.timeline_commands import Seek
+from workbench.page.command import Command
+from workbench.page.door.gated_server import GatedServer
+from workbench.review.commands import (
     AlignRecordings,
     ChoosePlaybackSpeed,
     ChooseReviewCurve,
@@ -29,11 +33,7 @@ from workbench.commands.review import (
     SwapWithFirst,
     ToggleOverlaid,
 )
-from workbench.commands.run import TogglePlay
-from workbench.commands.timeline import Seek
-from workbench.recording.episode.columns import TextEntry
-from workbench.ui.review.panel import GHOSTS, GO_LIVE, GRID, TRY_AGAIN
-from workbench.ui.server.gated_server import GatedServer
+from workbench.review.panel import GHOSTS, GO_LIVE, GRID, TRY_AGAIN
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from workbench.core.cameras.report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
-from workbench.ui.cameras.report import env_words, headline, object_rows
+from workbench.cameras.report_panel import env_words, headline, object_rows
+from workbench.pictures.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
 
 
 def seen(

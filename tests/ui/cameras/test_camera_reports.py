@@ -15,26 +15,26 @@ from hypothesis import strategies as st
 from tests.drive.live import HandedSession
 from tests.drive.panels import Panels
 from tests.ui.scenes import description, running, table_scene
-from workbench.commands.cameras import ReturnToKept, SaveCameraChange, ToggleWantedObject
-from workbench.commands.command import Command
-from workbench.core.camera_data import CameraInfo, CameraSettings, differences
-from workbench.core.cameras.conventions import axes_of, make_pose, with_pose
-from workbench.core.cameras.report import ObjectToSee
-from workbench.session.cameras.events import (
+from workbench.cameras.commands import ReturnToKept, SaveCameraChange, ToggleWantedObject
+from workbench.cameras.compare_panel import NAMES, CameraCompare, what_differs
+from workbench.cameras.edit_panel import WriteToFile
+from workbench.cameras.events import (
     CameraPlaced,
     ComparisonWanted,
     EditWanted,
     MeasureWanted,
     SuggestionsWanted,
 )
-from workbench.session.cameras.view import EditRequest, EditState, StudioCamera, StudioView
-from workbench.session.live.view import SessionView
-from workbench.ui.cameras.compare import NAMES, CameraCompare, what_differs
-from workbench.ui.cameras.export import CameraExport, calibrated_pose, calibration_text, file_name
-from workbench.ui.cameras.report import CameraReportPanel
-from workbench.ui.cameras.suggest import CameraSuggest, choices_of
-from workbench.ui.cameras.write_to_file import WriteToFile
-from workbench.ui.widgets.visitors import Visitor
+from workbench.cameras.export_panel import CameraExport, calibrated_pose, calibration_text, file_name
+from workbench.cameras.report_panel import CameraReportPanel
+from workbench.cameras.suggest_panel import CameraSuggest, choices_of
+from workbench.cameras.view import EditRequest, EditState, StudioCamera, StudioView
+from workbench.envs.camera_data import CameraInfo, CameraSettings, differences
+from workbench.live.view import SessionView
+from workbench.page.command import Command
+from workbench.page.widgets.visitors import Visitor
+from workbench.pictures.camera_conventions import axes_of, make_pose, with_pose
+from workbench.pictures.camera_report import ObjectToSee
 
 SETTINGS = CameraSettings(
     position=(0.3, 0.0, 0.6),
@@ -244,7 +244,7 @@ def test_only_a_change_that_was_read_is_saved(panels: Panels) -> None:
 
 
 def test_a_camera_gets_the_name_that_was_typed_until_it_is_taken(panels: Panels) -> None:
-    writing, key = Writing(panels), looked_at().studio.cameras[0].key
+    writing, key = Writing(panels), looked_at().of(StudioView).cameras[0].key
     writing.draw(looked_at())
     for name, button, why_not in (
         ("", "Rename", "Type a new name"),

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 from tests.drive.live import Live
 from tests.ui.scenes import camera, running
-from workbench.commands.cameras import ChooseCamera, MoveCameraToView
-from workbench.core.camera_data import CameraKey
-from workbench.session.cameras.events import CameraChosen
-from workbench.session.cameras.view import StudioCamera, StudioView
-from workbench.session.live.view import SessionView
-from workbench.ui.cameras.studio import NO_CAMERA, TAB
+from workbench.cameras.commands import ChooseCamera, MoveCameraToView
+from workbench.cameras.events import CameraChosen
+from workbench.cameras.studio_panel import NO_CAMERA, TAB
+from workbench.cameras.view import StudioCamera, StudioView
+from workbench.envs.camera_data import CameraKey
+from workbench.live.view import SessionView
 
 BASE, PEOPLE = "base_camera · sensor", "base_camera · human view"
 

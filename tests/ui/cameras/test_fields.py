@@ -12,9 +12,14 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import camera
-from workbench.commands.cameras import ChooseShader
-from workbench.core.camera_data import CameraSettings, differences
-from workbench.core.cameras.conventions import (
+from workbench.app.session import Session
+from workbench.cameras.commands import ChooseShader
+from workbench.cameras.events import CameraChosen
+from workbench.cameras.number_fields import AXES, FOV, INTRINSIC, RPY, WXYZ, CameraNumbers
+from workbench.cameras.pose_math import Placing
+from workbench.cameras.view import StudioView
+from workbench.envs.camera_data import CameraSettings, differences
+from workbench.pictures.camera_conventions import (
     LookAt,
     axes_of,
     intrinsic_of,
@@ -24,10 +29,6 @@ from workbench.core.cameras.conventions import (
     target_of,
     with_pose,
 )
-from workbench.session.cameras.events import CameraChosen
-from workbench.session.live.session import Session
-from workbench.ui.cameras.fields import AXES, FOV, INTRINSIC, RPY, WXYZ, CameraNumbers
-from workbench.ui.cameras.pose_math import Placing
 
 pytestmark = pytest.mark.thorough
 
@@ -46,12 +47,12 @@ class Desk:
 
     @property
     def now(self) -> CameraSettings:
-        camera = self.session.view().studio.chosen
+        camera = self.session.view().of(StudioView).chosen
         assert camera is not None and camera.now is not None
         return camera.now
 
     def draw(self) -> None:
-        self.numbers.draw(self.session.view().studio.placeable)
+        self.numbers.draw(self.session.view().of(StudioView).placeable)
 
     def types(self, label: str, value: object, at: int = 0) -> CameraSettings:
         """Type it, or choose it; `at` is the place in a row."""

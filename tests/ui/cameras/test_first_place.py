@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.ui.scenes import running
-from workbench.core.cameras.conventions import LookAt, axes_of, pose_from_look_at, with_pose
-from workbench.core.cameras.report import ObjectToSee
-from workbench.ui.cameras.write_to_file import NEW, first_place, objects_in
+from workbench.cameras.edit_panel import NEW, first_place, objects_in
+from workbench.pictures.camera_conventions import LookAt, axes_of, pose_from_look_at, with_pose
+from workbench.pictures.camera_report import ObjectToSee
 
 metres = st.floats(-0.5, 0.5)
 places = st.lists(st.tuples(metres, metres, metres), min_size=1, max_size=9).map(np.array)

@@ -7,8 +7,8 @@ import viser.transforms
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import camera
-from workbench.core.camera_data import CameraKind, Picture
-from workbench.ui.cameras.frustums import CameraFrustums, frustum_pose
+from workbench.cameras.frustums import CameraFrustums, frustum_pose
+from workbench.envs.camera_data import CameraKind, Picture
 
 POSE = np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0], np.float32)
 GREY = np.full((6, 8, 3), 128, np.uint8)

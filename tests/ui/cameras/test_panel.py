@@ -8,11 +8,11 @@ import numpy as np
 
 from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import camera, description, running, table_scene
-from workbench.commands.cameras import ShowPictures
-from workbench.core.camera_data import CameraInfo, Picture
-from workbench.session.live.view import ShownCameras
-from workbench.session.protocol.messages import CameraRequest
-from workbench.ui.cameras.panel import CamerasPanel
+from workbench.cameras.commands import ShowPictures
+from workbench.cameras.panel import CamerasPanel
+from workbench.cameras.view import ShownCameras, shown_cameras
+from workbench.envs.camera_data import CameraInfo, Picture
+from workbench.live.messages import CameraRequest
 
 POSE = np.array([0, 0, 1, 1, 0, 0, 0], np.float32)
 
@@ -31,7 +31,7 @@ def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) ->
         pictures=pictures if pictured else {},
         pictures_serial=serial,
     )
-    return view.shown_cameras
+    return shown_cameras(view)
 
 
 def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:

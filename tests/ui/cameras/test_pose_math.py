@@ -9,8 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.core.camera_data import CameraSettings
-from workbench.core.cameras.conventions import (
+from workbench.cameras.pose_math import (
+    Frame,
+    Snap,
+    looking_at,
+    nudged,
+    panned,
+    picture_corners,
+    snapped,
+    turned_in_world,
+    viewer_pose,
+)
+from workbench.envs.camera_data import CameraSettings
+from workbench.pictures.camera_conventions import (
     LookAt,
     axes_of,
     compose,
@@ -22,17 +33,6 @@ from workbench.core.cameras.conventions import (
     rpy_of,
     target_of,
     with_pose,
-)
-from workbench.ui.cameras.pose_math import (
-    Frame,
-    Snap,
-    looking_at,
-    nudged,
-    panned,
-    picture_corners,
-    snapped,
-    turned_in_world,
-    viewer_pose,
 )
 
 SETTINGS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 1.0, None, 64, 48, 0.01, 10.0, "minimal")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from workbench.checks.findings import cards, count, summary
 from workbench.checks.results import RuleResult
-from workbench.core.rules import Degree, Finding
-from workbench.session.checks.checks import ChecksView
-from workbench.ui.checks.findings import cards, count, summary
+from workbench.checks.state import ChecksView
+from workbench.envs.gpu_rules import Degree, Finding
 
 
 def finding(

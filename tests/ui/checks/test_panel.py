@@ -10,9 +10,7 @@ import pytest
 
 from tests.drive.live import Live
 from tests.ui.scenes import running
-from workbench.authoring.problem import Problem
-from workbench.checks.results import HookTime, LineTime, RuleResult, StepProfile, failed
-from workbench.commands.checks import (
+from workbench.checks.commands import (
     CheckAfterSave,
     CheckNow,
     ChooseSeeds,
@@ -25,16 +23,18 @@ from workbench.commands.checks import (
     ToggleRule,
     ToggleVerdict,
 )
-from workbench.core.rules import Finding
-from workbench.planning.report import SolvedSeed, SolveReport
+from workbench.checks.panel import AFTER_SAVE, CHECK_NOW, REST, STOP_CHECKS, findings_mark, status_html
+from workbench.checks.profile import ProfileView
+from workbench.checks.profile_panel import PROFILE, STOP_PROFILE
+from workbench.checks.results import HookTime, LineTime, RuleResult, StepProfile, failed
+from workbench.checks.state import ChecksView
+from workbench.envs.gpu_rules import Finding
+from workbench.live.messages import RulesBroken
+from workbench.planning.seeds_report import SolvedSeed, SolveReport
 from workbench.planning.verdicts import RewardVerdict
-from workbench.session.checks.checks import ChecksView
-from workbench.session.checks.profile import ProfileView
-from workbench.session.checks.solve_seeds import SeedsView
-from workbench.session.protocol.messages import RulesBroken
-from workbench.ui.checks.panel import AFTER_SAVE, CHECK_NOW, REST, STOP_CHECKS, findings_mark, status_html
-from workbench.ui.checks.solve_seeds import SOLVE, STOP_SOLVING
-from workbench.ui.checks.step_profile import PROFILE, STOP_PROFILE
+from workbench.solve.seeds import SeedsView
+from workbench.solve.seeds_panel import SOLVE, STOP_SOLVING
+from workbench.task.problem import Problem
 
 FOUND = Finding(
     "success-at-reset", "stop", "success in <b> 8 of 8 seeds", "/home/me/push.py", 88, "x < <i>", "evaluate", 8, 0

@@ -10,8 +10,8 @@ import pytest
 from tests.drive.episodes import made, write
 from tests.drive.panels import Panels
 from workbench.cli.main import main
-from workbench.recording.library.library import Library
-from workbench.ui.library.panel import LibraryPanel
+from workbench.library.folder import Library
+from workbench.library.panel import LibraryPanel
 
 
 @pytest.mark.usefixtures("child_process")

@@ -8,8 +8,8 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.commands.command import Command
-from workbench.commands.library import (
+from workbench.episodes.row import LibraryRow
+from workbench.library.commands import (
     AlsoNextRow,
     AlsoPreviousRow,
     ClearRowFilter,
@@ -28,8 +28,8 @@ from workbench.commands.library import (
     ToggleRow,
     UndoDelete,
 )
-from workbench.recording.episode.row import LibraryRow
-from workbench.ui.library.listing import MOST_ROWS, LibraryList, Listing, apply, make_listing
+from workbench.library.listing import MOST_ROWS, LibraryList, Listing, apply, make_listing
+from workbench.page.command import Command
 
 Rows = tuple[LibraryRow, ...]
 ROWS: Rows = tuple(

@@ -15,8 +15,7 @@ import pytest
 from tests.drive.panels import Clock, Panels, told_so_far
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
-from workbench.commands.command import Command
-from workbench.commands.library import (
+from workbench.library.commands import (
     AlsoPreviousRow,
     ClearRowFilter,
     DeleteSelected,
@@ -34,12 +33,13 @@ from workbench.commands.library import (
     TagSelected,
     UndoDelete,
 )
-from workbench.commands.page import AnswerDialog, CloseDialog
-from workbench.recording.library.library import Library
-from workbench.ui.library.listing import MOST_ROWS, Action
-from workbench.ui.library.panel import LibraryPanel
-from workbench.ui.library.rows import OpenVersion
-from workbench.ui.widgets.visitors import Visitor
+from workbench.library.folder import Library
+from workbench.library.listing import MOST_ROWS, Action
+from workbench.library.panel import LibraryPanel
+from workbench.library.rows import OpenVersion
+from workbench.page.command import Command
+from workbench.page.commands import AnswerDialog, CloseDialog
+from workbench.page.widgets.visitors import Visitor
 
 COUNT = MOST_ROWS + 5
 

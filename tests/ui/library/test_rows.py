@@ -9,16 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.recording.episode.row import LibraryRow, clean_facts
-from workbench.ui.library.rows import (
-    COLUMNS,
-    SECOND_LINE,
-    Column,
-    OpenVersion,
-    cells,
-    chosen,
-    ordered,
-)
+from workbench.episodes.row import LibraryRow, clean_facts
+from workbench.library.rows import COLUMNS, SECOND_LINE, Column, OpenVersion, cells, chosen, ordered
 
 NOW = datetime.datetime(2026, 11, 21, 12, tzinfo=datetime.timezone.utc)
 

@@ -10,12 +10,12 @@ import pytest
 
 from tests.drive.live import Live
 from tests.ui.scenes import running, step_of
-from workbench.commands.run import ToggleCurve
-from workbench.commands.timeline import Seek, SeekOnCurve
-from workbench.core.env.step_result import StepResult
-from workbench.session.history.curves import Curves, Group, StepCurves
-from workbench.session.live.view import SessionView
-from workbench.session.run.past import TimelineView
+from workbench.envs.step_result import StepResult
+from workbench.live.commands import ToggleCurve
+from workbench.live.history.curves import Curves, Group, StepCurves
+from workbench.live.past import TimelineView
+from workbench.live.timeline_commands import Seek, SeekOnCurve
+from workbench.live.view import SessionView
 
 JOINTS = ("hinge", "slide")
 

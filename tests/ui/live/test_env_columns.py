@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from workbench.ui.live.env_columns import EnvColumn, levels, wanted_width
+from workbench.live.panels.env_columns import EnvColumn, levels, wanted_width
 
 COLUMNS = [
     EnvColumn("env", 3),

@@ -11,8 +11,7 @@ import pytest
 from tests.drive.live import Live
 from tests.ui.env_rows import FELL, rows_of
 from tests.ui.scenes import running
-from workbench.commands.command import Command
-from workbench.commands.envs import (
+from workbench.live.env_commands import (
     FilterEnvs,
     NextFailedEnv,
     NextFlaggedEnv,
@@ -20,10 +19,11 @@ from workbench.commands.envs import (
     SortEnvs,
     TurnEnvs,
 )
-from workbench.commands.page import TellUnfolded, ToggleTable
-from workbench.session.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
-from workbench.session.run.events import EpisodeStepShown, SettingsChanged
-from workbench.ui.live.env_panel import MOST_ROWS, TABLE
+from workbench.live.events import EpisodeStepShown, SettingsChanged
+from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, LastEpisode
+from workbench.live.panels.env_panel import MOST_ROWS, TABLE
+from workbench.page.command import Command
+from workbench.page.commands import TellUnfolded, ToggleTable
 
 pytestmark = pytest.mark.thorough
 

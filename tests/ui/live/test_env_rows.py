@@ -10,16 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tests.ui.env_rows import rows_of
-from workbench.session.history.env_table import KEPT_REWARDS, EnvRows
-from workbench.ui.live.env_panel import (
-    FILTERS,
-    columns,
-    entry_names,
-    make_rows,
-    mask,
-    moment_of,
-    order,
-)
+from workbench.live.history.env_table import KEPT_REWARDS, EnvRows
+from workbench.live.panels.env_panel import FILTERS, columns, entry_names, make_rows, mask, moment_of, order
 
 
 def cells_of(rows: EnvRows, envs: NDArray[np.int64]) -> list[SimpleNamespace]:

@@ -7,27 +7,18 @@ from typing import Any
 
 from tests.drive.live import Live
 from tests.ui.scenes import running
-from workbench.commands.recording import (
+from workbench.live.past import TimelineView
+from workbench.live.process.background_jobs import JobProgress
+from workbench.record.commands import (
     ChooseRecordedEnvs,
     RecordNextEpisode,
     SavePreviousEpisode,
     ToggleRecording,
     ToggleSavePast,
 )
-from workbench.session.process.jobs import JobProgress
-from workbench.session.record.recording import RecordingStatus
-from workbench.session.record.saving import SaveStatus
-from workbench.session.run.past import TimelineView
-from workbench.ui.live.episodes_panel import (
-    ALL_ENVS,
-    NEXT,
-    RECORD,
-    SAVE,
-    SAVE_BEFORE,
-    STOP,
-    STOP_SAVING,
-    STOP_WAITING,
-)
+from workbench.record.panel import NEXT, RECORD, SAVE, SAVE_BEFORE, STOP, STOP_SAVING, STOP_WAITING
+from workbench.record.saving_state import SaveStatus
+from workbench.record.state import RecordingStatus
 
 PAST = TimelineView(0, 40, None, 0, 40, 40, moments=41)
 
@@ -46,7 +37,7 @@ def test_what_can_be_done_is_offered_and_asked_for_of_the_chosen_envs(live_page:
     tab.press(NEXT)
     tab.press(SAVE)
     tab.press(SAVE_BEFORE)
-    tab.set("Envs", ALL_ENVS)
+    tab.set("Envs", "all envs")
     assert live_page.asked == [
         ToggleRecording(),
         RecordNextEpisode(),
@@ -67,6 +58,6 @@ def test_what_can_be_done_is_offered_and_asked_for_of_the_chosen_envs(live_page:
     tab.press(STOP_SAVING)
     assert live_page.asked == [ToggleRecording(), ToggleRecording(), ToggleSavePast()]
     show(RecordingStatus(chosen="all"))
-    assert tab.field("Envs").value == ALL_ENVS
+    assert tab.field("Envs").value == "all envs"
     show(task=None)
     assert tab.button(RECORD).command is None

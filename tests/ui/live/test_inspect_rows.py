@@ -8,8 +8,8 @@ import pytest
 
 from tests.drive.live import Live
 from tests.ui.scenes import running
-from workbench.core.capture.inspection import Inspection, JointReadings, Leaf, Touching
-from workbench.ui.live.inspect_panel import (
+from workbench.envs.inspection import Inspection, JointReadings, Leaf, Touching
+from workbench.live.panels.inspect_panel import (
     CHOICES,
     LONGEST,
     METRES_AT_ONE_NEWTON,

@@ -11,14 +11,7 @@ from rich.style import Style
 
 from tests.drive.live import Live
 from tests.ui.scenes import running
-from workbench.session.process.captured_output import (
-    NOTHING_PRINTED,
-    Printed,
-    PrintedLine,
-    PrintedLog,
-    StyledText,
-)
-from workbench.ui.live.log_panel import (
+from workbench.live.panels.log_panel import (
     DARK_PAGE,
     LIGHT_PAGE,
     LINES_SHOWN,
@@ -27,6 +20,13 @@ from workbench.ui.live.log_panel import (
     log_html,
     readable_on,
     spans_of_lines,
+)
+from workbench.live.process.captured_output import (
+    NOTHING_PRINTED,
+    Printed,
+    PrintedLine,
+    PrintedLog,
+    StyledText,
 )
 
 LINES = (

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from tests.drive.entries import ENTRIES
 from tests.ui.scenes import step_of, table_scene
-from workbench.core.env.evaluate_entries import split_entries
-from workbench.core.env.step_result import OtherEntry
-from workbench.ui.live.reward import NumberRow, number_rows
-from workbench.ui.widgets.templates import render
+from workbench.envs.evaluate_entries import split_entries
+from workbench.envs.step_result import OtherEntry
+from workbench.live.panels.reward_panel import NumberRow, number_rows
+from workbench.page.widgets.templates import render
 
 _, POSES = table_scene(4)
 

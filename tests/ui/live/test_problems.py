@@ -12,7 +12,7 @@ import pytest
 from tests.drive.live import Live
 from tests.drive.waiting import until
 from tests.ui.scenes import EMPTY, PLAN, problem, running
-from workbench.commands.run import (
+from workbench.live.commands import (
     ChooseClass,
     FillEmptyFile,
     Interrupt,
@@ -22,13 +22,13 @@ from workbench.commands.run import (
     ReloadFile,
     RestartWorker,
 )
-from workbench.session.live.solver import SolveView
-from workbench.session.live.view import SessionView
-from workbench.session.process.heartbeat import Busy, busy_at
-from workbench.session.protocol.messages import ReloadReport
-from workbench.session.run.run import PastLoad
-from workbench.ui.live.banners import FILL, INTERRUPT, NEW_WORKER, REBUILD, RELOAD, RESTART, SHOWN_AFTER
-from workbench.ui.live.version_panel import MOST_SHOWN
+from workbench.live.messages import ReloadReport
+from workbench.live.panels.banners import FILL, INTERRUPT, NEW_WORKER, REBUILD, RELOAD, RESTART, SHOWN_AFTER
+from workbench.live.panels.version_panel import MOST_SHOWN
+from workbench.live.process.heartbeat import Busy, busy_at
+from workbench.live.run import PastLoad
+from workbench.live.view import SessionView
+from workbench.solve.state import SolveView
 
 pytestmark = pytest.mark.thorough
 

@@ -15,35 +15,35 @@ import viser
 from tests.drive.live import Live
 from tests.drive.panels import difference
 from tests.ui.env_rows import rows_of
-from tests.ui.scenes import PLAN, camera, problem, running, step_of
+from tests.ui.scenes import PLAN, camera, changed, problem, running, step_of
+from workbench.cameras.view import StudioCamera, StudioView
+from workbench.checks.profile import ProfileView
 from workbench.checks.results import HookTime, RuleResult, StepProfile
-from workbench.commands.page import ToggleTable
-from workbench.core.camera_data import CameraSettings, Picture
-from workbench.core.capture.inspection import Inspection, Leaf
-from workbench.core.env.keywords import HowMade, Keyword
-from workbench.core.rules import Finding
-from workbench.jobs.rescore.verdict import Verdict
-from workbench.jobs.task import TaskOptions
-from workbench.planning.report import SolvedSeed, SolveReport
-from workbench.session.cameras.view import StudioCamera, StudioView
-from workbench.session.checks.checks import ChecksView
-from workbench.session.checks.profile import ProfileView
-from workbench.session.checks.solve_seeds import SeedsView
-from workbench.session.history.curves import StepCurves
-from workbench.session.history.history import RESET, SUCCESS
-from workbench.session.live.solver import SolveView
-from workbench.session.live.view import SessionView
-from workbench.session.process.captured_output import Printed, PrintedLine
-from workbench.session.process.heartbeat import Busy
-from workbench.session.process.jobs import JobProgress
-from workbench.session.process.supervisor import Vitals
-from workbench.session.protocol.messages import ReloadReport, RulesBroken
-from workbench.session.record.recording import RecordingStatus
-from workbench.session.record.saving import SaveStatus
-from workbench.session.rescore.past import PastRun, RescoredCurve
-from workbench.session.rescore.rescoring import RescoreView
-from workbench.session.run.past import Strip, TimelineView
-from workbench.session.run.run import PastLoad
+from workbench.checks.state import ChecksView
+from workbench.envs.camera_data import CameraSettings, Picture
+from workbench.envs.gpu_rules import Finding
+from workbench.envs.inspection import Inspection, Leaf
+from workbench.envs.keywords import HowMade, Keyword
+from workbench.live.history.curves import StepCurves
+from workbench.live.history.moments import RESET, SUCCESS
+from workbench.live.messages import ReloadReport, RulesBroken
+from workbench.live.past import Strip, TimelineView
+from workbench.live.process.background_jobs import JobProgress
+from workbench.live.process.captured_output import Printed, PrintedLine
+from workbench.live.process.heartbeat import Busy
+from workbench.live.process.supervisor import Vitals
+from workbench.live.run import PastLoad
+from workbench.live.view import SessionView
+from workbench.page.commands import ToggleTable
+from workbench.planning.seeds_report import SolvedSeed, SolveReport
+from workbench.record.saving_state import SaveStatus
+from workbench.record.state import RecordingStatus
+from workbench.rescore.past_scores import PastRun, RescoredCurve
+from workbench.rescore.state import RescoreView
+from workbench.rescore.verdict import Verdict
+from workbench.solve.seeds import SeedsView
+from workbench.solve.state import SolveView
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.thorough
 
@@ -89,7 +89,7 @@ def base() -> SessionView:
         view.task, cameras=(CAMERA,), made=HowMade("panda", MODES), joints=("hinge",), notices=("note one",)
     )
     load = PastLoad(1e9, None, "the first version", 900.0)
-    return replace(
+    return changed(
         view,
         task=task,
         options=TaskOptions(ENVS),
@@ -225,7 +225,7 @@ def test_a_change_is_seen_and_gone_when_it_is_taken_back(live: Live, change: str
     live.show(view, rows())
     live.show(view, rows())  # pictures that follow each other are sent whole a moment later
     before = live.everything()
-    after = replace(view, **CHANGES[change](view))
+    after = changed(view, **CHANGES[change](view))
     live.show(after, rows())
     live.again()  # a new version is announced for some seconds
     shown = live.everything()
@@ -247,9 +247,9 @@ def test_a_step_is_in_the_table_of_envs(live: Live) -> None:
 def test_a_page_that_has_shown_much_shows_what_a_new_one_shows(live: Live) -> None:
     view = base()
     for change in CHANGES.values():
-        live.show(replace(view, **change(view)), rows())
+        live.show(changed(view, **change(view)), rows())
     for last in ("another env", "the past"):
-        new, shown = made(), replace(view, **CHANGES[last](view))
+        new, shown = made(), changed(view, **CHANGES[last](view))
         for page in (live, new):
             page.show(shown, rows())
             page.again()

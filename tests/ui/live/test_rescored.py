@@ -11,8 +11,9 @@ import pytest
 from tests.drive.live import Live
 from tests.drive.panels import Panels
 from tests.ui.scenes import running
-from workbench.authoring.problem import Problem
-from workbench.commands.timeline import (
+from workbench.live.events import MomentShown
+from workbench.live.past import TimelineView
+from workbench.live.timeline_commands import (
     ChooseRescoredCurve,
     NextDifference,
     PreviousDifference,
@@ -20,15 +21,14 @@ from workbench.commands.timeline import (
     StopRescoring,
     TurnRescored,
 )
-from workbench.jobs.rescore.verdict import Verdict
-from workbench.session.rescore import verdict_text
-from workbench.session.rescore.past import PastRun, RescoredCurve
-from workbench.session.rescore.rescoring import RescoreView
-from workbench.session.run.events import MomentShown
-from workbench.session.run.past import TimelineView
-from workbench.ui.live.rescored import chart_data
-from workbench.ui.widgets.line_chart import LONGEST
-from workbench.ui.widgets.rescored import MOST_ROWS
+from workbench.page.widgets.line_chart import LONGEST
+from workbench.rescore import verdict_text
+from workbench.rescore.past_panel import chart_data
+from workbench.rescore.past_scores import PastRun, RescoredCurve
+from workbench.rescore.result_parts import MOST_ROWS
+from workbench.rescore.state import RescoreView
+from workbench.rescore.verdict import Verdict
+from workbench.task.problem import Problem
 
 STOP = "Stop rescoring"
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from tests.drive.live import Live
 from tests.ui.scenes import running
-from workbench.commands.run import SetPolicy
-from workbench.session.protocol.messages import Settings
-from workbench.ui.live.run_panel import CHOOSE
+from workbench.live.commands import SetPolicy
+from workbench.live.messages import Settings
+from workbench.live.panels.run_panel import CHOOSE
 
 
 def test_a_policy_is_chosen_from_the_known_ones_while_policies_act(live_page: Live) -> None:

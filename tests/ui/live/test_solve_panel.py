@@ -11,31 +11,24 @@ import pytest
 from tests.drive.live import Live
 from tests.ui.env_rows import rows_of
 from tests.ui.scenes import PLAN, problem, running
-from workbench.commands.run import UseControlMode
-from workbench.commands.solve import (
+from workbench.envs.keywords import HowMade, Keyword
+from workbench.live.commands import UseControlMode
+from workbench.live.messages import Settings
+from workbench.live.process.background_jobs import JobProgress
+from workbench.planning.options import PlanOptions
+from workbench.record.commands import SaveSolved
+from workbench.record.saving_state import SaveStatus
+from workbench.record.state import RecordingStatus
+from workbench.solve.commands import (
     ChooseMethod,
     ChoosePlannedEnvs,
     FollowBody,
     LookAtRollout,
-    SaveSolved,
     SetPlanEvery,
     SetRollouts,
 )
-from workbench.core.env.keywords import HowMade, Keyword
-from workbench.planning.options import PlanOptions
-from workbench.session.live.solver import SolveView
-from workbench.session.process.jobs import JobProgress
-from workbench.session.protocol.messages import Settings
-from workbench.session.record.recording import RecordingStatus
-from workbench.session.record.saving import SaveStatus
-from workbench.ui.live.solve_panel import (
-    ALL_ENVS,
-    SAVE_SOLVED,
-    USE_MODE,
-    horizon_seconds,
-    in_words,
-    solve_html,
-)
+from workbench.solve.panel import ALL_ENVS, SAVE_SOLVED, USE_MODE, horizon_seconds, in_words, solve_html
+from workbench.solve.state import SolveView
 
 pytestmark = pytest.mark.thorough
 
@@ -142,7 +135,7 @@ def test_a_solved_episode_is_saved_and_a_playing_one_is_not_offered(solve: Solve
 def test_a_success_is_told_once_for_each_episode(solve: Solve, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     monkeypatch.setattr(
-        "workbench.ui.live.solve_panel.tell_all", lambda server, title, text, **more: told.append(text)
+        "workbench.solve.panel.tell_all", lambda server, title, text, **more: told.append(text)
     )
     for view in (SolveView(), SOLVED, SOLVED, SolveView(), SOLVED):
         solve.draw(view)

@@ -10,10 +10,13 @@ import pytest
 
 from tests.drive.panels import Clock, Panels
 from tests.drive.session import wait_until
+from workbench.app.live_page import Page
+from workbench.app.session import Session
 from workbench.commands import COMMANDS
-from workbench.commands.command import Refused
-from workbench.commands.run import ResetAll, Step
-from workbench.commands.timeline import (
+from workbench.live.commands import ResetAll, Step
+from workbench.live.events import MomentShown
+from workbench.live.past import TimelineView
+from workbench.live.timeline_commands import (
     ContinueFromHere,
     GoToFirst,
     GoToLast,
@@ -24,10 +27,7 @@ from workbench.commands.timeline import (
     UndoReset,
     ZoomTimeline,
 )
-from workbench.session.live.session import Session
-from workbench.session.run.events import MomentShown
-from workbench.session.run.past import TimelineView
-from workbench.ui.app.live_page import Page
+from workbench.page.command import Refused
 
 pytestmark = pytest.mark.thorough
 

@@ -7,15 +7,10 @@ import numpy as np
 import pytest
 
 from tests.ui.scenes import running
-from workbench.session.history.history import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
-from workbench.session.run.past import Strip, TimelineView
-from workbench.ui.live.timeline import LINE_HEIGHT as HEIGHT
-from workbench.ui.live.timeline import (
-    MOST_MARKS,
-    POINTS,
-    reward_lines,
-    strip_html,
-)
+from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.live.panels.timeline_panel import LINE_HEIGHT as HEIGHT
+from workbench.live.panels.timeline_panel import MOST_MARKS, POINTS, reward_lines, strip_html
+from workbench.live.past import Strip, TimelineView
 
 
 def strip(**changes: object) -> Strip:

@@ -13,8 +13,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.drive.episodes import made
-from workbench.commands.command import Command, Refused
-from workbench.commands.review import (
+from workbench.app.review_page import ReviewTimeline
+from workbench.episodes.row import LibraryRow
+from workbench.library.folder import LibraryView
+from workbench.live.commands import Step, TogglePlay
+from workbench.live.effects import Asked
+from workbench.live.timeline_commands import (
+    GoToFirst,
+    GoToLast,
+    NextEvent,
+    PreviousEvent,
+    Seek,
+    StepBack,
+    StepForward,
+)
+from workbench.page.command import Command, Refused
+from workbench.review.commands import (
     AlignRecordings,
     ChoosePlaybackSpeed,
     CloseRecording,
@@ -25,20 +39,11 @@ from workbench.commands.review import (
     SelectRecording,
     SwapWithFirst,
 )
-from workbench.commands.run import Step, TogglePlay
-from workbench.commands.timeline import (
-    GoToFirst,
-    GoToLast,
-    NextEvent,
-    PreviousEvent,
-    Seek,
-    StepBack,
-    StepForward,
-)
-from workbench.recording.episode.row import LibraryRow
-from workbench.recording.library.library import LibraryView
-from workbench.session.events import Asked
-from workbench.session.review.state import (
+from workbench.review.compare_panel import ReviewComparePanel
+from workbench.review.curves_panel import ReviewCurves, ReviewNumbers
+from workbench.review.panel import ReviewPanel
+from workbench.review.scene_view import caption, review_scene
+from workbench.review.state import (
     FilesChecked,
     FileStamp,
     Listed,
@@ -53,12 +58,7 @@ from workbench.session.review.state import (
     SceneTold,
     apply,
 )
-from workbench.session.review.view import Opened, ReviewView, find_events
-from workbench.ui.app.review_page import ReviewTimeline
-from workbench.ui.review.compare import ReviewComparePanel
-from workbench.ui.review.curves import ReviewCurves, ReviewNumbers
-from workbench.ui.review.panel import ReviewPanel
-from workbench.ui.review.scene import caption, review_scene
+from workbench.review.view import Opened, ReviewView, find_events
 
 EPISODES = {
     "a": made(10, success_from=7),

@@ -10,9 +10,9 @@ import pytest
 import viser
 
 from tests.drive.episodes import made
-from workbench.session.review.view import Opened, ReviewView, find_events
-from workbench.ui.live.reward import NumberRow
-from workbench.ui.review.curves import ReviewCurves, compared
+from workbench.live.panels.reward_panel import NumberRow
+from workbench.review.curves_panel import ReviewCurves, compared
+from workbench.review.view import Opened, ReviewView, find_events
 
 
 def test_what_only_another_recording_has_is_in_the_table() -> None:

@@ -14,15 +14,11 @@ import pytest
 from tests.drive.episodes import made, write
 from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
-from workbench.commands.review import ChooseRescoreCode
-from workbench.commands.timeline import ShowRescored, StopRescoring, TurnRescored
-from workbench.jobs.rescore.verdict import Verdict
-from workbench.recording.episode.row import Source
-from workbench.recording.library.library import Library
-from workbench.session.rescore import verdict_text
-from workbench.session.rescore.rescoring import RescoreView
-from workbench.session.review.review import Review
-from workbench.ui.review.rescore import (
+from workbench.episodes.row import Source
+from workbench.library.folder import Library
+from workbench.live.timeline_commands import ShowRescored, StopRescoring, TurnRescored
+from workbench.rescore import verdict_text
+from workbench.rescore.recordings_panel import (
     RECORDED,
     TODAYS,
     Code,
@@ -30,7 +26,11 @@ from workbench.ui.review.rescore import (
     RescorePanel,
     episode_files,
 )
-from workbench.ui.widgets.rescored import MOST_ROWS
+from workbench.rescore.result_parts import MOST_ROWS
+from workbench.rescore.state import RescoreView
+from workbench.rescore.verdict import Verdict
+from workbench.review.commands import ChooseRescoreCode
+from workbench.review.playback import Review
 
 AS_RECORDED, TODAYS_CODE = Code(RECORDED, "", recorded=True), Code(TODAYS, "")
 

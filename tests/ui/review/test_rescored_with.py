@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from workbench.authoring.loading.task_content import source_hash
-from workbench.recording.episode.episode import EpisodeInfo
-from workbench.ui.review.rescore import RECORDED, TODAYS, codes_for
+from workbench.episodes.episode import EpisodeInfo
+from workbench.rescore.recordings_panel import RECORDED, TODAYS, codes_for
+from workbench.task.content import source_hash
 
 TASK = '@register_env("Push-v1")\nclass Push(BaseEnv):\n    pass\n'
 

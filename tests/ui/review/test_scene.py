@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from tests.drive.episodes import BODY, geometry_of, made, poses_of
-from workbench.recording.episode.episode import Episode
-from workbench.session.review.view import Opened, find_events
-from workbench.ui.review.scene import SEE_THROUGH, review_scene
-from workbench.ui.scene.glb import group_visuals
+from workbench.episodes.episode import Episode
+from workbench.page.scene.glb import group_visuals
+from workbench.review.scene_view import SEE_THROUGH, review_scene
+from workbench.review.view import Opened, find_events
 
 
 def opened(*episodes: Episode) -> tuple[Opened, ...]:

@@ -17,8 +17,10 @@ from tests.drive.episodes import made
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
-from workbench.commands.command import Command, name_of
-from workbench.commands.review import (
+from workbench.episodes.sweep_results import RESULTS, SweepEpisode, SweepResults, write_results
+from workbench.library.folder import Library
+from workbench.page.command import Command, name_of
+from workbench.review.commands import (
     ClearSweepFilter,
     FilterSweep,
     OpenSweepEpisode,
@@ -26,11 +28,9 @@ from workbench.commands.review import (
     SortSweep,
     TurnSweep,
 )
-from workbench.recording.library.library import Library
-from workbench.recording.sweeps import RESULTS, SweepEpisode, SweepResults, write_results
-from workbench.session.review.view import Opened, ReviewView
-from workbench.ui.review import sweep
-from workbench.ui.review.sweep import SweepPanel, best_first
+from workbench.review.view import Opened, ReviewView
+from workbench.sweep import panel as sweep
+from workbench.sweep.panel import SweepPanel, best_first
 
 
 class Tab:

@@ -9,9 +9,9 @@ import trimesh
 import viser
 
 from tests.ui.scenes import table_scene
-from workbench.core.scene.shapes import Material, Mesh
-from workbench.ui.scene.bodies import LEAVES_AFTER, Looks, SceneView
-from workbench.ui.scene.env_grid import lay_out
+from workbench.envs.scene.shapes import Material, Mesh
+from workbench.page.scene.bodies import LEAVES_AFTER, Looks, SceneView
+from workbench.page.scene.env_grid import lay_out
 
 
 def handle_named(view: SceneView, part: str) -> viser.BatchedGlbHandle:

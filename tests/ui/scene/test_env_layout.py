@@ -6,14 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.ui.scenes import box_mesh, table_scene, visual
-from workbench.core.scene.shapes import SceneGeometry
-from workbench.ui.scene.env_grid import (
-    env_under_ray,
-    grid_offsets,
-    lay_out,
-    place_of_plane,
-    plane_normal,
-)
+from workbench.envs.scene.shapes import SceneGeometry
+from workbench.page.scene.env_grid import env_under_ray, grid_offsets, lay_out, place_of_plane, plane_normal
 
 
 def test_box_of_an_env_holds_what_stands_in_it_and_not_its_floor() -> None:

@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 
 from tests.ui.scenes import box_mesh
-from workbench.core.scene.shapes import Material
-from workbench.ui.scene.glb import LAYER, as_glb, lift_painted_layers
+from workbench.envs.scene.shapes import Material
+from workbench.page.scene.glb import LAYER, as_glb, lift_painted_layers
 
 
 def read_back(glb: bytes) -> list[Any]:

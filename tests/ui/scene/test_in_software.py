@@ -12,13 +12,13 @@ import trimesh
 
 from tests.drive.waiting import until
 from tests.ui.scenes import table_scene
-from workbench.core.scene.shapes import Mesh, SceneGeometry
-from workbench.session.loop import do
-from workbench.ui.scene.bodies import Looks
-from workbench.ui.scene.env_grid import EnvLayout, lay_out
-from workbench.ui.scene.in_software import InSoftware, pixel_of
-from workbench.ui.scene.pixels import Eye
-from workbench.ui.widgets.visitors import Visitor
+from workbench.envs.scene.shapes import Mesh, SceneGeometry
+from workbench.machine.loop import do
+from workbench.page.scene.bodies import Looks
+from workbench.page.scene.env_grid import EnvLayout, lay_out
+from workbench.page.scene.software_rendering import InSoftware, pixel_of
+from workbench.page.scene.visible_motion import Eye
+from workbench.page.widgets.visitors import Visitor
 
 Callback = Callable[[Any], Coroutine[Any, Any, None]]
 
@@ -66,7 +66,7 @@ def test_a_page_that_does_not_tell_in_time_draws_otherwise_until_it_leaves(
 ) -> None:
     server: Any = Server()
     in_software = InSoftware(server)
-    monkeypatch.setattr("workbench.ui.scene.in_software.PATIENCE", 0.05)
+    monkeypatch.setattr("workbench.page.scene.software_rendering.PATIENCE", 0.05)
     server.come(1)
     assert not in_software.all_pages
     in_software.told_by(server.visitor(1))

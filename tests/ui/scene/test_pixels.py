@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.ui.scene.pixels import AT_REST, Eye, SentPoses, displacements, pixel_sizes
+from workbench.page.scene.visible_motion import AT_REST, Eye, SentPoses, displacements, pixel_sizes
 
 EYE = Eye(np.array([0.0, 0.0, 5.0]), 0.001)
 """A pixel is 5 mm at the origin."""

@@ -9,7 +9,7 @@ import pytest
 import viser
 
 from tests.drive.panels import Panels
-from workbench.ui.scene.rollout_traces import BEST, RolloutTraces, segments
+from workbench.solve.rollout_traces import BEST, RolloutTraces, segments
 
 HERE = np.zeros(3, np.float32)
 

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import table_scene
-from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.scene.viewpoint import Stage
+from workbench.page.scene.env_grid import lay_out
+from workbench.page.scene.viewpoint import Stage
 
 
 def test_bodies_and_light_outlive_a_page_and_nothing_else_does(panels: Panels) -> None:

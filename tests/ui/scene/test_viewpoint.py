@@ -10,19 +10,11 @@ from tests.drive.panels import Panels
 from tests.drive.waiting import until
 from tests.ui.scenes import running, table_scene
 from tests.ui.tabs import camera_message, handshake
-from workbench.core.camera_data import Picture
-from workbench.ui.scene.bodies import Looks
-from workbench.ui.scene.env_grid import lay_out
-from workbench.ui.scene.viewpoint import (
-    FOV,
-    ONE,
-    Framing,
-    ViewChoice,
-    ViewPanel,
-    Viewpoint,
-    frame_box,
-    frame_one,
-)
+from workbench.envs.camera_data import Picture
+from workbench.live.panels.view_panel import ViewPanel
+from workbench.page.scene.bodies import Looks
+from workbench.page.scene.env_grid import lay_out
+from workbench.page.scene.viewpoint import FOV, ONE, Framing, ViewChoice, Viewpoint, frame_box, frame_one
 
 
 @given(

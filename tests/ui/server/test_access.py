@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 import pytest
 
-from workbench.ui.server.access import (
+from workbench.page.door.access import (
     AccessRules,
     Admitted,
     Decision,

@@ -33,8 +33,8 @@ from tests.ui.knocking import (
     say,
     token_of,
 )
-from workbench.ui.server import responses, viser_private
-from workbench.ui.server.access import (
+from workbench.page.door import responses, viser_private
+from workbench.page.door.access import (
     AccessRules,
     Admitted,
     Entered,
@@ -43,10 +43,10 @@ from workbench.ui.server.access import (
     cookie_name,
     decide,
 )
-from workbench.ui.server.client_messages import KINDS, MAX_BYTES, MalformedMessage
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
-from workbench.ui.server.page_guard import PageGuard
-from workbench.ui.server.strangers import RareLog
+from workbench.page.door.client_messages import KINDS, MAX_BYTES, MalformedMessage
+from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.page_guard import PageGuard
 
 pytestmark = pytest.mark.thorough
 

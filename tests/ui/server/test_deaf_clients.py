@@ -11,7 +11,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from workbench.ui.server import strangers
+from workbench.page.door import connection_limits as strangers
 
 pytestmark = pytest.mark.thorough
 

@@ -13,8 +13,8 @@ import pytest
 
 from tests.drive.waiting import until
 from tests.ui.knocking import ask, cookie_of
-from workbench.ui.server.file_response import BLOCK, FileReply
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.file_response import BLOCK, FileReply
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
 LARGE = 48 * 2**20
 """More bytes than the kernel takes of a connection whose other end does not read."""

@@ -21,12 +21,13 @@ import viser._messages
 import viser.infra._infra
 
 from tests.drive.page import page_at
-from workbench.cli.terminal.output import print_addresses
-from workbench.ui.server import gated_server as door_module
-from workbench.ui.server import listening, viser_private
-from workbench.ui.server.access import cookie_name
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
-from workbench.ui.server.listening import ServerError
+from workbench.cli.output import print_addresses
+from workbench.page.door import gated_server as door_module
+from workbench.page.door import listening_socket as listening
+from workbench.page.door import viser_private
+from workbench.page.door.access import cookie_name
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.listening_socket import ServerError
 
 
 def token_of(gated_server: GatedServer) -> str:
@@ -171,7 +172,7 @@ SERVED = """
 import os
 before = dict(os.environ)
 import numpy as np
-from workbench.ui.server.gated_server import ServerOptions, open_server
+from workbench.page.door.gated_server import ServerOptions, open_server
 door = open_server(ServerOptions(port=0))
 door.server.gui.add_image(np.zeros((8, 8, 3), np.uint8))
 import rich

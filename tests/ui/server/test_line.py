@@ -18,8 +18,8 @@ from websockets.exceptions import ConnectionClosed
 from tests.drive.far_line import FarLine, line_to
 from tests.drive.waiting import until
 from tests.ui.tabs import camera_message, handshake, messages_in
-from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.server.line import CompressWhenFar, Line, WhenFar
+from workbench.page.door.client_connection import CompressWhenFar, Line, WhenFar
+from workbench.page.door.gated_server import GatedServer
 
 pytestmark = pytest.mark.thorough
 

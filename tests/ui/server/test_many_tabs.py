@@ -18,16 +18,16 @@ from tests.drive.scripted import scripted
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import Tabs, open_deaf_tab, tabs_of
-from workbench.commands.run import PauseRun, PlayRun
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.session.run.events import PagesCounted, RunEvent
-from workbench.ui.app.live_page import Page
-from workbench.ui.app.pages import Pages
-from workbench.ui.scene.viewpoint import Stage
-from workbench.ui.server import strangers
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
-from workbench.ui.widgets.visitors import Visitors
+from workbench.app.live_page import Page
+from workbench.app.pages import Pages
+from workbench.app.session import Session
+from workbench.live.commands import PauseRun, PlayRun
+from workbench.live.events import PagesCounted, RunEvent
+from workbench.page.door import connection_limits as strangers
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.scene.viewpoint import Stage
+from workbench.page.widgets.visitors import Visitors
+from workbench.task.description import TaskOptions
 
 pytestmark = pytest.mark.thorough
 

@@ -13,8 +13,8 @@ from websockets.sync.connection import Connection
 from tests.drive.waiting import until
 from tests.ui.knocking import CAMERA, Bell, client, close_code, say
 from tests.ui.tabs import messages_in
-from workbench.ui.server import page_guard
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door import page_guard
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 
 pytestmark = pytest.mark.thorough
 

@@ -16,9 +16,9 @@ from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.ui.knocking import ask
 from workbench.machine.folders import web_assets_folder
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
-from workbench.ui.server.responses import DIRECTIVES
-from workbench.ui.widgets.visitors import PATH, Visitors
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.responses import DIRECTIVES
+from workbench.page.widgets.visitors import PATH, Visitors
 
 
 @pytest.fixture

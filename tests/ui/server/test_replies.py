@@ -14,7 +14,8 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from workbench.ui.server.responses import (
+from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.responses import (
     EVERY_REPLY,
     LONGEST_NAME,
     LONGEST_PATH,
@@ -28,7 +29,6 @@ from workbench.ui.server.responses import (
     refusals,
     request_parts,
 )
-from workbench.ui.server.strangers import RareLog
 
 AUTHORITY = "localhost:8080"
 PAGE = b"<html><head><title>viser</title></head><body></body></html>"

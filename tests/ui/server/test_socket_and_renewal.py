@@ -23,10 +23,10 @@ from tests.drive.waiting import until
 from tests.ui.knocking import CAMERA, PROTOCOL, Bell, ask, both, client, close_code, cookie_of, say, token_of
 from tests.ui.tabs import open_deaf_tab
 from workbench.machine.processes.child_python import child_environment, python_command
-from workbench.ui.server import listening
-from workbench.ui.server.access import cookie_name
-from workbench.ui.server.gated_server import GatedServer, ServerOptions, open_server
-from workbench.ui.server.listening import ServerError
+from workbench.page.door import listening_socket as listening
+from workbench.page.door.access import cookie_name
+from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
+from workbench.page.door.listening_socket import ServerError
 
 
 @pytest.fixture

@@ -17,10 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.ui.knocking import PROTOCOL, ask, both, client, cookie_of, knock, token_of
-from workbench.ui.server import strangers
-from workbench.ui.server.access import cookie_name
-from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.server.strangers import RareLog
+from workbench.page.door import connection_limits as strangers
+from workbench.page.door.access import cookie_name
+from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.gated_server import GatedServer
 
 
 def connected(gated_server: GatedServer) -> socket.socket:

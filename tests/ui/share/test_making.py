@@ -15,12 +15,12 @@ import pytest
 
 from tests.drive.episodes import Made, Track
 from tests.drive.waiting import until
-from workbench.core.camera_data import CameraInfo
-from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
-from workbench.recording.episode.episode import EpisodeInfo
-from workbench.recording.episode.row import Source
-from workbench.recording.reader.reading import find_all_sources, read_recording
-from workbench.ui.share.make import MakeRequest, Making, MakingView, make
+from workbench.envs.camera_data import CameraInfo
+from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.reader.reading import find_all_sources, read_recording
+from workbench.episodes.row import Source
+from workbench.share.make import MakeRequest, Making, MakingView, make
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -113,10 +113,10 @@ def test_downloads_of_one_name_are_kept_apart_until_the_end(recordings: Path, tm
 def test_the_end_waits_for_work_that_was_begun_and_does_not_wait_for_ever(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.ui.share.make.END_SECONDS", 0.1)
+    monkeypatch.setattr("workbench.share.make.END_SECONDS", 0.1)
     told, go_on = Told(), threading.Event()
     monkeypatch.setattr(
-        "workbench.ui.share.make.Processes", lambda count: SimpleNamespace(run=lambda *work: go_on.wait(60))
+        "workbench.share.make.Processes", lambda count: SimpleNamespace(run=lambda *work: go_on.wait(60))
     )
     told.making.start(MakeRequest("zip", find_all_sources([recordings]), tmp_path))
     told.making.close()

@@ -8,18 +8,12 @@ from pathlib import Path
 import pytest
 
 from tests.drive.panels import Panels
-from workbench.commands.share import MakeShared
-from workbench.recording.episode.row import Source
-from workbench.ui.server.file_response import Downloads
-from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView
-from workbench.ui.share.panel import (
-    ALL_CAMERAS,
-    MOST_NAMED,
-    Chosen,
-    SharePanel,
-    will_make,
-)
+from workbench.episodes.row import Source
+from workbench.page.door.file_response import Downloads
+from workbench.page.door.gated_server import GatedServer
+from workbench.share.commands import MakeShared
+from workbench.share.make import EVERY_CAMERA, Made, MakeRequest, Making, MakingView
+from workbench.share.panel import ALL_CAMERAS, MOST_NAMED, Chosen, SharePanel, will_make
 
 
 class Noted(Making):

@@ -14,12 +14,12 @@ from playwright.sync_api import Browser, Request
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
-from workbench.recording.rerun.viewer import VIEWER_FILES, web_viewer_folder
-from workbench.ui.server.access import cookie_name
-from workbench.ui.server.file_response import Downloads
-from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.share.rerun_view import RerunPages, RerunView
-from workbench.ui.widgets.visitors import PATH, Visitors
+from workbench.episodes.rerun.viewer import VIEWER_FILES, web_viewer_folder
+from workbench.page.door.access import cookie_name
+from workbench.page.door.file_response import Downloads
+from workbench.page.door.gated_server import GatedServer
+from workbench.page.widgets.visitors import PATH, Visitors
+from workbench.share.rerun_panel import RerunPages, RerunView
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import pytest
 from playwright.sync_api import Browser
 
 from tests.drive.page import page_at
-from workbench.core.scene.shapes import Material, Mesh, SceneGeometry, Visual
-from workbench.recording.episode.episode import Episode, EpisodeInfo
-from workbench.ui.share.scene_html import write_scene_html
+from workbench.envs.scene.shapes import Material, Mesh, SceneGeometry, Visual
+from workbench.episodes.episode import Episode, EpisodeInfo
+from workbench.share.scene_html import write_scene_html
 
 DRAWN = """before => {
     const said = document.querySelector(".wb-caption").innerText;

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import running
+from workbench.app.session import Session
 from workbench.commands import COMMANDS, Refused
-from workbench.commands.run import ResetEnvOptions
-from workbench.core.env.keywords import HowMade, Keyword
-from workbench.jobs.task import TaskOptions
-from workbench.session.live.session import Session
-from workbench.session.live.view import SessionView
-from workbench.session.run.events import OptionsApplied
-from workbench.ui.tasks.env_options import EnvOptionsPanel, merged
-from workbench.ui.widgets.parts import Parts
+from workbench.envs.keywords import HowMade, Keyword
+from workbench.live.commands import ResetEnvOptions
+from workbench.live.events import OptionsApplied
+from workbench.live.panels.env_options import EnvOptionsPanel, merged
+from workbench.live.view import SessionView
+from workbench.page.widgets.parts import Parts
+from workbench.task.description import TaskOptions
 
 ROBOT = Keyword("robot_uids", "choice", '"panda"', choices=('"panda"', '"fetch"'))
 CONTROL = Keyword("control_mode", "choice", '"pd_joint_pos"', choices=('"pd_joint_pos"', '"pd_ee_pose"'))

@@ -10,19 +10,15 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
-from workbench.authoring.templates.new_task import TEMPLATES
-from workbench.commands.tasks import (
+from workbench.start.catalogue import Catalogue, CatalogueView, Entry, Section
+from workbench.start.commands import (
     ClearTaskSearch,
     OpenFoundTask,
     OpenListedTask,
     OpenTaskList,
     TemplateName,
 )
-from workbench.jobs.task import TaskOptions
-from workbench.session.tasks.catalogue import Catalogue, CatalogueView, Entry, Section
-from workbench.session.tasks.recents import RecentTasks
-from workbench.session.tasks.registered import NotDrawn, RegisteredTasks, RegisteredView
-from workbench.ui.tasks.task_list import (
+from workbench.start.panel import (
     CREATE,
     OPEN,
     OpenDialog,
@@ -32,6 +28,10 @@ from workbench.ui.tasks.task_list import (
     picture_route,
     tasks_html,
 )
+from workbench.start.recents import RecentTasks
+from workbench.start.registered import NotDrawn, RegisteredTasks, RegisteredView
+from workbench.task.description import TaskOptions
+from workbench.task.new_task import TEMPLATES
 
 PUSH = Entry(1, Section.FOLDER, "push.py", "Push-v1", "/w/push.py", Path("/w/push.py"))
 PICK = Entry(2, Section.REGISTERED, "PickCube-v1", "", "PickCube-v1", env_id="PickCube-v1")

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.ui.widgets.editor import EDITORS, editor_link, parse_editor
-from workbench.ui.widgets.templates import render
+from workbench.page.widgets.editor_links import EDITORS, editor_link, parse_editor
+from workbench.page.widgets.templates import render
 
 REMOTE = "vscode://vscode-remote/ssh-remote+lab{file}:{line}"
 

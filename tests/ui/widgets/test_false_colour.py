@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from workbench.ui.widgets.images import (
+from workbench.page.widgets.images import (
     LONGEST_LEGEND,
     NOTHING,
     VIRIDIS,

@@ -6,7 +6,7 @@ import numpy as np
 import viser
 
 from tests.drive.panels import Panels
-from workbench.ui.widgets.line_chart import TAKING_TURNS, YES_OR_NO, ChartLine, LineChart, span_of
+from workbench.page.widgets.line_chart import TAKING_TURNS, YES_OR_NO, ChartLine, LineChart, span_of
 
 X = np.arange(3.0)
 Y = np.array([0.5, np.nan, 1.0])

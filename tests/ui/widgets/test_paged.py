@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from workbench.commands.envs import TurnEnvs
-from workbench.ui.widgets.paged import Paged
+from workbench.live.env_commands import TurnEnvs
+from workbench.page.widgets.paged import Paged
 
 
 def turn(by: int) -> TurnEnvs:

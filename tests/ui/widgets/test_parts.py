@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from tests.drive.panels import Clock
-from workbench.ui.widgets.parts import DrawDue, PagePart, Parts
+from workbench.page.widgets.parts import DrawDue, PagePart, Parts
 
 
 class Plain(PagePart[int]):

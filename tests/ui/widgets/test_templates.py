@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.ui.scenes import running
-from workbench.authoring.problem import Problem
-from workbench.ui.live.banners import banner_html
-from workbench.ui.widgets.templates import render
+from workbench.live.panels.banners import banner_html
+from workbench.page.widgets.templates import render
+from workbench.task.problem import Problem
 
 
 def test_a_name_that_cannot_be_sent_is_shown() -> None:

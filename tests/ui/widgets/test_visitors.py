@@ -17,11 +17,11 @@ from websockets.sync.connection import Connection
 from tests.drive.waiting import PATIENCE, until
 from tests.ui.tabs import handshake, tabs_of
 from workbench.commands import COMMANDS
-from workbench.commands.command import Command, Refused
-from workbench.commands.envs import NextEnv, SelectEnv
-from workbench.commands.run import SetSeed, Step, TogglePlay
-from workbench.ui.server.gated_server import GatedServer
-from workbench.ui.widgets.visitors import PATH, Done, Visitor, Visitors
+from workbench.live.commands import SetSeed, Step, TogglePlay
+from workbench.live.env_commands import NextEnv, SelectEnv
+from workbench.page.command import Command, Refused
+from workbench.page.door.gated_server import GatedServer
+from workbench.page.widgets.visitors import PATH, Done, Visitor, Visitors
 
 
 @dataclass

@@ -1,1 +1,1 @@
-"""The rules, a function each, by the hook that they guard, and what runs them."""
+"""The rules, one function each, by the hook that they guard."""

@@ -8,17 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from workbench.authoring.loading.blamed import blamed
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
-from workbench.core import maniskill_private
-from workbench.core.broken_rule import Place
-from workbench.core.camera_data import CameraKey, CameraKind
-from workbench.core.camera_shader import is_ray_traced
-from workbench.core.cameras.place import rows_of_pose
-from workbench.core.cameras.render import cameras_of, here_without_ray_tracing, mount_of
-from workbench.core.cameras.report import CameraReport, join_reports
-from workbench.core.cameras.temporary import temporary_camera
-from workbench.core.cameras.visibility import (
+from workbench.envs import maniskill_private
+from workbench.envs.broken_rule import Place
+from workbench.envs.camera_data import CameraKey, CameraKind
+from workbench.envs.rendering.camera_shader import is_ray_traced
+from workbench.envs.scene.scene_index import read_poses, scene_index
+from workbench.machine.text import listed, of
+from workbench.pictures.camera_report import CameraReport, join_reports
+from workbench.pictures.placed_cameras import rows_of_pose
+from workbench.pictures.render import cameras_of, here_without_ray_tracing, mount_of
+from workbench.pictures.temporary_camera import temporary_camera
+from workbench.pictures.visibility import (
     SceneObject,
     entities_of,
     is_drawn,
@@ -28,8 +29,7 @@ from workbench.core.cameras.visibility import (
     placement_pose,
     small_size,
 )
-from workbench.core.scene.scene_index import read_poses, scene_index
-from workbench.machine.text import listed, of
+from workbench.task.blame import blamed
 
 RESETS = 4
 """Resets of `Checkup.pictured` whose pictures are measured."""

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note
 from workbench.checks.evidence.places import Module
-from workbench.checks.evidence.step_profile import EVERY_STEP
 from workbench.checks.evidence.tensor_watch import TensorUses
-from workbench.core.broken_rule import Place
+from workbench.checks.evidence.time_step import EVERY_STEP
+from workbench.envs.broken_rule import Place
 
 _ONE_FOR_EACH_ENV = {"num_envs", "_num_envs", "_objs", "_bodies", "sub_scenes"}
 _LOOPS = (ast.For, ast.comprehension)

@@ -16,8 +16,8 @@ from mani_skill.utils import assets
 from workbench.checks.by_hook.source import HOOKS
 from workbench.checks.evidence.checkup import Check, Checkup, Found, Note
 from workbench.checks.evidence.places import Module
-from workbench.core.broken_rule import Place
-from workbench.core.env.assets import assets_at
+from workbench.envs.assets import assets_at
+from workbench.envs.broken_rule import Place
 
 _SUFFIXES = {
     ".urdf", ".xml", ".mjcf", ".srdf", ".glb", ".gltf", ".obj", ".stl", ".ply", ".dae", ".usd", ".png", ".jpg", ".jpeg",

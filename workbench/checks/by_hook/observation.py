@@ -11,21 +11,21 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.authoring.loading.blamed import blamed
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown, leaf_rows
 from workbench.checks.evidence.odd_states import DENSE_HOOKS, odd_states, write_all
 from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
 from workbench.checks.results import Seen
-from workbench.core import maniskill_private
-from workbench.core.broken_rule import Place
-from workbench.core.capture.recorded_state import read_states
-from workbench.core.capture.state_columns import flat_names, split_flat
-from workbench.core.env.evaluate_entries import split_entries
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.scene.scene_index import scene_index
-from workbench.core.simulation.state_layout import BODY
-from workbench.core.snapshots.snapshot import remembering
+from workbench.envs import maniskill_private
+from workbench.envs.broken_rule import Place
+from workbench.envs.evaluate_entries import split_entries
+from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.simulation.state_layout import BODY
+from workbench.envs.snapshots.snapshot import remembering
+from workbench.envs.state_columns import flat_names, split_flat
+from workbench.envs.task_env import TaskEnv
+from workbench.episodes.recorded_state import read_states
 from workbench.machine.text import listed, of
+from workbench.task.blame import blamed
 
 HUGE = 1000.0
 MOVED = np.array([0.031, -0.043, 0.057], np.float32)

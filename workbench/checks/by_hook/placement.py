@@ -13,16 +13,16 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.utils.structs.link import Link
 from numpy.typing import NDArray
 
-from workbench.authoring.problem import TaskError
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
-from workbench.checks.evidence.episodes import SeenOutlier
 from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
+from workbench.checks.evidence.rollouts import SeenOutlier
 from workbench.checks.results import Seen
-from workbench.core.broken_rule import Place
-from workbench.core.env.actions import random_action
-from workbench.core.maniskill_private import agents, apply_and_fetch, objects_of
-from workbench.core.scene.scene_index import SceneIndex, joints_of_scene, present_states, scene_index
+from workbench.envs.action_vector import random_action
+from workbench.envs.broken_rule import Place
+from workbench.envs.maniskill_private import agents, apply_and_fetch, objects_of
+from workbench.envs.scene.scene_index import SceneIndex, joints_of_scene, present_states, scene_index
 from workbench.machine.text import listed, of
+from workbench.task.problem import TaskError
 
 DEEP = 0.002
 """Metres that two bodies may overlap: contacts of bodies at rest are about so deep."""

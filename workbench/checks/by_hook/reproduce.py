@@ -9,17 +9,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from workbench.authoring.loading.blamed import blamed
 from workbench.checks.evidence.builds import shapes_of_env
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown, read_obs
 from workbench.checks.evidence.random_calls import first_draw, global_draw, torch_draw
-from workbench.checks.evidence.step_profile import EVERY_STEP
-from workbench.core.capture.state_columns import env_states, flat_names, split_flat
-from workbench.core.env.actions import random_action
-from workbench.core.env.step_result import StepResult
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.maniskill_private import apply_and_fetch
+from workbench.checks.evidence.time_step import EVERY_STEP
+from workbench.envs.action_vector import random_action
+from workbench.envs.maniskill_private import apply_and_fetch
+from workbench.envs.state_columns import env_states, flat_names, split_flat
+from workbench.envs.step_result import StepResult
+from workbench.envs.task_env import TaskEnv
 from workbench.machine.text import listed
+from workbench.task.blame import blamed
 
 ROUNDS = 6
 """Partial resets, with a step between them."""

@@ -17,10 +17,10 @@ from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicab
 from workbench.checks.evidence.meshes import is_hollow, triangles_in
 from workbench.checks.evidence.over_seeds import OverSeeds, together, tried
 from workbench.checks.results import Seen
-from workbench.core.broken_rule import Place
-from workbench.core.maniskill_private import envs_of, named_to_hide, objects_of
-from workbench.core.scene.scene_index import scene_index
-from workbench.core.simulation.hiding import why_not_hidden
+from workbench.envs.broken_rule import Place
+from workbench.envs.maniskill_private import envs_of, named_to_hide, objects_of
+from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.simulation.hiding import why_not_hidden
 from workbench.machine.text import listed
 
 DEEP_AT_LOAD = 0.005

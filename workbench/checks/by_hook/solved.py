@@ -6,15 +6,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from workbench.authoring.loading.blamed import blamed
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note, NotKnown
-from workbench.core.env.task_env import TaskEnv, given_arguments
-from workbench.planning.episodes import EpisodeLog, PlannedEpisode
+from workbench.envs.task_env import TaskEnv, given_arguments
+from workbench.planning.planned_episodes import EpisodeLog, PlannedEpisode
 from workbench.planning.planner import Planner
-from workbench.planning.report import few_seeds_text
 from workbench.planning.rollouts import NotAlike, NothingToPlan, control_mode_to_plan, require_plannable
+from workbench.planning.seeds_report import few_seeds_text
 from workbench.planning.verdicts import ENOUGH_SEEDS, MOST_OF, PlannedEpisodes
 from workbench.planning.verdicts import RULES as VERDICTS
+from workbench.task.blame import blamed
 
 SEEDS = ENOUGH_SEEDS
 """Most seeds that are solved: each takes seconds."""

@@ -14,13 +14,13 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.building import ActorBuilder, ArticulationBuilder
 
-from workbench.authoring.loading import registry
 from workbench.checks.by_hook.devices import EVERY_STEP
 from workbench.checks.by_hook.reward import REWARD_HOOKS
 from workbench.checks.evidence.checkup import Check, Checkup, Found, NotApplicable, Note
 from workbench.checks.evidence.random_calls import global_draw
-from workbench.core.broken_rule import Place
-from workbench.core.env.assets import robots_of
+from workbench.envs.assets import robots_of
+from workbench.envs.broken_rule import Place
+from workbench.task import registry
 
 HOOKS = tuple(
     name for name, member in vars(BaseEnv).items() if callable(member) or isinstance(member, property)

@@ -1,1 +1,1 @@
-"""What the checks look at: envs of a version, what they were seen to do, and lines of the source."""
+"""What the rules look at: envs of a version, what they did, and lines of the source."""

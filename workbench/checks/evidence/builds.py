@@ -18,7 +18,7 @@ from mani_skill.utils.building.articulation_builder import ArticulationBuilder
 from mani_skill.utils.structs import Actor, Articulation, Link, Pose
 from numpy.typing import NDArray
 
-from workbench.core.broken_rule import Place
+from workbench.envs.broken_rule import Place
 
 _BUILDERS = ("mani_skill.utils.building", "sapien.", "workbench.")
 """Modules whose lines build for whoever calls them."""

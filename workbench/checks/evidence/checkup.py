@@ -15,9 +15,6 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
-from workbench.authoring.loading.blamed import blamed, returns_check
-from workbench.authoring.loading.load import LoadedTask
-from workbench.authoring.problem import Problem, TaskError
 from workbench.checks.evidence.builds import (
     Built,
     Merged,
@@ -26,26 +23,29 @@ from workbench.checks.evidence.builds import (
     noting_poses,
     shapes_of_env,
 )
-from workbench.checks.evidence.episodes import Actor, Episodes, SeenOutliers, joined, stacked
 from workbench.checks.evidence.places import Places
+from workbench.checks.evidence.rollouts import Actor, Episodes, SeenOutliers, joined, stacked
 from workbench.checks.evidence.tensor_watch import NUM_ENVS, TensorUses, TensorWatch
 from workbench.checks.results import Silenced
-from workbench.core.backends import find_renderer
-from workbench.core.broken_rule import BrokenRules, Place
-from workbench.core.capture.inspect_env import list_contacts
-from workbench.core.capture.outliers import OutlierWatch
-from workbench.core.env import actions
-from workbench.core.env.assets import MissingAssets
-from workbench.core.env.cpu_scene import BatchedCpuMixin
-from workbench.core.env.evaluate_entries import flat_entries
-from workbench.core.env.keywords import constructor_arguments
-from workbench.core.env.step_result import StepResult
-from workbench.core.env.task_env import EnvOptions, TaskEnv, make_env
-from workbench.core.maniskill_private import apply_and_fetch, fetch
-from workbench.core.rules import Degree, Finding
-from workbench.core.scene.read_scene import read_geometry
-from workbench.core.scene.scene_index import scene_index
-from workbench.core.scene.shapes import SceneGeometry
+from workbench.envs import action_vector as actions
+from workbench.envs.assets import MissingAssets
+from workbench.envs.backends import find_renderer
+from workbench.envs.broken_rule import BrokenRules, Place
+from workbench.envs.cpu_scene import BatchedCpuMixin
+from workbench.envs.evaluate_entries import flat_entries
+from workbench.envs.gpu_rules import Degree, Finding
+from workbench.envs.inspect_env import list_contacts
+from workbench.envs.keywords import constructor_arguments
+from workbench.envs.maniskill_private import apply_and_fetch, fetch
+from workbench.envs.outliers import OutlierWatch
+from workbench.envs.scene.read_scene import read_geometry
+from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.scene.shapes import SceneGeometry
+from workbench.envs.step_result import StepResult
+from workbench.envs.task_env import EnvOptions, TaskEnv, make_env
+from workbench.task.blame import blamed, returns_check
+from workbench.task.load import LoadedTask
+from workbench.task.problem import Problem, TaskError
 
 ROLLOUT_STEPS = 50
 """Most control steps of an episode that is rolled out."""

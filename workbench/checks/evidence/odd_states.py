@@ -12,16 +12,16 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import common
 from numpy.typing import NDArray
 
-from workbench.authoring.loading.blamed import blamed, returns_check
 from workbench.checks.evidence.checkup import Checkup, leaf_rows
-from workbench.core import maniskill_private
-from workbench.core.capture.recorded_state import read_states, write_states
-from workbench.core.env import actions
-from workbench.core.env.evaluate_entries import split_entries
-from workbench.core.env.task_env import TaskEnv
-from workbench.core.scene.scene_index import scene_index
-from workbench.core.simulation.state_layout import BODY
-from workbench.core.snapshots.snapshot import remembering
+from workbench.envs import action_vector as actions
+from workbench.envs import maniskill_private
+from workbench.envs.evaluate_entries import split_entries
+from workbench.envs.scene.scene_index import scene_index
+from workbench.envs.simulation.state_layout import BODY
+from workbench.envs.snapshots.snapshot import remembering
+from workbench.envs.task_env import TaskEnv
+from workbench.episodes.recorded_state import read_states, write_states
+from workbench.task.blame import blamed, returns_check
 
 BATCHES = 2
 """Batches of seeds whose states are changed."""

@@ -12,13 +12,10 @@ from functools import cached_property
 
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.authoring.loading.load import LoadedTask
-from workbench.authoring.problem import hook_definition
-from workbench.checks.rules import RULES, degree_of_each
-from workbench.core.broken_rule import Place
-from workbench.core.capture.outliers import OUTLIER_RULES
-from workbench.core.rules import Degree, Finding, silence_of
+from workbench.envs.broken_rule import Place
 from workbench.machine.parse_python import parse_python
+from workbench.task.load import LoadedTask
+from workbench.task.problem import hook_definition
 
 
 @dataclass(frozen=True)
@@ -68,34 +65,6 @@ class Module:
         line: int = getattr(node, "lineno", 1)
         inside = [f for f in self.functions if f.lineno <= line <= (f.end_lineno or f.lineno)]
         return self.file, line, function or (inside[-1].name if inside else "")
-
-
-def rules_of_outliers(loaded: LoadedTask, choice: Degree | None) -> dict[str, Finding]:
-    """The rules that an outlier can break, by id, each as a finding without a breach at the hook that it guards; without those
-    that are off, or silenced there.
-
-    Args:
-        choice: the degree of all rules; None for each rule's own.
-    """
-    degrees = degree_of_each(choice=choice)
-    found: dict[str, Finding] = {}
-    for rule in sorted(OUTLIER_RULES):
-        hooks = (RULES[rule].hook, *_OTHER_HOOKS.get(rule, ()))
-        hook = hook_definition(loaded.cls, hooks, loaded.source_files)
-        name, (file, line) = ("", (None, None)) if hook is None else hook
-        if degrees[rule] == "off" or silence_of(file, line, rule) is not None:
-            continue
-        code = "" if file is None or line is None else linecache.getline(file, line).strip()
-        found[rule] = Finding(rule, degrees[rule], "", file, line, code, name, 0, 0)
-    return found
-
-
-_OTHER_HOOKS = {
-    "reward-finite": ("compute_normalized_dense_reward", "compute_sparse_reward"),
-    "reward-normalized": ("compute_dense_reward", "compute_sparse_reward"),
-    "bodies-stay": ("_initialize_episode",),  # no author writes `step`: what flies off was placed in a reset
-}
-"""Where a rule's own hook is not the author's."""
 
 
 class Places:

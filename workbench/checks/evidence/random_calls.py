@@ -6,7 +6,7 @@ import ast
 from collections.abc import Callable
 
 from workbench.checks.evidence.places import Module, Places
-from workbench.core.broken_rule import Place
+from workbench.envs.broken_rule import Place
 
 _SEEDED = {"RandomState", "default_rng", "Generator", "SeedSequence", "PCG64", "Philox", "MT19937", "Random"}
 """They are random of their own accord only without an argument."""

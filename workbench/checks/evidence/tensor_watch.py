@@ -15,7 +15,7 @@ import torch
 from torch.overrides import TorchFunctionMode, _get_current_function_mode_stack
 from torch.utils._device import DeviceContext
 
-from workbench.core.broken_rule import Place
+from workbench.envs.broken_rule import Place
 
 NUM_ENVS = 5
 """No vector that a task iterates has this length: positions have 3, quaternions 4, poses 7."""

@@ -15,7 +15,7 @@ LOWEST = 19
 
 
 def python_command(*arguments: str) -> list[str]:
-    """Command line of a child of this interpreter: ``python_command("-m", "workbench.session.worker.start")``.
+    """Command line of a child of this interpreter: ``python_command("-m", "workbench.app.worker.start")``.
 
     Plain ``-m`` and ``-c`` put the current folder first on ``sys.path``: a ``numpy.py`` in a downloaded folder of
     recordings would run as soon as ``workbench review .`` starts a process there. ``-P`` leaves that folder out.

@@ -1,0 +1,496 @@
+"""Chooses actions: random, zero, hold, sliders, a policy, a plan, or a file."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.actions.policy import Policy, find_policy, load_policy, policy_problem
+from workbench.envs import action_vector as actions
+from workbench.envs.recorded_run import RecordedRun
+from workbench.envs.step_result import StepResult
+from workbench.envs.task_env import TaskEnv, given_arguments
+from workbench.episodes.reader.reading import find_sources, read_recording
+from workbench.episodes.recorded_source import run_of
+from workbench.machine.files import open_regular_file
+from workbench.machine.folders import CurrentFolder
+from workbench.planning.options import PlanOptions
+from workbench.planning.planned_episodes import EpisodeLog, PlannedEpisode
+from workbench.planning.planner import Planner
+from workbench.planning.rollouts import require_plannable
+from workbench.task.blame import blamed
+from workbench.task.description import ActionSource
+from workbench.task.load import LoadedTask
+from workbench.task.problem import TaskError, is_ctrl_c
+from workbench.task.reference import find_module, named_file, split_reference
+
+
+class ActionChooser:
+    """Chooses the action of every control step for the page's batch.
+
+    Random actions and the seeds of new episodes come from one generator for the whole batch, so that a reset with the
+    session's seed repeats everything after it. What env 3 does then depends on the number of envs.
+    """
+
+    def __init__(self, folder: CurrentFolder) -> None:
+        """
+        Args:
+            folder: relative policies are found from here.
+        """
+        self._folder = folder
+        self._source: ActionSource = "random"
+        self._policy: Policy | None = None
+        self._policy_name = ""
+        self._task_folder: Path | None = None
+        self._rng = np.random.default_rng(0)
+        self._sliders: NDArray[np.float32] | None = None
+        """(N, A) deltas, velocities and the like that sliders were moved to; NaN elsewhere."""
+        self._targets: NDArray[np.float32] | None = None
+        """(N, A) the last action of each env, or where a slider was moved since; NaN from a reset to the first action."""
+
+    @property
+    def name(self) -> str:
+        """The source's name in a recording."""
+        return {"hold": "hold still", "policy": f"policy {self._policy_name}"}.get(self._source, self._source)
+
+    def seed(self, seed: int) -> None:
+        """Restart the random numbers."""
+        self._rng = np.random.default_rng(seed)
+
+    def fresh_seeds(self, count: int) -> list[int]:
+        # A seed for each episode, or its recording could not say how to start it again.
+        return [int(seed) for seed in self._rng.integers(2**31, size=count)]
+
+    def use(self, source: ActionSource, policy: str | None, task_folder: Path | None = None) -> None:
+        """Set the source of the actions.
+
+        Args:
+            policy: as for `load_policy`; None or empty fails only at the next action.
+            task_folder: as for `load_policy`.
+
+        Raises:
+            TaskError: the policy cannot be imported. `next_action` tries again.
+        """
+        self._source, self._policy_name, self._task_folder = source, policy or "", task_folder
+        self._policy = self._sliders = None
+        if source != "policy" or not self._policy_name:
+            return
+        with self._imported():
+            pass
+
+    def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
+        """(N, A), within the bounds unless a policy gives it.
+
+        Raises:
+            TaskError: the policy raised, returned no action, or cannot be imported. The next call imports it again.
+        """
+        if self._source == "random":
+            return actions.random_action(task.parts, task.num_envs, self._rng)
+        if self._source == "policy":
+            # Never another action instead: the page says that the policy acts.
+            with self._imported() as policy:
+                return actions.to_flat_action(task.env, task.parts, policy(task.obs))
+        low, high = actions.bounds(task.parts)
+        if self._source == "zero":
+            return _same_for_all(np.clip(0.0, low, high), task)
+        if self._source == "sliders":
+            return self.slider_action(task)
+        return actions.hold_action(task.parts, task.num_envs)
+
+    def slider_action(self, task: TaskEnv) -> NDArray[np.float32]:
+        """(N, A) action that the sliders set: joint targets stay, and other dimensions that no slider has moved
+        hold still."""
+        low, high = actions.bounds(task.parts)
+        action = actions.hold_action(task.parts, task.num_envs)
+        is_target = actions.is_target(task.parts)
+        for told, where in ((self._targets, is_target), (self._sliders, ~is_target)):
+            if told is not None:
+                action = np.where(where & ~np.isnan(told), told, action)
+        return np.clip(action, low, high).astype(np.float32)
+
+    def tell(
+        self, task: TaskEnv, env_idx: Sequence[int], dimensions: Sequence[int], values: Sequence[float]
+    ) -> None:
+        """Set dimensions of these envs' actions to these values, by slider; without values the envs hold still
+        where they are."""
+        shape = task.num_envs, actions.width(task.parts)
+        if self._sliders is None or self._targets is None:
+            self._sliders = np.full(shape, np.nan, np.float32)
+            self._targets = np.full(shape, np.nan, np.float32)
+        if not dimensions:
+            self._sliders[list(env_idx)] = self._targets[list(env_idx)] = np.nan
+        for told in (self._sliders, self._targets):
+            told[np.ix_(env_idx, dimensions)] = values
+
+    def acted(self, action: NDArray[np.float32]) -> None:
+        """Note the action of a control step, whatever its source."""
+        self._targets = action.copy()
+
+    def begin(
+        self, env_idx: Sequence[int] | None, led: Mapping[int, NDArray[np.float32]] | None = None
+    ) -> None:
+        """Forget the targets of these envs (all if None): they were reset, or put back to where the actions `led`, by env."""
+        if self._targets is None:
+            return
+        self._targets[slice(None) if env_idx is None else list(env_idx)] = np.nan
+        for env, action in (led or {}).items():
+            self._targets[env] = action
+
+    def new_scene(self) -> None:
+        """Forget the slider values of all envs; the new scene may have another number of envs."""
+        self._sliders = self._targets = None
+
+    @property
+    def by_sliders(self) -> bool:
+        return self._source == "sliders"
+
+    @contextmanager
+    def _imported(self) -> Iterator[Policy]:
+        """Give the policy. An exception inside the block becomes the policy's TaskError, and the next call imports
+        the policy again."""
+        try:
+            if self._policy is None:
+                with self._folder.again():
+                    self._policy = load_policy(self._policy_name, self._task_folder)
+            yield self._policy
+        except BaseException as error:
+            if is_ctrl_c(error):
+                raise
+            policy, self._policy = self._policy, None
+            raise TaskError(policy_problem(error, self._policy_name, self._task_folder, policy)) from error
+
+
+def _same_for_all(action: NDArray[Any], task: TaskEnv) -> NDArray[np.float32]:
+    return np.broadcast_to(action, (task.num_envs, len(action))).astype(np.float32)
+
+
+class RecordActionChooser:
+    """Chooses the actions of a headless recording; an env without an episode holds still.
+
+    Each episode has a generator of its own with its seed, so that a recording holds the same episodes on any number of
+    envs and processes.
+    """
+
+    def __init__(self, chooser: ActionChooser | None, planned: PlannedActions | None = None) -> None:
+        """
+        Args:
+            chooser: chooses actions that are neither random, planned nor from a file; None for those three.
+            planned: plans them; None where they are not planned.
+        """
+        self._chooser, self._planned = chooser, planned
+        self._rng: dict[int, np.random.Generator] = {}
+        self._given: dict[int, RecordedRun] = {}
+
+    def begin(self, env: int, seed: int, given: RecordedRun | None) -> str:
+        """Begin an episode in this env; returns the name of its source of actions for the recording."""
+        self._rng[env] = np.random.default_rng(seed)
+        self._given.pop(env, None)
+        if given is not None:
+            self._given[env] = given
+            return given.name
+        if self._planned is not None:
+            self._planned.begin(env, seed)
+            return self._planned.name
+        return "random" if self._chooser is None else self._chooser.name
+
+    def end(self, env: int) -> None:
+        """End the episode of this env."""
+        self._rng.pop(env, None)
+
+    def next_action(self, task: TaskEnv, steps: Mapping[int, int]) -> NDArray[np.float32]:
+        """(N, A); `steps` has the number of steps so far for each env with an episode.
+
+        Raises:
+            TaskError: the policy raised, or returned no action; or the task raised in a rollout.
+            ValueError: the file's actions have another size.
+        """
+        if self._planned is not None:
+            return self._planned.next_action(list(steps))
+        action = actions.hold_action(task.parts, task.num_envs)
+        if self._chooser is not None:
+            # For the whole batch: that is what a policy expects.
+            chosen = self._chooser.next_action(task)
+            for env in steps:
+                action[env] = chosen[env]
+            return action
+        for env, step in steps.items():
+            given = self._given.get(env)
+            if given is None:
+                action[env] = actions.random_action(task.parts, 1, self._rng[env])[0]
+                continue
+            if given.action.shape[1] != action.shape[1]:
+                raise ValueError(
+                    f"the file's actions have {given.action.shape[1]} dimensions, and this task's {action.shape[1]} "
+                    f"({', '.join(name for part in task.parts for name in part.names)}): another control mode or robot?"
+                )
+            action[env] = given.action[step]
+        return action
+
+
+class PlannedActions:
+    """Plans the actions of a batch's episodes, each as if it were planned alone, and records the returns of the
+    rollouts."""
+
+    def __init__(
+        self, loaded: LoadedTask, task: TaskEnv, env_kwargs: Mapping[str, Any], plan: PlanOptions
+    ) -> None:
+        """
+        Args:
+            task: the live batch.
+            env_kwargs: as of the `TaskOptions` that it was opened with.
+
+        Raises:
+            TaskError: the task fails while the envs of the rollouts are built.
+            NothingToPlan: it has no actions, or no reward.
+        """
+        require_plannable(task.env)
+        self._loaded, self._task = loaded, task
+        made_with = given_arguments(loaded.cls, env_kwargs, loaded.default_kwargs)
+        with blamed("build", loaded):
+            self._planner = Planner(task.env, made_with=made_with, **vars(plan))
+        self._rolled = TaskEnv(self._planner.rollout_env)
+        self._logs: dict[int, EpisodeLog] = {}
+        self.name = f"solve ({plan.method}, {plan.rollouts} rollouts of {self._planner.horizon} steps)"
+        """The source's name in a recording."""
+
+    def begin(self, env: int, seed: int) -> None:
+        """Begin an episode in this env, with candidates from this seed."""
+        self._planner.reset([env], seed)
+        self._logs[env] = EpisodeLog(seed, self._planner.horizon)
+
+    def next_action(self, env_idx: Sequence[int]) -> NDArray[np.float32]:
+        """(N, A): plans for these envs; the others hold still.
+
+        Raises:
+            TaskError: the task raised in a rollout.
+            NotAlike: it builds other bodies in each env.
+        """
+        for env in env_idx:
+            self._planner.require_alike(env)
+        with blamed("step", self._loaded, self._rolled):
+            action = self._planner.flat_actions(env_idx)
+        for env in env_idx:
+            self._logs[env].add_plan(self._planner.plans[env])
+        return action
+
+    def add_step(self, step: StepResult, env_idx: Sequence[int]) -> None:
+        """Record the result of a step of these envs."""
+        for env in env_idx:
+            self._logs[env].add_step(step, env)
+
+    def cut_off(self, env: int) -> None:
+        """Note that the episode of this env ends now because its wall time is up."""
+        self._logs[env].cut_off = True
+
+    def episode(self, env: int) -> PlannedEpisode:
+        """The episode of this env so far."""
+        return self._logs[env].episode()
+
+    def close(self) -> None:
+        self._planner.close()
+
+
+# --- what ``--actions`` names ----------------------------------------------------------------------------
+
+
+KINDS = ("random", "zero", "hold")
+SOLVE = "solve"
+"""Value of ``--actions`` for planned actions."""
+STEPS_WITHOUT_LIMIT = 200
+"""Control steps of an episode whose task has no time limit."""
+
+
+def find_actions(name: str, task: str) -> tuple[Sequence[RecordedRun], dict[str, Any]]:
+    """The runs of a file, and the env's keywords that it needs; both empty for a policy, `SOLVE`, or one of `KINDS`.
+
+    Args:
+        name: as `RecordArguments.actions`.
+        task: as `RecordArguments.task`; a policy may be in its folder.
+
+    Raises:
+        FileNotFoundError, ValueError: as `read_actions`; or it names no policy (`NoPolicy`).
+    """
+    if Path(name).suffix in SUFFIXES:
+        return read_actions(Path(name))
+    if name not in (*KINDS, SOLVE):
+        find_policy(name, _folder_of(task))
+    return (), {}
+
+
+def plain_chooser(name: str, task: str, seed: int, here: CurrentFolder) -> ActionChooser:
+    """Make the chooser for an ``--actions`` value that is neither random, planned nor a file.
+
+    Raises:
+        TaskError: the policy cannot be imported.
+    """
+    chooser = ActionChooser(here)
+    chooser.seed(seed)
+    if name in ("hold", "zero"):
+        chooser.use(name, None)
+    else:
+        with here.again():
+            folder = _folder_of(task)
+        chooser.use("policy", name, folder)
+    return chooser
+
+
+def _folder_of(task: str) -> Path | None:
+    file = named_file(task)
+    return None if file is None else file.parent
+
+
+@dataclass(frozen=True)
+class Needed:
+    """Files of the author that a job needs."""
+
+    folders: tuple[Path, ...]
+    files: tuple[Path, ...]
+
+
+def needed_by(task: str, actions: str = "", imports: Iterable[str] = ()) -> Needed:
+    """What a job needs that is not installed.
+
+    Args:
+        task: as `RecordArguments.task`: the folder of its file, or of its package.
+        actions: as `RecordArguments.actions`, if it names a file or a policy.
+        imports: as `TaskOptions.imports`.
+    """
+    folders: list[Path] = []
+    files: list[Path] = []
+    named = split_reference(task)
+    modules = [*imports, *([named[0]] if named else [])]
+    if named is None and (file := named_file(task)) is not None:
+        folders.append(file.parent)
+    policy, colon, _ = actions.rpartition(":")
+    if not colon:
+        if (file := Path(actions)).suffix and file.is_file():
+            files.append(file)
+    elif policy.endswith(".py"):
+        found, _ = find_policy(actions, folders[0] if folders else None)
+        folders.append(Path(found).parent)
+    else:
+        modules.append(policy)
+    for name in modules:
+        place = find_module(name)
+        if place is None or place.file is None or "site-packages" in place.file.parts:
+            continue
+        # With the packages above it, and what else they import.
+        top = name.partition(".")[0]
+        root = next((parent for parent in place.file.parents if parent.name == top), None)
+        if root is None:
+            files.append(place.file)
+        else:
+            folders.append(root)
+    return Needed(tuple(folders), tuple(files))
+
+
+# --- actions from a file: NumPy arrays, or demonstrations in ManiSkill's ``.h5`` -----------------------
+
+
+MOST_BYTES = 2**30
+"""Maximum size of a NumPy file in bytes, also unpacked: 20 million steps of a Panda."""
+SUFFIXES = (".npy", ".npz", ".h5")
+
+
+def read_actions(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
+    """Read a file of actions: a run for each episode, and the env's keywords that it needs, such as its control mode.
+
+    ``.npy``: (T, A) for every episode, or (E, T, A), one for each. ``.npz``: an array (T, A) for each episode. ``.h5``:
+    trajectories of ManiSkill, or a recording of the workbench; their runs have a seed and env states too, with which a
+    replay is corrected where the same actions lead to another state (another machine or version, a batch that was
+    seeded as one on a GPU). An episode of a file does not stop at success or at the time limit, as in ManiSkill's
+    ``replay_trajectory``.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it holds no actions; the message says what it holds.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    if path.suffix == ".h5":
+        return _demonstrations(path)
+    try:
+        arrays = _arrays(path)
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, zlib.error) as error:
+        raise ValueError(f"{path} cannot be read as a NumPy file of numbers: {error}") from error
+    if path.suffix == ".npy" and arrays[0].ndim == 3:
+        arrays = list(arrays[0])
+    for array in arrays:
+        if array.ndim != 2 or array.shape[0] == 0 or array.dtype.kind not in "fiub":
+            raise ValueError(
+                f"{path} holds {array.dtype} of shape {array.shape}; actions are numbers of shape (steps, dimensions), in a "
+                ".npy also (episodes, steps, dimensions)"
+            )
+    if not arrays:
+        raise ValueError(f"{path} holds no array")
+    names = [
+        f"file {path.name}" + (f", its array {i}" if len(arrays) > 1 else "") for i in range(len(arrays))
+    ]
+    return [RecordedRun(name, -1, {}, _finite(path, array), {}) for name, array in zip(names, arrays)], {}
+
+
+def _arrays(path: Path) -> list[NDArray]:
+    """The arrays of a NumPy file. `np.load` would allocate what a header claims before it checks the file's size."""
+    with open_regular_file(path, MOST_BYTES) as file:
+        if path.suffix == ".npy":
+            return [_array(file, path.stat().st_size)]
+        with zipfile.ZipFile(file) as archive:
+            if sum(member.file_size for member in archive.infolist()) > MOST_BYTES:
+                raise ValueError("unpacked it is larger than any file of actions")
+            found = []
+            for member in archive.infolist():
+                with archive.open(member) as opened:
+                    found.append(_array(opened, member.file_size))
+            return found
+
+
+def _array(file: IO[bytes], size: int) -> NDArray:
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"it is of NumPy's format {version}")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(file)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects")
+    length = math.prod(shape) * dtype.itemsize
+    if length > size:
+        raise ValueError(f"it says that it holds {length} bytes of {dtype}, and has {size}")
+    content = file.read(length)
+    return np.frombuffer(content, dtype, math.prod(shape)).reshape(shape, order="F" if fortran else "C")
+
+
+def _demonstrations(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
+    runs, kwargs = list[RecordedRun](), dict[str, Any]()
+    for source in find_sources(path):
+        episode = read_recording(source)
+        if episode.length == 0:
+            continue
+        run = run_of(episode)
+        runs.append(
+            replace(
+                run, name=f"file {path.name}, {source.part or source.name}", action=_finite(path, run.action)
+            )
+        )
+        given: Mapping[str, Any] = episode.info.env_kwargs
+        kwargs = {key: given[key] for key in ("robot_uids", "control_mode") if given.get(key) is not None}
+        if episode.info.control_mode is not None:
+            kwargs["control_mode"] = episode.info.control_mode
+    if not runs:
+        raise ValueError(f"{path} holds no trajectory with actions")
+    return runs, kwargs
+
+
+def _finite(path: Path, actions: NDArray) -> NDArray[np.float32]:
+    actions = np.asarray(actions, np.float32)
+    if not np.isfinite(actions).all():
+        raise ValueError(f"{path} holds actions that are NaN or infinite")
+    return actions

@@ -1,0 +1,257 @@
+"""Finds, imports and watches a policy: ``module:function`` or ``file.py:function``."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import importlib
+import importlib.machinery
+import importlib.util
+import linecache
+import os
+import sys
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from workbench.envs.error_notes import WrongAction
+from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file
+from workbench.machine.parse_python import parse_python
+from workbench.task.library_names import (
+    files_named_like_libraries,
+    is_library,
+    named_like_library_text,
+    searched_first,
+)
+from workbench.task.problem import Problem, definition_line, problem_from_exception
+from workbench.task.watch import SourceWatcher
+
+Policy = Callable[[Any], Any]
+"""Gets the task's observation (batched, as its ``obs_mode`` gives it); returns an array or tensor (N, A), one action (A,)
+for all envs, or a dict for several robots."""
+
+_warned: set[Path] = set()
+"""Files whose name is that of a library and that a warning has named."""
+
+
+class NoPolicy(ValueError):
+    """The reference names no policy; the message says why. Not raised by the author's code."""
+
+
+def find_policy(reference: str, task_folder: Path | None = None) -> tuple[str | Path, str]:
+    """The module or file, and the function, of `reference`. Imports nothing.
+
+    Args:
+        task_folder: the task's folder, searched for a relative file after the current folder.
+
+    Raises:
+        NoPolicy: it has another form, or the file does not exist.
+    """
+    if not reference.strip():
+        raise NoPolicy("name a policy: module:function or file.py:function")
+    name, separator, attribute = reference.rpartition(":")
+    if not separator or not name or not attribute:
+        raise NoPolicy(f"'{reference}' is not of the form module:function or file.py:function")
+    return (_find(name, task_folder) if name.endswith(".py") else name), attribute
+
+
+def load_policy(reference: str, task_folder: Path | None = None) -> Policy:
+    """Import the function of `reference`.
+
+    Args:
+        task_folder: as for `find_policy`.
+
+    Raises:
+        NoPolicy: the reference has another form, or names nothing callable.
+        Exception: as raised by the policy's module during its import.
+    """
+    named, attribute = find_policy(reference, task_folder)
+    name = str(named)
+    if isinstance(named, Path):
+        path, name = named, f"workbench_policy_{named.stem}"
+        spec = importlib.util.spec_from_file_location(name, path, loader=_PolicyLoader(name, str(path)))
+        if spec is None or spec.loader is None:
+            raise NoPolicy(f"{path} cannot be imported")
+        module = importlib.util.module_from_spec(spec)
+        for file in files_named_like_libraries(path.parent):
+            if file not in (path, *_warned):
+                _warned.add(file)
+                print(named_like_library_text(file), file=sys.stderr)
+        with searched_first(path.parent):
+            spec.loader.exec_module(module)
+    elif importlib.util.find_spec(package := name.partition(".")[0]) is None:
+        # A module that is not installed is looked for in the current folder.
+        with searched_first(Path.cwd()):
+            if importlib.util.find_spec(package) is None:
+                raise NoPolicy(f"there is no module {package}: it is neither installed nor in {Path.cwd()}")
+            module = importlib.import_module(name)
+    else:
+        module = importlib.import_module(name)
+    function = getattr(module, attribute, None)
+    if not callable(function):
+        callables = [each for each, value in vars(module).items() if callable(value)]
+        close = difflib.get_close_matches(attribute, callables, n=1)
+        hint = f"; did you mean {close[0]}?" if close else _hint(name, attribute, task_folder)
+        raise NoPolicy(f"{named} has no function {attribute}{hint}")
+    return function
+
+
+def _hint(name: str, attribute: str, task_folder: Path | None) -> str:
+    """Advice for a file that has a library's name."""
+    for folder in (Path.cwd(), task_folder or Path.cwd()):
+        file = folder / f"{name}.py"
+        if file.is_file() and is_library(name):
+            return f", it is a library's; name the file: {file}:{attribute}"
+    return ""
+
+
+class _PolicyLoader(importlib.machinery.SourceFileLoader):
+    """Reads only regular files of limited size; see `read_regular_file`."""
+
+    def get_data(self, path: str) -> bytes:
+        return read_regular_file(path, MOST_SOURCE_BYTES)
+
+    def path_stats(self, path: str) -> Mapping[str, Any]:
+        # Python's bytecode cache compares length and whole seconds: it would miss a second save.
+        raise OSError("no bytecode is kept")
+
+
+def policy_problem(
+    error: BaseException, reference: str, task_folder: Path | None = None, policy: Policy | None = None
+) -> Problem:
+    """The problem of a policy, at a line of its module or of one in the same folder.
+
+    Args:
+        task_folder: as for `load_policy`.
+        policy: the function, if it was imported: its ``def`` is the place if the traceback has no line of the author's,
+            as with a wrong return value.
+    """
+    if isinstance(error, NoPolicy):
+        return Problem("policy", str(error), None, None, None, "")
+    linecache.checkcache()  # the file may have changed since a line of it was last shown
+    defined = None if policy is None else definition_line(policy)
+    if isinstance(error, WrongAction):
+        file, line = defined or (None, None)
+        code = None if defined is None else linecache.getline(*defined).strip() or None
+        return Problem("policy", f"what {reference} returned {error.problem}", file, line, code, "")
+    files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
+    own = [file for file in files if _is_module_of(file, reference, task_folder)]
+    # Also for a syntax error: the fault is the policy's and not the task's.
+    return replace(problem_from_exception(error, "policy", own, otherwise=defined), stage="policy")
+
+
+def _is_module_of(file: Path, reference: str, task_folder: Path | None) -> bool:
+    name = reference.rpartition(":")[0]
+    if name.endswith(".py"):
+        path = Path(os.path.expanduser(name))
+        return file in (path.resolve(), (task_folder or Path()).joinpath(path).resolve())
+    module = sys.modules.get(name)
+    if module is not None and module.__spec__ is not None:
+        return str(file) == module.__spec__.origin
+    # Its import failed.
+    path = "/" + name.replace(".", "/")
+    return str(file).endswith((f"{path}.py", f"{path}/__init__.py"))
+
+
+def _find(name: str, task_folder: Path | None) -> Path:
+    """The file's path: in the current folder, else in the task's."""
+    path = Path(os.path.expanduser(name))
+    here = path.resolve()
+    if here.is_file():
+        return here
+    if path.is_absolute() or task_folder is None or (task_folder / path).resolve() == here:
+        raise NoPolicy(f"there is no file {here}")
+    there = (task_folder / path).resolve()
+    if not there.is_file():
+        raise NoPolicy(
+            f"there is no {name} in {Path.cwd()}, where the command was started, nor in the folder of the task, {task_folder}"
+        )
+    return there
+
+
+MOST_FILES, MOST_LISTED = 100, 40
+"""Maximum number of files that are read of a folder, and of policies that are listed."""
+_MOST_BYTES = 256 * 1024
+"""Maximum size in bytes of a file that is searched for policies; a larger file was not written by a person."""
+
+
+def list_policies(here: Path, task_folder: Path | None) -> tuple[str, ...]:
+    """Functions that may be policies, as ``file.py:function``: those of one required parameter, in the files of a folder and
+    beside the task. They are read, not imported. Those whose parameter is called obs or observation come first.
+
+    Args:
+        here: the folder where the command was started.
+    """
+    found: list[tuple[bool, str]] = []
+    taken: set[str] = set()
+    folders = [here.resolve()] if task_folder is None else [here.resolve(), task_folder.resolve()]
+    for folder in folders if folders[0] != folders[-1] else folders[:1]:
+        for file in _python_files(folder):
+            # Same lookup as `find_policy`: a file of the first folder hides one of the same name.
+            name = str(file) if file.name in taken else file.name
+            taken.add(file.name)
+            found += [(not likely, f"{name}:{function}") for function, likely in _functions_that_fit(file)]
+    return tuple(reference for _, reference in sorted(found, key=lambda one: one[0])[:MOST_LISTED])
+
+
+def _python_files(folder: Path) -> list[Path]:
+    try:
+        files = sorted(file for file in folder.iterdir() if file.suffix == ".py")
+    except OSError:
+        return []  # it is gone, or not readable: there is nothing to list
+    return [file for file in files if not file.name.startswith(("test_", "conftest", "setup."))][:MOST_FILES]
+
+
+def _functions_that_fit(file: Path) -> list[tuple[str, bool]]:
+    """Names of public functions of one required parameter, and whether the parameter is named as an observation."""
+    try:
+        tree = parse_python(read_regular_file(file, _MOST_BYTES))
+    except (OSError, ValueError, SyntaxError, RecursionError, MemoryError):
+        return []  # a file that cannot be read has no policy to list; choosing it by name says why
+    found = []
+    for node in tree.body:
+        if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
+            continue
+        given = node.args
+        named = [*given.posonlyargs, *given.args]
+        required = named[: len(named) - len(given.defaults)]
+        if len(required) == 1 and None not in given.kw_defaults:
+            found.append((node.name, required[0].arg.startswith("obs")))
+    return found
+
+
+class PolicyFile:
+    """Watches the file of the current policy, as the task's file is watched. Thread-safe."""
+
+    def __init__(self, on_save: Callable[[], None]) -> None:
+        """
+        Args:
+            on_save: called on the watcher's thread.
+        """
+        self._on_save = on_save
+        self._watcher: SourceWatcher | None = None
+        self._files: list[Path] = []
+
+    def follow(self, reference: str | None, task_folder: Path | None) -> None:
+        """Watch the file of a ``file.py:function`` from now on; nothing for other references.
+
+        Args:
+            task_folder: as for `find_policy`.
+        """
+        name = (reference or "").rpartition(":")[0]
+        files: list[Path] = []
+        if name.endswith(".py"):
+            path = Path(os.path.expanduser(name))
+            files = [path, *([] if task_folder is None else [task_folder / path])]
+        if files == self._files:
+            return
+        self._files = files
+        if self._watcher is None:
+            self._watcher = SourceWatcher(lambda changed: self._on_save())
+        self._watcher.follow(files)
+
+    def close(self) -> None:
+        if self._watcher is not None:
+            self._watcher.stop()

@@ -1,0 +1,1 @@
+"""Puts state, commands, worker and pages together."""

@@ -1,0 +1,332 @@
+"""Continues a recording in a live env: chooses or opens a session, asks for consent, and switches the page."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import viser
+
+from workbench.app.session import Session
+from workbench.envs.recorded_run import RecordedRun
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.recorded_source import (
+    CannotEnterRecording,
+    options_of,
+    reference_of,
+    run_of,
+    why_not_enter,
+    write_source,
+)
+from workbench.episodes.side_files import side_files_text
+from workbench.live.commands import PauseRun
+from workbench.live.panels.banners import is_busy_for_long
+from workbench.machine.loop import Aside, begin, do
+from workbench.page.command import Command, Refused
+from workbench.page.widgets.fields import choice
+from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import render, sentence
+from workbench.page.widgets.tools import tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+from workbench.rescore.recordings_panel import RECORDED, TODAYS
+from workbench.review.commands import ChooseLiveCode, ChooseLiveEnvs, ReturnToFirstTask
+from workbench.review.view import ReviewView
+from workbench.task.description import TaskOptions
+from workbench.task.reference import TaskName
+from workbench.trust.clearance import Clearances, CodeToRun, NotCleared
+
+if TYPE_CHECKING:
+    from workbench.app.server import Workplace
+
+
+ONE, ALL = "the selected env", "all envs"
+NEW_ENVS = 4
+"""Envs of a session that is opened for "all envs"."""
+
+
+_LOOK = 0.05
+"""Seconds between two checks whether a live env exists."""
+_OPENED_WITHIN = 2.0
+"""Seconds that the end of the program waits for a session that is being opened."""
+MakeSession = Callable[[TaskName, TaskOptions], Session]
+
+
+@dataclass
+class _Way:
+    """One transition from a recording to a live env."""
+
+    info: EpisodeInfo
+    run: RecordedRun
+    state: int
+    given_up: bool = False
+    asks: bool = False
+    """Whether a person may have to say that the code may run."""
+    number: int = 0
+    """Value of `TimelineView.entered` once the env has the recorded state."""
+    problems: int = 0
+    session: Session | None = None
+    """Session that gets the recorded state; None until the consent is given. Set last."""
+
+    def is_over(self) -> bool:
+        """Whether to show the live page now: the state is there, the task failed, or it may have to be interrupted."""
+        if self.session is None:
+            return False
+        view = self.session.view()
+        arrived = view.timeline.entered == self.number
+        failed = view.problem_serial > self.problems or view.state == "stopped"
+        return arrived or failed or is_busy_for_long(view)
+
+    def words(self) -> str:
+        """Text for the page: what the transition waits for."""
+        task = self.info.task
+        if self.session is None:
+            return f"waiting for permission to run the code of {task}" if self.asks else f"opening {task} …"
+        view = self.session.view()
+        if view.task is None:
+            doing = f"loading {task} at step {self.state}"
+        else:
+            doing = f"restoring {task} at step {self.state}"
+        return f"{doing}: {view.activity}" if view.activity else f"{doing} …"
+
+
+class GoLive:
+    """Continues recordings in a live env.
+
+    If the recording's task is open already, its env (or all) gets the recorded state; else another session is opened
+    for it, and closed here, with the folder of a recorded text. The review stays until the live page has something to
+    show. Used on the loop, but for `close`.
+
+    Args:
+        place: The pages, and the open session, if any.
+        make_session: Opens a task; gets what `Session` gets.
+        clearances: Decide which code named by recordings may run.
+        base: Options that all opened tasks share.
+    """
+
+    def __init__(
+        self,
+        place: Workplace,
+        make_session: MakeSession,
+        clearances: Clearances,
+        base: TaskOptions,
+    ) -> None:
+        self._place, self._make, self._clearances, self._base = place, make_session, clearances, base
+        self._own: tuple[Session, Path | None] | None = None
+        self.recorded_source, self.everywhere = False, False
+        self._way: _Way | None = None
+        self._opening = Aside("go-live")
+        """Asks for consent, and opens sessions."""
+        self._ending = Aside("end-session")
+
+    def go(self, id: str, state: int) -> None:
+        """Continue live from a state of an opened recording; if that is in progress, cancel it."""
+        if self._way is not None:
+            self._give_up()
+            return
+        review = self._place.shelf.review.view()
+        one = next((one for one in review.opened if one.id == id), None)
+        if one is None:
+            return
+        try:
+            run = run_of(one.episode, state)
+        except CannotEnterRecording as error:
+            self._say(str(error))
+            return
+        if self.recorded_source:
+            run = replace(run, name=f"{run.name} as it was recorded")
+        self._way = way = _Way(one.episode.info, run, state)
+        begin(self._go(way))
+
+    async def _go(self, way: _Way) -> None:
+        info, recorded_source = way.info, self.recorded_source
+        try:
+            why = await self._opening.run(lambda: self._clearances.refused_arguments(info))
+            if why is not None:
+                raise NotCleared(why)
+            session = None if recorded_source else self._open_already(info)
+            if session is None:
+                session = await self._open(way, recorded_source)
+            if session is not None:
+                await self._enter(session, way)
+        except (CannotEnterRecording, NotCleared) as error:
+            if not way.given_up:
+                self._say(sentence(str(error)))
+        finally:
+            if self._way is way:
+                self._way = None
+
+    def _open_already(self, info: EpisodeInfo) -> Session | None:
+        """An open session with this task in today's code."""
+        session = self._place.session
+        if session is not None and (self._own is None or self._own[1] is None):
+            task = session.view().task
+            if task is None or not why_not_enter(task, info):
+                return session
+        known = self._place.home if self._place.home is not session else None
+        task = None if known is None else known.view().task
+        return known if task is not None and not why_not_enter(task, info) else None
+
+    async def _open(self, way: _Way, recorded_source: bool) -> Session | None:
+        """Another session for the recording's task; None if the transition is given up meanwhile.
+
+        Raises:
+            CannotEnterRecording, NotCleared: it may not be opened.
+        """
+        info, num_envs = way.info, NEW_ENVS if self.everywhere else 1
+
+        def open_cleared() -> tuple[Session, Path | None] | None:
+            wanted = CodeToRun(reference_of(info), info, recorded_source, followed=not recorded_source)
+            options = options_of(info, num_envs, self._base)
+            folder, reference = None, self._clearances.clear(wanted, lambda: way.given_up)
+            if recorded_source:
+                folder, reference = write_source(info)
+            if not way.given_up:
+                if self._place.home is not None:
+                    self._place.home.do(PauseRun())
+                return self._make(reference, options), folder
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+            return None
+
+        way.asks = True
+        opened = await self._opening.run(open_cleared)
+        if opened is None or way.given_up:
+            if opened is not None:
+                self._ending.begin(lambda: _end(*opened))
+            return None
+        self._let_go()
+        self._own = opened
+        return opened[0]
+
+    async def _enter(self, session: Session, way: _Way) -> None:
+        """Put the recorded state into the env, and show the live page once it is there."""
+        self._place.session = session
+        way.problems = session.view().problem_serial
+        way.number = session.enter_recording(way.run, self.everywhere, way.info.source_file, way.info.source)
+        way.session = session
+        while self._way is way:
+            if way.is_over():
+                self._place.pages.show("live")
+                return
+            await asyncio.sleep(_LOOK)
+
+    def _give_up(self) -> None:
+        way, self._way = self._way, None
+        if way is not None:
+            way.given_up = True
+
+    def going(self) -> str:
+        """Text: what the transition waits for; empty without a transition."""
+        way = self._way
+        return "" if way is None else way.words()
+
+    def review_is_back(self) -> None:
+        """Forget a transition that waits for no consent, because the review page is shown again."""
+        if self._way is not None and self._way.session is not None:
+            self._way = None
+
+    def can_go_home(self) -> bool:
+        """Whether the live session was opened here."""
+        home = self._place.home
+        return home is not None and self._place.session is not home
+
+    def go_home(self) -> None:
+        """Return to the session that a person opened; the other session ends."""
+        if self._place.home is None:
+            return
+        self._place.session = self._place.home
+        self._place.pages.show("live")
+        self._let_go()
+
+    def let_go(self) -> None:
+        """Give up a transition, and end a session that was opened here, because a person opens another task."""
+        self._give_up()
+        self._let_go()
+
+    def close(self) -> None:
+        """End the session opened here; the pages must be stopped. Called on another thread than the loop."""
+        do(self.let_go)
+        self._opening.close(_OPENED_WITHIN)
+        do(lambda: None)  # what was opened meanwhile is given up by now
+        self._ending.close()
+
+    def _let_go(self) -> None:
+        """End the session that was opened here; the caller shows another page meanwhile."""
+        own, self._own = self._own, None
+        if own is not None:
+            self._ending.begin(lambda: _end(*own))
+
+    def _say(self, text: str) -> None:
+        tell_all(self._place.server, "This recording cannot be continued", text, "red")
+
+
+class GoLivePart(PagePart[ReviewView]):
+    """Options of going live: which code, and into which envs."""
+
+    does = (ChooseLiveCode, ChooseLiveEnvs, ReturnToFirstTask)
+
+    def __init__(self, server: viser.ViserServer, go_live: GoLive) -> None:
+        self._go_live = go_live
+        go_live.review_is_back()
+        self._about: object = None
+        """Recording and code that the note below the choice of code is about."""
+        gui = server.gui
+        self._folder = gui.add_folder("Continue live", expand_by_default=False, visible=False)
+        with self._folder:
+            self._code = choice(
+                server,
+                "Code",
+                ChooseLiveCode,
+                "code",
+                (TODAYS, RECORDED),
+                TODAYS,
+                hint="The current code of the task, or the recorded code, opened from a temporary folder",
+            )
+            self._besides = gui.add_html("")
+            self._envs = choice(
+                server,
+                "Into",
+                ChooseLiveEnvs,
+                "envs",
+                (ONE, ALL),
+                ONE,
+                hint="Which envs get the recorded state",
+            )
+            self._home = gui.add_html("")
+
+    def draw(self, view: ReviewView) -> None:
+        home = self._go_live.can_go_home()
+        self._folder.visible = bool(view.opened) or home
+        self._code.show(RECORDED if self._go_live.recorded_source else TODAYS)
+        self._envs.show(ALL if self._go_live.everywhere else ONE)
+        back = tool("Back to the first task", ReturnToFirstTask(), tone="main")
+        self._home.content = tools_html([back] if home else [])
+        info = None if view.chosen is None else view.chosen.episode.info
+        if self._about != (info and info.id, self._go_live.recorded_source):
+            self._about = info and info.id, self._go_live.recorded_source
+            words = ""
+            if info is not None and self._go_live.recorded_source:
+                words = side_files_text(info.source_file, info.side_files)
+            self._besides.content = render("note", text=words) if words else ""
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseLiveCode(code=code):
+                self._go_live.recorded_source = code == RECORDED
+            case ChooseLiveEnvs(envs=envs):
+                self._go_live.everywhere = envs == ALL
+            case ReturnToFirstTask():
+                if not self._go_live.can_go_home():
+                    raise Refused("No other task is open.")
+                self._go_live.go_home()
+
+
+def _end(session: Session, folder: Path | None) -> None:
+    session.close()
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)

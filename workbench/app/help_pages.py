@@ -1,0 +1,226 @@
+"""The documents as topics: which there are, their text, and the pages that *Help* opens in the browser."""
+
+from __future__ import annotations
+
+import html
+import posixpath
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from workbench.machine.folders import web_assets_folder
+from workbench.page.widgets.templates import render
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from markdown_it.token import Token
+
+ADDRESS = "/help/"
+"""Prefix of the route of `reply`."""
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; style-src 'self'; img-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'self'",
+    "Cache-Control": "no-cache",
+}
+_BEGINNING = 1000
+"""Number of characters of a page that say what the page is about."""
+_LITTLE_WORDS = frozenset("a an and for how i in is it my of on or the to with your".split())
+OVERVIEW = "overview"
+"""The topic that is README."""
+GROUPS = (
+    ("", "Use it"),
+    ("jobs", "Let it run for long"),
+    ("reference", "Look something up"),
+    ("developers", "Change the workbench"),
+)
+"""Folders of the documents, and what a reader who opens the folder wants."""
+RULE_PAGES = "rules"
+"""Folder with a page for each rule of `checks`. They are no list to read: the topic ``rules`` has them in a table."""
+FIRST = (
+    OVERVIEW, "install", "tutorial", "start_page", "tasks", "debugging", "history", "cameras", "recordings", "checks", "solve",
+    "sweep", "cluster", "batched_env", "safety", "limits", "gallery", "rules", "keys", "cli",
+)  # fmt: skip
+"""Order of the topics; those that are not listed follow by name."""
+_DOCS = "web_assets/docs/"
+_SCREENSHOTS = "web_assets/screenshots/"
+
+
+@dataclass(frozen=True)
+class Topic:
+    name: str
+    title: str
+    group: str
+    """One of `GROUPS`, or `RULE_PAGES`."""
+    path: str
+    """From the root of a checkout; links of the page are relative to it."""
+    text: str
+    """Markdown."""
+
+    def link(self, address: str) -> tuple[str, str]:
+        """The path from the root of a checkout that a link on this page leads to, and its ``#fragment``."""
+        parts = urlsplit(address)
+        inside = f"#{parts.fragment}" if parts.fragment else ""
+        return posixpath.normpath(
+            posixpath.join(posixpath.dirname(self.path), parts.path)
+        ) if parts.path else self.path, inside
+
+
+@cache
+def topics() -> tuple[Topic, ...]:
+    """All topics, in the order in which they are listed."""
+    folder = web_assets_folder()
+    found = [(OVERVIEW, "", "README.md", _overview_file(folder))]
+    for file in (folder / "docs").rglob("*.md"):
+        below = file.relative_to(folder / "docs")
+        found.append(
+            (file.stem, below.parent.as_posix().removeprefix("."), f"{_DOCS}{below.as_posix()}", file)
+        )
+    folders = [*(name for name, _ in GROUPS), RULE_PAGES]
+
+    def place(one: tuple[str, str, str, Path]) -> tuple[int, int, str]:
+        name, group, *_ = one
+        return folders.index(group), FIRST.index(name) if name in FIRST else len(FIRST), name
+
+    return tuple(_topic(*one) for one in sorted(found, key=place))
+
+
+def _overview_file(folder: Path) -> Path:
+    """Path of README: in the folder in a wheel, next to the folder in a checkout."""
+    inside = folder / "README.md"
+    return inside if inside.is_file() else folder.parent / "README.md"
+
+
+def _topic(name: str, group: str, path: str, file: Path) -> Topic:
+    text = file.read_text(encoding="utf-8")
+    title = "The first ten minutes" if name == OVERVIEW else text.partition("\n")[0].removeprefix("# ")
+    return Topic(name, title, dict(GROUPS).get(group, RULE_PAGES), path, text)
+
+
+def find_topic(name: str) -> Topic | None:
+    """The topic of this name; ``Batched env`` and ``batched-env`` name ``batched_env``, and ``rows_lost`` ``rows-lost``."""
+    wanted = _as_named(name.strip().lower().removesuffix(".md"))
+    return next((topic for topic in topics() if _as_named(topic.name) == wanted), None)
+
+
+def _as_named(name: str) -> str:
+    return re.sub(r"[\s-]+", "_", name)
+
+
+def topics_about(words: str) -> list[Topic]:
+    """Topics whose text holds each of these words, whatever their case and order; first those that begin with them. Pages of
+    rules only where no other does."""
+    wanted = [word for word in re.findall(r"[\w-]+", words.lower()) if word not in _LITTLE_WORDS]
+    if not wanted:
+        return []
+
+    def holds(text: str) -> bool:
+        return all(word in text.lower() for word in wanted)
+
+    found = [topic for topic in topics() if holds(topic.text)]
+    found = [topic for topic in found if topic.group != RULE_PAGES] or found
+    return sorted(found, key=lambda topic: not holds(topic.text[:_BEGINNING]))
+
+
+def by_path(path: str) -> Topic | None:
+    return next((topic for topic in topics() if topic.path == path), None)
+
+
+# --- in the browser -----------------------------------------------------------------------------------
+
+
+def reply(path: str) -> tuple[int, str, bytes]:
+    """The page of a topic by its name; the overview for an empty one. Reads no file by a name that a browser sends."""
+    topic = find_topic(path or OVERVIEW)
+    status = 200 if topic is not None else 404
+    groups = [(group, [one for one in topics() if one.group == group]) for _, group in GROUPS]
+    body = "" if topic is None else html_of(topic)
+    page = render("help_page", topic=topic, groups=groups, body=body, address=ADDRESS)
+    return status, "text/html; charset=utf-8", page.encode()
+
+
+def html_of(topic: Topic) -> str:
+    """The text as HTML, with links to other topics and pictures as this server has them."""
+    from markdown_it import MarkdownIt  # late: a page that nobody opens needs none
+
+    # HTML in the text is our own: README's <picture>.
+    markdown = MarkdownIt("commonmark", {"html": True, "highlight": _coloured}).enable("table")
+    tokens = markdown.parse(topic.text)
+    for token in _all(tokens):
+        if token.type == "link_open":
+            token.attrSet("href", _address(topic, str(token.attrGet("href"))))
+        elif token.type == "image":
+            token.attrSet("src", _address(topic, str(token.attrGet("src"))))
+        elif token.attrGet("style") == "text-align:right":
+            # A style in a tag is refused by the policy.
+            token.attrs = {"class": "number"}
+        elif token.type == "html_block":
+            token.content = re.sub(
+                r'(src|srcset)="([^"]+)"', lambda m: f'{m[1]}="{_address(topic, m[2])}"', token.content
+            )
+    for opened, inline in zip(tokens, tokens[1:]):
+        if opened.type == "heading_open":
+            opened.attrSet("id", _anchor(inline.content))
+        elif opened.type == "td_open":
+            if inline.content.endswith("."):
+                opened.attrJoin("class", "sentence")
+            for part in inline.children or ():
+                if part.type == "text":
+                    part.type, part.content = "html_inline", _breakable(part.content)
+    made = markdown.renderer.render(tokens, markdown.options, {})
+    # In a frame of its own, so that a wide table scrolls and not the page.
+    made = made.replace("<table>", '<div class="wide"><table>').replace("</table>", "</table></div>")
+    # Each picture of the page was taken dark and light.
+    return re.sub(r'<img src="(/workbench/screenshots/)dark/([\w.]+)" alt="([^"]*)" />', _PICTURE, made)
+
+
+def _coloured(code: str, language: str, attributes: str) -> str:
+    """The lines of a diff as HTML with their signs as classes; empty for other code, which is then only escaped."""
+    if language != "diff":
+        return ""
+    kinds = {"-": "gone", "+": "come"}
+    return "".join(
+        f'<span class="{kinds[line[0]]}">{html.escape(line)}</span>'
+        if line[0] in kinds
+        else html.escape(line)
+        for line in code.splitlines(keepends=True)
+    )
+
+
+_PICTURE = (
+    r'<picture><source media="(prefers-color-scheme: light)" srcset="\1light/\2">'
+    r'<img src="\1dark/\2" alt="\3"></picture>'
+)
+
+
+def _breakable(text: str) -> str:
+    """The text as HTML in which a path or a long name may go on in another line: a table is as wide as its longest word."""
+    path = re.sub(r"(?<=\w)([/_])(?=\w)", r"\1<wbr>", html.escape(text, quote=False))
+    return re.sub(r"[A-Za-z0-9]{20,}", lambda name: re.sub(r"(?<=[a-z])(?=[A-Z])", "<wbr>", name[0]), path)
+
+
+def _all(tokens: Sequence[Token]) -> Iterator[Token]:
+    for token in tokens:
+        yield token
+        yield from _all(token.children or ())
+
+
+def _address(topic: Topic, link: str) -> str:
+    if urlsplit(link).scheme:
+        return link
+    path, inside = topic.link(link)
+    if path.startswith(_SCREENSHOTS):
+        return f"/workbench/screenshots/{path.removeprefix(_SCREENSHOTS)}"
+    to = by_path(path)
+    if to is None:
+        return link
+    return inside if to is topic and inside else f"{ADDRESS}{to.name}{inside}"
+
+
+def _anchor(heading: str) -> str:
+    """The id of a heading, as git hosts make it."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")

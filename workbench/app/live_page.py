@@ -1,0 +1,484 @@
+"""The live page: builds its parts and redraws them when the session has something new."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import viser
+
+from workbench.app import state
+from workbench.app.marks import EPISODES, STUDIO, Marks
+from workbench.app.pages import draw_apart
+from workbench.app.palette_entries import TaskCommands
+from workbench.app.session import Session
+from workbench.app.status_line import StatusLine
+from workbench.cameras.commands import SelectCamera
+from workbench.cameras.events import CameraChosen
+from workbench.cameras.frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
+from workbench.cameras.panel import CamerasPanel
+from workbench.cameras.studio_panel import StudioPanel
+from workbench.cameras.view import shown_cameras
+from workbench.checks.panel import TAB as CHECKS
+from workbench.checks.panel import ChecksPanel
+from workbench.checks.profile_panel import StepProfilePanel
+from workbench.live.commands import ChoosePictures
+from workbench.live.env_commands import ToggleOnlySelected
+from workbench.live.events import PagesCounted
+from workbench.live.messages import CameraRequest
+from workbench.live.panels.banners import Banner, BusyBanner
+from workbench.live.panels.env_options import EnvOptionsPanel
+from workbench.live.panels.env_panel import TABLE as ENVS
+from workbench.live.panels.env_panel import EnvPanel
+from workbench.live.panels.inspect_panel import TAB as INSPECT
+from workbench.live.panels.inspect_panel import ForceArrows, InspectPanel
+from workbench.live.panels.log_panel import LogPanel
+from workbench.live.panels.reward_panel import CurvesPanel, NumbersPanel
+from workbench.live.panels.run_panel import RunPanel
+from workbench.live.panels.timeline_panel import HEIGHT as TIMELINE_HEIGHT
+from workbench.live.panels.timeline_panel import TimelinePanel
+from workbench.live.panels.version_panel import VersionPanel
+from workbench.live.panels.view_panel import ViewPanel
+from workbench.live.timeline_commands import Seek
+from workbench.live.view import SessionView
+from workbench.machine.kept_choices import close_hints
+from workbench.machine.loop import Aside, post
+from workbench.page.command import Command
+from workbench.page.commands import (
+    CloseDialog,
+    CloseHints,
+    FrameScene,
+    ShowRecordings,
+    ShowTab,
+    TellDrawnInSoftware,
+    TellOpenTab,
+    TellUnfolded,
+    ToggleTable,
+    ToggleTheme,
+)
+from workbench.page.scene.bodies import Looks
+from workbench.page.scene.env_grid import EnvLayout, SelectionMark, acting_box, env_under_ray, lay_out
+from workbench.page.scene.viewpoint import FOV, Stage, Viewpoint, frame_all, frame_one
+from workbench.page.widgets.editor_links import editor_link
+from workbench.page.widgets.fields import choice
+from workbench.page.widgets.hotkeys import add_hints, key_rows, register
+from workbench.page.widgets.open_tabs import OpenTabs
+from workbench.page.widgets.parts import Clock, DrawDue, PagePart, Parts
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import tool, tools_html
+from workbench.page.widgets.visitors import Done, Visitor, Visitors
+from workbench.record.panel import RecordPanel
+from workbench.rescore.past_panel import PastRescorePanel, RescoredAbove
+from workbench.solve.panel import SolvePanel
+from workbench.solve.seeds_panel import SolveSeedsPanel
+from workbench.start.panel import Chooser, OpenDialog
+from workbench.task.reference import named_file
+
+DOES: frozenset[type[Command]] = frozenset(
+    {
+        ShowRecordings,
+        ShowTab,
+        TellOpenTab,
+        TellUnfolded,
+        TellDrawnInSoftware,
+        ToggleTable,
+        FrameScene,
+        ToggleTheme,
+        ToggleOnlySelected,
+        CloseHints,
+        CloseDialog,
+        *CamerasPanel.does,
+    }
+)
+"""Commands that the page itself carries out; the session has its own, and the parts of the page have the others."""
+PANELS_EVERY = 0.06
+"""Seconds between two drawings of the panels while the envs play, every second frame; numbers cannot be read faster."""
+PICTURES_HINT = (
+    "Exact ones are SAPIEN's own; fast ones take a fraction of the time without a graphics card, of simplified meshes. "
+    "Auto: fast while something moves, exact when it stands still. What this page records is exact."
+)
+PANEL_WIDTH = 372
+ENVS_WIDTHS = 220, 640
+"""Minimum and maximum width in pixels of the table of envs; the view keeps half of the page."""
+
+
+class Page:
+    """The workbench's page on this server, showing this session.
+
+    Each redraw takes one immutable snapshot of the session, and every part compares it with what it drew last. Callbacks
+    of the page run in any thread and order, and only ask the session for something. While no page is open nothing is
+    drawn or rendered.
+
+    Args:
+        server: Of viser.
+        visitors: The open pages.
+        session: The session.
+        dark: The first theme.
+        on_review: Called when a person wants to see the recordings.
+        on_look: Called with the recording that a person wants to look at.
+        stage: The 3-D view; None makes one.
+        also: Further commands for the palette, which somebody else does.
+        clock: Of all parts of the page.
+        editor: Address of a line in the author's editor, as `parse_editor` gives it.
+        chooser: Opens another task; None for a page that keeps its own.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        visitors: Visitors,
+        session: Session,
+        dark: bool = True,
+        on_review: Callable[[], object] = lambda: None,
+        on_look: Callable[[Path], None] = lambda path: None,
+        stage: Stage | None = None,
+        also: frozenset[type[Command]] = frozenset(),
+        clock: Clock = time.monotonic,
+        editor: str = "",
+        chooser: Chooser | None = None,
+    ) -> None:
+        self._server, self._visitors = server, visitors
+        self._session = session
+        self._clock = clock
+        self._link = partial(editor_link, editor, known=session.knows_file)
+        self._on_review, self._on_look = on_review, on_look
+        self._visitors_counted = -1
+        self._watched: tuple[CameraRequest, ...] = ()
+        """Pictures that the session was asked for."""
+        self._choices = Aside("choices")
+        """Keeps what a person chose for later runs."""
+        self._panels_due = DrawDue(PANELS_EVERY, clock)
+        self._layout: EnvLayout | None = None
+        self._scene_serial = -1
+        self._built: tuple[bool, Looks] | None = None
+        self._waits_for_human = False
+        stage = stage or Stage(server)
+        self._scene, self._framing, self._view_choice = stage.scene, stage.framing, stage.choice
+
+        server.gui.main_panel.dock_right()
+        server.gui.main_panel.set_width(PANEL_WIDTH)
+        # Until it has loaded, and for good where it fails.
+        file = named_file(session.reference)
+        server.gui.set_panel_label(str(session.reference) if file is None else file.name)
+
+        status = StatusLine(server, clock)
+        # Not the path itself, which may be long.
+        which = hashlib.sha256(str(session.reference).encode(errors="replace")).hexdigest()[:16]
+        self._open_tabs = OpenTabs(visitors)
+        server.gui.add_html(render("which", which=which, anew=False, says=True))
+        marks = Marks(server, session, self._open_tabs)
+        self._opening = None if chooser is None else OpenDialog(server, chooser)
+        if self._opening is not None:
+            self._opening.add_button()
+        self._in_software = stage.in_software
+        self._in_software.ask()
+        run_tab, in_tabs = self._add_tabs(dark)
+        self._timeline = TimelinePanel(server, session, clock)
+        self._add_table_of_envs()
+        banner = Banner(server, self._link, self._is_own)
+        busy_banner = BusyBanner(server, self._link)
+        floating = self._envs, self._timeline, banner, busy_banner
+        opening = () if self._opening is None else (self._opening,)
+        self._parts = Parts((status, marks, *in_tabs, *floating, *opening), clock)
+
+        self._mark = SelectionMark(server)
+        self._frustums = CameraFrustums(server)
+        self._forces = ForceArrows(server)
+        self._parts.add(TaskCommands(server, visitors))
+        kinds = DOES | state.DOES | self._parts.does | also
+        register(server, visitors, kinds, "live page")
+        with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
+            server.gui.add_html(render("keys", rows=key_rows(kinds)))
+        # viser awaits coroutines, although its types do not say so.
+        server.scene.on_click()(self._on_scene_click)  # type: ignore[arg-type]
+
+    def _is_own(self, file: str) -> bool:
+        return isinstance(self._session.reference, str) and self._session.knows_file(file)
+
+    def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[SessionView]]]:
+        """Returns the Run tab, which gets more content later, and the parts of all tabs."""
+        server, session, clock = self._server, self._session, self._clock
+        tabs = server.gui.add_tab_group()
+        run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
+        with run_tab:
+            self._hints = add_hints(server)
+            self._run = RunPanel(server, session)
+            self._solve = SolvePanel(server, session, self._link)
+            self._view_panel = ViewPanel(server, dark, self._view_choice)
+            version = VersionPanel(server, self._link)
+            options = EnvOptionsPanel(server, session)
+        with tabs.add_tab("Cameras", viser.Icon.CAMERA):
+            degrees = "auto", "exact", "fast"
+            self._degree = choice(
+                server, "Pictures", ChoosePictures, "pictures", degrees, "auto", hint=PICTURES_HINT
+            )
+            self._cameras = CamerasPanel(
+                server,
+                studio_shows=lambda: self._studio.shows,
+                clock=clock,
+            )
+        with tabs.add_tab(STUDIO, viser.Icon.CAMERA_PLUS):
+            self._studio = StudioPanel(
+                server, session, self._view_panel, lambda: self._open_tabs.pages_at(STUDIO), clock
+            )
+        with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
+            reward = [
+                NumbersPanel(server),
+                RescoredAbove(server),
+                CurvesPanel(server, lambda tick: session.do(Seek(step=tick))),
+            ]
+            self._rescored = PastRescorePanel(server, session, session.rescored_curve)
+        with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
+            self._inspect = InspectPanel(server, session, clock)
+        with tabs.add_tab(EPISODES, viser.Icon.MOVIE):
+            self._record = RecordPanel(server)
+            server.gui.add_html(tools_html([tool("Review recordings", ShowRecordings())]))
+        with (checks_tab := tabs.add_tab(CHECKS, viser.Icon.CHECKLIST)):
+            checks = ChecksPanel(server, checks_tab, self._link)
+            seeds = SolveSeedsPanel(server, session, self._on_look, self._link)
+            profile = StepProfilePanel(server, self._link)
+        with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
+            log = LogPanel(server, session.clear_printed)
+        parts = [
+            self._run,
+            self._solve,
+            self._view_panel,
+            version,
+            options,
+            self._studio,
+            *reward,
+            self._rescored,
+        ]
+        return run_tab, [*parts, self._inspect, self._record, checks, seeds, profile, log]
+
+    def _add_table_of_envs(self) -> None:
+        self._env_window = self._server.gui.add_panel(order=5.0)
+        with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
+            self._envs = EnvPanel(self._server, self._session)
+        self._env_window.dock_left()
+        # Minimized at first: it takes half of a small screen's view.
+        self._env_window.minimize()
+        self._envs_open = False
+        self._envs_fitted = 0
+        """Width of the page in pixels for which the width of the table was set last."""
+
+    # --- drawing ---------------------------------------------------------------------------------
+
+    @property
+    def dark(self) -> bool:
+        """Its theme."""
+        return self._view_panel.dark
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """See `ShownPage`."""
+        return self._session.wait(seen, timeout)
+
+    def counted(self, visitors: int) -> None:
+        """So many browsers show it: for none, nothing is rendered."""
+        if visitors != self._visitors_counted:
+            self._visitors_counted = visitors
+            self._session.happen(PagesCounted(visitors))
+
+    def close(self) -> None:
+        """It is shown no more. The session may live on under another page, and must not render for this one."""
+        self.counted(0)
+        self._choices.end()
+
+    def redraw(self) -> None:
+        """Draw the present state of the session; where only steps advance, the panels are drawn less often than
+        the view."""
+        view = self._session.view()
+        panels = (lambda: self._draw_panels(view)) if self._panels_due.is_due(*_shown_of(view)) else None
+        draw_apart(self._server, panels, lambda: self._draw_scene(view))
+        self._watch(view)
+
+    def _watch(self, view: SessionView) -> None:
+        """Ask the session for the pictures that the page shows."""
+        wanted = self._cameras.wanted(shown_cameras(view))
+        if wanted != self._watched:
+            self._watched = wanted
+            self._session.change(cameras=wanted)
+
+    def _draw_panels(self, view: SessionView) -> None:
+        self._parts.draw(view)
+        self._degree.show(view.settings.pictures)
+        self._cameras.draw(shown_cameras(view))
+
+    # --- what a person does ----------------------------------------------------------------------
+
+    def do(self, command: Command, visitor: Visitor) -> Done:
+        """Carry out a command of a page. Raises `Refused`."""
+        session = self._session
+        match command:
+            case ShowRecordings():
+                self._on_review()
+            case ShowTab(tab=tab, fold=fold):
+                self._open_tabs.open(visitor, tab, fold)
+            case TellOpenTab(tab=tab):
+                self._open_tabs.said(visitor, tab)
+            case TellUnfolded(panel=panel):
+                self._unfolded(panel)
+            case TellDrawnInSoftware():
+                self._in_software.told_by(visitor)
+            case ToggleTable():
+                self._toggle_envs()
+            case FrameScene():
+                self.frame(session.view())
+            case ToggleTheme():
+                self._view_panel.toggle_dark()
+            case ToggleOnlySelected():
+                self._view_panel.toggle_only_selected()
+            case CloseHints():
+                self._hints.content = ""
+                self._choices.begin(close_hints)
+            case SelectCamera():
+                session.do(command, visitor.name)
+                self._open_tabs.open(visitor, STUDIO)
+            case CloseDialog():
+                if self._opening is not None:
+                    self._opening.close()
+            case _ if type(command) in state.DOES:
+                session.do(command, visitor.name)
+            case _ if isinstance(command, CamerasPanel.does):
+                self._cameras.do(command, visitor)
+            case _:
+                return self._parts.do(command, visitor)
+        return None
+
+    def _unfolded(self, panel: str) -> None:
+        """Handle that a page shows this panel."""
+        if panel == ENVS:
+            self._envs_open = True
+            self._fit_envs()
+            self._envs.unfold()
+        elif panel == STUDIO:
+            self._studio.unfold()
+        elif panel == INSPECT:
+            self._inspect.unfold()
+
+    def _fit_envs(self) -> None:
+        """Set the table's width to that of its columns, once for each page width: a person may have dragged its edge."""
+        wanted = self._envs.wanted_width()
+        page = min((visitor.page_width for visitor in self._visitors.all() if visitor.page_width), default=0)
+        if page in (0, self._envs_fitted) or not wanted:
+            return
+        least, most = ENVS_WIDTHS
+        self._env_window.set_width(max(least, min(wanted, most, page / 2 - PANEL_WIDTH)))
+        self._envs_fitted = page
+
+    def _toggle_envs(self) -> None:
+        self._envs_open = not self._envs_open
+        if self._envs_open:
+            self._fit_envs()
+            self._envs.unfold()
+            self._env_window.expand()
+        else:
+            self._envs.fold()
+            self._env_window.minimize()
+
+    # --- the 3-D view ----------------------------------------------------------------------------
+
+    def _draw_scene(self, view: SessionView) -> None:
+        task, step, seen = view.task, view.step, shown_cameras(view)
+        if task is None:
+            # The bodies are those of the page before.
+            self._scene.hide()
+            return
+        if (
+            step is None
+            or seen is None
+            or step.poses.shape[:2]
+            != (
+                task.num_envs,
+                len(task.geometry.body_names),
+            )
+        ):
+            # Between two versions a step of the old one may come with the new task.
+            return
+        one = self._view_panel.only_selected and task.num_envs > 1
+        env = min(view.selected_env, task.num_envs - 1)
+        if view.scene_serial != self._scene_serial or self._layout is None:
+            self._scene_serial = view.scene_serial
+            self._layout = lay_out(task.geometry, step.poses)
+            self._server.gui.set_panel_label(task.env_id)
+            self._built = None
+        looks = self._in_software.looks(self._view_panel.looks, task.geometry, self._layout, one)
+        built = (one, looks)
+        if built != self._built:
+            self._built = built
+            self._scene.build(task.geometry, self._layout, step.poses, env if one else None, looks)
+        self._scene.move(step.poses, self._layout, env if one else None)
+        self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
+        pictures = self._cameras.shown_pictures(seen) if self._cameras.show_frustums else {}
+        alone = one or task.num_envs == 1
+        if alone:
+            pictures = without_the_viewpoint(pictures, view.pictures)
+        offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
+        placed = self._studio.draw_in_view(view, offset)
+        self._timeline.fold(self._studio.looks_through)
+        self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE, placed)
+        self._forces.draw(self._inspect.forces(view), offset)
+        self._solve.draw_in_view(view, offset)
+        # A scene of another size is framed again; a reload that keeps the size never moves the view.
+        size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
+        if self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size)):
+            self._waits_for_human = alone
+            self._framing.frame_new(lambda aspect, height: self._viewpoint(view, aspect, height))
+        if self._waits_for_human and any(kind == "human" for kind, _ in view.pictures):
+            # The human camera's place comes with its first picture, after the scene.
+            self._waits_for_human = False
+            self.frame(view, untouched_only=True)
+        self._framing.frame_untouched(lambda aspect, height: self._viewpoint(view, aspect, height))
+
+    def frame(self, view: SessionView, untouched_only: bool = False) -> None:
+        """Point every open page (or only untouched ones), and those to come, at the scene."""
+        if self._layout is not None and view.task is not None:
+            self._framing.frame(lambda aspect, height: self._viewpoint(view, aspect, height), untouched_only)
+
+    def _viewpoint(self, view: SessionView, aspect: float, height: float) -> Viewpoint:
+        assert self._layout is not None and view.task is not None, "asked only where a scene is drawn"
+        if self._view_panel.only_selected or view.task.num_envs == 1:
+            human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
+            fovy = next((c.fovy for c in view.task.cameras if human and c.name == human.camera), FOV)
+            acting = None
+            if human is None and view.step is not None:
+                acting = acting_box(view.task.geometry, view.step.poses, self._layout)
+            return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height, fovy, acting)
+        return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
+
+    async def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
+        post(lambda: self._clicked(event))
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        layout, view = self._layout, self._session.view()
+        if layout is None or view.task is None:
+            return
+        ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        if (camera := self._frustums.under_ray(*ray)) is not None:
+            self._session.happen(CameraChosen(camera))
+            return
+        if self._view_panel.only_selected:
+            return
+        env = env_under_ray(layout, *ray)
+        if env is not None and env < view.task.num_envs:
+            self._session.change(selected_env=env)
+
+
+def _shown_of(view: SessionView) -> tuple[object, object]:
+    """Keys of what the panels show and of what a person waits for in it, as `DrawDue` takes them."""
+    steps_go_on = view.playing and view.state == "running" and view.timeline.shown is None
+    waited_for = (
+        view.settings,
+        view.busy,
+        view.task_serial,
+        view.problem_serial,
+        view.stale,
+        view.activity,
+        view.pictures_serial,
+    )
+    # Every view is new; where no steps go on, a person waits for each.
+    return object(), (waited_for if steps_go_on else object())

@@ -1,0 +1,186 @@
+"""Opens a listed task in place of the open one: asks for consent, changes the session, and keeps what was done in the old."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from workbench.app.session import KeptWork, Session
+from workbench.live.commands import PauseRun
+from workbench.machine.folders import example_tasks
+from workbench.machine.loop import Aside, begin, result_of
+from workbench.machine.processes.watched_thread import report_failure
+from workbench.page.widgets.notices import tell_all
+from workbench.page.widgets.templates import sentence
+from workbench.start.catalogue import Catalogue, Entry, Section
+from workbench.start.commands import TemplateName
+from workbench.start.recents import RecentTasks
+from workbench.task.description import TaskOptions
+from workbench.task.find import is_below
+from workbench.task.new_task import write_new_task
+from workbench.task.reference import TaskName, file_and_class, lasting
+from workbench.trust.clearance import Clearances, NotCleared
+
+if TYPE_CHECKING:
+    from workbench.app.server import Workplace
+
+OpenSession = Callable[[TaskName, TaskOptions, KeptWork | None], Session]
+"""Opens a task, with what was kept of an earlier session of it."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Content of the list of tasks in addition to the tasks that are found, and how a chosen task is opened."""
+
+    recents: RecentTasks
+    open_session: OpenSession
+    options: TaskOptions
+    """Options of tasks without options of their own."""
+
+
+_SHOWN_WITHIN = 10.0
+"""Seconds that the old session waits for the page of the new one."""
+
+
+class OpenTask:
+    """Opens what a person chooses from the list.
+
+    One at a time, since a question may wait for minutes and a session that ends writes its recordings. Of several
+    wishes the last counts: a question for an earlier one is withdrawn. The page of the new session is shown first, then
+    the old session is closed as at the end of the program. Used on the loop, but for `close`.
+
+    Args:
+        place: The pages and the open session.
+        open_session: Opens a task.
+        catalogue: What may be chosen.
+        clearances: Decide whether a file may run.
+    """
+
+    def __init__(
+        self, place: Workplace, open_session: OpenSession, catalogue: Catalogue, clearances: Clearances
+    ) -> None:
+        self._place, self._open_session = place, open_session
+        self.catalogue, self._clearances = catalogue, clearances
+        home = place.home
+        self._open_reference = "" if home is None else lasting(str(home.reference))
+        """Reference of the task that a person opened, as `Entry.lasting` has it."""
+        self._wish: Entry | None = None
+        self._opening: asyncio.Task[None] | None = None
+        self._aside = Aside("open-task")
+        self._doing = ""
+        self._closing = False
+        self._ran: set[str] = set()
+        """References of tasks that were open in this run; opening one again asks for no consent."""
+        self._kept: dict[str, KeptWork] = {}
+        """Work kept of sessions of this run, by `lasting` reference."""
+
+    def choose(self, number: int) -> None:
+        """Open the row of this number; returns at once. What is not listed is refused."""
+        entry = self.catalogue.entry(number)
+        if entry is not None:
+            self._want(entry)
+
+    def _want(self, entry: Entry) -> None:
+        self._wish = entry
+        if self._opening is None or self._opening.done():
+            self._opening = begin(self._open_wishes())
+
+    async def create(self, name: str, template: TemplateName) -> None:
+        """Write a new task into the folder of the list, and open it; see `Chooser.create`."""
+        made = await self._aside.run(lambda: write_new_task(name, template, self.catalogue.folder))
+        # Not by its number: a search that began before it was written may end now, and list it not.
+        self._want(self.catalogue.add_file(made.file, made.env_id))
+
+    def doing(self) -> str:
+        """Text for the page: what is being done; empty if nothing."""
+        return self._doing
+
+    def is_open(self, entry: Entry) -> bool:
+        """Whether this is the open task."""
+        return self._place.home is not None and self._open_reference == entry.lasting
+
+    def close(self) -> None:
+        """Withdraw a question and end the thread; a session that is being closed is waited for."""
+        self._closing = True
+        if self._opening is not None:
+            result_of(asyncio.wait([self._opening]))
+        self._aside.close()
+        self.catalogue.close()
+
+    async def _open_wishes(self) -> None:
+        while (entry := self._wish) is not None and not self._closing:
+            self._wish = None
+            try:
+                await self._open(entry)
+            except Exception as error:
+                report_failure(f"{entry.name} was not opened", error)
+            finally:
+                self._doing = ""
+
+    def _withdrawn(self) -> bool:
+        return self._closing or self._wish is not None
+
+    async def _open(self, entry: Entry) -> None:
+        if entry.section is Section.RECORDINGS:
+            self._place.pages.show("review")
+            return
+        file = entry.file
+        if file is not None and not await self._aside.run(file.is_file):
+            self._say(f"{entry.name} is gone", f"There is no file {entry.file} any more.")
+            self.catalogue.refresh()
+            return
+        home = self._place.home
+        if home is not None and self.is_open(entry):
+            self._place.go_live.let_go()
+            self._place.session = home
+            self._place.pages.show("live")
+            return
+        self._doing = f"Opening {entry.name}: asking whether its code may run"
+        try:
+            reference = await self._aside.run(lambda: self._cleared(entry))
+        except NotCleared as error:
+            if not self._withdrawn():
+                self._say(f"{entry.name} is not opened", sentence(str(error)))
+            return
+        self._doing = f"Opening {entry.name} …"
+        if not self._withdrawn():
+            await self._change(reference, entry)
+
+    def _cleared(self, entry: Entry) -> TaskName:
+        """What to open; asks a person if need be, and waits for the answer. A file is opened unasked where the workbench was
+        started, if it is one of the examples, and if it was open before in this run.
+
+        Raises:
+            NotCleared: it may not run.
+        """
+        file = entry.file
+        known = entry.lasting in self._ran or file in example_tasks()
+        if file is None or known or is_below(file, self.catalogue.folder):
+            return entry.reference
+        return self._clearances.clear_file(file, file_and_class(entry.reference)[1], self._withdrawn)
+
+    async def _change(self, reference: TaskName, entry: Entry) -> None:
+        place, old = self._place, self._place.home
+        place.go_live.let_go()
+        if old is not None:
+            old.do(PauseRun())
+            self._kept[self._open_reference] = old.kept_work()
+            # Not the texts of a recording, which name a path and are other code.
+            if isinstance(old.reference, str):
+                self._ran.add(self._open_reference)
+        kept = self._kept.get(entry.lasting)
+        options = entry.options or self.catalogue.options
+        session = await self._aside.run(lambda: self._open_session(reference, options, kept))
+        place.session = place.home = session
+        self._open_reference = entry.lasting
+        # Until then the old page draws the old session.
+        shown = asyncio.wrap_future(place.pages.show("live", anew=True))
+        await asyncio.wait([shown], timeout=_SHOWN_WITHIN)
+        if old is not None:
+            self._doing = "Closing the task before: its recordings are written …"
+            await self._aside.run(old.close)
+
+    def _say(self, title: str, text: str) -> None:
+        tell_all(self._place.server, title, text, "red")

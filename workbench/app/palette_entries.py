@@ -1,0 +1,75 @@
+"""Entries of the palette that the open task has: its envs, cameras and control modes by name."""
+
+from __future__ import annotations
+
+import json
+
+import viser
+
+from workbench.cameras.commands import SelectCamera
+from workbench.live.commands import UseControlMode
+from workbench.live.env_commands import SelectEnv
+from workbench.live.view import SessionView
+from workbench.page.command import Command
+from workbench.page.widgets.hotkeys import add
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.visitors import Visitors
+
+MAX_ENVS = 256
+"""Maximum number of envs with an entry; more entries would make every page wait for them."""
+STUDIO = "Studio"
+
+
+class TaskCommands(PagePart[SessionView]):
+    """Make it in no container, after the commands of the page: the palette lists them in the order of making."""
+
+    def __init__(self, server: viser.ViserServer, visitors: Visitors) -> None:
+        self._server, self._visitors = server, visitors
+        self._handles: list[viser.CommandHandle] = []
+
+    def key(self, view: SessionView) -> object:
+        if view.task is None:
+            return None
+        return (
+            view.task.num_envs,
+            [camera.key for camera in view.task.cameras],
+            _modes(view),
+            view.task.control_mode,
+        )
+
+    def draw(self, view: SessionView) -> None:
+        for handle in self._handles:
+            handle.remove()
+        self._handles = [
+            add(self._server, self._visitors, label, command, about)
+            for label, command, about in _entries(view)
+        ]
+
+
+def _entries(view: SessionView) -> list[tuple[str, Command, str]]:
+    """Label, command, and what is below the label."""
+    task = view.task
+    if task is None:
+        return []
+    return [
+        *((f"Env {env}", SelectEnv(env=env), "") for env in range(min(task.num_envs, MAX_ENVS))),
+        *(
+            (f"Camera {one.name}", SelectCamera(kind=one.kind, name=one.name), f"in {STUDIO}")
+            for one in task.cameras
+        ),
+        *(
+            (
+                f"Control mode {mode}",
+                UseControlMode(mode=mode),
+                "in effect" if mode == task.control_mode else "makes the envs again",
+            )
+            for mode in _modes(view)
+        ),
+    ]
+
+
+def _modes(view: SessionView) -> list[str]:
+    """The control modes that the robot has."""
+    made = () if view.task is None else view.task.made.modes
+    choices = next((keyword.choices for keyword in made if keyword.name == "control_mode"), ()) or ()
+    return [mode for text in choices if isinstance(mode := json.loads(text), str)]

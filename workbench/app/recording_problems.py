@@ -1,0 +1,62 @@
+"""Tells every open browser, whichever page and tab it shows, and the terminal why something was not recorded."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import viser
+
+from workbench.app.session import Session
+from workbench.machine.loop import begin, do
+from workbench.page.widgets.notices import tell_all
+from workbench.record.state import RecordingStatus
+
+_LOOK = 0.2
+"""Seconds between two looks."""
+REFUSED_SECONDS = 8.0
+
+
+class RecordingProblems:
+    """Follows the live session, also while another page is shown: it goes on recording.
+
+    Args:
+        session: The live session now, if there is one.
+        on_notice: Called with a message for the terminal.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Callable[[], Session | None],
+        on_notice: Callable[[str], None],
+    ) -> None:
+        self._server, self._session, self._on_notice = server, session, on_notice
+        self._before = RecordingStatus()
+        self._watching = do(lambda: begin(self._watch()))
+
+    def close(self) -> None:
+        """Called on another thread than the loop."""
+        do(self._watching.cancel)
+
+    async def _watch(self) -> None:
+        while True:
+            session = self._session()
+            if session is not None:
+                self._tell(session.view().of(RecordingStatus))
+            await asyncio.sleep(_LOOK)
+
+    def _tell(self, now: RecordingStatus) -> None:
+        before, self._before = self._before, now
+        # By identity: the same may happen again between two looks.
+        if now.problem is not None and now.problem is not before.problem:
+            self._on_notice(now.problem)
+            tell_all(self._server, "Not recorded", now.problem, "red")
+        saving = now.saving
+        if not saving.failed or saving.message is before.saving.message:
+            return
+        if saving.refused_at is not None:
+            tell_all(self._server, "Nothing was saved", saving.message, seconds=REFUSED_SECONDS)
+        elif saving.message != now.problem:
+            self._on_notice(saving.message)
+            tell_all(self._server, "Nothing was saved", saving.message, "red")

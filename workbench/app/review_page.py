@@ -1,0 +1,485 @@
+"""The review page: recordings in place of a live env, with the same timeline and keys."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import viser
+
+from workbench.app.go_live import GoLivePart
+from workbench.app.pages import draw_apart
+from workbench.cameras.panel import CamerasPanel
+from workbench.cameras.view import ShownCameras
+from workbench.envs.camera_data import CameraKey, Picture
+from workbench.library.commands import OpenSideBySide, RescoreSelected
+from workbench.library.folder import Library
+from workbench.library.listing import Action
+from workbench.library.panel import LibraryPanel
+from workbench.library.rows import OpenVersion
+from workbench.live.commands import TogglePlay
+from workbench.live.messages import CameraRequest
+from workbench.live.panels.timeline_panel import MOST_MARKS, TimeBar, strip_values, walk_tools
+from workbench.live.panels.view_panel import ViewPanel
+from workbench.live.timeline_commands import (
+    GoToFirst,
+    GoToLast,
+    NextEvent,
+    PreviousEvent,
+    Seek,
+    StepBack,
+    StepForward,
+)
+from workbench.page.command import Command, Refused
+from workbench.page.commands import (
+    CloseDialog,
+    FrameScene,
+    ShowLive,
+    ShowTab,
+    TellDrawnInSoftware,
+    TellUnfolded,
+    ToggleTable,
+    ToggleTheme,
+)
+from workbench.page.widgets.hotkeys import key_rows, register
+from workbench.page.widgets.open_tabs import OpenTabs
+from workbench.page.widgets.parts import Clock, DrawDue, PagePart, Parts
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import tool, tools_html
+from workbench.page.widgets.visitors import Done, Visitor
+from workbench.rescore.recordings_panel import RescorePanel
+from workbench.review.commands import RescoreChosen
+from workbench.review.compare_panel import ReviewComparePanel
+from workbench.review.curves_panel import ReviewCurves, ReviewNumbers
+from workbench.review.panel import ReviewPanel
+from workbench.review.playback import Review
+from workbench.review.scene_view import ReviewIn3D, shown_together
+from workbench.review.state import MOST_OPEN
+from workbench.review.view import PictureReader, ReviewView, column_at, outcome_text
+from workbench.start.panel import OpenDialog
+from workbench.sweep.panel import SweepPanel
+
+if TYPE_CHECKING:
+    from workbench.app.server import Workplace
+
+TOLD_EVERY = 0.1
+"""Seconds between two drawings of the panels while a recording plays; numbers cannot be read faster."""
+PANEL_WIDTH = 340
+LIBRARY_WIDTH = 520
+LEAST_VIEW = 240
+"""Minimum width in pixels of the view between the library and another panel."""
+LEAST_BESIDE_SWEEP = 400
+"""Minimum width in pixels of the view in which an episode of a sweep is watched next to its table; the timeline
+needs most of it."""
+NARROW = 700
+"""Pixels of the view next to the library; below this there is no room for both."""
+TOLD_WIDTH = 20.0
+"""Seconds within which a page reports the new width of its view."""
+BACK = "Back to the live env"
+LIBRARY = "library"
+"""Name of the panel in the page's report that the panel was unfolded."""
+DOES: frozenset[type[Command]] = frozenset(
+    {
+        ShowLive,
+        ShowTab,
+        TellUnfolded,
+        TellDrawnInSoftware,
+        ToggleTable,
+        FrameScene,
+        ToggleTheme,
+        RescoreChosen,
+        CloseDialog,
+        *CamerasPanel.does,
+    }
+)
+"""Commands that the page itself carries out; its parts carry out the others."""
+
+
+class ReviewPage:
+    """The review's page, built and redrawn like the live page, without a worker or a task file.
+
+    Args:
+        place: The recordings, and what can be done with them.
+        dark: The first theme.
+        anew: Show the first tab also to a browser that left the page at another one.
+        clock: Of all parts of the page.
+    """
+
+    def __init__(
+        self, place: Workplace, dark: bool = True, anew: bool = False, clock: Clock = time.monotonic
+    ) -> None:
+        self._place, self._clock = place, clock
+        self._server, self._review = server, review = place.server, place.shelf.review
+        self._reader = PictureReader()
+        self._requests: tuple[CameraRequest, ...] = ()
+        self._pictures: dict[CameraKey, Picture] = {}
+        self._pictures_serial = 0
+        self._had_opened = tuple(one.id for one in review.view().opened)
+        self._fold_other: Callable[[bool], None] = lambda folded: None
+        """Folds and unfolds rerun's panel."""
+        self._other_folded = False
+        self._unfolded = "", 0.0
+        """Name of the panel (library or rerun) that was unfolded last, and when, until the width was checked."""
+        self._told = DrawDue(TOLD_EVERY, clock)
+
+        server.gui.main_panel.dock_right()
+        server.gui.main_panel.set_width(PANEL_WIDTH)
+        server.gui.set_panel_label("Recordings")
+        self._status = server.gui.add_html("")
+        self._opening = OpenDialog(server, place.open_task)
+        self._opening.add_button()
+        self._open_tabs = OpenTabs(place.visitors)
+        server.gui.add_html(render("which", which="review", anew=anew, says=False))
+        place.stage.in_software.ask()
+        self._add_way_back()
+        review_tab, in_tabs = self._add_tabs(dark)
+        self._timeline = ReviewTimeline(server, review)
+        self._in_3d = ReviewIn3D(server, review, place.stage)
+        self._parts = Parts((self._panel, self._timeline, *in_tabs, self._opening), clock)
+        if self._sweep is not None:
+            self._parts.add(self._sweep)
+        kinds = DOES | self._parts.does | place.does
+        register(
+            server, place.visitors, kinds if place.session is not None else kinds - {ShowLive}, "review page"
+        )
+        with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
+            server.gui.add_html(render("keys", rows=key_rows(kinds)))
+
+    def _add_way_back(self) -> None:
+        if self._place.session is not None:
+            self._server.gui.add_html(tools_html([tool(BACK, ShowLive())]))
+
+    def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
+        """Returns the Review tab, which gets more content later, and the parts of all tabs."""
+        server, review, place = self._server, self._review, self._place
+        library, go_live = place.shelf.library, place.go_live
+        tabs = server.gui.add_tab_group()
+        review_tab = tabs.add_tab("Review", viser.Icon.PLAYER_PLAY)
+        with review_tab:
+            self._panel = ReviewPanel(server, review, go_live.go, go_live.going)
+        with tabs.add_tab("Cameras", viser.Icon.CAMERA):
+            self._cameras_note = server.gui.add_html("")
+            self._cameras = CamerasPanel(server, "This recording has no pictures.", clock=self._clock)
+        with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
+            numbers, curves = ReviewNumbers(server), ReviewCurves(server)
+        with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
+            compare = ReviewComparePanel(server, review)
+        share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
+        with tabs.add_tab("Rescore", viser.Icon.GAVEL):
+            self._rescore = RescorePanel(
+                server, place.rescorer, review, library, place.rescore_choices, place.task_files
+            )
+        self._add_library(library)
+        with share_tab:
+            sharing = place.sharing
+            self._share = sharing.part(server, library, self._library, self._make_way)
+        with review_tab:
+            going = GoLivePart(server, go_live)
+            self._view_panel = ViewPanel(server, dark, place.stage.choice)
+        return review_tab, [
+            numbers,
+            curves,
+            compare,
+            self._library,
+            self._share,
+            going,
+            self._view_panel,
+            self._rescore,
+        ]
+
+    def _running(self) -> OpenVersion | None:
+        session = self._place.session
+        task = None if session is None else session.view().task
+        return None if task is None else OpenVersion(task.env_id, task.source_hash)
+
+    def _add_library(self, library: Library) -> None:
+        """The table of recordings, in a panel of its own."""
+        self._library_window = self._server.gui.add_panel(order=5.0)
+        self._sweep = self._sweep_of(library)
+        with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
+            self._library = LibraryPanel(self._server, library, self._review.open, self._running)
+            self._server.gui.add_html(render("tell", command=TellUnfolded(panel=LIBRARY)))
+        self._library.add_action(
+            Action(
+                "Side by side",
+                OpenSideBySide(),
+                "Show them side by side (Shift+Enter)",
+                self._open_side_by_side,
+                MOST_OPEN,
+            )
+        )
+        self._library.add_action(
+            Action(
+                "Rescore",
+                RescoreSelected(),
+                "Run the current reward and evaluate over them (J)",
+                self._rescore.rescore_and_notify,
+            )
+        )
+        self._library_window.dock_left()
+        self._library_window.set_width(LIBRARY_WIDTH)
+        self._library_open = True
+        if self._had_opened and not self._review.view().library_stays:
+            self._show_library(False)
+
+    def _sweep_of(self, library: Library) -> SweepPanel | None:
+        """The tab with the results of a sweep, if the folder has some."""
+        if library.view().sweep is None:
+            return None
+        with self._library_window.add_tab("Sweep", viser.Icon.ADJUSTMENTS_HORIZONTAL):
+            return SweepPanel(self._server, library, self._open_of_sweep)
+
+    def _add_late_sweep(self) -> None:
+        """Add the tab of a sweep whose results came after the page."""
+        if self._sweep is None and (sweep := self._sweep_of(self._place.shelf.library)) is not None:
+            self._sweep = sweep
+            self._parts.add(sweep)
+
+    def _open_of_sweep(self, ids: tuple[str, ...]) -> None:
+        # The panel stays: a person goes from the best episode to the worst.
+        self._review.open(ids, library_stays=self._smallest_view() >= LEAST_BESIDE_SWEEP)
+
+    # --- drawing ---------------------------------------------------------------------------------
+
+    @property
+    def dark(self) -> bool:
+        """Its theme."""
+        return self._view_panel.dark
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """See `ShownPage`."""
+        return self._review.wait(seen, timeout)
+
+    def counted(self, visitors: int) -> None:
+        """A review plays whoever looks."""
+
+    def close(self) -> None:
+        """It is shown no more."""
+        self._library.end()
+        self._share.close()
+        if self._sweep is not None:
+            self._sweep.end()
+
+    def redraw(self) -> None:
+        """Draw the present state of the review."""
+        view = self._review.view()
+        self._take_pictures(view)
+        draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
+
+    def _draw_panels(self, view: ReviewView) -> None:
+        """Draw the panels, all from one view; while it plays, less often than the 3-D view."""
+        if not self._told.is_due(object(), urgent=None if view.playing else object()):
+            return
+        self._add_late_sweep()
+        self._make_way_for_the_first(view)
+        self._fold_what_crowds()
+        self._status.content = render(
+            "review_status",
+            view=view,
+            going=self._place.go_live.going(),
+            outcome_text=outcome_text,
+        )
+        self._draw_cameras(view)
+        self._parts.draw(view)
+
+    def _draw_scene(self, view: ReviewView) -> None:
+        chosen = view.chosen
+        cameras = () if chosen is None else self._reader.cameras(chosen.episode)
+        pictures = self._pictures if self._cameras.show_frustums else {}
+        self._in_3d.draw(view, self._panel.ghosts, self._view_panel.looks, cameras, pictures)
+
+    def _make_way_for_the_first(self, view: ReviewView) -> None:
+        """On a small screen, minimize the library when a recording is opened, and expand it when all are closed."""
+        ids = tuple(one.id for one in view.opened)
+        if view.library_stays and (ids or view.loading):
+            self._had_opened = ids
+            return
+        if ids != self._had_opened:
+            self._had_opened = ids
+            if not ids or self._smallest_view() < NARROW:
+                self._show_library(not ids)
+
+    def _make_way(self, fold: Callable[[bool], None]) -> int:
+        self._fold_other = fold
+        width = self._smallest_view() + (LIBRARY_WIDTH if self._library_open else 0)
+        self._show_library(False)
+        return width
+
+    def _smallest_view(self) -> int:
+        """Width in pixels of the smallest view of all pages; 0 without viewers."""
+        widths = [client.camera.image_width for client in self._server.get_clients().values()]
+        return min((width for width in widths if width), default=0)
+
+    def _show_library(self, shown: bool) -> None:
+        self._library_open = shown
+        self._unfolded = "", 0.0
+        if shown:
+            # While it is folded, the other panel and the view share the width.
+            self._other_folded = 0 < self._smallest_view() < LIBRARY_WIDTH + LEAST_VIEW
+            if self._other_folded:
+                self._fold_other(True)
+            self._library_window.expand()
+        else:
+            self._library_window.minimize()
+            if self._other_folded:
+                self._other_folded = False
+                self._fold_other(False)
+
+    def _panel_unfolded(self, panel: str) -> None:
+        """Handle that a page shows this panel."""
+        if panel == LIBRARY:
+            self._library_open = True
+        self._unfolded = panel, self._clock()
+
+    def _fold_what_crowds(self) -> None:
+        """Fold the panel that was unfolded first, where library and rerun leave no room for the view.
+
+        A page reports its new width some time later; while rerun loads, that takes seconds.
+        """
+        last, since = self._unfolded
+        if not last or not 0 < self._smallest_view() < LEAST_VIEW:
+            return
+        self._unfolded = "", 0.0
+        if self._clock() - since > TOLD_WIDTH or not self._library_open:
+            return
+        if last == LIBRARY:
+            self._other_folded = True
+            self._fold_other(True)
+        else:
+            self._other_folded = False
+            self._show_library(False)
+
+    # --- cameras -----------------------------------------------------------------------------------
+
+    def _take_pictures(self, view: ReviewView) -> None:
+        chosen = view.chosen
+        pictures = (
+            {}
+            if chosen is None
+            else self._reader.pictures(
+                chosen.episode, view.states[view.selected], self._requests, view.selected
+            )
+        )
+        if pictures.keys() != self._pictures.keys() or any(
+            pictures[key] is not known for key, known in self._pictures.items()
+        ):
+            self._pictures, self._pictures_serial = pictures, self._pictures_serial + 1
+
+    def _draw_cameras(self, view: ReviewView) -> None:
+        episode = None if view.chosen is None else view.chosen.episode
+        self._cameras_note.content = render("note", text=self._reader.problem) if self._reader.problem else ""
+        shown = episode and ShownCameras(
+            self._reader.cameras(episode),
+            # Each recording brings its own cameras.
+            view.opened_serial * 1000 + view.selected,
+            self._pictures,
+            self._pictures_serial,
+            episode.segmentation,
+            view.selected,
+            hidden=() if episode.geometry is None else episode.geometry.hidden_names,
+        )
+        self._cameras.draw(shown)
+        self._requests = self._cameras.wanted(shown)
+
+    # --- what a person does ------------------------------------------------------------------------
+
+    def do(self, command: Command, visitor: Visitor) -> Done:
+        """Carry out a command of a page. Raises `Refused`."""
+        match command:
+            case ShowLive():
+                if self._place.session is None:
+                    raise Refused("No task is open.")
+                self._place.pages.show("live")
+            case ShowTab(tab=tab, fold=fold):
+                self._open_tabs.open(visitor, tab, fold)
+            case TellUnfolded(panel=panel):
+                self._panel_unfolded(panel)
+            case TellDrawnInSoftware():
+                self._place.stage.in_software.told_by(visitor)
+            case ToggleTable():
+                self._show_library(not self._library_open)
+            case FrameScene():
+                self._in_3d.frame()
+            case ToggleTheme():
+                self._view_panel.toggle_dark()
+            case RescoreChosen():
+                self._rescore_chosen()
+            case CloseDialog():
+                if not self._opening.close():
+                    self._library.close()
+            case _ if isinstance(command, CamerasPanel.does):
+                self._cameras.do(command, visitor)
+            case _:
+                return self._parts.do(command, visitor)
+        return None
+
+    def _rescore_chosen(self) -> None:
+        opened = tuple(one.id for one in self._review.view().opened)
+        self._rescore.rescore_and_notify(self._library.selected() or opened)
+
+    def _open_side_by_side(self, ids: tuple[str, ...]) -> None:
+        self._panel.lay_side_by_side()
+        self._review.open(ids)
+
+
+# --- The timeline of a review -------------------------------------------------------------------------
+
+
+PLAY, PAUSE = "play", "pause"
+FIRST, LAST = "first", "last"
+
+
+class ReviewTimeline(TimeBar[ReviewView]):
+    """The live page's slider, strip and keys, but counting forwards: a recording has a beginning and an end.
+
+    Each of several recordings has its own line on the strip, placed as they are aligned.
+    """
+
+    does = (StepBack, StepForward, PreviousEvent, NextEvent, Seek, GoToFirst, GoToLast)
+
+    def __init__(self, server: viser.ViserServer, review: Review) -> None:
+        super().__init__(server, "step of the timeline", Seek, "step")
+        self._review = review
+        self._drawn: tuple[object, ...] = ()
+        self._fixed: dict[str, object] = {}
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        self._review.do(command, visitor.name)
+
+    def draw(self, view: ReviewView) -> None:
+        if not self._draw_panel(bool(view.opened)):
+            return
+        self._show_slider(view.first, view.last, view.position)
+        back, forward = walk_tools()[:2], walk_tools()[2:]
+        play = tool(PAUSE if view.playing else PLAY, TogglePlay())
+        ends = tool(FIRST, GoToFirst()), tool(LAST, GoToLast())
+        self._walk.content = tools_html([ends[0], *back, play, *forward, ends[1]])
+        wanted = (view.position, view.selected, view.opened_serial, view.anchors, view.align)
+        if wanted == self._drawn:
+            return
+        # Only the cursor and the texts follow the position.
+        if wanted[1:] != self._drawn[1:]:
+            self._fixed = fixed_values(view)
+        self._drawn = wanted
+        one, state = view.opened[view.selected], view.states[view.selected]
+        self._strip.content = render(
+            "review_timeline", view=view, one=one, state=state, seek=lambda at: Seek(step=at), **self._fixed
+        )
+
+
+def fixed_values(view: ReviewView) -> dict[str, object]:
+    """The values of the strip that do not depend on the position."""
+    rows = [
+        (index, [h for h in view.opened[index].events if h.style != "reset"][:MOST_MARKS])
+        for index in shown_together(view)
+    ]
+    episode = view.opened[view.selected].episode
+    reward = np.asarray(episode.reward, np.float64)
+    if not episode.info.has_reward:
+        reward = np.full_like(reward, np.nan)  # ManiSkill's is 0 then
+    after, anchor = np.arange(1, len(reward) + 1), view.anchors[view.selected]
+    over = column_at(after, reward, anchor, np.arange(view.first, view.last + 1)).astype(np.float32)
+    styles = {h.style for _, marks in rows for h in marks}
+    return {"rows": rows, **strip_values(view.first, view.last, over, styles)}

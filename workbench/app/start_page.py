@@ -1,0 +1,80 @@
+"""The start page: the list of tasks, while none is open."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import workbench
+from workbench.live.panels.view_panel import BRAND
+from workbench.page.command import Command, Refused
+from workbench.page.commands import ShowRecordings, TellDrawnInSoftware, ToggleTheme
+from workbench.page.widgets.hotkeys import register
+from workbench.page.widgets.parts import Clock
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.visitors import Done, Visitor
+from workbench.start.panel import TaskList
+
+if TYPE_CHECKING:
+    from workbench.app.server import Workplace
+
+
+class StartPage:
+    """The list in a panel over the whole window (``.wb-start`` in page.css): there is no scene to look at.
+
+    Args:
+        place: The pages, and the list.
+        dark: The first theme.
+        clock: Of all parts of the page.
+    """
+
+    def __init__(self, place: Workplace, dark: bool = True, clock: Clock = time.monotonic) -> None:
+        self._server = server = place.server
+        self.dark = dark
+        server.gui.main_panel.dock_right()
+        server.gui.set_panel_label("Workbench")
+        self._apply_theme()
+        server.gui.add_html(render("start_head", version=workbench.__version__))
+        place.open_task.catalogue.refresh()
+        self._list = TaskList(server, place.open_task)
+        self._place = place
+        kinds = frozenset({ShowRecordings, ToggleTheme, *TaskList.does}) | place.does
+        register(server, place.visitors, kinds, "start page")
+
+    def do(self, command: Command, visitor: Visitor) -> Done:
+        """Carry out a command of a page. Raises `Refused`."""
+        match command:
+            case ShowRecordings():
+                self._place.pages.show("review")
+            case ToggleTheme():
+                self.dark = not self.dark
+                self._apply_theme()
+            case _ if isinstance(command, TaskList.does):
+                return self._list.do(command, visitor)
+            case TellDrawnInSoftware():
+                self._place.stage.in_software.told_by(visitor)
+            case _:
+                raise Refused(f"Not on this page: {command.help()}.")
+        return None
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """It is drawn at its own pace; see `Pages`."""
+        time.sleep(timeout)
+        return seen
+
+    def counted(self, visitors: int) -> None:
+        """It has no pictures that somebody would have to draw."""
+
+    def close(self) -> None:
+        """Nothing of it lasts."""
+
+    def redraw(self) -> None:
+        """Draw what has changed."""
+        with self._server.atomic():
+            self._list.draw()
+        self._server.flush()
+
+    def _apply_theme(self) -> None:
+        self._server.gui.configure_theme(
+            dark_mode=self.dark, show_logo=False, show_share_button=False, brand_color=BRAND
+        )

@@ -1,0 +1,106 @@
+"""All that a session knows, as one value, and how each event changes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from workbench.cameras import apply as of_studio
+from workbench.cameras.events import StudioEffect, StudioEvent
+from workbench.cameras.state import Studio
+from workbench.checks import profile as of_profile
+from workbench.checks import state as of_checks
+from workbench.live import apply as of_run
+from workbench.live import policies as of_policies
+from workbench.live.effects import Then
+from workbench.live.events import Now, RunEffect, RunEvent
+from workbench.live.run import Run
+from workbench.page.command import Command
+from workbench.record import state as of_recording
+from workbench.record.saving_state import SaveEvent, SaveWanted
+from workbench.rescore import state as of_rescoring
+from workbench.solve import seeds as of_seeds
+from workbench.solve import state as of_solver
+
+SessionEvent = (
+    RunEvent
+    | of_recording.RecordingWanted
+    | of_recording.RecordEvent
+    | SaveWanted
+    | SaveEvent
+    | of_rescoring.RescoringTold
+    | of_checks.CheckEvent
+    | of_profile.ProfileEvent
+    | of_seeds.SeedsEvent
+    | of_solver.SolverEvent
+    | of_policies.PoliciesListed
+    | StudioEvent
+)
+Effect = (
+    RunEffect
+    | of_recording.RecordEffect
+    | of_rescoring.RescoreEffect
+    | of_checks.CheckEffect
+    | of_checks.KeepCheckAfterSave
+    | of_profile.ProfileEffect
+    | of_seeds.SeedsEffect
+    | of_solver.SolverEffect
+    | of_policies.ListPolicies
+    | StudioEffect
+    | Then
+)
+DOES: frozenset[type[Command]] = (
+    of_run.DOES
+    | of_recording.DOES
+    | of_rescoring.DOES
+    | of_checks.DOES
+    | of_profile.DOES
+    | of_seeds.DOES
+    | of_solver.DOES
+    | of_studio.DOES
+)
+"""Commands that `apply` takes."""
+
+
+@dataclass(frozen=True)
+class State:
+    """One moment of a session. Parts that an event did not change are the same objects."""
+
+    run: Run
+    recording: of_recording.LiveRecording
+    studio: Studio
+    rescoring: of_rescoring.Rescoring = of_rescoring.Rescoring()
+    """The history rescored with the new code."""
+    checks: of_checks.Checks = of_checks.Checks()
+    """The rules of the running version."""
+    profile: of_profile.ProfileView = of_profile.ProfileView()
+    """Where the time of a step of the running version goes."""
+    seeds: of_seeds.SeedsView = of_seeds.SeedsView()
+    """The task solved from many seeds."""
+    solving: of_solver.Solving = of_solver.Solving()
+    """Plans of the source of actions *solve*."""
+    policies: of_policies.KnownPolicies = of_policies.KnownPolicies()
+    """Policies to choose from, for the source of actions *policy*."""
+
+
+def apply(state: State, event: SessionEvent, now: Now) -> tuple[State, list[Effect]]:
+    """The state after an event, and what has to be done.
+
+    Raises:
+        Refused: a command makes no sense now; nothing has changed.
+    """
+    before, solved = state.run, state.solving.solved
+    run, for_run = of_run.apply(before, event, now)
+    recording, for_recording = of_recording.apply(state.recording, event, run, now, solved)
+    rescoring, for_rescoring = of_rescoring.apply(state.rescoring, event, before, run)
+    checks, for_checks = of_checks.apply(state.checks, event, before, run)
+    profile, for_profile = of_profile.apply(state.profile, event, run)
+    seeds, for_seeds = of_seeds.apply(state.seeds, event, run)
+    solving, for_solver = of_solver.apply(state.solving, event, run)
+    policies, for_policies = of_policies.apply(state.policies, event, run)
+    studio, for_studio = of_studio.apply(state.studio, event, run, now)
+    new = State(run, recording, studio, rescoring, checks, profile, seeds, solving, policies)
+    same = all(getattr(new, part.name) is getattr(state, part.name) for part in fields(State))
+    # Rescoring begins before checks: the later of two jobs of one priority comes first. What the run has to do comes after
+    # them: when a load is done a recording continues before a recorded run is entered.
+    for_jobs = [*for_recording, *for_rescoring, *for_checks, *for_profile, *for_seeds, *for_solver]
+    return state if same else new, [*for_jobs, *for_run, *for_policies, *for_studio]

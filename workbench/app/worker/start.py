@@ -1,0 +1,113 @@
+"""Entry of a worker process: installs its crash handlers before any heavy import."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import os
+import signal
+import sys
+import threading
+import traceback
+from pathlib import Path
+from typing import NoReturn
+
+from workbench.machine.maniskill_installed import lines_if_lacking
+from workbench.machine.processes.child_python import LOWEST, quick_imports
+from workbench.machine.processes.family import begin_family
+from workbench.machine.versions import untested_text
+
+
+def main() -> None:
+    """Run a worker: ``python -m workbench.app.worker.start SOCKET HEARTBEAT STACKS SERVER NICENESS``; see `run`."""
+    run(*map(int, sys.argv[1:6]))
+
+
+def run(connection: int, heartbeat_fd: int, stacks: int, server: int, niceness: int) -> None:
+    """Continue as a worker in a child of this process, and as its keeper in this one.
+
+    The first three are file descriptors (see `WorkerProcess`), `server` is the process id of the parent. Heavy modules are
+    imported last: by then a crash writes its stack, the server can read the stack by a signal, the kernel ends this
+    process first when memory is short, and the process ends with its server (`family`).
+    """
+    begin_family(server)
+    if niceness:
+        os.nice(niceness)
+    if niceness >= LOWEST:
+        # Only what no other process wants. Some containers forbid it.
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    # A server that a script started in the background inherits an ignored SIGINT, and so would we.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    _let_kernel_end_us_first()
+    leave = os._exit
+    _install_stack_writers(stacks)
+    from workbench.live.process.heartbeat import INTERRUPT_SIGNAL, HeartbeatWriter
+
+    heartbeat = HeartbeatWriter(heartbeat_fd)
+    heartbeat.begin("starting")
+    from workbench.machine.processes.debugger import OPEN_WITH_DEBUG, pass_breakpoints, refuse_breakpoints
+
+    if niceness:  # in the background; the worker that plays is the one that is debugged
+        pass_breakpoints()
+    else:
+        refuse_breakpoints(OPEN_WITH_DEBUG)
+    code = 0
+    try:
+        if (lacking := lines_if_lacking("A task")) is not None:
+            print(*lacking, sep="\n", file=sys.stderr)
+            code = 1
+        else:
+            with quick_imports():
+                from workbench.app.worker.loop import work
+
+            work(connection, heartbeat)
+    except BaseException as error:
+        traceback.print_exc()
+        if isinstance(error, ImportError) and (text := untested_text()):
+            print(f"workbench: {text}", file=sys.stderr)
+        code = 1
+    signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)  # by default it would end the process from here on
+    # Or the interpreter would wait for the task's threads, and the page for this process.
+    others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+    if code or not all(thread.daemon for thread in others):
+        try:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:  # the task may have closed them
+            leave(code)
+
+
+def _let_kernel_end_us_first() -> None:
+    """Give this process the highest score, so that the kernel ends it first when memory runs out, and not the server."""
+    try:
+        Path("/proc/self/oom_score_adj").write_text("1000")
+    except OSError:
+        pass  # a sandbox may forbid it; the supervisor checks the memory as well
+
+
+def _install_stack_writers(stacks: int) -> None:
+    """Write the stack into the file `stacks`: at a crash, at the server's signal, and at ``os._exit``."""
+    from workbench.live.process.heartbeat import INTERRUPT_SIGNAL, STACK_SIGNAL
+
+    faulthandler.enable(file=stacks, all_threads=False)
+    # At its end the interpreter takes faulthandler's handler down and puts back what was there. By default the signal would
+    # then end the process, and the page would name the signal as the cause.
+    signal.signal(STACK_SIGNAL, signal.SIG_IGN)
+    faulthandler.register(STACK_SIGNAL, file=stacks, all_threads=False)
+    # Until the worker installs its handler there is nothing to interrupt, and the default would end the process.
+    signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)
+    leave, us = os._exit, os.getpid()
+
+    def leave_with_stack(code: int) -> NoReturn:
+        # os._exit runs no handler and raises nothing: only the exit code would be known.
+        if os.getpid() == us:  # not in a process that the author's code forked
+            os.write(stacks, f"os._exit({code})\n".encode())
+            faulthandler.dump_traceback(file=stacks, all_threads=False)
+        leave(code)
+
+    os._exit = leave_with_stack
+
+
+if __name__ == "__main__":
+    main()

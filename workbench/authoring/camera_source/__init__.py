@@ -1,1 +1,0 @@
-"""A camera's settings written into the author's file as the smallest edit."""

@@ -1,1 +1,0 @@
-"""The author's file and its modules: found, trusted, executed, registered, watched."""

@@ -1,1 +1,0 @@
-"""Compares two versions of a task and decides how much of the env must be rebuilt."""

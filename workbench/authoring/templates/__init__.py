@@ -1,1 +1,0 @@
-"""New task files, made from the examples and from installed tasks."""

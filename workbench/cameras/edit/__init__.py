@@ -1,0 +1,1 @@
+"""Writes a camera into the author's file as the smallest edit."""

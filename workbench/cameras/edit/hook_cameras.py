@@ -1,0 +1,111 @@
+"""The cameras that the author's camera hooks make, as a worker reports them, and the calls that make them."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from workbench.envs.camera_data import CallSite, CameraKey, CameraKind, CameraSettings, differences
+from workbench.source.parsed import LOOPS, SourceFile, Trace
+
+FIELDS = ("pose", "fov", "intrinsic", "width", "height", "near", "far", "shader_pack")
+PARAMETERS = (
+    *("uid", "pose", "width", "height", "fov", "near", "far", "intrinsic", "entity_uid", "mount"),
+    *("shader_pack", "shader_config"),
+)
+"""Parameters of mani_skill 3.0.1's ``CameraConfig``, in order."""
+HOOKS: dict[str, CameraKind] = {
+    "_default_sensor_configs": "sensor",
+    "_sensor_configs": "sensor",
+    "_default_human_render_camera_configs": "human",
+}
+_SAME = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class HookCamera:
+    """One camera that a hook made."""
+
+    made: CameraSettings | None
+    """Settings of its ``CameraConfig`` call; None if the call was not recorded or has other settings."""
+    settings: CameraSettings | None
+    """Settings of the config that the hook returned."""
+    mount: str
+    """Text that identifies the body that the camera is mounted on."""
+    site: CallSite | None
+    trace: Trace | None
+    """Trace of the call; None if the call is in none of the author's files."""
+
+
+@dataclass(frozen=True, eq=False)
+class HookCameras:
+    """What the camera hooks of the open task return for given texts of the author's files."""
+
+    cameras: Mapping[CameraKey, HookCamera]
+    owners: Mapping[str, tuple[str, str]]
+    """Hook to name and file of the class that defines it; ManiSkill's empty hooks are left out."""
+
+
+RunHooks = Callable[[Mapping[str, str]], HookCameras]
+"""Runs the hooks with these texts by path in place of the author's files. Raises RefusedEdit with the reason."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCall:
+    """The ``CameraConfig(...)`` call that made a camera."""
+
+    file: SourceFile
+    node: ast.Call
+    camera: CameraKey
+    arguments: dict[str, ast.expr]
+    run: HookCamera
+    trace: Trace
+
+    @property
+    def where(self) -> str:
+        return f"{self.file.name}, line {self.file.line(self.node)}"
+
+    @property
+    def hook(self) -> str | None:
+        """Name of ManiSkill's hook that contains the call."""
+        return next((name for name in reversed(self.trace.function.split(".")) if name in HOOKS), None)
+
+    @property
+    def key(self) -> ast.expr | ast.keyword | None:
+        """Key of the call, if the call is a value of a dict."""
+        outer = self.file.parents[self.node]
+        if isinstance(outer, ast.Dict):
+            return outer.keys[outer.values.index(self.node)]
+        call = self.container
+        of_dict = isinstance(call, ast.Call) and self.file.code(call.func) == "dict"
+        return outer if isinstance(outer, ast.keyword) and of_dict else None
+
+    @property
+    def container(self) -> ast.AST:
+        """The expression or statement that directly contains the call."""
+        outer = self.file.parents[self.node]
+        return self.file.parents[outer] if isinstance(outer, ast.keyword) else outer
+
+    @property
+    def loop(self) -> ast.AST | None:
+        """The loop within its function that contains the call."""
+        scope = self.file.scopes(self.node)[0]
+        outers = self.file.ancestors(self.node)
+        return next((o for o in outers if isinstance(o, LOOPS) and scope in self.file.ancestors(o)), None)
+
+
+def changed_fields(a: CameraSettings, b: CameraSettings) -> list[str]:
+    """The names in `FIELDS` of settings that differ."""
+    apart = differences(a, b, _SAME)
+    return [
+        name
+        for name in FIELDS
+        if name in apart or (name == "pose" and {"position", "orientation"} & set(apart))
+    ]
+
+
+def with_fields(settings: CameraSettings, other: CameraSettings, names: list[str]) -> CameraSettings:
+    """`settings` with the fields `names` of `other`."""
+    fields = [f for name in names for f in (("position", "quaternion") if name == "pose" else (name,))]
+    return replace(settings, **{name: getattr(other, name) for name in fields})

@@ -1,0 +1,278 @@
+"""Writes a new camera pose in the author's own form where that can express it."""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from transforms3d.euler import euler2quat
+from transforms3d.quaternions import mat2quat
+
+from workbench.envs.camera_data import CameraSettings
+from workbench.pictures.camera_conventions import angle_between, rotation_matrix, target_of
+from workbench.source.parsed import Replacement, SourceFile, TracedValue
+from workbench.source.traced_edits import Changes, list_text, quaternion_texts, same_side, written_value
+
+POSITION_STEP = 1e-4
+"""0.1 mm: the precision of written positions."""
+ANGLE_STEP = 1.745e-4
+"""0.01 degree."""
+_SAPIEN_POSE = ("sapien.Pose", "sapien.core.Pose", "sapien.pysapien.Pose")
+_MANISKILL_POSE = ("mani_skill.utils.structs.Pose", "mani_skill.utils.structs.pose.Pose")
+
+_STILL_AT_TARGET = 3e-5
+_LEAST_DISTANCE = 0.1
+_METRES = (4, 5, 6)
+"""Decimals to try: 0.1 mm, and more if the target is so close that 0.1 mm would turn the camera."""
+
+
+def why_not_a_pose(changes: Changes, pose: TracedValue) -> str | None:
+    """Why a pose cannot be edited in its form; None if it can."""
+    p, q = pose.parts.get("p"), pose.parts.get("q")
+    if pose.function == "look_at":
+        triples = [
+            pose.parts.get("eye"),
+            pose.parts.get("target"),
+            pose.parts.get("up", pose.parts.get("eye")),
+        ]
+    elif pose.function == "pose":
+        triples = [] if p is None or p.value is None else [p]
+    else:
+        return f"`{changes.one_line(pose.at)}` is computed when the task runs"
+    if any(part is None or not _is_vector(part, 3) for part in triples):
+        return f"`{changes.one_line(pose.at)}` is not a pose that can be read"
+    if q is None or q.value is None or (not q.function and _is_vector(q, 4)):
+        return None
+    angles = [q.parts.get(name) for name in ("ai", "aj", "ak")]
+    if q.function != "euler" or not all(
+        part is not None and isinstance(part.value, float) for part in angles
+    ):
+        return f"`{changes.one_line(q.at)}` is computed when the task runs"
+    axes = q.parts.get("axes")
+    return (
+        None
+        if axes is None or axes.value == "sxyz"
+        else f"`{changes.one_line(q.at)}` uses other axes than sxyz"
+    )
+
+
+def _is_vector(part: TracedValue, length: int) -> bool:
+    return isinstance(part.value, tuple) and len(part.value) == len(part.numbers) == length
+
+
+def write_pose(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
+    """Edit `pose` to that of `after`, in its own form or else with a quaternion.
+
+    A ``look_at`` stays one while the camera is level and does not look along `up`: the target stays if the camera still
+    looks at it, else it is on the new line of sight at the distance of `after`, or its old one. ManiSkill's ``look_at`` gives no unit
+    quaternion straight down or up (its `left` is the zero vector there), so those poses get a quaternion.
+    """
+    if pose.function == "look_at":
+        if not _look_at(changes, pose, after):
+            _as_quaternion(changes, pose, after)
+        return
+    _position(changes, pose, after.position)
+    quaternion = pose.numbers[3:]
+    if angle_between(quaternion, after.quaternion) <= ANGLE_STEP / 10:
+        return
+    part = pose.parts.get("q")
+    if part is not None and part.function and _euler(changes, part, after):
+        return
+    texts = quaternion_texts(same_side(after.quaternion, quaternion))
+    if part is None:
+        changes.added.setdefault(pose, []).append(f"q=[{', '.join(texts)}]")
+    elif part.literal and part.parts:
+        for item, text in zip(part.parts.values(), texts, strict=True):
+            if abs(item.numbers[0] - float(text)) > 1e-7:
+                changes.texts[item] = text
+    else:
+        changes.texts[part] = f"[{', '.join(texts)}]"
+
+
+def _position(changes: Changes, pose: TracedValue, requested: Sequence[float]) -> None:
+    part = pose.parts.get("p")
+    if part is not None and part.value is not None:
+        _vector(changes, part, requested, 4)
+    elif max(abs(a - b) for a, b in zip(pose.numbers, requested, strict=False)) > 0.5e-4:
+        if part is None:
+            changes.added.setdefault(pose, []).append(f"p={list_text(requested, 4)}")
+        else:
+            changes.texts[part] = list_text(requested, 4)
+
+
+def _vector(changes: Changes, vector: TracedValue, requested: Sequence[float], decimals: int) -> None:
+    if vector.literal:
+        for item, number in zip(vector.parts.values(), requested, strict=True):
+            changes.number(item, number, decimals)
+    elif _written_values(vector, requested, decimals) != vector.numbers:
+        text = list_text(requested, decimals)
+        code = changes.code(vector.at)
+        changes.texts[vector] = text
+        changes.note(f"`{code}` became {text}: it is no longer computed")
+
+
+def _written_values(vector: TracedValue, requested: Sequence[float], decimals: int) -> tuple[float, ...]:
+    """The numbers that result from writing `requested`."""
+    if vector.literal:
+        pairs = zip(vector.parts.values(), requested, strict=True)
+        return tuple(written_value(item, number, decimals) for item, number in pairs)
+    if max(abs(a - b) for a, b in zip(vector.numbers, requested, strict=True)) > 0.5 * 10**-decimals:
+        return tuple(round(number, decimals) for number in requested)
+    return vector.numbers
+
+
+def _look_at(changes: Changes, pose: TracedValue, after: CameraSettings) -> bool:
+    """Write eye and target; False if a look_at cannot express the orientation."""
+    eye, target = pose.parts["eye"], pose.parts["target"]
+    up = pose.parts["up"].numbers if "up" in pose.parts else (0.0, 0.0, 1.0)
+    forward = rotation_matrix(after.quaternion)[:, 0].tolist()
+    # This close to `up`, 0.1 mm of the target turns the picture.
+    if abs(_cosine(forward, up)) > math.cos(1e-3):
+        return False
+
+    def error(a: Sequence[float], b: Sequence[float]) -> float:
+        return _turned(look_at(a, b, up), after)
+
+    still = error(after.position, target.numbers) <= _STILL_AT_TARGET
+    for decimals in _METRES if still else ():
+        if error(_written_values(eye, after.position, decimals), target.numbers) <= ANGLE_STEP:
+            _vector(changes, eye, after.position, decimals)
+            return True
+    distance = max(_LEAST_DISTANCE, after.distance or math.dist(pose.numbers[:3], target.numbers))
+    for decimals in _METRES:
+        from_eye = _written_values(eye, after.position, decimals)
+        requested = [a + distance * b for a, b in zip(from_eye, forward, strict=True)]
+        if error(from_eye, _written_values(target, requested, decimals)) <= ANGLE_STEP:
+            _vector(changes, eye, after.position, decimals)
+            _vector(changes, target, requested, decimals)
+            return True
+    return False
+
+
+def look_at_text(name: str, settings: CameraSettings) -> str | None:
+    """A new camera's pose as a call of the look_at `name`; None if that cannot express it."""
+    forward = rotation_matrix(settings.quaternion)[:, 0]
+    if abs(_cosine(forward.tolist(), (0.0, 0.0, 1.0))) > math.cos(1e-3):
+        return None
+    for aimed in (settings, replace(settings, distance=None)):
+        target = target_of(aimed).tolist()
+        for decimals in _METRES:
+            eye, point = ([round(x, decimals) for x in numbers] for numbers in (settings.position, target))
+            if _turned(look_at(eye, point), settings) <= ANGLE_STEP:
+                return f"{name}(eye={list_text(eye, decimals)}, target={list_text(point, decimals)})"
+    return None
+
+
+def _as_quaternion(changes: Changes, pose: TracedValue, after: CameraSettings) -> None:
+    """Replace a look_at by a pose with a quaternion, keeping the author's expression of the position."""
+    file, node = changes.find(pose.at)
+    assert isinstance(node, ast.Call)
+    height = float(rotation_matrix(after.quaternion)[2, 0])
+    if abs(height) > math.cos(1e-3):
+        changes.note(
+            f"the camera looks straight {'down' if height < 0 else 'up'}; look_at gives no valid rotation there (its "
+            "quaternion is not of unit length), so the pose is written with a quaternion"
+        )
+    else:
+        changes.note(
+            "the camera is turned about its own line of sight, which look_at cannot express, so the pose is written with "
+            "a quaternion"
+        )
+    eye = pose.parts["eye"]
+    _vector(changes, eye, after.position, 4)
+    call = pose_call(changes, file)
+    quaternion = f"[{', '.join(quaternion_texts(same_side(after.quaternion, (1, 0, 0, 0))))}]"
+    shared = any(read.others is not None for read in pose.reads)
+    if len(node.args) + len(node.keywords) == 2 and not shared:
+        # Argument by argument, so that the author's comments between them stay.
+        changes.replace(file, node.func, call)
+        for index, arg in enumerate((*node.args, *node.keywords)):
+            name = ("eye", "target")[index] if isinstance(arg, ast.expr) else arg.arg
+            if isinstance(arg, ast.keyword):
+                start = file.inner_span(arg)[0]
+                new = "p" if name == "eye" else "q"
+                changes.change(file, Replacement(start, start + len(arg.arg or ""), new))
+            if name == "target":
+                changes.replace(file, arg.value if isinstance(arg, ast.keyword) else arg, quaternion)
+        return
+    position = changes.rendered(eye, len(pose.reads), file)
+    for value in eye.walk():
+        changes.texts.pop(value, None)
+    changes.texts[pose] = f"{call}(p={position}, q={quaternion})"
+
+
+def pose_call(changes: Changes, file: SourceFile) -> str:
+    """The name of a pose class in `file`; adds ``import sapien`` if it has none."""
+    for name, bindings in changes.project.bindings(file, file.module).items():
+        dotted = bindings[-1].dotted
+        if f"{dotted}.Pose" in _SAPIEN_POSE:
+            return f"{name}.Pose"
+        if dotted in _SAPIEN_POSE:
+            return name
+        if dotted in _MANISKILL_POSE:
+            return f"{name}.create_from_pq"
+    changes.add_imports(file, {"sapien": "import sapien"})
+    return "sapien.Pose"
+
+
+def look_at(
+    eye: Sequence[float], target: Sequence[float], up: Sequence[float] = (0, 0, 1)
+) -> NDArray[np.float64] | None:
+    """The orientation of ManiSkill's ``look_at`` as a quaternion (wxyz); None straight along `up`, where it gives none."""
+    # ManiSkill computes in float32, whose rounding turns the picture if the eye is nearly above its target.
+    seen = np.asarray(target, np.float32).astype(float), np.asarray(eye, np.float32).astype(float)
+    forward, upward = np.subtract(*seen), np.asarray(up, float)
+    left = np.cross(upward, forward)
+    if np.linalg.norm(left) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(upward):
+        return None
+    columns = (forward, left, np.cross(forward, left))
+    return mat2quat(np.stack([column / np.linalg.norm(column) for column in columns], axis=-1))
+
+
+def to_euler(quaternion: ArrayLike, near: Sequence[float]) -> tuple[float, float, float]:
+    """Roll, pitch and yaw in radians for transforms3d's ``euler2quat``, of the equivalent ones those closest to `near`."""
+    m = rotation_matrix(quaternion)
+    level = math.hypot(m[0, 0], m[1, 0])
+    if level > 1e-6:
+        roll, pitch = math.atan2(m[2, 1], m[2, 2]), math.atan2(-m[2, 0], level)
+        yaw = math.atan2(m[1, 0], m[0, 0])
+        ways = [(roll, pitch, yaw), (roll + math.pi, math.pi - pitch, yaw + math.pi)]
+    else:
+        # Looking along z only the sum or difference of roll and yaw matters: yaw is kept.
+        pitch = math.copysign(math.pi / 2, -m[2, 0])
+        whole = math.atan2(m[0, 1], m[1, 1]) if pitch > 0 else math.atan2(-m[0, 1], m[1, 1])
+        ways = [(whole + near[2] if pitch > 0 else whole - near[2], pitch, near[2])]
+    turned = [
+        tuple(a - 2 * math.pi * round((a - b) / (2 * math.pi)) for a, b in zip(way, near, strict=True))
+        for way in ways
+    ]
+    best = min(turned, key=lambda way: sum(abs(a - b) for a, b in zip(way, near, strict=True)))
+    return best[0], best[1], best[2]
+
+
+def _euler(changes: Changes, part: TracedValue, after: CameraSettings) -> bool:
+    items = [part.parts[name] for name in ("ai", "aj", "ak")]
+    requested = to_euler(after.quaternion, [item.numbers[0] for item in items])
+    for decimals in (4, 5, 6):
+        roll, pitch, yaw = (
+            written_value(item, w, decimals) for item, w in zip(items, requested, strict=True)
+        )
+        if _turned(euler2quat(roll, pitch, yaw), after) <= ANGLE_STEP:
+            for item, w in zip(items, requested, strict=True):
+                changes.number(item, w, decimals)
+            return True
+    return False
+
+
+def _turned(quaternion: ArrayLike | None, requested: CameraSettings) -> float:
+    """Radians between `quaternion` and the orientation of `requested`; inf for None."""
+    return math.inf if quaternion is None else angle_between(quaternion, requested.quaternion)
+
+
+def _cosine(a: Sequence[float], b: Sequence[float]) -> float:
+    length = math.hypot(*a) * math.hypot(*b)
+    return sum(x * y for x, y in zip(a, b, strict=True)) / length if length else 0.0

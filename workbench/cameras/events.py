@@ -1,0 +1,377 @@
+"""What can happen to the camera studio, and what is done about it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.cameras.commands import MOST_MEASURED, Measured
+from workbench.cameras.questions import DrawCamera, MeasureCamera
+from workbench.cameras.view import EditRequest, EditState, MeasuredMoment, PickedPixel
+from workbench.envs.camera_data import CameraInfo, CameraKey, CameraSettings, Picture
+from workbench.live.events import Send
+from workbench.live.history.moments import ShownMoment
+from workbench.live.messages import Load
+from workbench.pictures.camera_report import CameraReport, OfferedPlacement, SearchSpace
+from workbench.task.apply_edits import SourceEdit
+from workbench.task.description import TaskDescription
+
+Triple = tuple[float, float, float]
+Case = tuple[int, NDArray[np.float32] | None, MeasuredMoment | None]
+"""What a camera is measured on: the env; the poses (B, 7) of its bodies, None for now; the moment of the history."""
+
+Lane = Literal["live", "background", "preview", "new camera"]
+"""Each has one job at a time; a new one replaces it. ``live`` measures by the worker that plays, ``background`` by the
+background process."""
+
+# --- what a page asks for, beside commands -------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CameraChosen:
+    """Select the camera that the page works on, or none."""
+
+    key: CameraKey | None
+
+
+@dataclass(frozen=True)
+class CameraPlaced:
+    """Place a camera, live. If placements come faster than the worker takes them, only the newest is made."""
+
+    key: CameraKey
+    settings: CameraSettings
+    control: object = None
+    """Id of the control; successive placements by the same one are one step of undo (a drag)."""
+    pause: float = math.inf
+    """Seconds without a placement after which a new step begins."""
+
+
+@dataclass(frozen=True)
+class StudioOpened:
+    """A page has opened the studio."""
+
+
+@dataclass(frozen=True)
+class MeasureWanted:
+    """Measure the selected camera, as placed: over all envs at the shown moment; over steps of the selected env's episode,
+    evenly spread; or over freshly reset envs, in the background."""
+
+    over: Measured
+    most: int = MOST_MEASURED
+    """Steps or resets at most."""
+
+
+@dataclass(frozen=True)
+class SuggestionsWanted:
+    """Search placements of the selected camera that see these objects in fresh episodes."""
+
+    objects: tuple[str, ...]
+    """Names of objects, or of single links of them (``TaskDescription.objects``)."""
+    low: Triple
+    high: Triple
+    """Corners of the box for the eye; metres, in the frame of the camera's mount, or the env's."""
+    seeds: int
+    """Number of episodes, at most one an env."""
+
+
+@dataclass(frozen=True)
+class ComparisonWanted:
+    """Draw the shown env with the selected camera as placed, and with other settings."""
+
+    other: CameraSettings
+
+
+@dataclass(frozen=True)
+class SheetWanted:
+    """Draw the selected camera's pictures of all envs, one by one; worst first if there is a report over them."""
+
+
+@dataclass(frozen=True)
+class EditWanted:
+    """Find the edit of the file for a request."""
+
+    request: EditRequest
+
+
+# --- what jobs come to ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PreviewDrawn:
+    """The preview that was asked for last."""
+
+    picture: Picture
+
+
+@dataclass(frozen=True)
+class ReportMade:
+    """A report over the cases measured so far."""
+
+    report: CameraReport
+    of: CameraKey
+    settings: CameraSettings | None
+    """The camera's settings when it was measured."""
+    seeds: int
+    """Number of fresh episodes; 0 for envs at known moments."""
+    moments: tuple[MeasuredMoment, ...]
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """A measurement has begun, or is over, complete or not."""
+
+    on: bool
+
+
+@dataclass(frozen=True)
+class SuggestionsFound:
+    """Placements that see these objects, best first."""
+
+    found: tuple[OfferedPlacement, ...]
+    objects: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PicturesCompared:
+    """The shown env by a camera as placed, and with other settings."""
+
+    now: Picture
+    other: Picture
+
+
+@dataclass(frozen=True)
+class SheetPictureDrawn:
+    """The next picture of the sheet."""
+
+    picture: Picture
+
+
+@dataclass(frozen=True)
+class PixelPicked:
+    """What a probed pixel shows."""
+
+    picked: PickedPixel
+
+
+@dataclass(frozen=True)
+class WorkFailed:
+    """The job of a lane failed."""
+
+    lane: Lane
+    why: str
+
+
+@dataclass(frozen=True)
+class PlanFound:
+    """The edit for a request, or why there is none."""
+
+    request: EditRequest
+    state: EditState
+
+
+@dataclass(frozen=True)
+class NewCameraDrawn:
+    """The preview of a camera that is to be added; None if it was not drawn."""
+
+    request: EditRequest
+    picture: Picture | None
+
+
+@dataclass(frozen=True)
+class FileChanged:
+    """The edit is in the file, or out of it again."""
+
+
+@dataclass(frozen=True)
+class FileNotChanged:
+    """The file was left as it is."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class TaskCopied:
+    file: Path | None
+    """The copy; None if there is none."""
+    state: EditState
+
+
+@dataclass(frozen=True)
+class EditFailed:
+    """A fault of the workbench ended an edit."""
+
+    error: str
+
+
+@dataclass(frozen=True)
+class StudioClosed:
+    """No edit is begun from now on."""
+
+
+StudioEvent = (
+    CameraChosen
+    | CameraPlaced
+    | StudioOpened
+    | MeasureWanted
+    | SuggestionsWanted
+    | ComparisonWanted
+    | SheetWanted
+    | EditWanted
+    | PreviewDrawn
+    | ReportMade
+    | Measuring
+    | SuggestionsFound
+    | PicturesCompared
+    | SheetPictureDrawn
+    | PixelPicked
+    | WorkFailed
+    | PlanFound
+    | NewCameraDrawn
+    | FileChanged
+    | FileNotChanged
+    | TaskCopied
+    | EditFailed
+    | StudioClosed
+)
+
+# --- effects ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StopJobs:
+    """Cancel the jobs of these lanes; results so far stay."""
+
+    lanes: tuple[Lane, ...]
+
+
+@dataclass(frozen=True)
+class StopQuestion:
+    """Cancel the question that an edit has asked the worker."""
+
+
+@dataclass(frozen=True)
+class DrawPreview:
+    """Draw the selected camera in another size."""
+
+    question: DrawCamera
+
+
+@dataclass(frozen=True)
+class MeasureLive:
+    """Measure a camera on these cases, with a report after each `every`."""
+
+    what: str
+    question: MeasureCamera
+    """Without env and poses."""
+    settings: CameraSettings | None
+    """The camera's present settings."""
+    cases: tuple[Case, ...]
+    every: int
+
+
+@dataclass(frozen=True)
+class MeasureSeeds:
+    """Measure a camera in fresh episodes, with partial reports."""
+
+    what: str
+    question: MeasureCamera
+    settings: CameraSettings | None
+    load: Load
+    seeds: int
+
+
+@dataclass(frozen=True)
+class Suggest:
+    """Search placements in fresh episodes."""
+
+    what: str
+    space: SearchSpace
+    load: Load
+    seeds: int
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Draw a camera as placed, and with other settings."""
+
+    key: CameraKey
+    other: CameraSettings
+    moment: ShownMoment
+
+
+@dataclass(frozen=True)
+class DrawEnvs:
+    """Draw a camera's pictures of these envs."""
+
+    key: CameraKey
+    env_idx: tuple[int, ...]
+    moment: ShownMoment
+
+
+@dataclass(frozen=True)
+class Pick:
+    """Probe a pixel of a camera."""
+
+    info: CameraInfo
+    u: float
+    v: float
+    moment: ShownMoment
+    segmentation: dict[int, str]
+
+
+@dataclass(frozen=True)
+class FindPlan:
+    """Find the edit of the files on disk for a request."""
+
+    request: EditRequest
+    task: TaskDescription
+    info: CameraInfo | None
+    load: Load | None
+    """The load of the running version."""
+
+
+@dataclass(frozen=True)
+class DrawNewCamera:
+    """Draw what a new camera would see."""
+
+    request: EditRequest
+    question: DrawCamera
+
+
+@dataclass(frozen=True)
+class ChangeFile:
+    """Write an edit, or revert it."""
+
+    edit: SourceEdit
+    revert: bool
+
+
+@dataclass(frozen=True)
+class CopyToFolder:
+    """Copy the task's file into a folder, and open the copy."""
+
+    task: TaskDescription
+    folder: Path
+
+
+StudioEffect = (
+    Send
+    | StopJobs
+    | StopQuestion
+    | DrawPreview
+    | MeasureLive
+    | MeasureSeeds
+    | Suggest
+    | Compare
+    | DrawEnvs
+    | Pick
+    | FindPlan
+    | DrawNewCamera
+    | ChangeFile
+    | CopyToFolder
+)

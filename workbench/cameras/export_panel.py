@@ -1,0 +1,277 @@
+"""Matrices of a camera in a chosen convention, files of cameras, and import of a calibration."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.cameras import calibration_files
+from workbench.cameras.commands import (
+    ApplyCalibration,
+    ChooseCameraFile,
+    ChooseConvention,
+    ChooseDirection,
+    ChooseDownloaded,
+    ChooseUnits,
+    DownloadCamera,
+    Form,
+    PasteCalibration,
+)
+from workbench.cameras.events import CameraPlaced
+from workbench.cameras.pose_math import chosen_camera
+from workbench.cameras.view import StudioCamera, StudioView
+from workbench.live.live_session import LiveSession
+from workbench.live.view import SessionView
+from workbench.page.command import Command, Refused
+from workbench.page.widgets.fields import Field, choice
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+from workbench.pictures import camera_conventions as frames
+from workbench.pictures.camera_conventions import Convention, Direction
+
+CONVENTIONS: dict[str, Convention] = {
+    "OpenCV, ROS optical": "opencv",
+    "OpenGL, Blender": "opengl",
+    "ManiSkill, ROS body": "maniskill",
+}
+"""In ROS x is forward in the frame of a camera's body, and z is forward in its optical frame (REP 103)."""
+AXES = {
+    "opencv": "x right, y down, z forward",
+    "opengl": "x right, y up, z backward",
+    "maniskill": "x forward, y left, z up",
+}
+DIRECTIONS: dict[str, Direction] = {
+    "world to camera": "world_to_camera",
+    "camera to world": "camera_to_world",
+}
+FORMS: dict[str, Form] = {"JSON": "json", "OpenCV YAML": "opencv", "ROS CameraInfo": "ros"}
+UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
+"""Length in metres of each unit: calibrations are often in the unit of the calibration board."""
+WHICH = {"this camera": False, "all cameras": True}
+CONVENTION_HINT = "The convention of the camera's own axes, for what is shown and what is pasted."
+DIRECTION_HINT = "OpenCV's extrinsic maps world to camera; a pose maps camera to world."
+CALIBRATION_HINT = (
+    "Paste a matrix of 4 x 4 or 3 x 4 numbers, our JSON, or an OpenCV YAML. It is read in the convention and direction "
+    "chosen above."
+)
+UNITS_HINT = "Units of what is pasted. What is shown or downloaded, and our own JSON, is in metres."
+
+
+class CameraExport(PagePart[SessionView]):
+    """The folder in the present container.
+
+    A matrix of sixteen numbers does not tell its direction and the names of the camera's axes: both are chosen here, and
+    hold for what is shown and for what is pasted.
+    """
+
+    does = (
+        ChooseConvention,
+        ChooseDirection,
+        ChooseCameraFile,
+        ChooseDownloaded,
+        DownloadCamera,
+        PasteCalibration,
+        ChooseUnits,
+        ApplyCalibration,
+    )
+
+    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
+        self._session = session
+        self._drawn: object = None
+        self._convention: Convention = "opencv"
+        self._direction: Direction = "world_to_camera"
+        self._form: Form = "json"
+        self._every = False
+        self._text, self._units = "", "metres"
+        gui = server.gui
+        with gui.add_folder("Matrices and files", expand_by_default=False) as self.folder:
+            self._conventions = choice(
+                server,
+                "Convention",
+                ChooseConvention,
+                "convention",
+                CONVENTIONS,
+                self._convention,
+                hint=CONVENTION_HINT,
+            )
+            self._directions = choice(
+                server,
+                "Direction",
+                ChooseDirection,
+                "direction",
+                DIRECTIONS,
+                self._direction,
+                hint=DIRECTION_HINT,
+            )
+            self._html = gui.add_html("")
+            self._forms = choice(server, "File", ChooseCameraFile, "form", FORMS, self._form)
+            self._which = choice(server, "Of", ChooseDownloaded, "every", WHICH, self._every)
+            self._download = gui.add_html("")
+            self._pasted = Field(
+                server,
+                "Calibration",
+                PasteCalibration,
+                "text",
+                hint=CALIBRATION_HINT,
+                longest=100_000,
+                lines=4,
+            )
+            self._in_units = choice(
+                server, "Units", ChooseUnits, "units", tuple(UNITS), self._units, hint=UNITS_HINT
+            )
+            self._apply = gui.add_html("")
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseConvention(convention=convention):
+                self._convention = convention
+            case ChooseDirection(direction=direction):
+                self._direction = direction
+            case ChooseCameraFile(form=form):
+                self._form = form
+            case ChooseDownloaded(every=every):
+                self._every = every
+            case DownloadCamera():
+                self._send_file(visitor.client)
+            case PasteCalibration(text=text):
+                self._text = text
+            case ChooseUnits(units=units):
+                self._units = units
+            case ApplyCalibration():
+                self._place_by_text(visitor.client)
+
+    def _send_file(self, client: viser.ClientHandle) -> None:
+        camera, _ = chosen_camera(self._session)
+        cameras = self._session.view().of(StudioView).cameras if self._every else (camera,)
+        try:
+            text = calibration_text(cameras, self._form)
+        except ValueError as reason:
+            raise Refused(str(reason)) from None
+        name = file_name("cameras" if self._every else camera.key[1], self._form)
+        client.send_file_download(name, text.encode("utf-8"), save_immediately=True)
+
+    def _place_by_text(self, client: viser.ClientHandle) -> None:
+        camera, now = chosen_camera(self._session)
+        if not self._text.strip():
+            raise Refused("Paste a calibration into the field first: a matrix, our JSON, or an OpenCV YAML.")
+        try:
+            pose = calibrated_pose(camera, self._text, self._direction, self._convention, UNITS[self._units])
+        except ValueError as reason:
+            raise Refused(str(reason)) from None
+        self._session.happen(CameraPlaced(camera.key, frames.with_pose(now, pose)))
+        client.add_notification(
+            "Placed",
+            "The pose was applied. The lens, if the text has one, was not: its matrix goes into Lens and image.",
+            color="green",
+            auto_close_seconds=8.0,
+        )
+
+    def draw(self, view: SessionView) -> None:
+        camera = view.of(StudioView).chosen
+        off = camera is None or camera.now is None
+        self._conventions.show(self._convention)
+        self._directions.show(self._direction)
+        self._forms.show(self._form)
+        self._which.show(self._every)
+        self._pasted.show(self._text)
+        self._in_units.show(self._units)
+        self._download.content = tools_html([tool("Download", DownloadCamera(), off=off)])
+        self._apply.content = tools_html([tool("Apply to the camera", ApplyCalibration(), off=off)])
+        mount = None if camera is None or camera.mount_pose is None else camera.mount_pose.tobytes()
+        shown = None if camera is None else (camera.key, camera.now)
+        wanted = (self._convention, self._direction, shown, mount)
+        if wanted != self._drawn:
+            self._drawn = wanted
+            self._html.content = matrices_html(camera, self._convention, self._direction)
+
+
+def calibration_text(cameras: Sequence[StudioCamera], form: Form) -> str:
+    """The text of a calibration file: cameras as placed, at the shown moment of the selected env.
+
+    ROS's format has one camera a file; several become YAML documents in one text.
+
+    Raises:
+        ValueError: a camera cannot be exported; the message is for the reader.
+    """
+    to_export = []
+    for camera in cameras:
+        kind, name = camera.key
+        if camera.now is None:
+            raise ValueError(f"there is no {kind} camera {name} whose settings are known")
+        to_export.append(
+            calibration_files.CameraToExport(camera.key, camera.now, camera.info.mount, camera.mount_pose)
+        )
+    if form == "ros":
+        return "---\n".join(calibration_files.camera_as_ros_yaml(one) for one in to_export)
+    write = calibration_files.cameras_as_json if form == "json" else calibration_files.cameras_as_opencv_yaml
+    return write(to_export)
+
+
+def calibrated_pose(
+    camera: StudioCamera,
+    text: str,
+    direction: Direction | None,
+    convention: Convention | None,
+    metres_per_unit: float = 1.0,
+) -> frames.Floats:
+    """(7,) pose by a calibration, in the frame of the camera's mount, or the env's if it has none.
+
+    Our own JSON contains direction and convention; for all else they are arguments.
+
+    Raises:
+        ValueError: with a message for the reader.
+    """
+    info = camera.info
+    found = calibration_files.find_poses(text)
+    chosen = [pose for pose in found if info.name in pose.label] or list(found)
+    if len(chosen) > 1:
+        labels = ", ".join(pose.label for pose in chosen)
+        raise ValueError(f"it holds several poses ({labels}): paste only the one you mean")
+    pose = calibration_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
+    if chosen[0].stated is None or info.mount is None:
+        return pose
+    if camera.mount_pose is None:
+        raise ValueError(f"the pose of {info.mount}, on which {info.name} is mounted, is not known yet")
+    return frames.relative_to(camera.mount_pose, pose)  # ours is of the env's frame
+
+
+def file_name(name: str, form: Form) -> str:
+    """A name for the download, with only letters, digits, - and _ of the camera's name."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "camera"
+    return f"{plain}.json" if form == "json" else f"{plain}_{form}.yaml"
+
+
+def matrices_html(camera: StudioCamera | None, convention: Convention, direction: Direction) -> str:
+    """Intrinsic and extrinsic of the camera at its present place, in the env's frame."""
+    if camera is None or camera.now is None:
+        return render("note", text="Choose a camera first.")
+    pose = frames.pose_in_env(camera.now, camera.mount_pose)
+    return render(
+        "camera_matrices",
+        camera=camera,
+        extrinsic=frames.matrix_of(pose, convention, direction),
+        intrinsic=frames.intrinsic_of(camera.now),
+        direction=direction,
+        axes=AXES[convention],
+        aligned=aligned,
+        as_lists=as_lists,
+    )
+
+
+def aligned(matrix: NDArray[np.float64]) -> str:
+    """Rows of a matrix with aligned decimal points, for reading."""
+    cells = [[f"{number + 0.0:.4f}".replace("-0.0000", "0.0000") for number in row] for row in matrix]
+    width = max(len(cell) for row in cells for cell in row)
+    return "\n".join("  ".join(cell.rjust(width) for cell in row) for row in cells)
+
+
+def as_lists(matrix: NDArray[np.float64]) -> str:
+    """The matrix as Python and JSON lists, for copying, with nine digits."""
+    rows = (", ".join(f"{number + 0.0:.9g}" for number in row) for row in matrix)
+    return "[" + ", ".join(f"[{row}]" for row in rows) + "]"

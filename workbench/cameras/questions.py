@@ -1,0 +1,69 @@
+"""Questions to a worker about cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.cameras.edit.hook_cameras import HookCameras
+from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
+from workbench.machine.processes.wire import Question
+from workbench.pictures.camera_report import CameraReport, OfferedPlacement, SearchSpace
+from workbench.task.reference import TaskName
+
+# Each question is small, so that the worker that plays answers it between two steps: sixteen envs are sixteen questions.
+# Only a search takes long: it goes to the worker in the background, and any later request ends it.
+
+
+@dataclass(frozen=True)
+class DrawCamera(Question[Picture]):
+    """The picture of one camera in one env."""
+
+    key: CameraKey
+    settings: CameraSettings | None
+    """Settings for this picture only; None for the current ones. Required for a camera that the env does not have: it
+    stands still and is drawn as with a `scale`."""
+    env: int
+    modalities: tuple[str, ...] = ("rgb",)
+    """Requested modalities; those that the camera's shader does not give are left out."""
+    poses: NDArray[np.float32] | None = None
+    """(B, 7) poses of the env's bodies at a past moment; None for now."""
+    scale: float = 1.0
+    """Factor on the picture's size. Other than 1 it needs `settings`, and a temporary camera with the minimal shader draws:
+    colours, depth and segmentation."""
+
+
+@dataclass(frozen=True)
+class MeasureCamera(Question[CameraReport]):
+    """Measure what one camera sees in one env."""
+
+    key: CameraKey
+    settings: CameraSettings | None
+    """Settings to measure with; None for the env's own."""
+    env: int
+    poses: NDArray[np.float32] | None = None
+    """(B, 7) poses of the env's bodies at a past moment, as in `DrawCamera`; None for now."""
+
+
+@dataclass(frozen=True)
+class SuggestCameras(Question[tuple[OfferedPlacement, ...]]):
+    """Search placements of one camera from which it sees the given objects."""
+
+    space: SearchSpace
+    envs: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class RunCameras(Question[HookCameras]):
+    """Run the camera hooks with other texts of the author's files."""
+
+    task: TaskName
+    """The task, by the reference with which it was opened."""
+    texts: Mapping[str, str]
+    """Text of each file, by path."""
+
+
+CameraQuestion = DrawCamera | MeasureCamera | SuggestCameras | RunCameras

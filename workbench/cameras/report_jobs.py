@@ -1,0 +1,311 @@
+"""Measures, compares, suggests and probes cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from workbench.cameras.commands import MOST_MEASURED, PickPixel, StopMeasuring
+from workbench.cameras.events import (
+    Case,
+    Compare,
+    ComparisonWanted,
+    DrawEnvs,
+    MeasureLive,
+    MeasureSeeds,
+    MeasureWanted,
+    Measuring,
+    Pick,
+    PicturesCompared,
+    PixelPicked,
+    ReportMade,
+    SheetPictureDrawn,
+    SheetWanted,
+    StopJobs,
+    StudioEvent,
+    Suggest,
+    SuggestionsFound,
+    SuggestionsWanted,
+)
+from workbench.cameras.questions import DrawCamera, MeasureCamera, SuggestCameras
+from workbench.cameras.state import Change, Studio, selected_camera
+from workbench.cameras.view import MeasuredMoment, PickedPixel
+from workbench.envs.camera_data import CameraInfo, CameraSettings, Picture, why_no_camera
+from workbench.live.history.moments import ShownMoment
+from workbench.live.messages import Load, Reset
+from workbench.live.process.ask import Asker, Background
+from workbench.live.process.background_jobs import Job
+from workbench.live.run import Run
+from workbench.page.command import Command, Refused
+from workbench.pictures.camera_conventions import compose
+from workbench.pictures.camera_report import CameraReport, OfferedPlacement, SearchSpace, join_reports
+
+FIRST_SEED = 10_000
+"""First seed of every report, so that two reports can be compared; far from the seeds that people start with."""
+MOST_ENVS = 16
+"""Most envs of a job in the background process; for more seeds these envs are reset again."""
+_REPORT_EVERY = 8
+"""Steps between two partial reports."""
+STOP_REPORTS = StopJobs(("live", "background"))
+
+
+# --- the value -------------------------------------------------------------------------------------
+
+
+def with_results(studio: Studio, **values: object) -> Studio:
+    """Change results; the last failure is forgotten."""
+    return replace(studio, results=replace(studio.results, **{"problem": "", **values}))  # type: ignore[arg-type]
+
+
+def outdated(studio: Studio) -> Studio:
+    """Mark the results as those of an earlier version."""
+    results = replace(studio.results, outdated=True, compared=None, picked=None, sheet=())
+    return replace(studio, results=results)
+
+
+def apply_to_reports(studio: Studio, event: object, run: Run) -> Change:
+    """The studio after an event about reports. The shown moment is asked of the worker that plays, one env at a time, so that it
+    continues playing; fresh episodes of the background process."""
+    match event:
+        case MeasureWanted():
+            return _measure(replace(studio, problem=""), event, run)
+        case SuggestionsWanted():
+            return _suggest(replace(studio, problem=""), event, run)
+        case ComparisonWanted():
+            return _compare(replace(studio, problem=""), event.other, run)
+        case SheetWanted():
+            return _draw_sheet(replace(studio, problem=""), run)
+        case ReportMade():
+            return with_results(
+                studio,
+                report=event.report,
+                report_of=event.of,
+                report_settings=event.settings,
+                report_seeds=event.seeds,
+                report_moments=event.moments,
+                outdated=False,
+                measuring=False,
+            ), []
+        case Measuring(on=on):
+            return with_results(studio, measuring=on), []
+        case SuggestionsFound(found=found, objects=objects):
+            problem = "" if found else f"no placement in that box sees {' and '.join(objects)} in any env."
+            return with_results(studio, suggestions=found, problem=problem), []
+        case PicturesCompared():
+            return with_results(studio, compared=(event.now, event.other)), []
+        case SheetPictureDrawn(picture=picture):
+            return with_results(studio, sheet=(*studio.results.sheet, picture)), []
+        case PixelPicked(picked=picked):
+            return with_results(studio, picked=picked), []
+    return studio, []
+
+
+def do_report(studio: Studio, command: Command, run: Run) -> Change:
+    """Commands about reports."""
+    match command:
+        case StopMeasuring():
+            return studio, [STOP_REPORTS]
+        case PickPixel(x=u, y=v):
+            camera = selected_camera(studio, run)
+            if camera is None or run.task is None:
+                raise Refused("Choose the camera first.")
+            pick = Pick(camera.info, u, v, run.shown_moment(), run.task.segmentation)
+            return replace(studio, problem=""), [pick]
+        case _:
+            raise AssertionError(f"{command} is not in DOES")
+
+
+def _measure(studio: Studio, wanted: MeasureWanted, run: Run) -> Change:
+    camera, load = selected_camera(studio, run), run.running_load()
+    if camera is None or load is None:
+        return studio, []
+    most = min(max(1, wanted.most), MOST_MEASURED)
+    what, question = f"measuring {camera.key[1]}", MeasureCamera(camera.key, None, 0)
+    if wanted.over == "resets":
+        question = replace(question, settings=camera.now if camera.moved else None)
+        what = f"{what} over {most} seeds"
+        return studio, [MeasureSeeds(what, question, camera.now, load, most)]
+    if wanted.over == "envs":
+        moment = run.shown_moment()
+        cases: tuple[Case, ...] = tuple((env, moment.of(env), None) for env in range(moment.num_envs))
+        what = f"{what} in all envs"
+        return studio, [MeasureLive(what, question, camera.now, cases, len(cases))]
+    cases = tuple(
+        (env, step.poses[env], MeasuredMoment(moment.serial, env, int(step.elapsed_steps[env])))
+        for moment, env in run.episode_moments(most)
+        for step in [moment.step]
+    )
+    if not cases:
+        return studio, []
+    what = f"{what} over {len(cases)} steps"
+    return studio, [MeasureLive(what, question, camera.now, cases, _REPORT_EVERY)]
+
+
+def _suggest(studio: Studio, wanted: SuggestionsWanted, run: Run) -> Change:
+    camera, load = selected_camera(studio, run), run.running_load()
+    if camera is not None and camera.now is None:
+        return replace(studio, problem=f"{camera.key[1]} cannot be placed: {camera.refused}."), []
+    if camera is None or camera.now is None or load is None:
+        return studio, []
+    key = camera.key
+    space = SearchSpace(wanted.objects, wanted.low, wanted.high, camera.now, key[0], mount=camera.info.mount)
+    studio = with_results(studio, suggestions=(), suggestions_of=key)
+    return studio, [Suggest(f"searching placements for {key[1]}", space, load, wanted.seeds)]
+
+
+def _compare(studio: Studio, other: CameraSettings, run: Run) -> Change:
+    camera = selected_camera(studio, run)
+    if camera is None:
+        return studio, []
+    if why_not := camera.refused or why_no_camera(other):
+        return replace(studio, problem=f"{camera.key[1]} is not compared: {why_not}."), []
+    return studio, [Compare(camera.key, other, run.shown_moment())]
+
+
+def _draw_sheet(studio: Studio, run: Run) -> Change:
+    camera = selected_camera(studio, run)
+    if camera is None:
+        return studio, []
+    moment, report = run.shown_moment(), studio.results.report_over_envs(camera.key)
+    order = tuple(range(moment.num_envs))
+    if report is not None:
+        measured = tuple(report.envs[i] for i in report.worst_first())
+        order = measured if sorted(measured) == list(order) else order
+    return with_results(studio, sheet=()), [DrawEnvs(camera.key, order, moment)]
+
+
+# --- the work --------------------------------------------------------------------------------------
+
+
+class CameraReports:
+    """Asks the questions of which reports consist. Used on the loop."""
+
+    def __init__(self, asker: Asker, background: Background, happen: Callable[[StudioEvent], object]) -> None:
+        """
+        Args:
+            asker, background: ask the worker that plays, and the background process.
+            happen: takes what comes of it.
+        """
+        self._live, self._background, self._happen = asker, background, happen
+
+    async def measure_live(self, job: Job, wanted: MeasureLive) -> None:
+        with self._measuring():
+            await self._measure(job, self._live, wanted, [], wanted.cases, len(wanted.cases), wanted.every)
+
+    async def measure_seeds(self, job: Job, wanted: MeasureSeeds) -> None:
+        reports: list[CameraReport] = []
+
+        async def measure() -> None:
+            """Continue with the first seed without a report: a job of higher rank may have interrupted this one."""
+            num_envs = await self._background.ensure(job, _for_measuring(wanted.load))
+
+            for seed in range(begun := len(reports), wanted.seeds):
+                if (env := seed % num_envs) == 0 or seed == begun:
+                    await self._background.ask(Reset(None, FIRST_SEED + seed - env))
+                cases: list[Case] = [(env, None, None)]
+                await self._measure(job, self._background, wanted, reports, cases, wanted.seeds, num_envs)
+
+        with self._measuring():
+            await self._background.in_turns(job, measure)
+
+    @contextmanager
+    def _measuring(self) -> Iterator[None]:
+        """The report is an old one until a new one comes or the work ends."""
+        self._happen(Measuring(True))
+        try:
+            yield
+        finally:
+            self._happen(Measuring(False))
+
+    async def _measure(
+        self,
+        job: Job,
+        asker: Asker,
+        wanted: MeasureLive | MeasureSeeds,
+        reports: list[CameraReport],
+        cases: Iterable[Case],
+        total: int,
+        every: int,
+    ) -> None:
+        """
+        Args:
+            reports: of earlier cases; those of `cases` are appended.
+            every: cases between two partial reports.
+        """
+        moments: list[MeasuredMoment] = []
+        for env, poses, moment in cases:
+            job.report(len(reports), total)
+            reports.append(await asker.ask(replace(wanted.question, env=env, poses=poses)))
+            moments += [] if moment is None else [moment]
+            if len(reports) % every == 0 or len(reports) == total:
+                seeds = len(reports) if isinstance(wanted, MeasureSeeds) else 0
+                report, of = join_reports(reports), wanted.question.key
+                self._happen(ReportMade(report, of, wanted.settings, seeds, tuple(moments)))
+
+    async def suggest(self, job: Job, wanted: Suggest) -> None:
+        async def search() -> tuple[OfferedPlacement, ...]:
+            num_envs = await self._background.ensure(job, _for_measuring(wanted.load))
+            await self._background.ask(Reset(None, FIRST_SEED))
+            envs = tuple(range(min(max(1, wanted.seeds), num_envs)))
+            job.report(0, 0, wanted.what)
+            return await self._background.ask(
+                SuggestCameras(wanted.space, envs),
+                lambda done, total, part: job.report(done, total, wanted.what),
+            )
+
+        found = await self._background.in_turns(job, search)
+        self._happen(SuggestionsFound(found, wanted.space.objects))
+
+    async def compare(self, job: Job, wanted: Compare) -> None:
+        moment = wanted.moment
+        now = await self._draw(moment, DrawCamera(wanted.key, None, moment.env))
+        other = await self._draw(moment, DrawCamera(wanted.key, wanted.other, moment.env))
+        self._happen(PicturesCompared(now, other))
+
+    async def draw_envs(self, job: Job, wanted: DrawEnvs) -> None:
+        for done, env in enumerate(wanted.env_idx):
+            job.report(done, len(wanted.env_idx))
+            self._happen(
+                SheetPictureDrawn(await self._draw(wanted.moment, DrawCamera(wanted.key, None, env)))
+            )
+
+    async def pick(self, job: Job, wanted: Pick) -> None:
+        question = DrawCamera(wanted.info.key, None, wanted.moment.env, ("depth", "segmentation"))
+        picture = await self._draw(wanted.moment, question)
+        picked = pick_pixel(wanted.info, picture, wanted.u, wanted.v, wanted.segmentation)
+        self._happen(PixelPicked(picked))
+
+    async def _draw(self, moment: ShownMoment, question: DrawCamera) -> Picture:
+        return await self._live.ask(replace(question, poses=moment.of(question.env)))
+
+
+def _for_measuring(load: Load) -> Load:
+    options = load.options
+    kwargs = dict(options.env_kwargs)
+    if kwargs.get("obs_mode", "state") not in ("state", "state_dict", "none"):
+        kwargs["obs_mode"] = "state"  # else every reset renders all cameras of all envs
+    envs = min(options.num_envs, MOST_ENVS)
+    return replace(load, options=replace(options, num_envs=envs, env_kwargs=kwargs))
+
+
+def pick_pixel(info: CameraInfo, picture: Picture, u: float, v: float, names: dict[int, str]) -> PickedPixel:
+    """What a pixel shows; `u` and `v` are from 0 to 1, from the picture's upper left corner."""
+    shape = next(a.shape for a in (picture.depth, picture.segmentation, picture.rgb) if a is not None)
+    height, width = shape[:2]
+    column = int(np.clip(np.floor(u * width), 0, width - 1))
+    row = int(np.clip(np.floor(v * height), 0, height - 1))
+    body, depth, point = None, None, None
+    if picture.segmentation is not None:
+        body = names.get(int(picture.segmentation[row, column]))
+    if picture.depth is not None and picture.depth[row, column] > 0:
+        depth = float(picture.depth[row, column])
+        k = info.intrinsic
+        # The pixel's centre in the camera's frame: x forward, y left, z up.
+        left = -(column + 0.5 - k[0, 2]) / k[0, 0] * depth
+        up = -(row + 0.5 - k[1, 2]) / k[1, 1] * depth
+        x, y, z = compose(picture.pose, [depth, left, up, 1, 0, 0, 0])[:3]
+        point = (float(x), float(y), float(z))
+    return PickedPixel(info.key, picture.env, float(u), float(v), (column, row), body, depth, point)

@@ -1,0 +1,241 @@
+"""Snapshot of the camera studio, a part of `SessionView`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraInfo, CameraKey, CameraSettings, Picture
+from workbench.live.view import SessionView
+from workbench.pictures.camera_report import CameraReport, OfferedPlacement
+
+if TYPE_CHECKING:
+    from workbench.task.apply_edits import SourceEdit
+from workbench.live.process.background_jobs import JobProgress
+
+EditStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
+"""``planned``: shown, not written. ``written``: in the file, before its reload. ``checked``: the new env's camera equals the
+edit. ``mismatch``: it does not. ``undone``: taken out of the file."""
+
+
+Change = Literal["edit", "add", "duplicate", "rename", "remove"]
+"""Kind of change to a camera in the file."""
+
+
+@dataclass(frozen=True)
+class EditRequest:
+    """A requested change of a camera in the file."""
+
+    what: Change
+    key: CameraKey
+    """The camera that is changed, copied, renamed or removed, or the one that is added."""
+    settings: CameraSettings | None = None
+    """New settings (its present ones if it is removed); None for its placement at the time of the request."""
+    name: str = ""
+    """The new name."""
+    about: str = ""
+    """A note that is shown with the plan."""
+
+    @property
+    def result(self) -> CameraKey:
+        """The camera that the file has afterwards."""
+        return (self.key[0], self.name) if self.name else self.key
+
+
+@dataclass(frozen=True)
+class StudioCamera:
+    """One camera, as the file has it and as it is placed."""
+
+    key: CameraKey
+    info: CameraInfo
+    """Description of the live camera; its `settings` are those of the file."""
+    now: CameraSettings | None
+    """Settings as placed; equal to ``info.settings`` without a placement. None only if ``info.settings`` is None."""
+    moved: bool
+    """Whether the placement differs from the file."""
+    mount_pose: NDArray[np.float32] | None
+    """(7,) p and wxyz of its mount in the selected env's frame, at the shown moment. None for a camera without a mount."""
+    refused: str = ""
+    """Why it cannot be placed, as a sentence; empty if it can."""
+
+
+@dataclass(frozen=True)
+class EditState:
+    """State of the edit of the file; there is one at a time."""
+
+    stage: EditStage = "none"
+    request: EditRequest | None = None
+    edit: SourceEdit | None = None
+    snippet: str = ""
+    """Code for a refused edit, which the author can copy into the file."""
+    message: str = ""
+    """One sentence or two: what happened, and what to do next."""
+    can_copy: bool = False
+    """Refused because the file must not be edited, while a copy could be: see `CopyTask`."""
+    picture: Picture | None = None
+    """Preview of a camera that is to be added, once it is drawn."""
+    drawing: bool = False
+    """The preview is being drawn."""
+    loading: bool = False
+    """The file has changed, and that version is not loaded yet."""
+
+    @property
+    def what(self) -> Change:
+        return "edit" if self.request is None else self.request.what
+
+
+@dataclass(frozen=True)
+class PickedPixel:
+    """What a probed pixel shows."""
+
+    key: CameraKey
+    env: int
+    u: float
+    """0 at the left border, 1 at the right."""
+    v: float
+    """0 at the top."""
+    pixel: tuple[int, int]
+    """Column and row."""
+    body: str | None
+    """Body name; None for the background."""
+    depth: float | None
+    """Metres along the optical axis; None for the background."""
+    point: tuple[float, float, float] | None
+    """Metres, in the env's frame; None for the background."""
+
+
+@dataclass(frozen=True)
+class MeasuredMoment:
+    """The moment and env of an entry of a report over steps."""
+
+    serial: int
+    env: int
+    step: int
+    """Control steps since the env's reset."""
+
+
+@dataclass(frozen=True)
+class StudioResults:
+    """Results of reports so far."""
+
+    report: CameraReport | None = None
+    """The newest one."""
+    report_of: CameraKey | None = None
+    report_settings: CameraSettings | None = None
+    """The camera's settings when it was measured."""
+    report_seeds: int = 0
+    """Number of fresh episodes; 0 for a report over the envs at the shown moment."""
+    report_moments: tuple[MeasuredMoment, ...] = ()
+    """Moment of each of ``report.envs`` in a report over steps; else empty."""
+    outdated: bool = False
+    """The report is of an earlier version."""
+    measuring: bool = False
+    """A new report is being made and has no numbers yet."""
+    suggestions: tuple[OfferedPlacement, ...] = ()
+    """Best first."""
+    suggestions_of: CameraKey | None = None
+    compared: tuple[Picture, Picture] | None = None
+    """The camera as placed, and with the settings of `ComparisonWanted`."""
+    picked: PickedPixel | None = None
+    sheet: tuple[Picture, ...] = ()
+    """The selected camera's picture in every env, worst first if there is a report over them."""
+    problem: str = ""
+    """Why the last job failed, as a sentence."""
+
+    def report_over_envs(self, key: CameraKey) -> CameraReport | None:
+        """The report, if it is of this camera and over the envs at one moment."""
+        return (
+            self.report if (self.report_of, self.report_seeds, self.report_moments) == (key, 0, ()) else None
+        )
+
+
+@dataclass(frozen=True)
+class StudioView:
+    """Immutable; plain data and numpy."""
+
+    cameras: tuple[StudioCamera, ...] = ()
+    selected: CameraKey | None = None
+    was_chosen: bool = False
+    """Whether somebody has chosen a camera, or none."""
+    undo: str | None = None
+    """What `UndoCamera` would undo, as text (``moved base_camera``); None if there is nothing."""
+    redo: str | None = None
+    edit_state: EditState = EditState()
+    copies_to: Path = Path()
+    """Folder for a copy of the task."""
+    results: StudioResults = StudioResults()
+    """Reports, suggestions, pictures."""
+    report_stale: bool = False
+    """Whether the camera was moved since it was measured, or another version runs."""
+    preview_scale: float = 1.0
+    """Size of the preview relative to the camera's own; 1 for no preview."""
+    preview: Picture | None = None
+    """The preview, while there is one."""
+    progress: JobProgress | None = None
+    """Progress of the running job; None while no job runs."""
+    problem: str = ""
+    """The last failure, or a placement that was dropped, as a sentence."""
+
+    def camera(self, key: CameraKey | None) -> StudioCamera | None:
+        """The camera of that key; None if there is none."""
+        return next((camera for camera in self.cameras if camera.key == key), None)
+
+    @property
+    def chosen(self) -> StudioCamera | None:
+        """The selected camera."""
+        return self.camera(self.selected)
+
+    @property
+    def placeable(self) -> StudioCamera | None:
+        """The selected camera, if it can be placed; its `now` is not None then."""
+        chosen = self.chosen
+        return None if chosen is None or chosen.now is None or chosen.refused else chosen
+
+
+@dataclass(frozen=True)
+class ShownCameras:
+    """Cameras and pictures of the shown env: of a session at the shown moment, or of a recording."""
+
+    cameras: tuple[CameraInfo, ...]
+    cameras_serial: int
+    """Number that differs for each set of cameras."""
+    pictures: Mapping[CameraKey, Picture]
+    pictures_serial: int
+    segmentation: dict[int, str]
+    """Names of the ids in a segmentation."""
+    env: int = 0
+    milliseconds: float | None = None
+    """Render time of the newest picture; None for a recorded one, and for one that was drawn while steps were made."""
+    can_render: bool = True
+    placed: CameraKey | None = None
+    """The camera that is placed by hand."""
+    preview: bool = False
+    """Whether the placed camera is shown in another size than its own."""
+    failed: Mapping[CameraKey, str] = field(default_factory=dict)
+    """Why cameras cannot be drawn, as sentences."""
+    hidden: tuple[str, ...] = ()
+    """Bodies that the task hides from its sensors."""
+
+
+def shown_cameras(view: SessionView) -> ShownCameras | None:
+    """Cameras and pictures of the shown env; None while there is no task."""
+    task, studio = view.task, view.of(StudioView)
+    return task and ShownCameras(
+        task.cameras,
+        view.cameras_serial,
+        view.pictures,
+        view.pictures_serial,
+        task.segmentation,
+        view.selected_env,
+        view.picture_milliseconds,
+        task.can_render,
+        studio.selected,
+        studio.preview_scale != 1.0,
+        view.failed_cameras,
+        task.geometry.hidden_names,
+    )

@@ -1,0 +1,179 @@
+"""What was seen of many episodes of a task, rolled out in batches, and who acts in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.outliers import OutlierKind, OutlierWatch
+from workbench.envs.step_result import StepResult
+from workbench.envs.task_env import TaskEnv
+
+
+class Actor(Protocol):
+    """Acts in K episodes of a task."""
+
+    @property
+    def kind(self) -> str:
+        """For a sentence: ``random``, ``given``."""
+        ...
+
+    @property
+    def seeds(self) -> Sequence[int]:
+        """(K,) with which each episode begins."""
+        ...
+
+    @property
+    def lengths(self) -> Sequence[int]:
+        """(K,) the most control steps of each episode."""
+        ...
+
+    def begin(self, task: TaskEnv, episodes: Sequence[int]) -> StepResult:
+        """Reset all envs to the start of these episodes, one for each env. The last may be there several times.
+
+        Raises:
+            TaskError: the task raised.
+        """
+        ...
+
+    def next_action(self, task: TaskEnv, step: int) -> NDArray[np.float32]:
+        """(N, A) in the episodes that were begun last; any for one that is over.
+
+        Raises:
+            TaskError: the actor raised; the problem's stage is ``policy``.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class SeenOutlier:
+    """An outlier of an episode."""
+
+    kind: OutlierKind
+    step: int
+    """1-based control step."""
+    seed: int
+    reason: str
+    """As `Outlier.reason`."""
+    body: str
+    """Its name, as in `SceneIndex.names`; empty if it is of no body."""
+
+
+@dataclass
+class Episodes:
+    """What was seen of K episodes over T control steps; episode k began with seed ``seeds[k]``. Leading dimension T + 1 for
+    states, T for rewards. An episode that has ended goes on, as in stock ManiSkill: `length` says where it ended. Of one
+    whose actions are over, the last state and reward are repeated."""
+
+    kind: str = "random"
+    """As `Actor.kind`."""
+    seeds: list[int] = field(default_factory=list)
+    poses: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0, 0, 7), np.float32))
+    """(T + 1, K, B, 7) position in metres, quaternion wxyz; bodies as `Checkup.bodies`."""
+    qpos: NDArray[np.float32] | None = None
+    """(T + 1, K, J); None without joints."""
+    evaluate: dict[str, NDArray] = field(default_factory=dict)
+    """(T + 1, K, ...) each."""
+    reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    """(T, K)"""
+    obs: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    """(T + 1, K, D) by leaf, pictures left out."""
+    length: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """(K,) control steps until the episode ended; T if it did not."""
+    outliers: tuple[SeenOutlier, ...] = ()
+    """Of each kind the first of an episode before its end; of random rollouts only."""
+
+
+class SeenOutliers:
+    """Notes the outliers of one batch of episodes."""
+
+    def __init__(self, watch: OutlierWatch, seeds: list[int]) -> None:
+        self._watch, self._seeds = watch, seeds
+        self._seen: dict[tuple[OutlierKind, int], SeenOutlier] = {}
+
+    def take(self, step: int, now: StepResult, over: NDArray[np.bool_]) -> None:
+        """Look at a control step.
+
+        Args:
+            over: (N,) episodes that have ended, which may end as they like.
+        """
+        for sight in self._watch.check(now):
+            for env in np.flatnonzero(sight.envs & ~over).tolist():
+                if (sight.kind, env) not in self._seen:
+                    body = "" if sight.body is None else sight.body(env)
+                    seen = SeenOutlier(sight.kind, step, self._seeds[env], sight.reason(env), body)
+                    self._seen[sight.kind, env] = seen
+
+    def all(self) -> list[SeenOutlier]:
+        return list(self._seen.values())
+
+
+def stacked(
+    kind: str,
+    seeds: list[int],
+    lengths: Sequence[int],
+    steps: int,
+    states: list[StepResult],
+    rewards: list[NDArray[np.float32]],
+    obs: list[dict[str, NDArray[np.float64]]],
+    ended: NDArray[np.int64],
+    outliers: Iterable[SeenOutlier],
+) -> Episodes:
+    """The episodes of one batch: of the first ``len(seeds)`` envs.
+
+    Args:
+        lengths: control steps for which each episode had actions; at most as many were made.
+        steps: T.
+        ended: (N,) as `Episodes.length`.
+    """
+    count = len(seeds)
+    names = [name for name in states[0].evaluate if all(name in state.evaluate for state in states)]
+    # The reward's terms exist from the first step on.
+    late = [name for name in states[-1].evaluate if name not in names]
+    leaves = [name for name in obs[0] if all(name in one for one in obs)]
+    envs = np.arange(count)
+    row = np.minimum(np.arange(steps + 1)[:, None], np.array(lengths)[None])
+
+    def of_states(rows: list[NDArray]) -> NDArray:
+        return np.stack(rows)[row, envs]
+
+    return Episodes(
+        kind=kind,
+        seeds=list(seeds),
+        poses=of_states([state.poses for state in states]),
+        qpos=None if states[0].qpos is None else of_states([s.qpos for s in states if s.qpos is not None]),
+        evaluate={
+            **{name: of_states([state.evaluate[name] for state in states]) for name in names},
+            **{
+                name: of_states([state.evaluate[name] for state in [states[1], *states[1:]]])
+                for name in late
+                if all(name in state.evaluate for state in states[1:])
+            },
+        },
+        reward=np.stack(rewards)[row[1:] - 1, envs] if rewards else np.zeros((0, count), np.float32),
+        obs={name: of_states([one[name] for one in obs]) for name in leaves},
+        length=np.minimum(ended[:count], np.array(lengths)),
+        outliers=tuple(outliers),
+    )
+
+
+def joined(parts: list[Episodes]) -> Episodes:
+    """The episodes of all batches."""
+    names = [name for name in parts[0].evaluate if all(name in part.evaluate for part in parts)]
+    leaves = [name for name in parts[0].obs if all(name in part.obs for part in parts)]
+    qpos = [part.qpos for part in parts if part.qpos is not None]
+    return replace(
+        parts[0],
+        seeds=[seed for part in parts for seed in part.seeds],
+        poses=np.concatenate([part.poses for part in parts], axis=1),
+        qpos=np.concatenate(qpos, axis=1) if len(qpos) == len(parts) else None,
+        evaluate={name: np.concatenate([part.evaluate[name] for part in parts], axis=1) for name in names},
+        reward=np.concatenate([part.reward for part in parts], axis=1),
+        obs={name: np.concatenate([part.obs[name] for part in parts], axis=1) for name in leaves},
+        length=np.concatenate([part.length for part in parts]),
+        outliers=tuple(seen for part in parts for seen in part.outliers),
+    )

@@ -1,0 +1,153 @@
+"""Content of the Checks tab: findings of the checks and of playing, one card for each rule."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from workbench.checks.results import RuleResult, State, counts, state_text
+from workbench.checks.rule_pages import RulePage, rule_page
+from workbench.checks.rules import RULES
+from workbench.checks.state import ChecksView
+from workbench.envs.gpu_rules import DEGREES, Degree, Finding, Rule
+from workbench.envs.outliers import OUTLIER_RULES
+
+_SUMMED: tuple[State, ...] = ("kept", "silenced", "not_known", "not_applicable", "failed")
+_UNDECIDED: tuple[State, ...] = ("not_known", "not_applicable")
+MOST_SHOWN = 5
+"""Maximum number of findings of one rule that are shown."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A finding."""
+
+    finding: Finding
+    played: str = ""
+    """Count of the times that it was seen while playing, as text; empty for a finding of the checks alone."""
+    old: bool = False
+    """Whether the finding is of an earlier version and its rule is not checked again yet."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """The findings of one rule."""
+
+    rule: Rule
+    degree: Degree
+    """The worst of its findings."""
+    rows: tuple[Row, ...]
+
+    @property
+    def old(self) -> bool:
+        return all(row.old for row in self.rows)
+
+    @property
+    def page(self) -> RulePage | None:
+        return rule_page(self.rule.id)
+
+    @property
+    def silence(self) -> str:
+        """The comment that silences it; without a reason after it it silences nothing."""
+        return f"# workbench: off[{self.rule.id}] "
+
+
+def cards(checks: ChecksView, played: Iterable[Finding] = ()) -> list[Card]:
+    """Cards by degree, ``stop`` first, then ``warn``, then the findings of an earlier version.
+
+    Args:
+        played: what was found while playing.
+    """
+    rows = [Row(finding) for finding in checks.findings]
+    for finding in played:
+        place = _same(finding, rows)
+        if place is None:
+            rows.append(Row(finding, _played(finding)))
+            continue
+        known = rows[place].finding
+        same = known.key == finding.key
+        rows[place] = Row(known, _played(finding) if same else f"{_played(finding)}: {finding.message}")
+    # Rules of GPU simulation are checked last, and seen while playing at once.
+    rows += [Row(finding, old=True) for finding in checks.before if _same(finding, rows) is None]
+    together: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.finding.rule in RULES:
+            together.setdefault(row.finding.rule, []).append(row)
+    found = [Card(RULES[rule], _worst(row.finding for row in of), tuple(of)) for rule, of in together.items()]
+    return sorted(found, key=lambda card: (card.old, DEGREES.index(card.degree)))
+
+
+def _same(finding: Finding, rows: Sequence[Row]) -> int | None:
+    """Index of the row with the same finding: an outlier is seen at its hook while playing, and at its line by the
+    checks."""
+    of_rule = [place for place, row in enumerate(rows) if row.finding.rule == finding.rule]
+    alike = [place for place in of_rule if rows[place].finding.key == finding.key]
+    if not alike and finding.rule in OUTLIER_RULES:
+        alike = of_rule
+    return next(iter(alike), None)
+
+
+def count(shown: Iterable[Card]) -> int:
+    """Number of findings; findings of an earlier version count until their rule is checked again."""
+    return sum(len(card.rows) for card in shown)
+
+
+def without_finding(checks: ChecksView, shown: list[Card]) -> list[RuleResult]:
+    """Results of the rules that have no finding: a rule that the checks kept may be broken while playing."""
+    broken = {card.rule.id for card in shown if not card.old}
+    return [result for result in checks.results if result.rule not in broken]
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """Rules with the same state for the same reason."""
+
+    state: str
+    """State, as `state_text` gives it."""
+    why: str
+    rules: tuple[str, ...]
+
+
+def undecided(results: Iterable[RuleResult]) -> list[Undecided]:
+    """What is not known, then what is not applicable, by reason."""
+    found: dict[tuple[State, str], list[str]] = {}
+    for state in _UNDECIDED:
+        for result in results:
+            if result.state == state:
+                found.setdefault((state, result.why), []).append(result.rule)
+    return [Undecided(state_text(state), why, tuple(rules)) for (state, why), rules in found.items()]
+
+
+def summary(checks: ChecksView, shown: list[Card]) -> str:
+    """``2 stop, 3 warn, 50 kept, 3 not known``: findings by degree, then rules."""
+    by_degree = dict.fromkeys(DEGREES, 0)
+    for card in shown:
+        for row in card.rows:
+            by_degree[row.finding.degree] += not row.old
+    states = counts(without_finding(checks, shown))
+    old = sum(row.old for card in shown for row in card.rows)
+    told = (
+        *((by_degree[degree], degree) for degree in DEGREES),
+        *((states[state], state_text(state)) for state in _SUMMED),
+        (old, "of the version before"),
+    )
+    return ", ".join(f"{number} {what}" for number, what in told if number)
+
+
+def times(count: int) -> str:
+    """``once``, ``7 times``, ``300 times and more``: only the first digit of large counts, or the list would change at
+    each step."""
+    if count < 10:
+        return "once" if count == 1 else f"{count} times"
+    scale = 10 ** (len(str(count)) - 1)
+    return f"{count // scale * scale:,} times and more".replace(",", " ")
+
+
+def _played(finding: Finding) -> str:
+    since = f"first at step {finding.first_step}" if finding.first_step else "from the start"
+    return f"while playing {times(finding.count)}, {since}"
+
+
+def _worst(findings: Iterable[Finding]) -> Degree:
+    degrees: list[Degree] = [finding.degree for finding in findings]
+    return min(degrees, key=DEGREES.index)

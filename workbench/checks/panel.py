@@ -1,0 +1,164 @@
+"""The Checks tab, and the content of the mark of findings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import viser
+
+from workbench.checks.commands import CheckAfterSave, CheckNow, StopChecks, ToggleRule
+from workbench.checks.findings import MOST_SHOWN, Card, cards, count, summary, undecided, without_finding
+from workbench.checks.rules import RULES
+from workbench.checks.silencing import Comment, comments_without_effect
+from workbench.checks.state import RUNNING, ChecksView
+from workbench.live.view import SessionView
+from workbench.page.command import Command
+from workbench.page.door.viser_private import set_tab_label
+from workbench.page.widgets.editor_links import LinkTo, no_links
+from workbench.page.widgets.fields import tick
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import place, render
+from workbench.page.widgets.tools import tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+
+TAB = "Checks"
+CHECK_NOW, STOP_CHECKS = "Check now", "Stop checking"
+AFTER_SAVE = "After each save"
+AFTER_SAVE_HINT = (
+    "Check each version that loads. In a process of its own at low priority: playing goes first."
+)
+REST = "rest"
+"""Key of the fold of rules without a finding."""
+
+
+class ChecksPanel(PagePart[SessionView]):
+    """Findings of the checks and of what was played, worst first, each with its line.
+
+    Args:
+        server: The page.
+        tab: The tab that it is in: its label has the number of findings.
+        link: Links the lines of the author's files.
+    """
+
+    every = 0.25
+    does = (ToggleRule,)
+
+    def __init__(self, server: viser.ViserServer, tab: viser.GuiTabHandle, link: LinkTo = no_links) -> None:
+        self._tab, self._link = tab, link
+        self._open: set[str] = set()
+        """Ids of unfolded rules, and `REST`."""
+        self._status = server.gui.add_html("")
+        self._tools = server.gui.add_html("")
+        self._after_save = tick(server, AFTER_SAVE, CheckAfterSave, "on", True, hint=AFTER_SAVE_HINT)
+        self._list = server.gui.add_html("", visible=False)
+
+    def key(self, view: SessionView) -> object:
+        checks = view.of(ChecksView)
+        seen = view.rules_serial, view.odd
+        return checks.serial, checks.waits, seen, tuple(sorted(self._open)), view.task_serial
+
+    def draw(self, view: SessionView) -> None:
+        checks = view.of(ChecksView)
+        found = cards(checks, view.played)
+        set_tab_label(self._tab, f"{TAB} {count(found)}" if found else TAB)
+        self._status.content = status_html(checks, found, self._link)
+        running = checks.state in RUNNING
+        pressed = tool(STOP_CHECKS, StopChecks()) if running else tool(CHECK_NOW, CheckNow(), tone="main")
+        self._tools.content = tools_html([pressed] if running or view.task is not None else [])
+        self._after_save.show(checks.after_each_save)
+        more = 0 if view.rules is None else view.rules.more
+        comments = _comments(view)
+        self._list.visible = bool(found or checks.results or comments)
+        self._list.content = list_html(checks, found, more, self._open, _toggle, self._link, comments)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ToggleRule(rule=rule):
+                self._open.symmetric_difference_update({rule})
+
+
+def _toggle(rule: str) -> ToggleRule:
+    return ToggleRule(rule=rule)
+
+
+@dataclass(frozen=True)
+class FindingsMark:
+    """Content of the mark of findings."""
+
+    count: int
+    newest: str
+    """Place of the worst finding, with the number of the others."""
+    stops: bool
+    old: bool
+    """Whether all were found before the last change, and that change is not checked yet."""
+
+
+def findings_mark(view: SessionView) -> FindingsMark | None:
+    """The mark of findings; None without any."""
+    found = cards(view.of(ChecksView), view.played)
+    if not found:
+        return None
+    rows = [row.finding for card in found for row in card.rows]
+    newest = next((place(finding) for finding in rows if finding.file), "")
+    if newest and len(rows) > 1:
+        newest += f" and {len(rows) - 1} more"
+    stops = any(finding.degree == "stop" for finding in rows)
+    return FindingsMark(len(rows), newest, stops, all(card.old for card in found))
+
+
+def status_html(checks: ChecksView, found: list[Card], link: LinkTo = no_links) -> str:
+    """HTML of the progress and the result of the checks."""
+    return render("checks_status", checks=checks, told=summary(checks, found), link=link)
+
+
+def _comments(view: SessionView) -> list[Comment]:
+    """Comments that silence nothing; known when all rules are checked."""
+    task, checks = view.task, view.of(ChecksView)
+    if task is None:
+        return []
+    results = checks.results if checks.state == "done" else ()
+    return comments_without_effect(task.source, results, task.class_name, task.others)
+
+
+def list_html(
+    checks: ChecksView,
+    found: list[Card],
+    more: int,
+    opened: set[str],
+    toggle: Callable[[str], Command],
+    link: LinkTo = no_links,
+    comments: Sequence[Comment] = (),
+) -> str:
+    """HTML of the findings, and of the rules without one if that part is unfolded.
+
+    Args:
+        more: breaches seen while playing at lines that are not listed.
+        opened: what is folded out.
+        toggle: the command that folds a part out and in.
+        comments: those that were to silence a rule and silence none.
+    """
+    known = {
+        "found": found,
+        "more": more,
+        "opened": opened,
+        "toggle": toggle,
+        "link": link,
+        "most": MOST_SHOWN,
+    }
+    rest = without_finding(checks, found)
+    failed = [result for result in rest if result.state == "failed"]
+    kept = [result.rule for result in rest if result.state == "kept"]
+    told = [result for result in rest if result.silenced or result.notes]
+    return render(
+        "checks",
+        **known,
+        rest=len(rest) - len(failed),
+        failed=failed,
+        undecided=undecided(rest),
+        told=told,
+        kept=kept,
+        comments=comments,
+        REST=REST,
+        RULES=RULES,
+    )

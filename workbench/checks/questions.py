@@ -1,0 +1,51 @@
+"""Questions to a worker about rules and the time of a step. Only for a worker that does not play: it makes envs of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from workbench.checks.results import RuleResult, StepProfile
+from workbench.envs.gpu_rules import Degree
+from workbench.machine.processes.wire import Question
+
+
+@dataclass(frozen=True)
+class CheckedGroup:
+    """A group was checked; its results were sent before."""
+
+    groups: int
+    """Number of groups."""
+    rules: int
+    """Number of rules in all groups that are not off."""
+    next: str
+    """What the next group looks at; empty after the last group."""
+
+
+@dataclass(frozen=True)
+class RuleProgress:
+    """Progress of the rules of a group."""
+
+    rule: str
+    """The rule that is being checked; empty for the rules of GPU simulation, which are checked together."""
+    result: RuleResult | None = None
+    """Result of the rule; None when its check begins."""
+
+
+@dataclass(frozen=True)
+class CheckGroup(Question[CheckedGroup]):
+    """Check the rules of one group on the loaded version. A later request ends the check."""
+
+    part: ClassVar[Any] = RuleProgress
+    group: int
+    """Index of the group, from 0 on, in the order of what people meet most."""
+    degrees: Mapping[str, Degree]
+    """Degree of each rule."""
+    known: tuple[str, ...] = ()
+    """Rules of the group that were checked before a job of higher priority came."""
+
+
+@dataclass(frozen=True)
+class ProfileStep(Question[StepProfile]):
+    """Time the hooks and lines of a control step, on separate envs. A later request ends it."""

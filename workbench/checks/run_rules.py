@@ -1,0 +1,376 @@
+"""Runs the checks, a rule at a time, and gives what each came to."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+import workbench
+from workbench.checks.by_hook import (
+    cameras,
+    devices,
+    evaluate,
+    files,
+    observation,
+    placement,
+    reproduce,
+    reward,
+    scene,
+    solved,
+    source,
+)
+from workbench.checks.evidence.checkup import (
+    Check,
+    CheckEnded,
+    Checkup,
+    Found,
+    NotApplicable,
+    Note,
+    NotKnown,
+    code_of,
+    finding_of,
+)
+from workbench.checks.evidence.over_seeds import OverSeeds
+from workbench.checks.results import RuleResult, Seen, Silenced, State, failed, merged
+from workbench.checks.rules import core_rules_of
+from workbench.envs import action_vector as actions
+from workbench.envs.broken_rule import NeedsOneEnv
+from workbench.envs.gpu_rules import Degree, Finding, silence_of
+from workbench.envs.kept_rows import KeptRows
+from workbench.envs.task_env import TaskEnv
+from workbench.machine.processes.wire import Unpacker, pack
+from workbench.task.problem import Problem, TaskError, problem_from_exception, shorten
+
+_PACKAGE = Path(workbench.__file__).parent
+
+
+@dataclass(frozen=True)
+class RuleGroup:
+    """Rules that look at the same evidence, checked by one process."""
+
+    name: str
+    """What is being looked at, for a status line."""
+    checks: Mapping[str, Check]
+
+
+GROUPS: tuple[RuleGroup, ...] = (
+    RuleGroup("source", {**source.CHECKS, **files.CHECKS}),
+    RuleGroup("resets", placement.CHECKS),
+    RuleGroup("success", {**evaluate.CHECKS, **placement.RUN_CHECKS}),
+    RuleGroup("rewards", reward.CHECKS),
+    RuleGroup("tensors", devices.CHECKS),
+    RuleGroup("the same again", reproduce.CHECKS),
+    RuleGroup("observations", observation.CHECKS),
+    RuleGroup("the scene", scene.CHECKS),
+    RuleGroup("pictures", {**observation.PICTURE_CHECKS, **cameras.CHECKS}),
+    RuleGroup("planned episodes", solved.CHECKS),
+)
+"""In the order in which they run: what people meet most first."""
+RULES_OVER_SEEDS: Mapping[str, OverSeeds] = {
+    rule: check for group in GROUPS for rule, check in group.checks.items() if isinstance(check, OverSeeds)
+}
+"""The rules whose results depend on which seeds are looked at, and on how many. All others look at the source, at what is
+built, or at the first batch."""
+CORE = RuleGroup("GPU simulation", {})
+"""All rules of GPU simulation: the env under check reports them, whatever runs."""
+_OF_RETURNS = ("evaluate-rows", "reward-rows")
+_OF_SEVERAL = frozenset(
+    (
+        *(*_OF_RETURNS, "observation-rows"),
+        *("other-env-written", "stepped-in-reset", "rows-lost", "rows-rewritten", "applied-by-reset"),
+    )
+)
+"""Rules of GPU simulation about the other envs: one env alone cannot break them."""
+CORE_RESETS = 6
+"""Resets of random envs, with steps between them."""
+ONE_ENV = "With one env it runs: --num-envs 1."
+
+
+def check_rule(rule: str, check: Check, checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
+    """The result of a rule; where the task raises, that of the rule `runs` too. Raises CheckEnded."""
+    began = time.perf_counter()
+    rows: list[Seen] = []
+    further: list[RuleResult] = []
+    try:
+        result = _checked(rule, check, checkup, degrees[rule], rows)
+        error = result.problem
+        if error is not None and error.stage != "policy" and degrees["runs"] != "off":
+            # What a policy raised is no fault of the task.
+            if not _is_known(error, checkup, degrees):
+                cause = result_of("runs", degrees["runs"], [raised(error, checkup)])
+                result, further = (cause, []) if rule == "runs" else (result, [cause])
+        result = as_sent(replace(result, seconds=time.perf_counter() - began, seen=tuple(rows)))
+    except CheckEnded:
+        raise
+    except Exception as error:
+        result = failed(rule, problem_of_crash(error), time.perf_counter() - began)
+    return [result, *further]
+
+
+def _checked(rule: str, check: Check, checkup: Checkup, degree: Degree, rows: list[Seen]) -> RuleResult:
+    """The result of a rule, with what it saw in `rows`."""
+    seen: list[Found | Note] = []
+
+    def look() -> None:
+        seen.clear()
+        rows.clear()
+        if isinstance(check, OverSeeds):
+            for row in check.see(checkup):
+                rows.append(_with_code(rule, row))
+        for found in check.judge(rows) if isinstance(check, OverSeeds) else check(checkup):
+            seen.append(found)  # one by one: the next may raise
+
+    ended = ended_as(lambda: _of_task(look, checkup))
+    if ended.problem is not None and isinstance(check, OverSeeds):
+        # What it had found before that is true all the same.
+        seen.extend(check.so_far(rows))
+    return _ended(result_of(rule, degree, seen), ended)
+
+
+@dataclass(frozen=True)
+class LookEnd:
+    """How looking at a rule ended, without regard to what was found."""
+
+    state: State = "kept"
+    why: str = ""
+    problem: Problem | None = None
+
+
+def ended_as(look: Callable[[], None]) -> LookEnd:
+    """Call it, and say how it ended. Other exceptions pass."""
+    try:
+        look()
+    except NotApplicable as reason:
+        return LookEnd("not_applicable", str(reason))
+    except NotKnown as reason:
+        return LookEnd("not_known", str(reason))
+    except TaskError as error:
+        return LookEnd("not_known", str(error), error.problem)
+    return LookEnd()
+
+
+def _of_task(look: Callable[[], None], checkup: Checkup) -> None:
+    """Call it; again with one env where the task does what exists for one only, as opening it does. What the author's code
+    raises in it, a robot's property say, is a TaskError."""
+    try:
+        look()
+    except TaskError as error:
+        if checkup.num_envs == 1 or not isinstance(error.__cause__, NeedsOneEnv):
+            raise
+        checkup.go_on_with_one_env()
+        _of_task(look, checkup)
+    except (NotApplicable, NotKnown, CheckEnded):
+        raise
+    except Exception as error:
+        if not _is_of_task(error, checkup):
+            raise
+        loaded = checkup.loaded
+        raise TaskError(problem_from_exception(error, "step", loaded.source_files, loaded.cls)) from error
+
+
+def _is_of_task(error: Exception, checkup: Checkup) -> bool:
+    """Whether the last line of the traceback that is the author's or the workbench's is the author's."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if frame.filename in checkup.files:
+            return True
+        if Path(frame.filename).is_relative_to(_PACKAGE):
+            return False
+    return False
+
+
+def _ended(result: RuleResult, ended: LookEnd) -> RuleResult:
+    """The result, where looking at it ended so: what was found counts most."""
+    if result.state != "kept":
+        # That the task raised then is told too: not all was looked at.
+        return replace(result, why=ended.why, problem=ended.problem) if ended.problem is not None else result
+    return replace(result, state=ended.state, why=ended.why, problem=ended.problem)
+
+
+def problem_of_crash(error: Exception) -> Problem:
+    """What a check raised: the innermost line of the workbench's, with the whole traceback."""
+    frames = traceback.extract_tb(error.__traceback__)
+    at = next((frame for frame in reversed(frames) if Path(frame.filename).is_relative_to(_PACKAGE)), None)
+    file = None if at is None else str(Path(at.filename).relative_to(_PACKAGE.parent))
+    line, code = (None, None) if at is None else (at.lineno, at.line)
+    text = shorten(f"{type(error).__qualname__}: {error}")
+    return Problem("worker", text, file, line, code, "".join(traceback.format_exception(error)))
+
+
+def as_sent(result: RuleResult) -> RuleResult:
+    """The result as another process reads it. Raises TypeError or Unreadable for a value of another type than it says: here
+    it is this rule's failure, there it would end the whole check."""
+    return Unpacker().unpack(pack(result), RuleResult)
+
+
+def over_seeds(results: Sequence[RuleResult], degree: Degree) -> RuleResult:
+    """The result of a rule of `RULES_OVER_SEEDS` over all seeds.
+
+    Args:
+        results: what it came to for each part of them, in their order.
+    """
+    rule, rows = results[0].rule, [row for result in results for row in result.seen]
+    check, seconds = RULES_OVER_SEEDS[rule], sum(result.seconds for result in results)
+    short = [result for result in results if result.problem is not None]
+    if not rows:
+        return replace(merged(results), seconds=seconds)
+    seen: list[Found | Note] = []
+
+    def judge() -> None:
+        for found in (check.so_far if short else check.judge)(rows):
+            seen.append(found)
+
+    ended = ended_as(judge)
+    whole = _ended(result_of(rule, degree, seen, rows), ended)
+    if short:
+        worst = merged(short)
+        whole = _ended(whole, LookEnd(worst.state, worst.why, worst.problem))
+    return replace(whole, seconds=seconds)
+
+
+def _with_code(rule: str, row: Seen) -> Seen:
+    """The row with what is known of its line here: it may be judged where the file is another one."""
+    if row.place is None:
+        return row
+    file, line, _ = row.place
+    silence = silence_of(file, line, rule)
+    return replace(
+        row,
+        code=code_of(row.place),
+        silence=None if silence is None else (silence.reason, silence.line),
+    )
+
+
+def _is_known(error: Problem, checkup: Checkup, degrees: Mapping[str, Degree]) -> bool:
+    """Whether a rule tells it, with its line: the type or shape of what a hook returned."""
+    returned = (each.rule for each in checkup.findings if each.rule in _OF_RETURNS)
+    return error.stage == "returns" and any(degrees[rule] != "off" for rule in returned)
+
+
+def raised(error: Problem, checkup: Checkup) -> Found:
+    """What the task raised, as a breach of the rule `runs`."""
+    file, line = error.file, error.line
+    place = None if file is None or line is None else (file, line, error.stage)
+    early = checkup.fails_with_several
+    alike = early is not None and (early.stage, early.file, early.line) == (
+        error.stage,
+        error.file,
+        error.line,
+    )
+    advice = f". {ONE_ENV}" if alike else ""
+    return Found(
+        f"{error.stage}: {error.message.removesuffix('.') if alike else error.message}{advice}", place
+    )
+
+
+def check_core(checkup: Checkup, degrees: Mapping[str, Degree]) -> list[RuleResult]:
+    """Step, and reset random envs among them, while the rules of GPU simulation look. Gives what each came to, but for breaches:
+    those are in `Checkup.findings`, of all that ran, and `core_results` makes results of them. Raises CheckEnded."""
+    further: list[RuleResult] = []
+    not_applicable: dict[str, str] = {}
+    try:
+        ended = ended_as(lambda: _of_task(lambda: _run_core(checkup), checkup))
+        error = ended.problem
+        if error is None:
+            not_applicable = _nothing_there(checkup.task)
+        if error is not None and degrees["runs"] != "off" and not _is_known(error, checkup, degrees):
+            further.append(result_of("runs", degrees["runs"], [raised(error, checkup)]))
+    except CheckEnded:
+        raise
+    except Exception as error:
+        problem = problem_of_crash(error)
+        return [failed(rule, problem) for rule in core_rules_of(degrees)]
+    results: list[RuleResult] = []
+    for rule in core_rules_of(degrees):
+        of_rule = ended
+        if rule in not_applicable:
+            of_rule = LookEnd("not_applicable", not_applicable[rule])
+        elif error is None and rule in _OF_SEVERAL:
+            of_rule = ended_as(checkup.require_several)
+        results.append(_ended(RuleResult(rule, "kept"), of_rule))
+    return [*results, *further]
+
+
+def _run_core(checkup: Checkup) -> None:
+    rng, task = np.random.default_rng(0), checkup.task
+    checkup.reset(task, checkup.seeds[0])
+    for _ in range(CORE_RESETS):
+        for _ in range(2):
+            checkup.step(task, actions.random_action(task.parts, task.num_envs, rng))
+        count = int(rng.integers(1, max(2, task.num_envs)))
+        checkup.reset(task, None, sorted(rng.choice(task.num_envs, count, replace=False).tolist()))
+
+
+def _nothing_there(task: TaskEnv) -> dict[str, str]:
+    """Rules of GPU simulation that say nothing about this task, with the reason."""
+    found: dict[str, str] = {}
+    if task.env.reward_mode == "none":
+        found["reward-rows"] = "it has no reward"
+    if not KeptRows(task.env, [0]).before:
+        found |= dict.fromkeys(("rows-lost", "rows-rewritten"), "it keeps nothing with a row for each env")
+    return found
+
+
+def core_results(
+    findings: Iterable[Finding], silenced: Iterable[Silenced], degrees: Mapping[str, Degree]
+) -> Iterator[RuleResult]:
+    """The results of the rules of GPU simulation that were broken while all others were checked."""
+    findings, silenced = list(findings), list(silenced)
+    for rule in core_rules_of(degrees):
+        of_rule = [replace(each, degree=degrees[rule]) for each in findings if each.rule == rule]
+        once = {each.key: each for each in of_rule}
+        off = {
+            (each.finding.key, each.line): replace(each, finding=replace(each.finding, degree=degrees[rule]))
+            for each in silenced
+            if each.finding.rule == rule
+        }
+        if once or off:
+            yield RuleResult(rule, _state(once, off), tuple(once.values()), tuple(off.values()))
+
+
+def findings_of(checkup: Checkup, first: int = 0) -> tuple[Finding, ...]:
+    """Breaches of the rules of GPU simulation that were seen so far, from the `first` on; those of a task that is written for
+    one env say so."""
+    return tuple(
+        replace(each, message=f"{each.message} {ONE_ENV}")
+        if each.rule in _OF_RETURNS and checkup.fails_with_several is not None
+        else each
+        for each in checkup.findings[first:]
+    )
+
+
+def _state(findings: Sized, silenced: Sized) -> State:
+    return "broken" if findings else "silenced" if silenced else "kept"
+
+
+def result_of(
+    rule: str, degree: Degree, seen: Sequence[Found | Note], rows: Sequence[Seen] = ()
+) -> RuleResult:
+    """The result of a rule whose check gave this.
+
+    Args:
+        rows: with what is known of their lines, where the files may be others here.
+    """
+    known = {row.place: row for row in rows if row.place is not None}
+    findings: list[Finding] = []
+    silenced: list[Silenced] = []
+    for found in seen:
+        if isinstance(found, Note):
+            continue
+        finding = finding_of(rule, degree, found)
+        if found.place in known:
+            row = known[found.place]
+            finding, silence = replace(finding, code=row.code), row.silence
+        else:
+            comment = silence_of(finding.file, finding.line, rule)
+            silence = None if comment is None else (comment.reason, comment.line)
+        if silence is None:
+            findings.append(finding)
+        else:
+            silenced.append(Silenced(finding, *silence))
+    notes = tuple(each.message for each in seen if isinstance(each, Note))
+    return RuleResult(rule, _state(findings, silenced), tuple(findings), tuple(silenced), notes)

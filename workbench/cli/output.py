@@ -1,0 +1,370 @@
+"""Prints results, errors and questions of all commands to a terminal, with escape sequences removed."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, redirect_stdout
+from enum import IntEnum
+from typing import IO, TYPE_CHECKING
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn
+from rich.segment import Segment
+from rich.text import Text
+
+from workbench.machine.maniskill_installed import lines_if_lacking, lines_if_mixed
+from workbench.machine.text import SafeStream, listed, plain_text
+from workbench.task.problem import place_text
+from workbench.trust.clearance import CodeFile, Consent, NotTrusted, Since, TrustQuestion, question_text
+
+if TYPE_CHECKING:
+    from workbench.envs.gpu_rules import Finding
+    from workbench.jobs.scheduler import Failure
+    from workbench.live.messages import Event, LoadFailed
+    from workbench.live.process.captured_output import PrintedLine
+    from workbench.task.problem import Problem
+
+
+class Exit(IntEnum):
+    """Exit codes of the commands."""
+
+    DONE = 0
+    FAILED = 1
+    """The author's code raised, a check found something, or fewer results than requested."""
+    REFUSED = 2
+    """Nothing was done: a wrong argument, a missing file."""
+    NOT_TRUSTED = 4
+    """Nothing was run: recordings name code that is not trusted (see ``--trust``)."""
+    INTERRUPTED = 130
+    """Ctrl-C, as shells have it; what was finished is kept."""
+
+
+class SafeConsole(Console):
+    """A rich console whose own colours, bars and cursor moves reach the terminal, but not those within printed text.
+
+    Text comes from file names, recordings, the author's code and requests. What libraries, loggers and tracebacks print past
+    this console is guarded by `machine.text`.
+    """
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            if segment.control is not None:
+                yield segment
+                continue
+            style = segment.style
+            # A link's address would be printed unescaped.
+            if style is not None and style.link is not None:
+                style = style.update_link(None)
+            yield Segment(plain_text(segment.text, "\n"), style)
+
+    @property
+    def file(self) -> IO[str]:
+        file = super().file
+        return file.raw if isinstance(file, SafeStream) else file
+
+    @file.setter
+    def file(self, new_file: IO[str]) -> None:
+        self._file = new_file
+
+
+out = SafeConsole(highlight=False)
+err = SafeConsole(stderr=True, highlight=False)
+
+_LINES = "\n\t"
+_MOST_FAILED = 100
+"""Maximum number of items with the same failure that are named."""
+_printed_notices: set[str] = set()
+"""Notices of the task that were printed; each reload sends them again."""
+
+
+def print_text(text: object) -> None:
+    """Print one line to stdout without wrapping, so that it can be copied."""
+    print(plain_text(str(text)), flush=True)
+
+
+@contextmanager
+def stdout_to_stderr() -> Iterator[None]:
+    """Within this block, output of the author's code, native libraries and child processes goes to stderr: stdout
+    is for results."""
+    sys.stdout.flush()
+    before = os.dup(1)
+    try:
+        os.dup2(2, 1)
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
+
+
+def progress_bar(*columns: ProgressColumn) -> Progress:
+    """A progress bar with `columns` on stderr, which keeps stdout for results."""
+    return Progress(TextColumn("{task.description}", markup=False), BarColumn(), *columns, console=err)
+
+
+def print_addresses(addresses: Sequence[str]) -> None:
+    """Print the addresses of a page: the one to open, then those for other machines."""
+    for i, address in enumerate(addresses):
+        print_text(f"  {'or' if i else 'page':8}{address}")
+
+
+def refuse(message: str) -> int:
+    """Print why a command does nothing; returns the exit code."""
+    err.print(f"[red]{escape(plain_text(message))}[/]", soft_wrap=True)
+    return Exit.REFUSED
+
+
+def interrupted(kept: str = "") -> int:
+    """Print that Ctrl-C ended a command; returns the exit code.
+
+    Args:
+        kept: what is kept of it.
+    """
+    refuse(f"interrupted; {kept}" if kept else "interrupted")
+    return Exit.INTERRUPTED
+
+
+def end_quietly() -> int:
+    """Exit code where the reader of our output has closed it, as of a command that SIGPIPE ends.
+
+    To be called while the BrokenPipeError is handled, which is raised again if it is of another pipe.
+    """
+    looker = select.poll()
+    looker.register(sys.stdout.fileno(), 0)
+    if not any(event & select.POLLERR for _, event in looker.poll(0)):
+        raise
+    # Else Python says it once more when it flushes at its end.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 128 + signal.SIGPIPE
+
+
+def warn(message: str) -> None:
+    """Print a warning."""
+    err.print(f"[yellow]{escape(plain_text(message))}[/]", soft_wrap=True)
+
+
+def lacks_maniskill(command: str) -> bool:
+    """Print what to type where the command cannot run without ManiSkill, and warn of two installed distributions
+    of ManiSkill. Returns whether ManiSkill is missing."""
+    lines = lines_if_lacking(f"workbench {command}", sys.argv[1:])
+    for line in lines or ():
+        refuse(line)
+    for line in lines_if_mixed() or ():
+        warn(line)
+    return lines is not None
+
+
+def print_problem(problem: Problem) -> None:
+    """Print an error in the author's code, with its line."""
+    place = place_text(problem.file, problem.line)
+    message = escape(plain_text(f"{place}{problem.message}"))
+    err.print(f"[red]{escape(problem.what_failed)}[/] {message}", soft_wrap=True)
+    if problem.code:
+        err.print(f"    {escape(plain_text(problem.code))}", soft_wrap=True)
+    if problem.traceback:
+        err.print(f"[dim]{escape(plain_text(problem.traceback.rstrip(), _LINES))}[/]", soft_wrap=True)
+
+
+def print_failures(failures: Sequence[Failure], names: Callable[[int], str]) -> None:
+    """Print the failures of a job that went on, each kind once with its items.
+
+    Args:
+        names: the name of an item.
+    """
+    from workbench.jobs.scheduler import by_kind
+
+    for problem, numbers in by_kind(failures):
+        print_problem(problem)
+        told = listed([names(number) for number in numbers], _MOST_FAILED)
+        err.print(escape(f"    without a result, {len(numbers)} in all: {told}"), soft_wrap=True)
+
+
+def print_finding(finding: Finding) -> None:
+    """Print a rule of GPU simulation that the author's code broke, with its line."""
+    place = place_text(finding.file, finding.line)
+    err.print(
+        f"[yellow]warning[/] {escape(place)}{escape(finding.message)} [dim](rule {finding.rule})[/]",
+        soft_wrap=True,
+    )
+    if finding.code:
+        err.print(f"    {escape(finding.code)}", soft_wrap=True)
+
+
+def print_event(event: Event) -> None:
+    """Print loads and failures, which the page shows too."""
+    from workbench.live.messages import Loaded, LoadFailed, RulesBroken
+
+    if isinstance(event, Loaded):
+        parts = ", ".join(f"{plain_text(name)} {ms:.0f}" for name, ms in event.milliseconds.items())
+        total = sum(event.milliseconds.values())
+        how = "loaded" if event.reload is None else event.reload.level
+        why = "" if event.reload is None or not event.reload.reason else f": {event.reload.reason}"
+        what = escape(plain_text(f"{event.task.env_id}{why}"))
+        out.print(
+            f"[green]{escape(how)}[/] {what} in {total:.0f} ms [dim]({escape(parts)})[/]",
+            soft_wrap=True,
+        )
+        for notice in event.task.notices:
+            if notice not in _printed_notices:
+                _printed_notices.add(notice)
+                warn(notice)
+    elif isinstance(event, LoadFailed):
+        print_problem(event.problem)
+        if event.kept:
+            err.print(f"[dim]{escape(_what_runs(event))}[/]", soft_wrap=True)
+    elif isinstance(event, RulesBroken):
+        for finding in event.new:
+            print_finding(finding)
+
+
+def _what_runs(failed: LoadFailed) -> str:
+    """Text: which version runs after a failure, and how to go on."""
+    if failed.at_run:
+        of = "the policy" if failed.problem.stage == "policy" else "the version"
+        process = f"; another process loads the version again: {failed.spoiled}" if failed.spoiled else ""
+        return f"{of} failed while the task ran, which is paused{process}; save a mended file, or go on with a reset"
+    if failed.spoiled or failed.problem.stage == "worker":
+        return "the last good version comes back where it was"
+    return "the last good version stays as it was, running or paused"
+
+
+def print_line(line: PrintedLine) -> None:
+    """Print a line of the author's code, marked to distinguish it from the workbench's own."""
+    from workbench.live.process.captured_output import for_terminal
+
+    coloured = line.runs and out.color_system is not None and not out.no_color
+    print(f"  | {for_terminal(line.runs) if coloured else line.text}", flush=True)
+
+
+# --- Asking whether code of a recording may run ------------------------------------------------
+
+
+MOST_NAMED = 20
+"""Maximum number of questions that are listed where they cannot be asked."""
+_TAB = "\t"
+_SHOW = ("s", "show")
+_ANSWERS = {
+    "y": Consent.ONCE,
+    "yes": Consent.ONCE,
+    "a": Consent.ALWAYS,
+    "always": Consent.ALWAYS,
+    "q": Consent.NONE,
+}
+
+
+def can_ask() -> bool:
+    """Whether stdin and stdout are terminals, so that a person can answer."""
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+class TerminalPrompt:
+    """Asks for consent in a terminal.
+
+    Args:
+        out: the console to ask on.
+        quiet: context in which nothing else writes to it.
+    """
+
+    def __init__(self, out: Console, quiet: Callable[[], AbstractContextManager[None]]) -> None:
+        self._out, self._quiet = out, quiet
+
+    def ask(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
+        with self._quiet():
+            print_question(question, self._out)
+            choices = (
+                "show: print the text first; y: run it and ask again next time; a: run it and trust this text from now on; "
+                "n: do not run it"
+            )
+            choices += f"; q: nor the {question.more} more" if question.more else ""
+            while True:
+                self._out.print(f"[bold]Run it?[/] ({choices}) \\[n] ", end="", soft_wrap=True)
+                try:
+                    typed = input().strip().lower()
+                except EOFError:
+                    return Consent.NO
+                if typed not in _SHOW:
+                    return _ANSWERS.get(typed, Consent.NO)
+                print_texts(question, self._out)
+
+
+def print_question(question: TrustQuestion, out: Console) -> None:
+    """Print which files would run and what is known of them."""
+
+    def print_escaped(text: str, style: str = "") -> None:
+        out.print(escape(plain_text(text)), style=style, soft_wrap=True)
+
+    holds = "hold this text" if question.recorded_text else "name this file"
+    print_escaped(f"Recordings of {question.task} that were not made by this installation {holds}:")
+    for place, file in enumerate(question.files):
+        if place == 1:
+            print_escaped(_modules_text(question))
+        name = escape(plain_text(file.name))
+        out.print(f"    {name if place else f'[bold]{name}[/]'}  {_file_mark(file)}", soft_wrap=True)
+    if question.nothing_known:
+        print_escaped(
+            "You trusted another version of this file and the modules beside it before. Which of them has changed since is "
+            "not known.",
+            "yellow",
+        )
+    elif question.trusted_before:
+        gone = f"; gone since: {', '.join(question.gone)}" if question.gone else ""
+        print_escaped(
+            f"You trusted another version of this before. Changes since then are marked{gone}.", "yellow"
+        )
+    for what in question.unseen:
+        print_escaped(what, "yellow")
+    print_escaped(
+        "It can read and change everything that you can. The digits are the first of each file's sha256sum."
+    )
+
+
+def print_texts(question: TrustQuestion, out: Console) -> None:
+    """Print the texts that would run, escaped."""
+    for file in question.files:
+        out.print(f"[bold]{escape(plain_text(file.name))}[/]  {file.hash}", soft_wrap=True)
+        for number, line in enumerate(file.text.split("\n"), 1):
+            # Not as markup, in which `:x:` is an emoji.
+            out.print(Text.assemble((f"{number:5} ", "dim"), plain_text(line, _TAB)), soft_wrap=True)
+
+
+def not_trusted_lines(error: NotTrusted) -> list[str]:
+    """Lines that say why nothing was run, and what to do."""
+    lines = [
+        f"Nothing was run: {reason}. Add it, which agrees to all in this run, if you know where the recording comes from."
+        for reason in error.reasons
+    ]
+    questions = error.questions
+    if not questions:
+        return lines
+    if can_ask():
+        return [*lines, "Nothing was run: you agreed to none of it."]
+    named: list[str] = []
+    for question in questions[:MOST_NAMED]:
+        named.append(f"    {question_text(question)}")
+        named += [f"        with {module.name} ({module.hash})" for module in question.modules]
+    if len(questions) > MOST_NAMED:
+        named.append(f"    and {len(questions) - MOST_NAMED} more")
+    return [
+        *lines,
+        "Nothing was run: the recordings were not made by this installation, and you have not agreed to run the code that they name:",
+        *named,
+        "Read it. Then run the command in a terminal, where you are asked, and where show prints the text; or add --trust, which "
+        "agrees for this run; or name your own task file with --task.",
+    ]
+
+
+def _modules_text(question: TrustQuestion) -> str:
+    if question.recorded_text:
+        return "Beside it they hold what it may import:"
+    if question.computed:
+        return "What it imports cannot be determined by reading it, so it may import everything beside it:"
+    return "It imports from beside it:"
+
+
+def _file_mark(file: CodeFile) -> str:
+    return file.hash if file.since is Since.SAME else f"{file.hash}  [yellow]{file.since.value} since[/]"

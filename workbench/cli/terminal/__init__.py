@@ -1,1 +1,0 @@
-"""Arguments that all commands share, and how commands print and ask."""

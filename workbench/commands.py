@@ -1,0 +1,44 @@
+"""All that can be asked for on a page, by a script or by an agent: `COMMANDS`.
+
+>>> from workbench.commands import COMMANDS
+>>> for command in COMMANDS:
+...     print(command.__name__, command.key, command.help())
+"""
+
+from __future__ import annotations
+
+from workbench.cameras import commands as cameras
+from workbench.checks import commands as checks
+from workbench.library import commands as library
+from workbench.live import commands as run
+from workbench.live import env_commands as envs
+from workbench.live import timeline_commands as timeline
+from workbench.page import commands as page
+from workbench.page.command import Command, CommandList, Refused
+from workbench.record import commands as recording
+from workbench.review import commands as review
+from workbench.share import commands as share
+from workbench.solve import commands as solve
+from workbench.start import commands as tasks
+
+COMMANDS = CommandList(
+    kind
+    for module in (
+        run,
+        solve,
+        timeline,
+        envs,
+        recording,
+        checks,
+        page,
+        tasks,
+        review,
+        library,
+        share,
+        cameras,
+    )
+    for kind in vars(module).values()
+    if isinstance(kind, type) and issubclass(kind, Command) and kind is not Command
+)
+
+__all__ = ["COMMANDS", "Command", "CommandList", "Refused"]

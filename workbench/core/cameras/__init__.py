@@ -1,1 +1,0 @@
-"""Cameras: placed, rendered, measured and searched for."""

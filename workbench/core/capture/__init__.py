@@ -1,1 +1,0 @@
-"""Data read from a running env: for a person, and for a recording."""

@@ -1,1 +1,0 @@
-"""Everything that decides how an episode continues: kept and restored."""

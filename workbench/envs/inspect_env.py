@@ -1,0 +1,272 @@
+"""Reads one env: observation, state dict, joints and contacts."""
+
+from __future__ import annotations
+
+import operator
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien.physx as physx
+import torch
+from numpy.typing import NDArray
+
+from workbench.envs import maniskill_private
+from workbench.envs.evaluate_entries import flat_entries
+from workbench.envs.indices import require_env
+from workbench.envs.inspection import Inspection, JointReadings, Leaf, Section, Touching
+from workbench.envs.scene.scene_index import SceneIndex, scene_index
+from workbench.envs.simulation.cpu_system import batched_system
+from workbench.envs.state_columns import env_states, flat_names, split_flat
+from workbench.envs.task_env import TaskEnv, to_numpy
+
+MOST_VALUES = 64
+"""Numbers of one array that are sent; a joint vector has fewer, a picture more."""
+
+
+def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspection:
+    """Read these sections of one env; what cannot be read is named in `Inspection.refused`.
+
+    The numbers come from where the task takes them: the last observation, ``get_state_dict()``, ManiSkill's batched
+    tensors. Costs about 1 ms a section for a Panda on a table, and does not change how the episode continues.
+
+    Raises:
+        IndexError: there is no such env.
+    """
+    require_env(env, task.num_envs)
+    readers: dict[Section, Callable[[TaskEnv, int], Any]] = {
+        "observation": read_observation,
+        "state": read_state,
+        "joints": read_joints,
+        "contacts": read_contacts,
+    }
+    began = time.perf_counter()
+    read: dict[str, Any] = {}
+    refused: list[tuple[Section, str]] = []
+    for section, reader in readers.items():
+        if section not in sections:
+            continue
+        try:
+            read[section] = reader(task, env)
+        except NotImplementedError as error:
+            refused.append((section, str(error)))
+        except Exception as error:
+            # The author's own get_state_dict or observation hook: the others are still worth seeing.
+            refused.append((section, f"reading it raised {type(error).__name__}: {error}"))
+    return Inspection(
+        env=env,
+        elapsed_steps=int(task.env.elapsed_steps[env]),
+        refused=tuple(refused),
+        milliseconds=1000 * (time.perf_counter() - began),
+        **read,
+    )
+
+
+def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
+    """The last observation; a flattened one (N, D) split by the names of its entries."""
+    leaves: list[Leaf] = []
+    for name, value in flat_entries({} if task.obs is None else task.obs):
+        # With pictures, ManiSkill's flattened part is called "state".
+        names = flat_names(task, value) if name in ("", "state") else None
+        if names is None:
+            leaves.append(_leaf(name or "observation", _row(value, env, task.num_envs)))
+        else:
+            leaves += [_leaf(*part) for part in split_flat(names, to_numpy(value[env]))]
+    return tuple(leaves)
+
+
+def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
+    """``get_state_dict()``; the 13 numbers of a body, and 13 + 2 J of an articulation, split by name."""
+    structs = scene_index(task.env).states
+    leaves: list[Leaf] = []
+    for name, value in env_states(task.env).items():
+        struct = structs.get(name)
+        if struct is None:
+            leaves.append(_leaf(name, _row(value, env, task.num_envs)))
+        elif env in maniskill_private.envs_of(struct):
+            leaves += [
+                _leaf(f"{name}/{part}", numbers) for part, numbers in _state_parts(to_numpy(value[env]))
+            ]
+    return tuple(leaves)
+
+
+def read_joints(task: TaskEnv, env: int) -> tuple[JointReadings, ...]:
+    """Every articulation of this env, in the order of building."""
+    found = []
+    for name, articulation in task.env.scene.articulations.items():
+        at = np.flatnonzero(np.asarray(maniskill_private.envs_of(articulation)) == env)
+        if not len(at):
+            continue
+        row = int(at[0])
+        joints = maniskill_private.objects_of(articulation)[row].active_joints
+        count = len(joints)
+        if not count:
+            continue
+        # SAPIEN's own names carry the env's number.
+        names = tuple(joint.name for joint in articulation.active_joints)
+        limits = to_numpy(articulation.get_qlimits()[row])[:count]
+        stiff = np.array([joint.stiffness > 0 for joint in joints])
+        found.append(
+            JointReadings(
+                articulation=name,
+                names=names,
+                kinds=tuple(str(joint.type) for joint in joints),
+                position=_floats(articulation.get_qpos()[row])[:count],
+                velocity=_floats(articulation.get_qvel()[row])[:count],
+                target=np.where(stiff, _floats(articulation.get_drive_targets()[row])[:count], np.nan),
+                low=limits[:, 0].astype(np.float32),
+                high=limits[:, 1].astype(np.float32),
+            )
+        )
+    return tuple(found)
+
+
+def read_contacts(task: TaskEnv, env: int) -> tuple[Touching, ...]:
+    """Pairs of bodies that touch in the last substep, strongest first.
+
+    Raises:
+        NotImplementedError: the env is simulated on the GPU.
+    """
+    pairs: dict[tuple[str, str], list[tuple[Contact, int]]] = {}
+    for contact in list_contacts(task.env, env):
+        first, second = contact.bodies
+        # Shapes that are only near have a contact too.
+        if not contact.impulses.any() and not (contact.separations <= 0).any():
+            continue
+        ordered = (first, second) if first <= second else (second, first)
+        pairs.setdefault(ordered, []).append((contact, 1 if ordered == (first, second) else -1))
+    touching = [_touching(bodies, contacts) for bodies, contacts in pairs.items()]
+    return tuple(sorted(touching, key=lambda pair: (-float(np.linalg.norm(pair.force)), pair.bodies)))
+
+
+def _touching(bodies: tuple[str, str], contacts: list[tuple[Contact, int]]) -> Touching:
+    timestep = np.float32(contacts[0][0].timestep)
+    impulses = np.concatenate([sign * contact.impulses for contact, sign in contacts])
+    impulse = impulses.sum(axis=0)
+    return Touching(
+        bodies=bodies,
+        force=impulse / timestep,
+        impulse=impulse,
+        points=np.concatenate([contact.points for contact, _ in contacts]),
+        forces=impulses / timestep,
+        separation=min(float(contact.separations.min()) for contact, _ in contacts),
+    )
+
+
+def _state_parts(row: NDArray) -> Iterator[tuple[str, NDArray]]:
+    """Named parts of a state row, as `Actor.get_state` and `Articulation.get_state` lay them out."""
+    joints = (len(row) - 13) // 2
+    widths = [("p", 3), ("q", 4), ("v", 3), ("w", 3), ("qpos", joints), ("qvel", joints)]
+    if 13 + 2 * joints != len(row):
+        widths = [("", len(row))]
+    at = 0
+    for name, width in widths:
+        if width:
+            yield name, row[at : at + width]
+        at += width
+
+
+def _row(value: Any, env: int, num_envs: int) -> NDArray:
+    shape: tuple[int, ...] = tuple(getattr(value, "shape", ()))
+    # Only the row leaves the device: a picture of every env would be megabytes.
+    return to_numpy(value[env] if shape[:1] == (num_envs,) else value)
+
+
+def _leaf(name: str, value: NDArray, dtype: str | None = None) -> Leaf:
+    numeric = value.dtype.kind in "fiub" and value.size > 0
+    low, high = (float(value.min()), float(value.max())) if numeric else (np.nan, np.nan)
+    values = value.reshape(-1)[:MOST_VALUES].copy()
+    return Leaf(name, tuple(value.shape), dtype or str(value.dtype), values, low, high)
+
+
+def _floats(value: torch.Tensor) -> NDArray[np.float32]:
+    return to_numpy(value).astype(np.float32)
+
+
+# --- Which bodies of an env touch, where, and how hard: for people who look, not for rewards ---
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One pair of collision shapes in the last substep, with K points; float32, the env's own world frame.
+
+    PhysX lists two shapes that are nearer than their contact offsets (1 cm each by default). So a pair of bodies may come
+    more than once, and a positive `separation` without an impulse means near, not touching.
+    """
+
+    bodies: tuple[str, str]
+    """Names as in `SceneIndex.names`; the ``sapien.Entity``'s name for what ManiSkill does not manage."""
+    points: NDArray[np.float32]
+    """(K, 3) metres."""
+    normals: NDArray[np.float32]
+    """(K, 3) unit vectors from the second body towards the first."""
+    impulses: NDArray[np.float32]
+    """(K, 3) newton seconds ON the first body, BY the second, in the last substep, friction included."""
+    separations: NDArray[np.float32]
+    """(K,) metres between the surfaces; negative where they overlap."""
+    timestep: float
+    """Seconds of a substep."""
+
+    @property
+    def impulse(self) -> NDArray[np.float32]:
+        """(3,) newton seconds on the first body: the sum of `impulses`."""
+        return self.impulses.sum(axis=0)
+
+    @property
+    def force(self) -> NDArray[np.float32]:
+        """(3,) newtons on the first body, the mean over the last substep. On the second: its negative."""
+        return self.impulse / np.float32(self.timestep)
+
+
+def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
+    """All contacts of one env in its last substep, ordered by their bodies' names, then by their points.
+
+    Stock ManiSkill has this for a single env only (``scene.get_contacts()``). Only the chosen env is read.
+
+    (SAPIEN's own order is that of memory addresses: it differs from run to run of the same episode.)
+
+    After a reset or a restored snapshot the list is still that of the last substep, as in stock ManiSkill, until the
+    next step.
+
+    Args:
+        env: a ManiSkill env, reset at least once, batched on the CPU or stock; wrappers are removed.
+
+    Raises:
+        IndexError: there is no such env.
+        NotImplementedError: the env is simulated on the GPU.
+    """
+    env, env_idx = maniskill_private.open_env(env), operator.index(env_idx)
+    require_env(env_idx, env.num_envs)
+    batched = batched_system(env.scene)
+    if batched is None and env.scene.gpu_sim_enabled:
+        raise NotImplementedError(
+            "PhysX on the GPU keeps no list of contacts that can be read: open the task with the CPU backend."
+        )
+    system = env.scene.px if batched is None else batched.systems[env_idx]
+    index, timestep = scene_index(env), env.scene.timestep
+    contacts = [_read(contact, index, timestep) for contact in system.get_contacts()]
+    return tuple(sorted(contacts, key=_place))
+
+
+def _place(contact: Contact) -> tuple[Any, ...]:
+    # Two shapes of one body may touch at the same point, with different depths.
+    return contact.bodies, contact.points.tolist(), contact.separations.tolist(), contact.impulses.tolist()
+
+
+def _read(contact: physx.PhysxContact, index: SceneIndex, timestep: float) -> Contact:
+    first, second = contact.bodies
+    points = contact.points
+    return Contact(
+        bodies=(index.name_of(first) or first.entity.name, index.name_of(second) or second.entity.name),
+        points=_rows([point.position for point in points]),
+        normals=_rows([point.normal for point in points]),
+        impulses=_rows([point.impulse for point in points]),
+        separations=np.array([point.separation for point in points], dtype=np.float32),
+        timestep=timestep,
+    )
+
+
+def _rows(vectors: Sequence[Any]) -> NDArray[np.float32]:
+    return np.array(vectors, dtype=np.float32).reshape(-1, 3)

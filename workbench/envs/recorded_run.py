@@ -1,0 +1,118 @@
+"""A recorded episode as plain arrays, the names of its columns, and the keywords that remake its env."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.keywords import control_mode_of
+
+if TYPE_CHECKING:
+    from mani_skill.envs.sapien_env import BaseEnv  # the server reads what is below, and loads no torch
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """T actions of one env, and its T + 1 states as far as they were recorded.
+
+    State 0 is the reset; action t leads to state t + 1.
+    """
+
+    name: str
+    """Name to show."""
+    seed: int
+    """Episode seed; negative if unknown."""
+    reset_options: dict[str, Any]
+    """``options`` of the reset that began it."""
+    action: NDArray[np.float32]
+    """(T, A)"""
+    env_states: dict[str, NDArray]
+    """``actors/cube``, ``articulations/panda`` ..., (T + 1, D) each, as ManiSkill's ``get_state_dict`` lays them out;
+    empty where none were recorded."""
+    evaluate: dict[str, NDArray] = field(default_factory=dict)
+    """(T + 1, ...) every entry that ``evaluate`` returned."""
+    reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    """(T,); empty where the task had none."""
+
+    @property
+    def length(self) -> int:
+        """T, the number of control steps."""
+        return len(self.action)
+
+    def state(self, at: int) -> dict[str, NDArray]:
+        """(D,) of every actor and articulation in state `at`; empty if it was not recorded."""
+        return {name: rows[at] for name, rows in self.env_states.items() if at < len(rows)}
+
+    def until(self, state: int) -> RecordedRun:
+        """The run up to that state."""
+        return replace(
+            self,
+            action=self.action[:state],
+            env_states={name: rows[: state + 1] for name, rows in self.env_states.items()},
+            evaluate={name: rows[: state + 1] for name, rows in self.evaluate.items()},
+            reward=self.reward[:state],
+        )
+
+
+def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distance of poses: (...) metres and (...) radians.
+
+    Args:
+        a, b: (..., 7) position in metres and quaternion wxyz. The distance is 0 if both poses are NaN, infinite if one is.
+    """
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    lacks = ~np.isfinite(a).all(-1), ~np.isfinite(b).all(-1)
+    with np.errstate(invalid="ignore"):
+        metres = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
+        # From the chord between the quaternions: the arc cosine of their product cannot distinguish angles below 3e-4 from
+        # none in single precision. q and -q are the same rotation.
+        p, q = a[..., 3:], b[..., 3:]
+        chord = np.minimum(np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1))
+        radians = 4 * np.arcsin(np.clip(chord / 2, 0, 1))
+    found = (np.where(lacks[0] | lacks[1], np.inf, way) for way in (metres, radians))
+    metres, radians = (np.where(lacks[0] & lacks[1], 0.0, way) for way in found)
+    return metres, radians
+
+
+# --- names of columns --------------------------------------------------------------------------------
+
+
+STATE, OBS = "state/", "obs/"
+"""Prefixes of column names: ``state/actors/cube``, ``obs/agent/qpos``."""
+
+
+def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
+    """One env's states, without those of what it lacks (NaN in the columns)."""
+    rows = {name[len(STATE) :]: column[env] for name, column in columns.items() if name.startswith(STATE)}
+    return {name: row for name, row in rows.items() if not np.isnan(row).all()}
+
+
+# --- keywords of ``gym.make`` that make an env again ------------------------------------------------
+
+
+HOW_IT_IS_RUN = frozenset({"num_envs", "sim_backend", "render_backend", "render_device", "render_mode"})
+"""Keywords that change how an env is run, not what it is."""
+
+
+def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Keywords of ``gym.make`` that make `env` again: those `given` and the modes it took, as far as JSON holds them.
+
+    ManiSkill's ``replay_trajectory`` calls ``gym.make(env_id, **env_kwargs)``. The replay chooses `HOW_IT_IS_RUN`.
+    """
+    modes: dict[str, Any] = {"obs_mode": env.obs_mode, "reward_mode": env.reward_mode}
+    if (mode := control_mode_of(env)) is not None:
+        modes["control_mode"] = mode
+    every = {**given, **modes}
+    return {name: every[name] for name in every if name not in HOW_IT_IS_RUN and _is_json(every[name])}
+
+
+def _is_json(value: Any) -> bool:
+    try:
+        return json.loads(json.dumps(value)) == value or isinstance(value, tuple)
+    except (TypeError, ValueError):
+        return False

@@ -1,0 +1,1 @@
+"""Shaders, and simplified shapes for fast pictures."""

@@ -1,0 +1,102 @@
+"""What a camera cannot see: boxes and triangles wholly outside its field of view. And what never moves before it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.render
+from numpy.typing import NDArray
+from sapien import physx
+from scipy.spatial import QhullError
+from trimesh.convex import hull_points
+
+from workbench.envs.scene.shapes import Mesh
+
+_MARGIN = 1.0
+"""Pixels around the picture that count as in view: a tolerance for poses that moved since they were measured."""
+
+Planes = NDArray[np.float64]
+"""(5, 4) left, right, top, bottom and near: a point is in view where all of ``planes @ (x, y, z, 1)`` are positive."""
+
+
+def planes_of(camera: sapien.render.RenderCameraComponent) -> Planes:
+    """View planes of a camera, in its own frame: x forward, y left, z up."""
+    k = np.asarray(camera.get_intrinsic_matrix(), np.float64)
+    # Times x, the column and the row of a point's pixel.
+    column, row, x = (
+        np.array([k[0, 2], -k[0, 0], -k[0, 1], 0]),
+        np.array([k[1, 2], 0, -k[1, 1], 0]),
+        np.eye(4)[0],
+    )
+    planes = [
+        column + _MARGIN * x,
+        (camera.width + _MARGIN) * x - column,
+        row + _MARGIN * x,
+        (camera.height + _MARGIN) * x - row,
+        x - [0, 0, 0, 0.99 * camera.near],
+    ]
+    return np.array(planes)
+
+
+def outside_and_inside(
+    boxes: NDArray[np.float32], planes: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(B,) whether boxes (B, 2, 3) are wholly outside one of the planes (B, 5, 4), each in the frame of its box; and whether
+    they are wholly inside all."""
+    sides = planes[:, :, None, :3] * boxes[:, None]
+    farthest = sides.max(axis=2).sum(axis=-1) + planes[..., 3]
+    nearest = sides.min(axis=2).sum(axis=-1) + planes[..., 3]
+    return farthest.min(axis=1) < 0, nearest.min(axis=1) >= 0
+
+
+def is_outside(points: NDArray[np.float64], planes: Planes) -> bool:
+    """Whether points (P, 3), and so what is between them, are wholly outside one of the planes, in whose frame they are."""
+    return bool((planes[:, :3] @ points.T + planes[:, 3:]).max(axis=1).min() < 0)
+
+
+def corners_of(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(P, 3) those of their convex hull, or of their box where they have none: in one plane, or not numbers."""
+    try:
+        return np.asarray(hull_points(points), np.float64)
+    except (QhullError, ValueError):
+        return box_corners(points)
+
+
+def box_corners(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(8, 3) of the box around them."""
+    return np.array(list(product(*zip(points.min(axis=0), points.max(axis=0)))), np.float64)
+
+
+def cut_to_view(mesh: Mesh, planes: Planes) -> Mesh:
+    """`mesh` without the triangles that are wholly outside one of the planes, in whose frame it is."""
+    outside = (mesh.vertices @ planes[:, :3].T + planes[:, 3] < 0) @ (1 << np.arange(len(planes)))
+    of_faces = outside[mesh.faces]
+    kept = mesh.faces[(of_faces[:, 0] & of_faces[:, 1] & of_faces[:, 2]) == 0]
+    index, faces = np.unique(kept, return_inverse=True)
+    return replace(
+        mesh,
+        vertices=mesh.vertices[index],
+        faces=faces.reshape(-1, 3).astype(np.uint32),
+        normals=None if mesh.normals is None else mesh.normals[index],
+        uvs=None if mesh.uvs is None else mesh.uvs[index],
+    )
+
+
+def fixed_to(entity: sapien.Entity) -> set[int]:
+    """Ids of the entities of an articulation that never move as seen from this one."""
+    link: Any = entity.find_component_by_type(physx.PhysxArticulationLinkComponent)
+    found, left = {id(entity)}, [] if link is None else [link]
+    while left:
+        link = left.pop()
+        beside = [child for child in link.children if child.joint.type == "fixed"]
+        if link.parent is not None and link.joint.type == "fixed":
+            beside.append(link.parent)
+        for other in beside:
+            if id(other.entity) not in found:
+                found.add(id(other.entity))
+                left.append(other)
+    return found

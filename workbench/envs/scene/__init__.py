@@ -1,0 +1,1 @@
+"""Bodies and shapes of a built scene."""

@@ -1,0 +1,355 @@
+"""Bodies of a built scene, where their poses are, and which have a state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import wraps
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import sapien
+import torch
+from numpy.typing import NDArray
+
+from workbench.envs import maniskill_private
+from workbench.envs.scene.shapes import BodyKind
+from workbench.envs.simulation.cpu_system import batched_system
+
+_T = TypeVar("_T")
+_AWAY = 5e4
+"""Metres along each axis from where an actor was hidden, if it is still hidden; ``Actor.hide_visual`` moves it by 99999."""
+
+
+def once_a_scene(find: Callable[[Any], _T]) -> Callable[[Any], _T]:
+    """Cache ``find(env)`` on the env's scene, so that it is called once a scene, and again when bodies came or went."""
+    name = f"_workbench {find.__module__}.{find.__qualname__}"
+
+    @wraps(find)
+    def known(env: Any) -> _T:
+        held, px = vars(env.scene), batched_system(env.scene)
+        version = 0 if px is None else px.layout_version
+        if name not in held or held[name][0] != version:
+            held[name] = version, find(env)
+        return held[name][1]
+
+    return known
+
+
+@dataclass(frozen=True)
+class SceneIndex:
+    """The bodies of one built scene.
+
+    Asked one by one a body's pose costs 2 us, so 64 envs of 16 bodies cost 2 ms a frame. Here it is found once which row of
+    ``px.cuda_rigid_body_data`` belongs to which (env, body), and a frame is one gather. Static bodies are not in that
+    tensor: `fixed` has their poses. In GPU simulation a hidden body was moved 99999 m away; `hidden_poses` has its true pose.
+    Objects that differ from env to env (`Actor.merge`) are one body by the merged name.
+    """
+
+    names: tuple[str, ...]
+    """(B,) an actor's name, or ``articulation/link``; unique."""
+    kinds: tuple[BodyKind, ...]
+    """(B,)"""
+    owners: tuple[str, ...]
+    """(B,) the actor's name again, or the articulation's."""
+    hidden: tuple[bool, ...]
+    """(B,) whether the task hides it from its sensors."""
+    entities: NDArray[np.object_]
+    """(N, B) the ``sapien.Entity`` of each body; None if the env lacks it."""
+    states: dict[str, Any]
+    """ManiSkill's structs by their names in its state dict: ``actors/cube`` (no static ones), ``articulations/panda``."""
+    actors: tuple[tuple[Any, NDArray[np.int64]], ...]
+    """Every Actor, merged ones and their parts, with the slots of its entities: positions in the flattened (N * B) array
+    of bodies, -1 if absent."""
+    fixed: NDArray[np.float32]
+    """(N, B, 7) poses of static bodies; NaN elsewhere. Only used with `rows`."""
+    rows: Any
+    """(K,) row of each moving (env, body) in ``px.cuda_rigid_body_data``, for `rows_of`; None on a stock CPU env."""
+    slots: NDArray[np.int64]
+    """(K,) the slot of each of `rows`."""
+    slot_of: dict[int, int]
+    """``id`` of an entity to its slot; `entities` keeps the entities alive, so ids stay valid."""
+
+    def name_of(self, entity: Any) -> str | None:
+        """Body name of an entity or SAPIEN component; None if ManiSkill does not manage it."""
+        slot = self.slot_of.get(id(_entity(entity)))
+        return None if slot is None else self.names[slot % len(self.names)]
+
+
+@once_a_scene
+def scene_index(env: Any) -> SceneIndex:
+    """The index of the present scene of a ManiSkill env (unwrapped, reset at least once).
+
+    Bodies are all actors, then all links of all articulations, by the name of their merged view if there is one.
+
+    Raises:
+        NotImplementedError: the env was made with ``parallel_in_single_scene``.
+    """
+    scene = env.scene
+    if scene.parallel_in_single_scene:
+        raise NotImplementedError(
+            "parallel_in_single_scene puts all envs into one sub-scene, which the workbench cannot take "
+            "apart. Make the env without it: the page shows all envs side by side."
+        )
+    names: list[str] = []
+    kinds: list[BodyKind] = []
+    owners: list[str] = []
+    columns: list[list[Any]] = []
+    for owner, name, structs in _named_structs(scene):
+        # An actor may be called "panda/panda_hand".
+        while name in names:
+            name += "'"
+        names.append(name)
+        kinds.append("link" if owner else structs[0].px_body_type)
+        owners.append(owner or name)
+        columns.append(structs)
+    shape = (env.num_envs, len(names))
+    entities = np.full(shape, None, dtype=object)
+    fixed = np.full((*shape, 7), np.nan, dtype=np.float32)
+    slots: list[NDArray[np.int64]] = []
+    rows: list[torch.Tensor] = []
+    for body, structs in enumerate(columns):
+        for struct in structs:
+            envs = maniskill_private.envs_of(struct)
+            for e, thing in zip(envs, maniskill_private.objects_of(struct), strict=True):
+                entity = entities[e, body] = _entity(thing)
+                if kinds[body] == "static":
+                    fixed[e, body] = [*entity.pose.p, *entity.pose.q]
+            if kinds[body] != "static" and scene.gpu_sim_enabled:
+                own = maniskill_private.data_rows_of(struct)
+                slots.append((envs * len(names) + body)[(own >= 0).numpy(force=True)])
+                rows.append(own[own >= 0])  # a body that was removed has none
+    slot_of = {id(entity): slot for slot, entity in enumerate(entities.ravel()) if entity is not None}
+    hidden = {
+        id(entity)
+        for actor in maniskill_private.hidden_objects(env)
+        for entity in maniskill_private.objects_of(actor)
+    }
+    actors = {id(actor): actor for actor in [*scene.actors.values(), *scene.actor_views.values()]}
+    registry = scene.state_dict_registry
+    moving = {f"actors/{a.name}": a for a in registry.actors.values() if a.px_body_type != "static"}
+    return SceneIndex(
+        names=tuple(names),
+        kinds=tuple(kinds),
+        owners=tuple(owners),
+        hidden=tuple(any(id(entity) in hidden for entity in column) for column in entities.T),
+        entities=entities,
+        states={**moving, **{f"articulations/{a.name}": a for a in registry.articulations.values()}},
+        actors=tuple(
+            (
+                actor,
+                np.array(
+                    [slot_of.get(id(entity), -1) for entity in maniskill_private.objects_of(actor)], np.int64
+                ),
+            )
+            for actor in actors.values()
+        ),
+        fixed=fixed,
+        rows=row_index(torch.cat([torch.zeros(0, dtype=torch.int64, device=scene.device), *rows]))
+        if scene.gpu_sim_enabled
+        else None,
+        slots=np.concatenate([np.zeros(0, np.int64), *slots]),
+        slot_of=slot_of,
+    )
+
+
+def read_poses(env: Any) -> NDArray[np.float32]:
+    """(N, B, 7) float32 pose of every body in its env's own frame: p in metres, q as wxyz.
+
+    NaN for bodies that an env lacks; the true pose for hidden ones.
+    """
+    index = scene_index(env)
+    poses = index.fixed.copy()
+    flat = poses.reshape(-1, 7)
+    px = batched_system(env.scene)
+    if px is not None and px.static_moves:
+        for env_idx, body in np.argwhere(~np.isnan(index.fixed[:, :, 0])):
+            entity: Any = index.entities[env_idx, body]
+            pose = entity.pose
+            poses[env_idx, body] = [*pose.p, *pose.q]
+    if index.rows is None:
+        # A stock CPU env has no such tensor, and does not move what it hides.
+        for slot, entity in enumerate(index.entities.ravel()):
+            if entity is not None:
+                flat[slot] = [*entity.pose.p, *entity.pose.q]
+        return poses
+    # Gathered on the tensor's device: one small copy to the host.
+    moved = rows_of(env.scene.px.cuda_rigid_body_data, index.rows)[:, :7]
+    flat[index.slots] = moved if isinstance(moved, np.ndarray) else moved.cpu().numpy()
+    for slots, kept in hidden_poses(env):
+        flat[slots[slots >= 0]] = kept[slots >= 0]
+    return poses
+
+
+@once_a_scene
+def joints_of_scene(env: Any) -> tuple[tuple[str, Any], ...]:
+    """Articulations that every env has, by name, with as many active joints in each: their joints can be compared."""
+    found = []
+    for name, articulation in env.scene.articulations.items():
+        count = len(articulation.active_joints)
+        everywhere = len(maniskill_private.envs_of(articulation)) == env.num_envs
+        if count and everywhere and tuple(articulation.get_qpos().shape) == (env.num_envs, count):
+            found.append((name, articulation))
+    return tuple(found)
+
+
+def joint_names(env: Any) -> tuple[str, ...]:
+    """(J,) names of the joints of `read_joints`: with the articulation's where there are several."""
+    found = joints_of_scene(env)
+    return tuple(
+        joint.name if len(found) == 1 else f"{name}/{joint.name}"
+        for name, articulation in found
+        for joint in articulation.active_joints
+    )
+
+
+def read_joints(env: Any) -> NDArray[np.float32] | None:
+    """(N, J) positions of the joints of all articulations that every env has, in rad or m; None if there are none."""
+    found = joints_of_scene(env)
+    if not found:
+        return None
+    rows = [articulation.get_qpos() for _, articulation in found]
+    return np.concatenate([np.array(row.numpy(force=True), np.float32) for row in rows], axis=1)
+
+
+def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+    """For each Actor that GPU simulation has moved away to hide it: slots (M,) and true poses (M, 7) of its entities, without
+    those that something else has moved since."""
+    for actor, slots in scene_index(env).actors:
+        if (kept := maniskill_private.pose_before_hiding(actor)) is not None:
+            now = rows_of(env.scene.px.cuda_rigid_body_data, maniskill_private.data_rows_of(actor).long())[
+                :, :3
+            ]
+            away = ((now - kept[:, :3]).abs() > _AWAY).all(dim=1).cpu().numpy()
+            yield slots[away], kept.cpu().numpy()[away]
+
+
+def present_states(env: Any) -> dict[str, Any]:
+    """(N, D) of each of `SceneIndex.states` of a batched env, laid out as by ``get_state()``; NaN in envs without it.
+
+    Copies: tensors, or arrays on the CPU.
+    """
+    return state_rows(env).states()
+
+
+class StateRows(NamedTuple):
+    """Copies from which the states of a moment are made, one call for each tensor."""
+
+    still: list[int]
+    places: dict[str, tuple[Any, int | None, Any, int]]
+    data: Any
+    """(N, B, 13)"""
+    qpos: Any
+    qvel: Any
+    asked: dict[str, Any]
+    """States that are in none of these tensors."""
+
+    def states(self) -> dict[str, Any]:
+        """States as `present_states` returns them."""
+        data = self.data
+        if self.still:
+            data[:, self.still, 7:] = 0.0
+        join: Any = np.hstack if isinstance(data, np.ndarray) else torch.hstack
+        states: dict[str, Any] = {}
+        for name, (_, column, joints, dof) in self.places.items():
+            if name in self.asked:
+                states[name] = self.asked[name]
+            elif joints is None:
+                states[name] = data[:, column]
+            else:
+                states[name] = join([data[:, column], self.qpos[joints, :dof], self.qvel[joints, :dof]])
+        return states
+
+
+def state_rows(env: Any) -> StateRows:
+    """Copy the present moment; ``states()`` then does the slow part of `present_states`."""
+    rows, still, places = _places_of_states(env)
+    px = env.scene.px
+    asked = {
+        name: in_every_env(env, struct, struct.get_state())
+        for name, (struct, column, joints, _) in places.items()
+        if column is None or (joints is None and maniskill_private.pose_before_hiding(struct) is not None)
+    }
+    qpos, qvel = px.cuda_articulation_qpos.torch(), px.cuda_articulation_qvel.torch()
+    qpos, qvel = (q.numpy().copy() if q.is_cpu else q.clone() for q in (qpos, qvel))
+    return StateRows(still, places, rows_of(px.cuda_rigid_body_data, rows), qpos, qvel, asked)
+
+
+@once_a_scene
+def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, int | None, Any, int]]]:
+    """Rows (N, B) of ``cuda_rigid_body_data``; the columns B of kinematic bodies, which have no velocity; and of each state its
+    struct and, if all envs have it, its column, and of an articulation its rows (N,) and number of joints."""
+    every, rows, still = np.arange(env.num_envs), [], []
+    places: dict[str, tuple[Any, int | None, Any, int]] = {}
+    for name, struct in scene_index(env).states.items():
+        body = struct if name.startswith("actors/") else struct.root
+        removed = bool((maniskill_private.data_rows_of(body) < 0).any())
+        if removed or not np.array_equal(maniskill_private.envs_of(struct), every):
+            places[name] = struct, None, None, 0
+            continue
+        if name.startswith("actors/"):
+            if struct.px_body_type != "dynamic":
+                still.append(len(rows))
+            places[name] = struct, len(rows), None, 0
+        else:
+            joints = row_index(maniskill_private.data_rows_of_articulation(struct))
+            places[name] = struct, len(rows), joints, maniskill_private.joints_of(struct)
+        rows.append(maniskill_private.data_rows_of(body).long())
+    none = torch.zeros((env.num_envs, 0), dtype=torch.long, device=env.device)
+    return row_index(torch.stack(rows, dim=1) if rows else none), still, places
+
+
+def in_every_env(env: Any, struct: Any, value: Any) -> Any:
+    """(N, ...) from a struct's value for the envs that have it, NaN in the others; all NaN if the struct is unknown."""
+    if not isinstance(value, torch.Tensor) or len(value) == env.num_envs:
+        return value
+    whole = value.new_full((env.num_envs, *value.shape[1:]), torch.nan)
+    envs = () if struct is None else maniskill_private.envs_of(struct)
+    if len(envs) == len(value):
+        whole[torch.as_tensor(envs, device=value.device)] = value
+    return whole
+
+
+def row_index(rows: torch.Tensor) -> Any:
+    """(K,) rows for `rows_of`: on the tensor's device, or an array on the CPU."""
+    return rows.long().numpy() if rows.is_cpu else rows.long()
+
+
+def rows_of(tensor: Any, rows: Any) -> Any:
+    """(K, D) copy from a tensor of the simulation; an array on the CPU, where numpy takes a quarter of torch's time for a
+    few hundred numbers."""
+    data = tensor.torch()
+    return data.numpy().take(rows, axis=0) if data.is_cpu else data[rows]
+
+
+def _named_structs(scene: Any) -> Iterator[tuple[str, str, list[Any]]]:
+    """The articulation ("" for an actor), name and structs of each body."""
+    for name, actors in _merged(scene.actors, scene.actor_views):
+        yield "", name, actors
+    for name, articulations in _merged(scene.articulations, scene.articulation_views):
+        links: dict[str, list[Any]] = {}
+        for articulation in articulations:
+            for link in articulation.links:
+                links.setdefault(link.name, []).append(link)
+        for link_name, same in links.items():
+            yield name, f"{name}/{link_name}", same
+
+
+def _merged(structs: dict[str, Any], views: dict[Any, Any]) -> Iterator[tuple[str, list[Any]]]:
+    """Structs by name; parts of one merged view together."""
+    view_of: dict[int, str] = {}
+    for name, view in views.items():
+        # Two objects of one env under one view cannot share a column: they keep their own names.
+        if len(set(maniskill_private.envs_of(view))) == len(maniskill_private.objects_of(view)):
+            for thing in maniskill_private.objects_of(view):
+                view_of.setdefault(id(thing), str(name if name is not None else view.name))
+    grouped: dict[str, list[Any]] = {}
+    for name, struct in structs.items():
+        labels = {view_of.get(id(thing)) for thing in maniskill_private.objects_of(struct)}
+        label = labels.pop() if len(labels) == 1 else None
+        grouped.setdefault(name if label is None else label, []).append(struct)
+    yield from grouped.items()
+
+
+def _entity(thing: Any) -> sapien.Entity:
+    return thing if isinstance(thing, sapien.Entity) else thing.entity

@@ -1,0 +1,108 @@
+"""Hides actors of a batched CPU scene from cameras, and leaves them where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import cache, wraps
+from typing import Any
+
+import sapien.render
+from mani_skill.utils.structs.actor import Actor
+
+from workbench.envs import maniskill_private
+from workbench.envs.error_notes import RefusedCall
+from workbench.envs.simulation.cpu_system import batched_system
+
+_KEPT = "_workbench_visibility"
+"""Attribute of a hidden actor: its render bodies and how visible they were."""
+
+
+@cache
+def install_hiding() -> None:
+    """Let ``Actor.hide_visual`` and ``show_visual`` set the visibility in batched CPU scenes, once a process.
+
+    Stock does so on the CPU too. In GPU simulation it moves an actor 99999 m away and keeps its pose aside, which shows
+    wrong poses, and shows the actor again, where another struct moves or reads it: the actor that it was merged into
+    (ManiSkill #1447). Other scenes get the stock code.
+    """
+    stock: property = Actor.__dict__["pose"]
+    Actor.pose = property(  # type: ignore[assignment]
+        _where_it_is(stock.fget), _where_it_is(stock.fset), doc=stock.__doc__
+    )
+    Actor.hide_visual = _in_batched_scenes(_hide, Actor.hide_visual)  # type: ignore[method-assign]
+    Actor.show_visual = _in_batched_scenes(_show, Actor.show_visual)  # type: ignore[method-assign]
+
+
+def _in_batched_scenes(ours: Callable[[Any], None], stock: Callable[[Any], None]) -> Callable[[Any], None]:
+    @wraps(stock)
+    def act(self: Any) -> None:
+        if batched_system(self.scene) is None:
+            stock(self)
+        elif why := why_not_hidden(self):
+            raise RefusedCall(f"ManiSkill cannot hide {self.name!r} from cameras: {why}.")
+        else:
+            ours(self)
+
+    return act
+
+
+def why_not_hidden(thing: Any) -> str:
+    """Why ManiSkill cannot hide a member of ``_hidden_objects``, as a clause; empty if it can. `RuntimeError` in a batched CPU
+    scene, an assertion or an AttributeError in others."""
+    if not isinstance(thing, Actor):
+        return f"it is no actor but a {type(thing).__name__}, and only actors can be hidden"
+    if thing.merged and "has_collision_shapes" not in vars(thing):
+        return "it is merged, and may collide. If it does not, set its has_collision_shapes to False first"
+    if thing.px_body_type == "static":
+        return "it is static. Build it with build_kinematic()"
+    return (
+        "it has collision shapes. Hide an actor that is made of visuals alone"
+        if thing.has_collision_shapes
+        else ""
+    )
+
+
+def _where_it_is(stock: Any) -> Callable[..., Any]:
+    """Stock's getter or setter, which in GPU simulation takes the pose of a hidden actor for one that is kept aside."""
+
+    @wraps(stock)
+    def call(self: Any, *args: Any) -> Any:
+        if not self.hidden or batched_system(self.scene) is None:
+            return stock(self, *args)
+        self.hidden = False
+        try:
+            return stock(self, *args)
+        finally:
+            self.hidden = True
+
+    return call
+
+
+def _hide(actor: Any) -> None:
+    if actor.hidden:
+        return
+    actor.hidden = True
+    bodies = (
+        thing.find_component_by_type(sapien.render.RenderBodyComponent)
+        for thing in maniskill_private.objects_of(actor)
+    )
+    kept = [(body, body.visibility) for body in bodies if body is not None and body.visibility > 0]
+    setattr(actor, _KEPT, kept)
+    for body, _ in kept:
+        body.visibility = 0.0
+
+
+def _show(actor: Any) -> None:
+    actor.hidden = False
+    for body, visibility in vars(actor).pop(_KEPT, ()):
+        body.visibility = visibility
+
+
+def shown_visibility(actors: Iterable[Any], body: Any) -> float:
+    """How visible a render body is where it is shown: a ghost of 0.3 stays one.
+
+    Args:
+        actors: those that may hide it.
+    """
+    hidden = (kept for actor in actors for kept in vars(actor).get(_KEPT, ()))
+    return next((was for other, was in hidden if other is body), body.visibility) or 1.0

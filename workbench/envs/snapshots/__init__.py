@@ -1,0 +1,1 @@
+"""Snapshots of everything that decides how an episode continues."""

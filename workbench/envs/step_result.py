@@ -1,0 +1,70 @@
+"""Result of one control step of the whole batch, as plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class OtherEntry:
+    """An entry of ``evaluate()`` that is not real numbers with a row for each env: None, a string, a mean."""
+
+    what: str
+    """Type as text: ``None``, ``str``, ``float32 tensor of shape ()``."""
+    texts: tuple[str, ...] = ()
+    """Value as text, one for the batch or, with `per_env`, one for each env; empty if there are `numbers`."""
+    numbers: NDArray | None = None
+    """(...) booleans or real numbers of the whole batch; None if it is no number."""
+    per_env: bool = False
+    whole: bool = True
+    """False if `texts` is shortened."""
+
+    def of_env(self, env: int) -> OtherEntry:
+        """The part of one env; all of it if it is not per env."""
+        return replace(self, texts=(self.texts[env],)) if self.per_env else self
+
+    @property
+    def nbytes(self) -> int:
+        """Roughly what it takes in memory."""
+        return 200 + sum(map(len, self.texts)) + (0 if self.numbers is None else self.numbers.nbytes)
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """The state of all N envs after a reset or a control step. Leading dimension is always N."""
+
+    elapsed_steps: NDArray[np.int32]
+    """(N,) control steps since each env's reset."""
+    reward: NDArray[np.float32]
+    """(N,); zero right after a reset."""
+    terminated: NDArray[np.bool_]
+    """(N,) success or fail, as ManiSkill defines it."""
+    truncated: NDArray[np.bool_]
+    """(N,) the time limit of ``@register_env(max_episode_steps=...)`` was reached."""
+    evaluate: dict[str, NDArray]
+    """The entries that ``evaluate()`` returned with a row for each env: booleans or real numbers, each (N, ...)."""
+    poses: NDArray[np.float32]
+    """(N, B, 7) of every body: position in metres, quaternion wxyz, env's own frame."""
+    action: NDArray[np.float32] | None = None
+    """(N, A) that led here; None right after a reset."""
+    sound_obs: NDArray[np.bool_] | None = None
+    """(N,) whether the env's observation is finite, pictures left out; None if unknown."""
+    qpos: NDArray[np.float32] | None = None
+    """(N, J) positions of the joints of `envs.scene.scene_index.joint_names`, in rad or m; None if there are none."""
+    others: dict[str, OtherEntry] = field(default_factory=dict)
+    """All other entries of ``evaluate()``; no name is also in `evaluate`."""
+
+    @property
+    def nbytes(self) -> int:
+        """Roughly what it takes in memory."""
+        return sum(map(_nbytes, vars(self).values()))
+
+
+def _nbytes(value: Mapping[str, NDArray | OtherEntry] | NDArray | OtherEntry | None) -> int:
+    if isinstance(value, Mapping):
+        return sum(map(_nbytes, value.values()))
+    return 0 if value is None else value.nbytes

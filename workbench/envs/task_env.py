@@ -1,0 +1,380 @@
+"""A running task: N envs behind one interface that gives plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, get_args
+
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import common
+from numpy.typing import NDArray
+
+from workbench.envs import action_vector as actions
+from workbench.envs import maniskill_private
+from workbench.envs.assets import refuse_downloads, require_assets, robots_of
+from workbench.envs.backends import Backend, BackendUnavailable, choose_backend, keep_render_device
+from workbench.envs.broken_rule import BrokenRules, warn_of
+from workbench.envs.camera_data import PictureDegree
+from workbench.envs.cpu_scene import batched_class, refuse_unbuilt_env
+from workbench.envs.evaluate_entries import FLAGS, flat_entries, split_entries
+from workbench.envs.gpu_rules import Degree, Finding, degrees_of
+from workbench.envs.indices import envs_of_batch
+from workbench.envs.keywords import constructor_arguments
+from workbench.envs.maniskill_private import episode_seeds, flatten_observation, keep_observation
+from workbench.envs.partial_reset import in_ascending_order, seeded
+from workbench.envs.scene.scene_index import read_joints, read_poses
+from workbench.envs.snapshots.snapshot import (
+    RestoreReport,
+    Snapshot,
+    remembering,
+    restore_snapshot,
+    take_snapshot,
+)
+from workbench.envs.step_result import StepResult
+from workbench.envs.strict import StrictMixin
+from workbench.envs.wrong_options import wrong_option
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """Options with which a task is made."""
+
+    num_envs: int = 16
+    backend: Backend = "auto"
+    """``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: see `choose_backend`."""
+    render: bool = True
+    """False makes no render system: no pictures, and no use of a graphics driver."""
+    threads: int | None = None
+    """Threads that step the envs on the CPU; None for one on each core that the process may use."""
+    pictures: PictureDegree = "exact"
+    """Degree of the pictures that the env itself draws: observations and ``render``."""
+    rules: Degree | None = None
+    """The degree of all rules of GPU simulation (on the CPU); None for each rule's own, see `rules`."""
+    on_finding: Callable[[Finding], None] = warn_of
+    """Called once for each place where a rule that does not stop the task is broken."""
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    """Further keyword arguments of the task class: ``obs_mode``, ``robot_uids``, ``control_mode`` ... A
+    ``render_backend`` among them replaces the one that is found."""
+
+    def __post_init__(self) -> None:
+        if self.num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, not {self.num_envs}")
+        if self.backend not in get_args(Backend):
+            raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, not {self.backend!r}")
+        if self.pictures not in get_args(PictureDegree):
+            raise ValueError(
+                f"pictures must be one of {', '.join(get_args(PictureDegree))}, not {self.pictures!r}"
+            )
+        degrees_of(self.rules)  # raises for an unknown degree
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"threads must be at least 1, or None for all cores, not {self.threads}")
+
+
+def given_arguments(
+    task: type[BaseEnv], env_kwargs: Mapping[str, Any], default_kwargs: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The keyword arguments that the task class is made with, apart from those of `EnvOptions`.
+
+    Args:
+        env_kwargs: as a person gave them, in JSON.
+        default_kwargs: those that it was registered with, for which a person's stand in.
+    """
+    return {**default_kwargs, **constructor_arguments(task, env_kwargs, BaseEnv)}
+
+
+def make_env(
+    task: type[BaseEnv],
+    options: EnvOptions,
+    *,
+    asset_ids: Sequence[str] = (),
+    default_kwargs: Mapping[str, Any] | None = None,
+) -> BaseEnv:
+    """The task class with N envs, unwrapped, with the best reward mode that it implements.
+
+    Raises:
+        MissingAssets: the task or its robot needs a download; names it and the command.
+        BackendUnavailable: ``backend="gpu"`` on a machine that cannot, or a ManiSkill that lacks names which are needed.
+        WrongOption: a keyword argument of `options` does not exist, or has an unknown value.
+        Exception: raised by the author's class while it builds.
+    """
+    reward = {"reward_mode": default_reward_mode(task)}
+    return build_env(task, options, asset_ids=asset_ids, default_kwargs={**reward, **(default_kwargs or {})})
+
+
+def build_env(
+    task: type[BaseEnv],
+    options: EnvOptions,
+    *,
+    asset_ids: Sequence[str] = (),
+    default_kwargs: Mapping[str, Any] | None = None,
+) -> BaseEnv:
+    """The task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` would give it; raises as `make_env`.
+
+    The class decides what the keyword arguments do not: the reward mode is then the first of
+    ``SUPPORTED_REWARD_MODES``, implemented or not.
+    """
+    if moved := maniskill_private.why_not(""):
+        raise BackendUnavailable(moved)
+    kwargs = {**(default_kwargs or {}), **options.kwargs, "num_envs": options.num_envs}
+    require_assets(task.__name__, asset_ids, robots_of(task, kwargs))
+    # ManiSkill also takes None for "none".
+    wanted = (kwargs.get("render_backend", "found") or "none") if options.render else "none"
+    # A process has one render device: do not look for another when one is named.
+    backend = choose_backend(options.backend, render=wanted == "found")
+    kwargs["render_backend"] = backend.render_backend if wanted == "found" else wanted
+    if kwargs["render_backend"] != "none":
+        keep_render_device(kwargs["render_backend"])
+    if backend.simulation == "gpu" and options.pictures == "fast":
+        raise BackendUnavailable(_NO_FAST_PICTURES)
+    try:
+        with refuse_downloads(task.__name__):
+            if backend.simulation == "gpu":
+                env = task(sim_backend="physx_cuda", **kwargs)
+                refuse_unbuilt_env(env, task, options.num_envs)
+                return env
+            made = batched_class(task, options.threads, options.rules, options.on_finding, options.pictures)
+            return made(**kwargs)
+    except Exception as error:
+        if (wrong := wrong_option(task, options.kwargs, error)) is not None:
+            raise wrong from error
+        raise
+
+
+_NO_FAST_PICTURES = (
+    "Fast pictures are for envs that are simulated on the CPU: a GPU draws exact ones as fast. Leave pictures out with "
+    "GPU simulation, or take the backend cpu."
+)
+
+
+def default_reward_mode(task: type[BaseEnv]) -> str:
+    """The richest reward mode that the class implements.
+
+    ManiSkill's own default is ``normalized_dense`` whether or not the class has one, and the first
+    step of a task without a dense reward then raises a bare NotImplementedError.
+    """
+    wanted = ("normalized_dense", "dense", "sparse", "none")
+    method = {"normalized_dense": "compute_normalized_dense_reward", "dense": "compute_dense_reward"}
+    for mode in wanted:
+        hook = method.get(mode)
+        implemented = hook is None or getattr(task, hook) is not getattr(BaseEnv, hook)
+        if mode in task.SUPPORTED_REWARD_MODES and implemented:
+            return mode
+    return "none"
+
+
+class TaskEnv:
+    """N envs of one task, on the CPU or a GPU: reset, step and snapshots, in plain arrays."""
+
+    def __init__(
+        self,
+        env: BaseEnv,
+        max_episode_steps: int | None = None,
+        check: Callable[[Mapping[str, Any], Any], None] | None = None,
+        obs: Any = None,
+    ) -> None:
+        """
+        Args:
+            env: an unwrapped ManiSkill env (see `make_env`).
+            max_episode_steps: the time limit that ``gym.make``'s wrapper would apply.
+            check: called with what ``evaluate`` and the reward returned, before either is converted;
+                raises if the task broke its contract.
+            obs: the last observation of an env that already runs, as its ``obs_mode`` gives it.
+        """
+        self.env = env
+        self.max_episode_steps = max_episode_steps
+        self.obs: Any = obs
+        """The last observation, as the task's ``obs_mode`` gives it."""
+        self._check = check
+
+    @property
+    def num_envs(self) -> int:
+        return self.env.num_envs
+
+    @property
+    def parts(self) -> tuple[actions.ActionPart, ...]:
+        return actions.action_parts(self.env)
+
+    @property
+    def control_dt(self) -> float:
+        """Simulated seconds in one control step."""
+        return self.env.control_timestep
+
+    def reset(
+        self,
+        seed: int | Sequence[int] | None = None,
+        env_idx: Sequence[int] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> StepResult:
+        """Start new episodes in all envs, or in those of `env_idx`.
+
+        All at once is ManiSkill's own ``reset(seed=[...])``. For a subset ManiSkill seeds torch with the seed of env 0, so
+        a seed given for env 3 means nothing. Here a partial reset draws from the seed of the lowest env:
+        ``reset(seed=7, env_idx=[3])`` starts the episode of a single stock env's ``reset(seed=7)``. The order in which envs
+        and their seeds are named makes no difference.
+
+        Args:
+            seed: one seed (the i-th env that is reset gets ``seed + i``), or one for each env that is reset; None
+                continues with the task's own random numbers.
+            options: further ``options`` for the task's own ``reset``.
+        """
+        chosen = envs_of_batch(range(self.num_envs) if env_idx is None else env_idx, self.num_envs)
+        seeds = _seed_list(seed, len(chosen))
+        if env_idx is None:
+            self.obs, info = self.env.reset(seed=seeds, options=dict(options or {}))
+        else:
+            self.obs, info = self._partial_reset(chosen, seeds, options or {})
+        info = {key: value for key, value in info.items() if key != "reconfigure"}
+        if self._check is not None:
+            self._check(info, None)
+        return self.result(info, np.zeros(self.num_envs), None)
+
+    def _partial_reset(
+        self, chosen: list[int], seeds: list[int] | None, further: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        # Not only in the CPU mixin: GPU simulation has ManiSkill's own reset.
+        options, seeds = in_ascending_order({**further, "env_idx": chosen}, seeds, self.env)
+        if seeds is None:
+            return self.env.reset(options=options)
+        with seeded(self.env, sorted(chosen), seeds):
+            return self.env.reset(options=options)
+
+    def step(self, action: NDArray[np.float32] | None) -> StepResult:
+        """One control step of all envs with a flat action (N, A), or None to leave the targets alone.
+
+        A task without a controller gets none.
+        """
+        action = action if self.parts else None
+        env_action = None if action is None else actions.to_env_action(self.env, self.parts, action)
+        self.obs, reward, terminated, _, info = self.env.step(env_action)
+        if self._check is not None:
+            self._check(info, reward)
+        return self.result(info, reward, action, terminated)
+
+    def snapshot(self, env_idx: Sequence[int] | None = None) -> Snapshot:
+        """Everything that decides how the episodes of these envs (None: of all) continue; see `snapshot`."""
+        return take_snapshot(self.env, env_idx)
+
+    def restore(
+        self,
+        snapshot: Snapshot,
+        env_idx: Sequence[int] | None = None,
+        source: int | Sequence[int] | None = None,
+        fresh_physics: bool = True,
+    ) -> tuple[StepResult, RestoreReport]:
+        """Restore envs, as `restore_snapshot` does, then observe and evaluate. The reward is zero, as after a reset."""
+        report = restore_snapshot(self.env, snapshot, env_idx, source, fresh_physics)
+        return self.rescore(), report
+
+    def rescore(self, action: NDArray[np.float32] | None = None) -> StepResult:
+        """Compute ``evaluate``, observation and reward of the present state, without a step.
+
+        Args:
+            action: (N, A) that led here, for the reward; None gives rewards of zero, as after a reset.
+        """
+        reward: Any = None
+        with remembering(self.env):
+            info = self.env.get_info()
+            obs = self.env.get_obs(info, unflattened=True)
+            if action is not None:
+                flat = actions.to_env_action(self.env, self.parts, action)
+                made: Any = common.to_tensor(flat, device=self.env.device) if self.parts else None
+                reward = self.env.get_reward(obs=obs, action=made, info=info)
+            self.obs = flatten_observation(self.env, obs)
+            keep_observation(self.env, self.obs)
+        if self._check is not None:
+            self._check(info, reward)
+        return self.result(info, np.zeros(self.num_envs) if reward is None else reward, action)
+
+    @property
+    def observes_pictures(self) -> bool:
+        """Whether every step renders pictures for the observation."""
+        return self.env.obs_mode not in ("state", "state_dict", "none")
+
+    @property
+    def episode_seeds(self) -> NDArray[np.int64]:
+        """(N,) seeds of the last resets."""
+        return np.array(episode_seeds(self.env), dtype=np.int64)
+
+    @property
+    def broken_rules(self) -> BrokenRules | None:
+        """Breaches of the rules of GPU simulation; None if no rule is checked."""
+        return self.env.broken_rules if isinstance(self.env, StrictMixin) else None
+
+    def close(self) -> None:
+        self.env.close()
+
+    def result(
+        self,
+        info: Mapping[str, Any],
+        reward: Any,
+        action: NDArray[np.float32] | None,
+        terminated: Any = None,
+        truncated: Any = None,
+        look: bool = True,
+    ) -> StepResult:
+        """The result of a step or (without an action) a reset, also of one made on `env` itself.
+
+        Args:
+            terminated, truncated: None to take them from `info` and the time limit.
+            look: whether to compute `StepResult.sound_obs`.
+        """
+        count = self.num_envs
+        elapsed = _column(self.env.elapsed_steps, np.int32, count)
+        if terminated is None:
+            flags = [_column(info[key], bool, count) for key in FLAGS if key in info]
+            terminated = np.logical_or.reduce(flags) if flags else False
+        if truncated is None:
+            truncated = self.max_episode_steps is not None and elapsed >= self.max_episode_steps
+        evaluate, others = split_entries(info, count)
+        return StepResult(
+            elapsed_steps=elapsed,
+            reward=_column(reward, np.float32, count),
+            terminated=_column(terminated, bool, count),
+            truncated=_column(truncated, bool, count),
+            evaluate=evaluate,
+            others=others,
+            poses=read_poses(self.env),
+            qpos=read_joints(self.env),
+            action=None if action is None else np.array(action, dtype=np.float32),
+            sound_obs=_sound(self.obs, count) if look else None,
+        )
+
+
+def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None:
+    if seed is None:
+        return None
+    seeds = [seed + i for i in range(count)] if isinstance(seed, int) else [int(s) for s in seed]
+    if len(seeds) != count:
+        raise ValueError(f"{len(seeds)} seeds for {count} envs")
+    return seeds
+
+
+def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
+    """`StepResult.sound_obs`; a value that is no batch of floats counts as finite."""
+    sound = np.ones(num_envs, bool)
+    for name, value in flat_entries(obs):
+        # Pictures are large, and the simulator's own.
+        if name.startswith("sensor_data/") or not isinstance(value, torch.Tensor):
+            continue
+        if value.is_floating_point() and value.ndim and len(value) == num_envs:
+            sound &= to_numpy(torch.isfinite(value.reshape(num_envs, -1)).all(dim=1))
+    return sound
+
+
+def _column(value: Any, dtype: type, num_envs: int) -> NDArray[Any]:
+    """(N, ...), a copy; a single value (of a task written for one env) is repeated."""
+    array = np.array(value.numpy(force=True) if isinstance(value, torch.Tensor) else value, dtype)
+    if num_envs == array.size == 1:
+        return array.reshape(1)
+    batched = array.ndim > 0 and len(array) == num_envs
+    return array if batched else np.broadcast_to(array, (num_envs, *array.shape)).copy()
+
+
+def to_numpy(value: Any) -> NDArray[Any]:
+    """A copy on the host, which the next step does not change."""
+    if isinstance(value, torch.Tensor):
+        return value.numpy(force=True).copy()
+    return np.array(value)

@@ -1,0 +1,1 @@
+"""Episodes on disk: their columns and documents, replay, films, and the results of a sweep."""

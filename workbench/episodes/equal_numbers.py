@@ -1,0 +1,40 @@
+"""Which numbers of two runs count as equal."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
+"""Numbers are equal within this share of the largest recorded one, or within this absolute difference."""
+
+
+def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:
+    """Absolute difference; infinite where one is NaN, zero where both are NaN or the same infinity."""
+    a, b = np.asarray(old, np.float64), np.asarray(new, np.float64)
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(b - a)
+    if not np.isfinite(apart).all():
+        apart[(np.isnan(a) & np.isnan(b)) | (a == b)] = 0.0
+        apart[np.isnan(apart)] = np.inf
+    return apart
+
+
+def numbers_differ(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> NDArray[np.bool_]:
+    """True where numbers differ.
+
+    Args:
+        least: absolute difference that still counts as equal.
+    """
+    return too_far(old, gap(old, new), least)
+
+
+def too_far(
+    old: NDArray, apart: NDArray, least: float = SAME_NUMBER, axis: int | None = None
+) -> NDArray[np.bool_]:
+    """True where `apart` is too large, relative to the largest of `old`; with `axis` 1 relative to the largest of
+    each row."""
+    if not apart.any():
+        return apart > 0
+    scale = np.abs(old).max(axis=axis, initial=0.0, where=np.isfinite(old), keepdims=True)
+    return apart > np.maximum(SAME_SHARE * scale, least)

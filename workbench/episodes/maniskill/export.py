@@ -1,0 +1,178 @@
+"""Writes episodes as one file of demonstrations, as ManiSkill's baselines load it: ``traj_0`` ... and a ``.json`` beside it."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from workbench.episodes.document import json_text, seen_otherwise
+from workbench.episodes.episode import Episode, read_whole
+from workbench.episodes.maniskill.sensors import missing_pictures, observed_pictures, put_pictures
+from workbench.episodes.maniskill.write import maniskill_json, put_columns
+from workbench.episodes.row import UnreadableRecording
+from workbench.machine.text import short_line
+
+WORKBENCH_ID = "workbench_id"
+"""Key of an episode in the ``.json``: the id of its recording."""
+_FLAT = "state"
+"""The observation mode in which ManiSkill gives one vector."""
+
+
+class OtherDemonstration(ValueError):
+    """An episode cannot be in one file with the others; the message is a sentence."""
+
+
+@dataclass
+class Demonstrations:
+    """Result of an export."""
+
+    file: Path
+    episodes: int = 0
+    steps: int = 0
+    left_out: int = 0
+    """Episodes without success."""
+    not_fitting: list[str] = field(default_factory=list)
+    """A sentence for each episode that was left out since it does not fit."""
+    lossy: bool = False
+    """Whether colour pictures come from recordings, which keep them as JPEG."""
+    incomplete: list[str] = field(default_factory=list)
+    """A sentence for each episode whose recording lacks some of its observations."""
+
+
+def export_maniskill(
+    sources: Sequence[tuple[str, Callable[[], Episode]]],
+    file: Path,
+    only_successes: bool = False,
+    only_fitting: bool = False,
+    on_progress: Callable[[int, str], None] = lambda done, doing: None,
+) -> Demonstrations:
+    """Write these episodes to a new ``.h5`` and its ``.json``.
+
+    One by one, so memory use does not grow with their number. Observations of the mode ``state`` are one vector (T + 1, D), and
+    pictures that were observed are in ``obs/sensor_data``, as ManiSkill records them. The files get their names when they are
+    complete.
+
+    Args:
+        sources: a name for messages and a function that reads the episode.
+        file: ends in ``.h5``; neither it nor its ``.json`` may exist.
+        only_successes: leave out episodes that reach success at no step.
+        only_fitting: leave out episodes that cannot be read or do not fit the first one.
+        on_progress: called with the number of finished episodes, and the name of the current one.
+
+    Raises:
+        UnreadableRecording: an episode cannot be read, or not all of it.
+        OtherDemonstration: an episode has no step, is of another task, or was made otherwise than the first one.
+        ValueError: there is no episode to write, or `file` has another suffix.
+        OSError: it cannot be written.
+    """
+    file = Path(file).absolute()
+    if file.suffix != ".h5":
+        raise ValueError(f"{file.name}: demonstrations are a file that ends in .h5")
+    for path in (file, file.with_suffix(".json")):
+        if path.exists():
+            raise FileExistsError(
+                f"There is something at {path} already; name a file that does not exist yet."
+            )
+    made = Demonstrations(file)
+    parts = [file.parent / f".{file.stem}.{uuid.uuid4().hex[:8]}{suffix}" for suffix in (".json", ".h5")]
+    document: dict[str, Any] | None = None
+    first: dict[str, Any] = {}
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with h5py.File(parts[1], "x") as written:
+            for number, (name, read) in enumerate(sources):
+                on_progress(number, name)
+                try:
+                    episode = read_whole(name, read)
+                    if episode.length == 0:
+                        raise OtherDemonstration(f"{name}: it has no step")
+                    shape = _shape(episode)
+                    if document is not None and (other := _difference(first, shape)):
+                        raise OtherDemonstration(f"{name}: {other}")
+                except (OtherDemonstration, UnreadableRecording) as error:
+                    if not only_fitting:
+                        raise
+                    made.not_fitting.append(str(error))
+                    continue
+                success = episode.flags.get("success")
+                if only_successes and (success is None or not success.any()):
+                    made.left_out += 1
+                    continue
+                entry = maniskill_json(episode)
+                if document is None:
+                    document, first = {**entry, "episodes": []}, shape
+                trajectory = written.create_group(f"traj_{made.episodes}", track_order=True)
+                put_columns(_flat(episode), trajectory)
+                put_pictures(episode, trajectory)
+                # ManiSkill's own files, which have no scene, keep them to the bit.
+                made.lossy |= episode.geometry is not None and any(
+                    "rgb" in m for m in shape["pictures"].values()
+                )
+                if missing := missing_pictures(episode):
+                    made.incomplete.append(
+                        f"{name}: its observations had more than its recording keeps: {missing}."
+                    )
+                document["episodes"].append(
+                    {
+                        **entry["episodes"][0],
+                        "episode_id": made.episodes,
+                        WORKBENCH_ID: episode.info.id,
+                        **seen_otherwise(episode.info),
+                    }
+                )
+                made.episodes, made.steps = made.episodes + 1, made.steps + episode.length
+        if document is None:
+            raise ValueError("\n".join(made.not_fitting) or "There is no episode to write.")
+        with parts[0].open("x") as described:
+            described.write(json_text(document, indent=2))
+        for part in parts:
+            os.rename(part, file.with_suffix(part.suffix))
+    except OSError as error:
+        if isinstance(error, FileExistsError) or error.errno is None:
+            raise
+        raise OSError(error.errno, f"Cannot write {file}: {os.strerror(error.errno)}.") from error
+    finally:
+        for part in parts:
+            part.unlink(missing_ok=True)
+    on_progress(len(sources), "done")
+    return made
+
+
+def _shape(episode: Episode) -> dict[str, Any]:
+    """What all episodes of a file have in common, by what a person calls it."""
+    info = episode.info
+    return {
+        "task": info.task,
+        "control mode": info.control_mode,
+        "arguments of the env": dict(info.env_kwargs),
+        "number of action dimensions": episode.action.shape[1],
+        "observations": {name: values.shape[1:] for name, values in episode.obs.items()},
+        "pictures": observed_pictures(episode),
+    }
+
+
+def _difference(first: dict[str, Any], other: dict[str, Any]) -> str:
+    """How an episode differs from the first one, as a sentence; empty if it does not."""
+    for what, wanted in first.items():
+        if other[what] != wanted:
+            found, expected = short_line(repr(other[what]), 300), short_line(repr(wanted), 300)
+            return f"its {what}: {found}, and of the first recording: {expected}"
+    return ""
+
+
+def _flat(episode: Episode) -> Episode:
+    """Copy of the episode whose state observations are one vector, where the env gives one."""
+    mode = episode.info.env_kwargs.get("obs_mode")
+    if not episode.obs or not isinstance(mode, str) or _FLAT not in mode.split("+"):
+        return episode
+    count = episode.length + 1
+    rows = [np.asarray(values, np.float32).reshape(count, -1) for values in episode.obs.values()]
+    # Beside pictures it has a name.
+    return replace(episode, obs={"" if mode == _FLAT else _FLAT: np.concatenate(rows, axis=1)})

@@ -1,0 +1,149 @@
+"""Writes a recorded state into a running env, and measures how far an env is from one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from workbench.envs import maniskill_private
+from workbench.envs.evaluate_entries import flat_entries
+from workbench.envs.partial_reset import active_controllers
+from workbench.envs.recorded_run import pose_distances
+from workbench.envs.scene.scene_index import present_states, scene_index
+from workbench.envs.simulation.cpu_system import batched_system
+from workbench.envs.simulation.state_layout import BODY
+from workbench.envs.snapshots.cpu_state import renew_physics
+from workbench.envs.task_env import to_numpy
+
+_POSE = 7
+
+
+def state_mismatches(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
+    """What of a recorded state does not fit this env, and what of the env the state lacks: name and reason.
+
+    Args:
+        env: an unwrapped ManiSkill env, batched.
+        state: (D,) by name, as `RecordedRun.state` gives it.
+    """
+    missed: dict[str, str] = {}
+    structs = scene_index(env).states
+    for name, struct in structs.items():
+        if env_idx not in maniskill_private.envs_of(struct):
+            continue
+        value, width = state.get(name), BODY + 2 * maniskill_private.joints_of(struct)
+        if value is None or np.isnan(value).any():
+            missed[name] = "the recording has none of this name: it is as the reset left it"
+        elif value.shape != (width,):
+            missed[name] = f"it has {width} numbers now, and {value.shape[-1]} in the recording"
+    for name, value in state.items():
+        kind = name.partition("/")[0]
+        if kind in ("actors", "articulations") and name not in structs and not np.isnan(value).all():
+            missed[name] = "this env has none of this name"
+    return missed
+
+
+def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
+    """Put a recorded state into each of these envs, except its `state_mismatches`; the other envs are not touched.
+
+    The env may have other code (an actor gone, an arm with another joint), so states are matched by name and shape and
+    written by ManiSkill's own setters. Fetches the tensors.
+    """
+    missed = {i: state_mismatches(env, i, state) for i, state in states.items()}
+    px = batched_system(env.scene)
+    maniskill_private.fetch(env)
+    # Only what differs is written: a root pose that is set once more reads back with another rounding.
+    with nullcontext() if px is None else px.holding_back():
+        for name, struct in scene_index(env).states.items():
+            fitting = [
+                i for i in maniskill_private.envs_of(struct).tolist() if i in states and name not in missed[i]
+            ]
+            rows = {i: states[i][name] for i in fitting}
+            if rows:
+                values = torch.as_tensor(np.stack([*rows.values()]).astype(np.float32), device=env.device)
+                struct.set_state(values, torch.tensor([*rows], device=env.device))
+    maniskill_private.apply_and_fetch(env)
+    _write_controllers(env, states)
+
+
+def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
+    """Set controllers and drive targets of these envs' robots to the present joint positions.
+
+    ``get_state_dict`` has controllers only if they keep their own target. The others would drive a restored robot
+    back to where it was before.
+    """
+    chosen = [int(i) for i in env_idx]
+    if env.agent is None or not chosen:
+        return
+    maniskill_private.set_reset_mask(env, chosen)
+    for controller in active_controllers(env):
+        controller.reset()
+    maniskill_private.set_reset_mask(env, list(range(env.num_envs)))
+    targets = env.scene.px.cuda_articulation_target_qpos.torch()
+    velocities = env.scene.px.cuda_articulation_target_qvel.torch()
+    for agent in maniskill_private.agents(env):
+        qpos = agent.robot.get_qpos()
+        rows = maniskill_private.data_rows_of_articulation(agent.robot)[chosen].long()
+        targets[rows, : qpos.shape[1]] = qpos[chosen]
+        velocities[rows] = 0.0
+    maniskill_private.apply_and_fetch(env)
+
+
+def new_physics(env: Any, env_idx: Sequence[int]) -> None:
+    """Give these envs a PhysX scene without a past (`renew_physics`); does nothing on a GPU, where there is no way."""
+    if batched_system(env.scene) is not None:
+        renew_physics(env.scene, [int(i) for i in env_idx])
+
+
+def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
+    """(N, D) of every actor and articulation, by the names of a recording; NaN in envs without it."""
+    return {name: to_numpy(state) for name, state in present_states(env).items()}
+
+
+def state_distance(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
+    """Distance of one env's state from a recorded one: metres of the farthest body, and radians of the body or joint
+    (metres of a sliding joint) that turned most. What only one of them has does not count.
+
+    Args:
+        now, was: (D,) by name.
+    """
+    both = [
+        (value, was[name])
+        for name, value in now.items()
+        # A controller's state is no pose.
+        if name.startswith(("actors/", "articulations/"))
+        and name in was
+        and was[name].shape == value.shape
+        # An env that lacks it has NaN throughout.
+        and not np.isnan(value).all()
+        and not np.isnan(was[name]).all()
+    ]
+    if not both:
+        return 0.0, 0.0
+    metres, radians = pose_distances(*(np.stack([pair[k][:_POSE] for pair in both]) for k in (0, 1)))
+    joints = [
+        np.abs(np.subtract(*pair, dtype=np.float64)[BODY : (BODY + len(pair[0])) // 2]) for pair in both
+    ]
+    turned = np.concatenate([radians, *joints]).max()
+    return float(metres.max()), float(turned) if np.isfinite(turned) else float("inf")
+
+
+def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
+    """Whether all that both have is equal to the last bit, including velocities."""
+    both = [name for name in was if name in now and now[name].shape == was[name].shape]
+    return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
+
+
+def _write_controllers(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
+    """Write the targets that controllers keep, if they were recorded (``controller/arm/target_qpos``)."""
+    if env.agent is None:
+        return
+    for name, value in flat_entries(env.agent.get_controller_state(), "controller"):
+        for i, state in states.items():
+            recorded = state.get(name)
+            if recorded is not None and recorded.shape == tuple(value.shape[1:]):
+                value[i] = torch.as_tensor(recorded, dtype=value.dtype, device=value.device)

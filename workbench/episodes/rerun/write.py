@@ -1,0 +1,243 @@
+"""Writes an episode as an ``.rrd`` with a blueprint in the arrangement of the workbench's page."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.chunk import Chunk
+from rerun.error_utils import catch_and_log_exceptions
+
+from workbench.envs.camera_data import moved_cameras_text
+from workbench.episodes.description import describe
+from workbench.episodes.document import fields_of, json_text
+from workbench.episodes.episode import Episode, EpisodeInfo, acted_by_text, movable_bounds
+from workbench.episodes.rerun.chunks import STEP, property_chunk, static_chunk
+from workbench.episodes.rerun.layout import (
+    EVENTS,
+    LOGS,
+    REWARD_TERMS,
+    WORLD,
+    batch_entity,
+    camera_entities,
+    chunks,
+    evaluate_entity,
+)
+from workbench.episodes.rerun.stream import encode_blueprint, write_recording
+
+MAX_SERIES = 32
+"""An ``evaluate()`` entry with more numbers is not drawn: it would hide the others."""
+MAX_STACKED = 3
+"""More cameras than this are in tabs: stacked, each would be a narrow strip."""
+EYE_DIRECTION = (0.75, 0.85, 0.6)
+"""Direction from the scene's middle to the eye, like ManiSkill's render cameras."""
+
+
+def write_rrd(episode: Episode, path: Path) -> None:
+    """Write `episode`, which has a scene, to `path`, overwriting a file there.
+
+    Chunks are made while rerun writes them, so that pictures are never in memory all at once.
+
+    Raises:
+        OSError: it cannot be written, or a picture cannot be read.
+        ValueError: rerun refuses a value.
+    """
+    application_id = _application_id(episode.info)
+    # Without strict mode rerun drops a mesh that it refuses, with a warning.
+    with catch_and_log_exceptions(strict=True):
+        blueprint = _blueprint(application_id, arrangement(episode))
+        everything = chain(_property_chunks(episode), chunks(episode))
+        write_recording(path, application_id, blueprint, everything)
+
+
+def _property_chunks(episode: Episode) -> Iterator[Chunk]:
+    written = datetime.datetime.fromisoformat(episode.info.written_at).timestamp()
+    started = rr.encodings.TimeInt(seconds=written)
+    info = rr.archetypes.RecordingInfo(name=_title(episode), start_time=started)
+    yield static_chunk("/__properties", info)
+    for name, values in properties(episode).items():
+        yield property_chunk(name, values)
+
+
+@lru_cache(maxsize=64)
+def _blueprint(application_id: str, arranged: Arrangement) -> bytes:
+    return encode_blueprint(application_id, blueprint_of(arranged))
+
+
+def _application_id(info: EpisodeInfo) -> str:
+    """The viewer keeps one blueprint per application id; rerun renames an id with a slash."""
+    return f"workbench {info.task}".replace("/", "-")
+
+
+def _title(episode: Episode) -> str:
+    flags = episode.flags
+    outcome = (
+        "success"
+        if "success" in flags and flags["success"][-1]
+        else "fail"
+        if "fail" in flags and flags["fail"][-1]
+        else "no success"
+    )
+    info = episode.info
+    seed = f"seed {info.seed}" if info.seed >= 0 else "no seed"
+    return f"{info.task} {seed} env {info.env_index}: {outcome}, {episode.length} steps"
+
+
+def properties(episode: Episode) -> dict[str, dict[str, Any]]:
+    """The properties of the recording, by name and component.
+
+    ``success`` and ``fail`` are those of the last state, ``success_once`` and ``fail_once`` of any, as in ManiSkill's
+    metrics. ``source`` has the texts of the task's files, so that the episode can be replayed after they change.
+    ``workbench`` is the `Description` for programs.
+    """
+    described = fields_of(describe(episode))
+    words = ("task", "seed", "env_index", "length", "return", "control_mode", "control_dt", "backend", "id")
+    words += ("source_file", "source_hash", "max_episode_steps", "written_at", "recovered", "pictures")
+    plain = {name: described[name] for name in words}
+    for name in ("success", "success_once", "fail", "fail_once"):
+        plain[name] = bool(described[name])
+    plain["acted_by"] = acted_by_text(episode.info.acted_by)
+    if episode.info.moved_cameras:
+        plain["moved_cameras"] = moved_cameras_text(episode.info.moved_cameras)
+    if episode.info.observed_by:
+        plain["observed_by"] = episode.info.observed_by
+    for name in ("env_kwargs", "reset_options"):
+        plain[name] = json_text(described[name])
+    values: dict[str, dict[str, Any]] = {"episode": plain}
+    if described["versions"]:
+        values["versions"] = dict(described["versions"])
+    if described["source"]:
+        values["source"] = {"files": list(described["source"]), "texts": list(described["source"].values())}
+    # Without the texts, which `source` holds.
+    values["workbench"] = {"description": json_text({**described, "source": None})}
+    return values
+
+
+# --- blueprint -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """The inputs of an episode's blueprint, which most episodes of a scene share."""
+
+    cameras: tuple[tuple[str, str, tuple[str, ...]], ...]
+    """Name, entity and modalities of each."""
+    drawn: tuple[str, ...]
+    """Entities of ``evaluate()`` that are drawn as curves."""
+    texts: bool
+    """Whether ``evaluate()`` returned texts."""
+    acted: bool
+    """Whether there are actions to draw."""
+    fps: float | None
+    eye: tuple[float, float, float]
+    looked_at: tuple[float, float, float]
+
+
+def arrangement(episode: Episode) -> Arrangement:
+    cameras = episode.cameras
+    entities = camera_entities([camera.info for camera in cameras])
+    entries = [
+        (evaluate_entity(name), column)
+        for name, column in episode.evaluate.items()
+        if not name.startswith(REWARD_TERMS)
+    ]
+    entries += [(batch_entity(name), column) for name, column in episode.batch.items()]
+    drawn = (entity for entity, column in entries if 0 < math.prod(column.shape[1:]) <= MAX_SERIES)
+    eye, looked_at = _eye(episode)
+    return Arrangement(
+        cameras=tuple(
+            (camera.info.name, entity, tuple(camera.pictures)) for camera, entity in zip(cameras, entities)
+        ),
+        drawn=tuple(drawn),
+        texts=bool(episode.texts),
+        acted=bool(episode.action_names),
+        fps=1.0 / episode.info.control_dt if episode.info.control_dt > 0 else None,
+        eye=eye,
+        looked_at=looked_at,
+    )
+
+
+def blueprint_of(arranged: Arrangement) -> rrb.Blueprint:
+    """The scene on the left, cameras on the right, curves below.
+
+    All views are given: rerun's automatic layout changes between releases and makes a view for every number.
+    """
+    scene = rrb.Spatial3DView(
+        name="Scene",
+        origin=WORLD,
+        # In a 3-D view a depth picture is a point cloud over the meshes.
+        contents=[
+            "$origin/**",
+            *(f"- {entity}/{m}" for _, entity, _ in arranged.cameras for m in ("depth", "segmentation")),
+        ],
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=arranged.eye,
+            look_target=arranged.looked_at,
+            eye_up=(0.0, 0.0, 1.0),
+        ),
+        line_grid=False,
+    )
+    top: rrb.ContainerLike = scene
+    if arranged.cameras:
+        top = rrb.Horizontal(scene, _cameras(arranged), column_shares=[3, 2])
+    return rrb.Blueprint(
+        rrb.Vertical(top, _curves(arranged), row_shares=[5, 2]),
+        rrb.TimePanel(state="collapsed", timeline=STEP, fps=arranged.fps, play_state="paused"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _cameras(arranged: Arrangement) -> rrb.ContainerLike:
+    alone = len(arranged.cameras) == 1
+    parts = [_camera(*camera, alone) for camera in arranged.cameras]
+    if alone:
+        return parts[0]
+    return rrb.Vertical(*parts) if len(parts) <= MAX_STACKED else rrb.Tabs(*parts)
+
+
+def _camera(name: str, entity: str, modalities: tuple[str, ...], alone: bool) -> rrb.ContainerLike:
+    views = [
+        rrb.Spatial2DView(name=f"{name} {m}", origin=entity, contents=[f"$origin/{m}"]) for m in modalities
+    ]
+    if len(views) == 1:
+        return views[0]
+    if alone:
+        return rrb.Vertical(views[0], rrb.Horizontal(*views[1:]), row_shares=[3, 2], name=name)
+    return rrb.Horizontal(views[0], rrb.Vertical(*views[1:]), column_shares=[2, 1], name=name)
+
+
+def _curves(arranged: Arrangement) -> rrb.ContainerLike:
+    views: list[rrb.View] = [rrb.TimeSeriesView(name="Reward", origin="/reward")]
+    if arranged.drawn:
+        views.append(rrb.TimeSeriesView(name="Evaluate", origin="/evaluate", contents=list(arranged.drawn)))
+    if arranged.acted:
+        views.append(rrb.TimeSeriesView(name="Action", origin="/action"))
+    columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
+    origin = LOGS if arranged.texts else EVENTS
+    views.append(rrb.TextLogView(name="Events", origin=origin, columns=columns))
+    return rrb.Horizontal(*views)
+
+
+def _eye(episode: Episode) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Eye and target, which frame the movable bodies. By default rerun frames the whole scene, with 100 m of ground."""
+    assert episode.poses is not None and episode.geometry is not None
+    low, high = movable_bounds(episode.poses[0], episode.geometry.body_kinds)
+    # Rounded, so that episodes of a scene share one cached blueprint.
+    middle = np.round((low + high).astype(np.float64) / 2, 1)
+    direction = np.array(EYE_DIRECTION) / np.linalg.norm(EYE_DIRECTION)
+    distance = round(1.5 * max(float(np.linalg.norm(high - low)), 0.5), 1)
+    eye = middle + distance * direction
+    return (eye[0], eye[1], eye[2]), (middle[0], middle[1], middle[2])

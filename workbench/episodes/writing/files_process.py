@@ -1,0 +1,153 @@
+"""A process that makes the files of episodes while this one goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+from workbench.envs.scene.shapes import Visual
+from workbench.episodes.writing.finish import EpisodeFiles, make_files
+from workbench.episodes.writing.from_journal import Header, read_header
+from workbench.episodes.writing.journal import SCENE_SUFFIX, Journal, JournalReader, read_visuals
+from workbench.machine.processes.child_python import child_environment, start_with_socket
+from workbench.machine.processes.wire import Unpacker, Unreadable, has_come, pack, pack_message
+
+_LONGEST = 1 << 16
+"""Limit of a message, in bytes."""
+
+
+@dataclass(frozen=True)
+class _Make:
+    journal: Path
+    states: int
+    visuals: int
+    """Number of meshes of the scene; a scene file with fewer is broken."""
+
+
+@dataclass(frozen=True)
+class _Ready:
+    """The subprocess has finished its imports."""
+
+
+@dataclass(frozen=True)
+class _Made:
+    rrd: str
+    h5: str
+    json: str
+    """File names of the recording."""
+    solved_at: int | None
+    means: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _NotMade:
+    """Export failed in the subprocess. The caller retries in-process to get the real error."""
+
+
+class FilesProcess:
+    """Makes files from journals, which hold all that they need. One thread may call `make`, any `is_ready`.
+
+    A thread would take turns for the interpreter with the env, whose calls of PhysX keep the lock. It takes a second of a core to start, and
+    110 MB. The lowest priority was no faster, and would let journals pile up where all cores are busy.
+    """
+
+    def __init__(self) -> None:
+        """Start it, not waiting for it. Raises OSError."""
+        self._is_ready = False
+        self._asking = threading.Lock()
+        self._unpacker = Unpacker((_Ready, _Made, _NotMade))
+        self._process, self._end = start_with_socket(__name__, child_environment())
+
+    @property
+    def is_ready(self) -> bool:
+        """False until the subprocess has finished its imports, and after it has ended."""
+        with self._asking:
+            if not self._is_ready and has_come(self._end):
+                self._is_ready = isinstance(self._receive(), _Ready)
+            return self._is_ready
+
+    def make(self, journal: Journal, header: Header, states: int) -> EpisodeFiles | None:
+        """`make_files` there, in the folder of the journal's; None if it could not, and may have begun."""
+        path = journal.path.absolute()
+        try:
+            # With the descriptor goes the lock: nobody recovers the journal while it is at work, also if we are killed.
+            asked = _Make(path, states, len(header.geometry.visuals))
+            socket.send_fds(self._end, [pack(asked)], [journal.descriptor])
+            made = self._receive()
+        except OSError:
+            made = None
+        if isinstance(made, _Made):
+            folder = journal.path.parent.parent
+            return EpisodeFiles(
+                folder / made.rrd, folder / made.h5, folder / made.json, made.solved_at, made.means
+            )
+        if made is None:
+            self.close()
+        return None
+
+    def close(self) -> None:
+        """End it, at once."""
+        self._is_ready = False
+        self._end.close()
+        self._process.kill()
+        self._process.wait()
+
+    def _receive(self) -> _Ready | _Made | _NotMade | None:
+        """None if it has ended."""
+        try:
+            said = self._end.recv(_LONGEST)
+            return self._unpacker.message(said) if said else None
+        except (OSError, Unreadable):
+            return None
+
+
+# --- in the process ----------------------------------------------------------------------------
+
+
+def main() -> None:
+    """``python -m workbench.episodes.writing.files_process SOCKET``. It ends when its socket closes."""
+    end = socket.socket(fileno=int(sys.argv[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    scenes: dict[tuple[int, ...], tuple[Visual, ...]] = {}
+    unpacker = Unpacker()
+    with contextlib.suppress(ConnectionError):
+        end.send(pack_message(_Ready()))
+        while True:
+            message, fds, _, _ = socket.recv_fds(end, _LONGEST, 1)
+            if not message:
+                return
+            try:
+                made = _make(unpacker.unpack(message, _Make), scenes)
+            finally:
+                for fd in fds:
+                    os.close(fd)
+            end.send(pack_message(made))
+
+
+def _make(what: _Make, scenes: dict[tuple[int, ...], tuple[Visual, ...]]) -> _Made | _NotMade:
+    try:
+        # Episodes of a scene have one file, by hard links, and share what is made of its meshes.
+        path = what.journal.with_suffix(SCENE_SUFFIX)
+        file = os.stat(path)
+        key = (file.st_dev, file.st_ino, file.st_mtime_ns, file.st_size)
+        if key not in scenes:
+            scenes.clear()
+            scenes[key] = read_visuals(path)
+        with contextlib.closing(JournalReader(what.journal)) as reader:
+            header = read_header(reader, scenes[key])
+        if header is None or len(header.geometry.visuals) != what.visuals:
+            return _NotMade()
+        files = make_files(what.journal, header, what.journal.parent.parent, what.states)
+    except Exception:
+        return _NotMade()
+    return _Made(files.rrd.name, files.h5.name, files.json.name, files.solved_at, dict(files.means))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,232 @@
+"""Turns journals into the files of recordings: at the end of an episode, or after its writer died."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from workbench.episodes.document import WrongDocument, read_document
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.maniskill.write import write_h5, write_json
+from workbench.episodes.rerun.write import write_rrd
+from workbench.episodes.writing.from_journal import Header, episode_in, mark_recovered, read_header
+from workbench.episodes.writing.journal import (
+    FOLDER,
+    SCENE_SUFFIX,
+    JournalReader,
+    claim,
+    read_visuals,
+    remove_empty_folder,
+)
+from workbench.episodes.writing.publish import RecordingError, candidates, publish, reason, sync_files
+
+SUFFIXES = (".rrd", ".h5", ".json")
+DAMAGED_SUFFIX = ".damaged"
+"""Suffix of a damaged journal; nothing reads such a file."""
+
+
+@dataclass(frozen=True)
+class EpisodeFiles:
+    """The files of one recording; without the .json the other two do not count."""
+
+    rrd: Path
+    h5: Path
+    json: Path
+    solved_at: int | None
+    """First step with success; see `Episode.solved_at`."""
+    means: Mapping[str, float]
+    """Mean of each entry of ``evaluate()``; see `Episode.means`."""
+
+
+def make_files(
+    journal: Path, header: Header, folder: Path, states: int | None = None, again: bool = False
+) -> EpisodeFiles:
+    """Write the episode in `journal` to `folder`; the journal stays.
+
+    Args:
+        states: how many there must be, if given.
+        again: another process was asked for it and ended, at any moment: files that it has published are those.
+
+    Raises:
+        RecordingError: the files cannot be written; none of them exists then.
+        ValueError: the journal holds no state, or rerun refuses a value.
+    """
+    temporaries = temporary_files(journal)
+    try:
+        with contextlib.closing(JournalReader(journal)) as reader:
+            episode = episode_in(reader, header)
+            if episode is None:
+                raise ValueError("the episode has no state yet: its first row is the state after the reset.")
+            if states is not None and episode.length + 1 != states:
+                there = f"{episode.length + 1} of {states} states"
+                raise OSError(errno.EIO, f"{there} can be read back from {journal.name}")
+            if again and (stem := _already_made(header.info, journal, folder)) is not None:
+                rrd, h5, json = (folder / f"{stem}{suffix}" for suffix in SUFFIXES)
+                return EpisodeFiles(rrd, h5, json, episode.solved_at, episode.means)
+            for path in temporaries:
+                path.unlink(missing_ok=True)
+            rrd, h5, json = temporaries
+            write_h5(episode, h5)
+            write_rrd(episode, rrd)
+            write_json(episode, json, folder, (rrd, h5), header.made_here)
+        sync_files(temporaries)
+        rrd, h5, json = publish(temporaries, folder, episode_stem(header.info))
+        return EpisodeFiles(rrd, h5, json, episode.solved_at, episode.means)
+    except OSError as error:
+        why = error if isinstance(error, RecordingError) else reason(error, folder)
+        raise RecordingError(
+            f"Cannot write the recording of {header.info.task} to {folder}: {why}"
+        ) from error
+    finally:
+        for path in temporaries:
+            # `recover` deletes what stays; an error here must not hide the one above.
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def temporary_files(journal: Path) -> tuple[Path, ...]:
+    """Paths of an episode's files until they are complete."""
+    return tuple(journal.with_suffix(suffix) for suffix in SUFFIXES)
+
+
+def episode_stem(info: EpisodeInfo) -> str:
+    """``PushCube-v1_seed0003_env03_2026-11-21T08-15-30``: task, seed, env, local time of the recording.
+
+    An unknown seed (below 0) gives ``noseed``. Only letters, digits and ``_ -``: ManiSkill's replay cuts a name at a dot.
+    Two episodes of one second get the same stem; `publish` makes it unique.
+    """
+    when = datetime.datetime.fromisoformat(info.written_at).astimezone()
+    return f"{stem_begin(info.task, info.seed)}{info.env_index:02d}_{when:%Y-%m-%dT%H-%M-%S}"
+
+
+def stem_begin(task: str, seed: int) -> str:
+    """Common beginning of the file stems of all episodes of a task with one seed."""
+    name = re.sub(r"[^A-Za-z0-9_-]+", "-", task).strip("-_")[:80] or "task"
+    return f"{name}_{f'seed{seed:04d}' if seed >= 0 else 'noseed'}_env"
+
+
+def remove_episode(folder: Path, task: str, seed: int, id: str) -> None:
+    """Delete what there is of the episode with this id: its files, and the journal of a writer that died.
+
+    Raises OSError.
+    """
+    for path in folder.glob(f"{stem_begin(task, seed)}*.json"):
+        if _id_of(path) == id:
+            for suffix in (".json", ".h5", ".rrd"):  # the .json first: without it there is no episode
+                path.with_suffix(suffix).unlink(missing_ok=True)
+    for path in (folder / FOLDER).glob(f"{id}.*"):
+        path.unlink(missing_ok=True)
+
+
+# --- after the writer died ---------------------------------------------------------------------
+
+
+def recover(folder: Path) -> list[EpisodeFiles]:
+    """Make recordings of all journals in `folder` whose writer is dead, which left its journal unlocked.
+
+    A writer may die while recording, while making files, and between two names of one recording; its journal is there
+    in each case. A journal without a control step is deleted, one that was damaged is kept under another name. When one
+    journal fails, the error is raised after the others are done.
+
+    Raises:
+        RecordingError: files cannot be written, or the folder or a journal cannot be read or not all of it; the journals stay.
+        MemoryError: a journal needs too much memory; the others are done.
+    """
+    folder = Path(folder)
+    if (folder / FOLDER).is_symlink():
+        # `_remove_strays` would delete files of another folder.
+        raise RecordingError(
+            f"Cannot recover the recordings in {folder}: {FOLDER} is a link to another folder"
+        )
+    made: list[EpisodeFiles] = []
+    failed: Exception | None = None
+    try:
+        for journal in sorted((folder / FOLDER).glob("*.arrow")):
+            try:
+                made += _recover(journal, folder)
+            except Exception as error:
+                # Of any type: a broken journal must not keep the others from being recovered.
+                failed = error
+        _remove_strays(folder)
+        remove_empty_folder(folder)
+    except OSError as error:
+        raise RecordingError(f"Cannot recover the recordings in {folder}: {reason(error, folder)}") from error
+    if isinstance(failed, RecordingError | MemoryError):
+        raise failed
+    if failed is not None:
+        why = reason(failed, folder) if isinstance(failed, OSError) else f"{failed}."
+        raise RecordingError(f"Cannot recover all recordings in {folder}: {why}") from failed
+    return made
+
+
+def _recover(journal: Path, folder: Path) -> list[EpisodeFiles]:
+    """Raises as `recover`, after the episode up to the damage was made of a damaged journal."""
+    descriptor = claim(journal)
+    if descriptor is None:
+        return []
+    try:
+        files: list[EpisodeFiles] = []
+        with contextlib.closing(JournalReader(journal)) as reader:
+            header = read_header(reader, read_visuals(journal.with_suffix(SCENE_SUFFIX)))
+            if header is not None and _already_made(header.info, journal, folder) is None:
+                header = mark_recovered(header)
+                episode = episode_in(reader, header)
+                if episode is not None and episode.length > 0:
+                    files.append(make_files(journal, header, folder))
+            lost = reader.lost_bytes()
+        if not lost:
+            journal.unlink(missing_ok=True)
+            return files
+        aside = journal.with_suffix(DAMAGED_SUFFIX)
+        os.rename(journal, aside)
+        before = f"The steps before are in {files[0].json.name}. " if files else ""
+        raise RecordingError(
+            f"A journal in {folder} is damaged, and {lost} bytes of it cannot be read. {before}All of it is kept in "
+            f"{FOLDER}/{aside.name}."
+        )
+    finally:
+        os.close(descriptor)
+
+
+def _already_made(info: EpisodeInfo, journal: Path, folder: Path) -> str | None:
+    """The stem of its files, if the writer had published them; deletes files of an incomplete publication."""
+    temporaries = dict(zip(SUFFIXES, temporary_files(journal)))
+    for stem in _stems(folder, episode_stem(info)):
+        if _id_of(folder / f"{stem}.json") == info.id:
+            return stem
+        if (folder / f"{stem}.json").exists():
+            continue
+        for suffix, temporary in temporaries.items():
+            path = folder / f"{stem}{suffix}"
+            if path.exists() and temporary.exists() and os.path.samefile(path, temporary):
+                path.unlink()
+    return None
+
+
+def _stems(folder: Path, stem: str) -> Iterator[str]:
+    """Stems in use among the candidates for the recording."""
+    for candidate in candidates(stem):
+        if not any((folder / f"{candidate}{suffix}").exists() for suffix in SUFFIXES):
+            return
+        yield candidate
+
+
+def _id_of(path: Path) -> str | None:
+    try:
+        return read_document(path).data["workbench"]["id"]
+    except (OSError, WrongDocument, KeyError, TypeError):
+        return None
+
+
+def _remove_strays(folder: Path) -> None:
+    """Delete temporary files without a journal: their writer died while it cleaned up."""
+    for path in (folder / FOLDER).glob("*"):
+        kept = (path.with_suffix(suffix) for suffix in (".arrow", DAMAGED_SUFFIX))
+        if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not any(one.exists() for one in kept):
+            path.unlink(missing_ok=True)

@@ -1,0 +1,422 @@
+"""Runs a job's work on a Ray cluster: one that is there, or one of this machine alone.
+
+A worker is a Ray actor that runs the same function as a local process. What it says goes as bytes of `wire` through one
+more actor, the post, which the process that deals asks: so a worker waits for nobody, and a pickle that the author's code
+made is never read here. When Ray says that an actor is gone, its chunk is dealt again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pickle
+import platform
+import shutil
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from workbench.jobs.ray_connection import AUTO, BREAKPOINT, ClusterLost, NoCluster, Pulse, connected
+from workbench.jobs.scheduler import NO_LIMIT, Chunk, Deal, PoolError, Result, Setup, Update, Work
+from workbench.jobs.worker_files import Baggage, pack_baggage, relocated
+from workbench.jobs.worker_messages import MESSAGES, Asks, Listener, Message, WorkerQueue, work_on
+from workbench.machine.processes.child_python import quick_imports
+from workbench.machine.processes.debugger import ONE_PROCESS, refuse_breakpoints
+from workbench.machine.processes.wire import Unpacker, Unreadable, pack_message
+from workbench.machine.versions import package_versions
+from workbench.task.problem import TaskError, treat_ctrl_c_as_error
+
+_LOOK_SECONDS = 0.1
+_ANSWER_SECONDS = 1.0
+"""Seconds to wait for the post before the cluster is checked; a post that has ended never answers."""
+_SAY_SECONDS = 1.0
+"""Seconds between two messages of a worker: the post takes some thousand messages a second from all workers."""
+_END_SECONDS = 120.0
+"""Seconds that a stopped worker may take to write the items that have ended."""
+_EXIT_SECONDS = 10.0
+_FOLDER = "workbench-job-"
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """An executor whose workers are actors of a Ray cluster."""
+
+    address: str = AUTO
+    """``local`` starts a cluster on this machine that only this user can connect to and that ends with the job;
+    ``auto`` takes a running cluster, or else starts one like ``local``."""
+    workers: int | None = None
+    """Number of workers; None for as many as the cluster has room for now."""
+    cpus_per_worker: float = 1
+    gpus_per_worker: float = 0
+    on_death: Callable[[str], None] = lambda text: None
+    """Called with a sentence when a worker has died and the job goes on; see `Listener`."""
+
+    @property
+    def elsewhere(self) -> bool:
+        return True
+
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+        """Run the work on the cluster; see `Executor.run`.
+
+        Raises:
+            NoCluster: as `connected`; or the cluster has no room for a worker.
+            PoolError: a machine has other versions of the packages; the cluster ended; or as `Executor.run`.
+            TooMuch: as `pack_baggage`.
+        """
+        baggage = pack_baggage(work.folders, work.files)
+        with connected(self.address) as ray:
+            try:
+                with closing(Pulse()) as pulse:
+                    pool = _ActorPool(ray, self, work, deal, baggage, pulse)
+                    try:
+                        pool.serve()
+                    finally:
+                        pool.end()
+            except (ray.exceptions.RayError, ClusterLost) as error:
+                # The text of Ray's is a traceback of its own.
+                why = str(error) if isinstance(error, ClusterLost) else f"Ray raised {type(error).__name__}"
+                raise PoolError(
+                    f"the Ray cluster ended before the job: {why}. What is done is kept. Start the cluster again, and then "
+                    "this command; a job with --job FILE goes on after what is done"
+                ) from error
+
+
+def versions_here() -> dict[str, str]:
+    """Versions that must be the same on all machines of a job."""
+    return {"Python": ".".join(platform.python_version_tuple()[:2]), **package_versions()}
+
+
+class OtherVersions(RuntimeError):
+    """A machine has other versions of the packages; the text names them."""
+
+
+# --- where the chunks are dealt ----------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class _Started:
+    """A worker as the dealing process sees it."""
+
+    handle: Any
+    ended: Any
+    """Reference that is ready when the actor has ended."""
+
+
+class _ActorPool:
+    """Starts the actors of one run, deals to them, and replaces those that fail."""
+
+    def __init__(
+        self,
+        ray: Any,
+        how: Cluster,
+        work: Work[Any, Any, Any],
+        deal: Deal[Any, Any],
+        baggage: Baggage,
+        pulse: Pulse,
+    ) -> None:
+        self._ray, self._how, self._work, self._deal, self._pulse = ray, how, work, deal, pulse
+        self._listener = Listener("a worker", work, deal, how.on_death)
+        self._read = Unpacker(MESSAGES).message
+        self._post = ray.remote(num_cpus=0)(Post).remote()
+        self._baggage = ray.put(baggage)
+        self._work_bytes = pickle.dumps((work.run, work.setup))
+        self._actor = ray.remote(
+            num_cpus=how.cpus_per_worker, num_gpus=how.gpus_per_worker, max_restarts=0, max_task_retries=0
+        )(RayWorker)
+        self._busy: dict[int, _Started] = {}
+        self._ending: list[_Started] = []
+        """Workers that have sent their last message and removed their folders."""
+        self._started = 0
+
+    def serve(self) -> None:
+        for _ in range(self._deal.count_left(self._how.workers or self._room())):
+            self._start()
+        sent_limit, stopped = self._deal.limit(), 0.0
+        failure: TaskError | PoolError | None = None
+        while self._busy:
+            self._pulse.check()
+            if (limit := self._deal.limit()) != sent_limit:
+                sent_limit = limit
+                self._post.set_limit.remote(limit)
+            if limit == 0:
+                stopped = stopped or time.monotonic()
+                if time.monotonic() - stopped > _END_SECONDS:
+                    raise failure or PoolError(f"a worker {self._work.name} did not end in time")
+            for number, raw in self._said(_LOOK_SECONDS):
+                failure = self._guarded(
+                    number, failure, lambda raw=raw, number=number: self._take(number, raw)
+                )
+            self._reap()
+            for number in self._gone():
+                failure = self._guarded(number, failure, lambda number=number: self._died(number))
+            if not self._busy and self._deal.count_left(1):
+                self._start()
+        if failure is not None:
+            raise failure
+
+    def end(self) -> None:
+        """Wait for the actors that are done, and end the others at once, as after a second Ctrl-C: they may not
+        respond."""
+        if self._ending:
+            ended = [actor.ended for actor in self._ending]
+            self._ray.wait(ended, num_returns=len(ended), timeout=_EXIT_SECONDS)
+        for actor in (*self._busy.values(), *self._ending):
+            self._ray.kill(actor.handle)
+        self._ray.kill(self._post)
+
+    def _said(self, seconds: float) -> list[tuple[int, bytes]]:
+        """Messages of the workers since the last call; see `Post.take`. Raises ClusterLost."""
+        said = self._post.take.remote(seconds)
+        while not self._ray.wait([said], timeout=_ANSWER_SECONDS)[0]:
+            self._pulse.check()
+        return self._ray.get(said)
+
+    def _reap(self) -> None:
+        """End the actors that have removed their folders: an actor keeps its cores as long as it lives."""
+        if not self._ending:
+            return
+        ended = [actor.ended for actor in self._ending]
+        ready, _ = self._ray.wait(ended, num_returns=len(ended), timeout=0)
+        for actor in [actor for actor in self._ending if actor.ended in ready]:
+            self._ray.kill(actor.handle)
+            self._ending.remove(actor)
+
+    def _guarded(self, number: int, failure: Any, act: Any) -> Any:
+        """Call `act` for a worker; after an error that ends the job the other workers finish the items that they
+        have."""
+        try:
+            act()
+        except (TaskError, PoolError) as error:
+            self._leave(number)
+            self._deal.lower(0)
+            return failure or error
+        return failure
+
+    def _room(self) -> int:
+        """Number of workers that the cluster has room for.
+
+        Raises:
+            NoCluster: for none.
+        """
+        asked = {"CPU": self._how.cpus_per_worker, "GPU": self._how.gpus_per_worker}
+        rooms = [
+            min(int(node["Resources"].get(name, 0) // count) for name, count in asked.items() if count > 0)
+            for node in self._ray.nodes()
+            if node["Alive"]
+        ]
+        if not sum(rooms):
+            told = ", ".join(f"{count:g} {name}" for name, count in asked.items() if count > 0)
+            raise NoCluster(f"no machine of the cluster has {told} for a worker")
+        return sum(rooms)
+
+    def _start(self) -> None:
+        number = self._started
+        self._started += 1
+        handle = self._actor.remote(self._post, number, self._how.cpus_per_worker)
+        ended = handle.run.remote(self._work_bytes, self._baggage, versions_here())
+        self._busy[number] = _Started(handle, ended)
+
+    def _leave(self, number: int) -> None:
+        if (actor := self._busy.pop(number, None)) is not None:
+            self._ray.kill(actor.handle)
+
+    def _take(self, number: int, raw: bytes) -> None:
+        if number not in self._busy:
+            return  # late words of a worker whose chunk was dealt again
+        try:
+            news = self._listener.take(number, self._read(raw))
+        except Unreadable as error:
+            raise PoolError(f"a worker {self._work.name} sent what cannot be read ({error})") from error
+        if news == "asks":
+            self._post.answer.remote(number, self._deal.next(number))
+        elif news in ("failed", "done"):
+            self._ending.append(self._busy.pop(number))
+            if news == "failed" and self._deal.count_left(1):
+                self._start()
+
+    def _gone(self) -> list[int]:
+        """Workers whose actor has ended."""
+        by_ref = {actor.ended: number for number, actor in self._busy.items()}
+        ready, _ = self._ray.wait(list(by_ref), num_returns=len(by_ref), timeout=0) if by_ref else ([], [])
+        return [by_ref[ref] for ref in ready]
+
+    def _died(self, number: int) -> None:
+        """Read the last messages of the worker, and handle its end.
+
+        Raises:
+            TaskError, PoolError: the job is over.
+        """
+        for one, raw in self._said(0.0):
+            self._take(one, raw)
+        actor = self._busy.get(number)
+        if actor is None:
+            return
+        how = "ended without a word"
+        try:
+            self._ray.get(actor.ended)
+        except self._ray.exceptions.RayTaskError as error:
+            cause = error.cause if isinstance(error.cause, Exception) else error
+            self._leave(number)
+            raise PoolError(str(cause)) from error
+        except self._ray.exceptions.RayError as error:
+            how = f"is gone ({type(error).__name__})"
+        self._leave(number)
+        self._listener.died(number, how, None)
+        if self._deal.count_left(1):
+            self._start()
+
+
+class Post:
+    """Actor that passes messages between the workers and the dealing process. It keeps messages until they are taken."""
+
+    def __init__(self) -> None:
+        self._said: deque[tuple[int, bytes]] = deque()
+        self._came = asyncio.Event()
+        self._answers: dict[int, asyncio.Future[Chunk | None]] = {}
+        self._limit = NO_LIMIT
+
+    async def put(self, worker: int, messages: list[bytes]) -> int:
+        """Store messages of a worker; returns the limit."""
+        self._said.extend((worker, message) for message in messages)
+        self._came.set()
+        return self._limit
+
+    async def ask(self, worker: int, messages: list[bytes]) -> tuple[Chunk | None, int]:
+        """Store messages of which the last asks for a chunk; returns the chunk and the limit."""
+        future: asyncio.Future[Chunk | None] = asyncio.get_running_loop().create_future()
+        self._answers[worker] = future
+        await self.put(worker, messages)
+        return await future, self._limit
+
+    async def answer(self, worker: int, chunk: Chunk | None) -> None:
+        if (future := self._answers.pop(worker, None)) is not None:
+            future.set_result(chunk)
+
+    async def take(self, seconds: float) -> list[tuple[int, bytes]]:
+        """New messages; waits up to `seconds` for the first one."""
+        if not self._said and seconds:
+            self._came.clear()
+            try:
+                await asyncio.wait_for(self._came.wait(), seconds)
+            except asyncio.TimeoutError:
+                return []
+        said = list(self._said)
+        self._said.clear()
+        return said
+
+    async def set_limit(self, limit: int) -> None:
+        self._limit = limit
+
+
+# --- a worker ----------------------------------------------------------------------------------------------
+
+
+class RayWorker:
+    """A worker, in its own process."""
+
+    def __init__(self, post: Any, number: int, cpus: float) -> None:
+        # Without this the software renderer starts a thread for each core of the machine.
+        os.environ["LP_NUM_THREADS"] = str(max(1, int(cpus)))
+        self._post, self._number = post, number
+
+    def run(self, work: bytes, baggage: Baggage, versions: Mapping[str, str]) -> None:
+        """Do the work.
+
+        Args:
+            work: the pickled function and its setup: what it imports takes seconds, and more before `quick_imports`.
+
+        Raises:
+            OtherVersions: this machine has other ones than the submitting side.
+        """
+        from workbench.machine.software_vulkan import use_private_driver
+
+        _require_versions(versions)
+        # Or a line with breakpoint() waits for someone who attaches Ray's debugger.
+        os.environ.pop(BREAKPOINT, None)
+        refuse_breakpoints(ONE_PROCESS)
+        treat_ctrl_c_as_error()
+        use_private_driver()
+        _remove_left_folders()
+        folder = Path(tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}-"))
+        try:
+            places = baggage.unpack(folder)
+            queue = _PostQueue(self._post, self._number, {str(folder): ""})
+            with quick_imports():
+                run, setup = pickle.loads(work)
+            work_on(run, relocated(setup, places), queue)
+            queue.flush()
+        finally:
+            os.chdir("/")
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remove_left_folders() -> None:
+    """Remove the folders that killed actors have left on this machine."""
+    for path in Path(tempfile.gettempdir()).glob(f"{_FOLDER}*-*"):
+        pid = path.name.removeprefix(_FOLDER).partition("-")[0]
+        if pid.isdigit() and not psutil.pid_exists(int(pid)):
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _require_versions(versions: Mapping[str, str]) -> None:
+    here = versions_here()
+    if here != versions:
+        told = [
+            f"{name} {here.get(name, 'is not installed')}, and the submitting side {versions.get(name, 'none')}"
+            for name in dict.fromkeys((*versions, *here))
+            if here.get(name) != versions.get(name)
+        ]
+        raise OtherVersions(f"{platform.node()} has {'; '.join(told)}: install the same on all machines")
+
+
+class _PostQueue(WorkerQueue):
+    """The chunks of an actor."""
+
+    def __init__(self, post: Any, worker: int, origin: Mapping[str, str]) -> None:
+        self._post, self._worker, self.origin = post, worker, origin
+        self._waiting: list[bytes] = []
+        self._said = 0.0
+        self._limit: int = NO_LIMIT
+        self._put: Any = None
+        """Ray reference to the last `Post.put` call; its value is the limit at that time."""
+
+    def next(self) -> Chunk | None:
+        import ray
+
+        messages, self._waiting = [*self._waiting, pack_message(Asks())], []
+        chunk, self._limit = ray.get(self._post.ask.remote(self._worker, messages))
+        return chunk
+
+    def limit(self) -> int:
+        import ray
+
+        if time.monotonic() - self._said > _SAY_SECONDS:
+            self._send()
+        if self._put is not None and ray.wait([self._put], timeout=0)[0]:
+            self._limit, self._put = int(ray.get(self._put)), None
+        return self._limit
+
+    def send(self, message: Message) -> None:
+        self._waiting.append(pack_message(message))
+        if time.monotonic() - self._said > _SAY_SECONDS:
+            self._send()
+
+    def flush(self) -> None:
+        """Wait until all messages are sent."""
+        import ray
+
+        self._send()
+        if self._put is not None:
+            ray.get(self._put)
+
+    def _send(self) -> None:
+        messages, self._waiting = self._waiting, []
+        self._put = self._post.put.remote(self._worker, messages)
+        self._said = time.monotonic()

@@ -1,1 +1,0 @@
-"""Records episodes, solves tasks and sweeps over settings: work whose items are episodes."""

@@ -1,1 +1,0 @@
-"""Rescores recorded runs with another version of their task, and lists the differences."""

@@ -1,0 +1,465 @@
+"""Deals a job's numbered items in fixed chunks, and keeps account of their results."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby, islice
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from workbench.task.problem import Problem, TaskError
+
+NO_LIMIT = sys.maxsize
+FIRST_ALIKE, LATER_ALIKE = 5, 20
+"""Maximum number of chunks that fail alike one after another, before the first result and after it; then the
+others would fail too."""
+_STARTS = 3
+"""Number of workers that may die before their first chunk."""
+_BEFORE_ANY = -1
+"""Stands for the group of a worker that has no chunk yet."""
+
+Setup = TypeVar("Setup")
+Result = TypeVar("Result")
+Update = TypeVar("Update")
+
+
+class PoolError(RuntimeError):
+    """A worker died or failed; the others were stopped and dropped the items under way."""
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Items that one worker runs together.
+
+    The division does not depend on the number of workers, so that what an item gives cannot depend on it either: the
+    numbers of a policy differ by their last bits with the size of its batch and the row in it.
+    """
+
+    numbers: tuple[int, ...]
+    """Item numbers, ascending."""
+    wanted: frozenset[int]
+    """Items whose results are still missing."""
+    again: bool = False
+    """Whether another worker, or an earlier run of the job, may have begun the chunk; files that it wrote may exist."""
+
+
+class ItemQueue(Protocol):
+    """The chunks of one worker. Used on one thread."""
+
+    @property
+    def origin(self) -> Mapping[str, str]:
+        """Folder on this worker, to the folder of the submitting side that its files came from."""
+        ...
+
+    def next(self) -> Chunk | None:
+        """The next chunk to begin; None if there is none."""
+        ...
+
+    def limit(self) -> int:
+        """First item number that is not needed, even if that item has begun. The limit never rises."""
+        ...
+
+    def send_result(self, number: int, result: Any) -> None:
+        """Send the result of an item."""
+        ...
+
+    def send_update(self, update: Any) -> None:
+        """Send progress."""
+        ...
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Items that gave no result."""
+
+    numbers: tuple[int, ...]
+    problem: Problem
+
+
+def kind_of(problem: Problem) -> object:
+    """Key that is equal for failures that are alike: where they were raised."""
+    return problem.stage, problem.file, problem.line
+
+
+def by_kind(failures: Iterable[Failure]) -> list[tuple[Problem, list[int]]]:
+    """The first problem of each kind, and the items of all of them."""
+    found: dict[object, tuple[Problem, list[int]]] = {}
+    for failure in failures:
+        found.setdefault(kind_of(failure.problem), (failure.problem, []))[1].extend(failure.numbers)
+    return [(problem, sorted(numbers)) for problem, numbers in found.values()]
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of the equal parts of a job."""
+
+    index: int = 1
+    """From 1 on."""
+    count: int = 1
+
+    def part(self, total: int) -> range:
+        """Range of the chunks in this part, out of `total` chunks: the parts follow each other, and their sizes
+        differ by at most one."""
+        return range(total * (self.index - 1) // self.count, total * self.index // self.count)
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
+
+
+def parse_shard(text: str) -> Shard:
+    """The part that ``--shard`` names, as in ``3/64``. Raises ValueError for another text."""
+    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise ValueError(f"--shard takes a part of a whole, as in 3/64 for the third of 64; got {text!r}")
+    return Shard(int(match[1]), int(match[2]))
+
+
+@dataclass(eq=False)
+class _Held:
+    """A chunk that a worker has."""
+
+    chunk: Chunk
+    missing: set[int]
+    """Wanted items that have no result yet."""
+
+
+class Deal(Generic[Result, Update]):
+    """The chunks of a job, and the callbacks for the results of its items. Used on one thread.
+
+    Chunks are dealt in ascending order. From the limit on no item is needed: a caller that has enough lowers it, and stopping
+    is a limit of 0. A chunk whose worker died is dealt again, after the others.
+    """
+
+    def __init__(
+        self,
+        numbers: Iterable[int],
+        on_result: Callable[[int, Result], None],
+        on_update: Callable[[Update], None] = lambda update: None,
+        stop: Callable[[], bool] = lambda: False,
+        *,
+        chunk: int = 1,
+        tries: int = 1,
+        on_failure: Callable[[Failure], None] | None = None,
+        group: int | None = None,
+    ) -> None:
+        """
+        Args:
+            numbers: ascending, from 0 on.
+            stop: called often; after True nothing more is needed.
+            chunk: items of a chunk: k belongs to chunk ``k // chunk``.
+            tries: how often a chunk is begun whose workers die.
+            on_failure: called with the items that the author's code failed in, and those whose workers died in each try; the
+                job goes on unless they fail alike. If None the first failure ends the job.
+            group: items of a group, of which each begins a chunk: k belongs to group ``k // group``. Where the chunks of one
+                fail alike, or the task cannot be built for it, what is left of it fails too, and the job goes on.
+        """
+        self._numbers, self._size, self._tries = numbers, chunk, tries
+        self._on_result, self._on_update, self._stop = on_result, on_update, stop
+        self._on_failure, self._group = on_failure, group or NO_LIMIT
+        self._with_results: set[int] = set()
+        """Groups that have a result."""
+        self._given_up: dict[int, Problem] = {}
+        """Problem of each group that was given up because its chunks failed alike."""
+        self._known: Mapping[int, Result] = {}
+        self._keep: Callable[[int, Result], None] = lambda number, result: None
+        self._left = self._chunks()
+        self._ahead: deque[Chunk] = deque()
+        """Chunks that were already taken from `_left`."""
+        self._alone: deque[Chunk] = deque()
+        """Items of a failed chunk, one per chunk: dealt first, to find out which of them fail."""
+        self._returned: deque[Chunk] = deque()
+        self._held: dict[Hashable, list[_Held]] = {}
+        self._deaths: dict[int, int] = {}
+        """Number of workers that died with a chunk, by the chunk's first item."""
+        self._failed_alike: dict[int, list[tuple[object, int]]] = {}
+        """Failures of each group since its last result: the kind of each, and the first item of its chunk."""
+        self._limit = NO_LIMIT
+        self.is_going_on = False
+        """Whether results of an earlier run are being taken."""
+        self.results = 0
+        self.failures: list[Failure] = []
+
+    # --- before it begins ------------------------------------------------------------------------------
+
+    def take_part(self, shard: Shard) -> None:
+        """Leave only the chunks of this part."""
+        total = sum(1 for _ in self._chunks())
+        part = shard.part(total)
+        self._left = islice(self._chunks(), part.start, part.stop)
+
+    def go_on(self, known: Mapping[int, Result], keep: Callable[[int, Result], None]) -> None:
+        """Take results of an earlier run of the job, and leave only what it did not do.
+
+        Args:
+            keep: called with each further result before anything else is done with it.
+        """
+        self._known, self._keep, self.is_going_on = known, keep, True
+        for number in sorted(known):
+            self.results += 1
+            self._with_results.add(number // self._group)
+            self._on_result(number, known[number])
+        self.is_going_on = False
+
+    # --- for the workers -------------------------------------------------------------------------------
+
+    def next(self, worker: Hashable) -> Chunk | None:
+        """The next chunk for this worker."""
+        limit = self.limit()
+        for waiting in (self._alone, self._ahead, self._returned):
+            if waiting is self._ahead:
+                self._look(1)
+            while waiting and min(waiting[0].wanted) >= limit:
+                if waiting is self._ahead:
+                    break  # all after it are further
+                waiting.popleft()
+            if waiting and min(waiting[0].wanted) < limit:
+                chunk = waiting.popleft()
+                self._held.setdefault(worker, []).append(_Held(chunk, set(chunk.wanted)))
+                return chunk
+        return None
+
+    def count_left(self, most: int) -> int:
+        """Number of chunks that can be dealt, counted up to `most`."""
+        limit = self.limit()
+        again = sum(min(chunk.wanted) < limit for chunk in (*self._alone, *self._returned))
+        return min(self._look(most) + again, most)
+
+    def limit(self) -> int:
+        if self._stop():
+            self.lower(0)
+        return self._limit
+
+    def lower(self, limit: int) -> None:
+        """Lower the limit: items from `limit` on are not needed."""
+        self._limit = min(limit, self._limit)
+
+    def result(self, worker: Hashable, number: int, result: Result) -> None:
+        """Take the result of an item. Raises PoolError if the worker does not have it."""
+        held = next((held for held in self._held.get(worker, ()) if number in held.missing), None)
+        if held is None:
+            raise PoolError("sent the result of an item that it does not have")
+        held.missing.remove(number)
+        if not held.missing:
+            self._held[worker].remove(held)
+        self._with_results.add(number // self._group)
+        for group in (number // self._group, _BEFORE_ANY):
+            self._failed_alike.pop(group, None)
+        self.results += 1
+        self._keep(number, result)
+        self._on_result(number, result)
+
+    def update(self, update: Update) -> None:
+        self._on_update(update)
+
+    def ended(self, worker: Hashable) -> None:
+        """Handle the message that a worker is done. Raises PoolError if it still has items."""
+        held = self._held.pop(worker, [])
+        if min((number for one in held for number in one.missing), default=NO_LIMIT) < self.limit():
+            raise PoolError("ended before it was done")
+
+    def failed(self, worker: Hashable, error: TaskError) -> None:
+        """Handle that the author's code failed in the last chunk of this worker, which has ended. The items of that
+        chunk are then dealt one by one.
+
+        Raises:
+            TaskError: the job is over: no item was begun, or the failure is one too many of its kind.
+        """
+        held = self._held.pop(worker, [])
+        if not held or self._on_failure is None:
+            raise error
+        *others, last = held
+        for one in others:
+            self._give_back(one)
+        # What cannot be built is not built for the next chunk of its group either.
+        unbuilt = self._group != NO_LIMIT and error.problem.stage in ("syntax", "import", "build")
+        if not unbuilt and self._divide(last):
+            return
+        self._fail(last.missing, error.problem)
+        if self._alike(kind_of(error.problem), last) or unbuilt:
+            self._give_up_group(last, error, error.problem)
+
+    def died(self, worker: Hashable, how: str, code: int | None) -> None:
+        """Handle that the worker died without a message.
+
+        Args:
+            how: the end of a sentence that begins with its name.
+            code: its exit code, if known: by it deaths are alike.
+
+        Raises:
+            PoolError: the job is over.
+        """
+        held = self._held.pop(worker, [])
+        if self._tries == 1:
+            raise PoolError(how)
+        if self.limit() == 0:
+            return
+        if not held:
+            # Before its first chunk: it is the machine, or the import.
+            before = self._failed_alike.setdefault(_BEFORE_ANY, [])
+            before.append((code, -len(before) - 1))
+            if len(before) >= _STARTS:
+                raise PoolError(how)
+        for one in held:
+            first = one.chunk.numbers[0]
+            self._deaths[first] = self._deaths.get(first, 0) + 1
+            over = self._deaths[first] >= self._tries
+            if not over:
+                self._give_back(one)
+            problem = Problem("worker", f"the worker {how}", None, None, None, "")
+            if self._alike(code, one):
+                self._give_up_group(one, PoolError(how), problem)
+            if over and not self._divide(one):
+                if self._on_failure is None or not (self.results or self.count_left(1)):
+                    raise PoolError(how)
+                self._fail(one.missing, problem)
+
+    def require_results(self) -> None:
+        """Raise the TaskError of the first failure, if no item has a result."""
+        if self.failures and not self.results:
+            raise TaskError(self.failures[0].problem)
+
+    # --- inside ----------------------------------------------------------------------------------------
+
+    def _chunks(self) -> Iterator[tuple[int, ...]]:
+        for _, numbers in groupby(self._numbers, lambda number: number // self._size):
+            yield tuple(numbers)
+
+    def _look(self, most: int) -> int:
+        """Have up to `most` chunks in `_ahead`; returns how many of them are needed."""
+        while len(self._ahead) < most and (numbers := next(self._left, None)) is not None:
+            if wanted := frozenset(numbers) - self._known.keys():
+                if (problem := self._given_up.get(numbers[0] // self._group)) is not None:
+                    self._fail(wanted, problem)
+                    continue
+                self._ahead.append(Chunk(numbers, wanted, again=bool(self._known)))
+        limit = self.limit()
+        return sum(min(chunk.wanted) < limit for chunk in islice(self._ahead, most))
+
+    def _give_back(self, held: _Held) -> None:
+        if (problem := self._given_up.get(held.chunk.numbers[0] // self._group)) is not None:
+            self._fail(held.missing, problem)
+        else:
+            self._returned.append(Chunk(held.chunk.numbers, frozenset(held.missing), again=True))
+
+    def _divide(self, held: _Held) -> bool:
+        """Have the missing items of a chunk dealt one by one; False if there is only one."""
+        limit = self.limit()
+        missing = sorted(number for number in held.missing if number < limit)
+        given_up = held.chunk.numbers[0] // self._group in self._given_up
+        if len(held.chunk.numbers) == 1 or not missing or self._on_failure is None or given_up:
+            return False
+        for number in missing:
+            self._alone.append(Chunk((number,), frozenset((number,)), again=True))
+            self._deaths[number] = self._tries - 1
+        return True
+
+    def _give_up_group(self, held: _Held, error: TaskError | PoolError, problem: Problem) -> None:
+        """Let what is left of the chunk's group fail; without groups, raise the error."""
+        if self._group == NO_LIMIT or self._on_failure is None:
+            raise error
+        group = held.chunk.numbers[0] // self._group
+        self._given_up[group] = problem
+        for waiting in (self._ahead, self._returned, self._alone):
+            for chunk in [chunk for chunk in waiting if chunk.numbers[0] // self._group == group]:
+                waiting.remove(chunk)
+                self._fail(chunk.wanted, problem)
+
+    def _fail(self, numbers: Iterable[int], problem: Problem) -> None:
+        limit = self.limit()
+        failure = Failure(tuple(sorted(number for number in numbers if number < limit)), problem)
+        self.failures.append(failure)
+        if self._on_failure is not None:
+            self._on_failure(failure)
+
+    def _alike(self, key: object, held: _Held) -> bool:
+        """Record a failure of this kind; returns whether enough chunks of its group failed alike one after another
+        to give it up."""
+        first = held.chunk.numbers[0]
+        group = first // self._group
+        before = self._failed_alike.setdefault(group, [])
+        before.append((key, first))
+        alike = {first for kind, first in before if kind == key}
+        return len(alike) >= (LATER_ALIKE if group in self._with_results else FIRST_ALIKE)
+
+
+@dataclass(frozen=True)
+class Work(Generic[Setup, Result, Update]):
+    """Work of each worker of a job."""
+
+    run: Callable[[Setup, ItemQueue], None]
+    """A function that can be imported by its name. It returns when its queue has no next chunk and none is under way.
+
+    A TaskError from it is the failure of its last chunk; an OSError, ValueError or RuntimeError ends the job.
+    """
+    setup: Setup
+    """The first argument of `run`; can be pickled."""
+    result: Any
+    update: Any
+    """Types of results and progress, against which `wire` checks the messages of other processes."""
+    name: str
+    """Clause that names the process in messages: "a process *that records* was killed by SIGKILL"."""
+    folders: Sequence[Path] = ()
+    """Folders of the author that workers on other machines need, each with all that is below it."""
+    files: Sequence[Path] = ()
+    """Likewise, further files. Paths in `setup` that are in neither must be places of all machines; what is below a folder
+    that travels and must not be taken for it, such as where results go, stands there as bytes."""
+
+
+class Executor(Protocol):
+    """Does the work of a job."""
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether workers may run on other machines."""
+        ...
+
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+        """Deal until no chunk is left or needed, and all items under way are finished.
+
+        Raises:
+            TaskError, PoolError: as `Deal` decides; or a worker failed in our own code. The other workers were stopped
+                and dropped the items under way.
+        """
+        ...
+
+
+class ThisProcess:
+    """Runs the work in this process; exceptions of `Work.run` other than TaskError pass through."""
+
+    @property
+    def elsewhere(self) -> bool:
+        return False
+
+    def run(self, work: Work[Setup, Result, Update], deal: Deal[Result, Update]) -> None:
+        while True:
+            try:
+                work.run(work.setup, _OwnQueue(deal))
+                return deal.ended(None)
+            except TaskError as error:
+                deal.failed(None, error)
+            if not deal.count_left(1):
+                return
+
+
+@dataclass(frozen=True)
+class _OwnQueue:
+    """The chunks of the process that deals."""
+
+    deal: Deal[Any, Any]
+    origin: Mapping[str, str] = field(default_factory=dict)
+
+    def next(self) -> Chunk | None:
+        return self.deal.next(None)
+
+    def limit(self) -> int:
+        return self.deal.limit()
+
+    def send_result(self, number: int, result: Any) -> None:
+        self.deal.result(None, number, result)
+
+    def send_update(self, update: Any) -> None:
+        self.deal.update(update)

@@ -1,0 +1,137 @@
+"""Messages of a worker of a pool, and the code that handles them in the dealing process. Messages are data, never
+a pickle."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from workbench.jobs.scheduler import Chunk, Deal, ItemQueue, PoolError, Setup, Work
+from workbench.jobs.worker_files import relocated
+from workbench.machine.processes.wire import Unpacker, pack
+from workbench.task.problem import Problem, TaskError
+
+
+@dataclass(frozen=True)
+class Asks:
+    """A request for a chunk."""
+
+
+@dataclass(frozen=True)
+class Updates:
+    """Progress of a worker."""
+
+    value: bytes
+    """Progress, packed as `Work.update`."""
+
+
+@dataclass(frozen=True)
+class Gives:
+    """The result of an item."""
+
+    number: int
+    value: bytes
+    """Result, packed as `Work.result`."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The last message of a worker: it does no further work."""
+
+    why: str = ""
+    """Reason of its failure; empty if it did not fail."""
+    problem: Problem | None = None
+    """Exception of the author's code, if that is the reason."""
+
+
+Message = Asks | Updates | Gives | Ended
+MESSAGES = get_args(Message)
+
+
+class WorkerQueue(ABC):
+    """The chunks of a worker in another process than the dealing one."""
+
+    origin: Mapping[str, str] = {}
+    """Folder on this worker, to the folder of the submitting side; see `ItemQueue.origin`."""
+
+    @abstractmethod
+    def next(self) -> Chunk | None: ...
+
+    @abstractmethod
+    def limit(self) -> int: ...
+
+    @abstractmethod
+    def send(self, message: Message) -> None: ...
+
+    def send_result(self, number: int, result: Any) -> None:
+        self.send(Gives(number, pack(relocated(result, self.origin))))
+
+    def send_update(self, update: Any) -> None:
+        self.send(Updates(pack(relocated(update, self.origin))))
+
+
+def work_on(run: Callable[[Setup, ItemQueue], None], setup: Setup, queue: WorkerQueue) -> None:
+    """Call `Work.run`, and send how it ended."""
+    try:
+        run(setup, queue)
+        queue.send(Ended())
+    except TaskError as error:
+        problem = relocated(error.problem, queue.origin)
+        queue.send(Ended(str(error) or "TaskError", problem))
+    except (OSError, ValueError, RuntimeError) as error:
+        queue.send(Ended(relocated(str(error), queue.origin) or type(error).__name__))
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Handles the messages of workers for a deal."""
+
+    kind: str
+    """Name of a worker in messages: "*a process* that records was killed"."""
+    work: Work[Any, Any, Any]
+    deal: Deal[Any, Any]
+    on_death: Callable[[str], None]
+    """Called with a sentence when a worker has died and the job goes on."""
+    _unpacker: Unpacker = field(default_factory=Unpacker)
+
+    def take(self, worker: Hashable, message: Message) -> Literal["asks", "goes on", "failed", "done"]:
+        """Take a message.
+
+        Returns:
+            ``asks``: it waits for a chunk. ``failed``: it is over, and the job goes on. ``done``: it is over.
+
+        Raises:
+            TaskError, PoolError: it failed, and the job is over.
+            Unreadable: what it sent is not what the work gives.
+        """
+        if isinstance(message, Asks):
+            return "asks"
+        if isinstance(message, Updates):
+            self.deal.update(self._unpacker.unpack(message.value, self.work.update))
+            return "goes on"
+        if isinstance(message, Gives):
+            result = self._unpacker.unpack(message.value, self.work.result)
+            self._named(lambda: self.deal.result(worker, message.number, result))
+            return "goes on"
+        if message.problem is not None:
+            self.deal.failed(worker, TaskError(message.problem))
+            return "failed"
+        if message.why:
+            raise PoolError(message.why)
+        self._named(lambda: self.deal.ended(worker))
+        return "done"
+
+    def died(self, worker: Hashable, how: str, code: int | None) -> None:
+        """Handle the death of a worker. Raises PoolError if the job is over."""
+        self._named(lambda: self.deal.died(worker, how, code))
+        if self.deal.limit():
+            self.on_death(f"{self.kind} {self.work.name} {how}; what it had begun is dealt again")
+
+    def _named(self, act: Callable[[], None]) -> None:
+        """Call `act`; prefix a PoolError of the deal with the name of the worker."""
+        try:
+            act()
+        except PoolError as error:
+            raise PoolError(f"{self.kind} {self.work.name} {error}") from None

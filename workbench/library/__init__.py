@@ -1,0 +1,1 @@
+"""The library: all recordings below a folder, as a table."""

@@ -1,0 +1,154 @@
+"""Progress of a job that records into a folder: the command writes it there, and a library of the folder shows it."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import uuid
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from workbench.episodes.row import clean_text
+from workbench.machine.files import read_regular_file, replace_file
+
+_PREFIX, _SUFFIX = ".job-", ".status"
+_MOST_BYTES = 1 << 18
+_MOST = 64
+"""Most status files that are read: a job in 64 parts has as many."""
+_WRITE_SECONDS = 1.0
+SILENT_SECONDS = 20.0
+"""A job whose status is older than this counts as dead."""
+_KEPT_SECONDS = 3600.0
+"""How long the last status of a job is shown."""
+_MOST_FAILURES = 5
+
+JobState = Literal["running", "done", "stopped", "failed"]
+
+
+@dataclass(frozen=True)
+class JobFailure:
+    """Items that failed with the same error."""
+
+    items: str
+    """Names of the items."""
+    count: int
+    message: str
+    traceback: str = ""
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """Status of a job at one moment."""
+
+    command: str
+    """Name of the command, for example ``record``."""
+    task: str
+    done: int
+    total: int
+    """Requested episodes; `done` of them are over."""
+    rate: float = 0.0
+    """Episodes a second since it began; 0 if unknown."""
+    failures: tuple[JobFailure, ...] = ()
+    state: JobState = "running"
+    part: str = ""
+    """Which part of a divided job it is, for example ``3/64``; empty if the job is not divided."""
+    written_at: float = 0.0
+    """Seconds since 1970."""
+    place: str = ""
+    """Where it records, below the folder of the library; the reader fills it in."""
+
+    @property
+    def failed(self) -> int:
+        return sum(failure.count for failure in self.failures)
+
+    @property
+    def seconds_left(self) -> float | None:
+        left = self.total - self.done - self.failed
+        return left / self.rate if self.state == "running" and self.rate > 0 else None
+
+    def is_silent(self, now: float) -> bool:
+        """Whether it was ended without a word."""
+        return self.state == "running" and now - self.written_at > SILENT_SECONDS
+
+
+class StatusFile:
+    """Writes how far a job is, at most once a second. What cannot be written is left out: it must not end the job."""
+
+    def __init__(self, folder: Path, clock: Callable[[], float] = time.time) -> None:
+        self._folder, self._clock = folder.absolute(), clock
+        self._path = self._folder / f"{_PREFIX}{uuid.uuid4().hex[:12]}{_SUFFIX}"
+        self._written_at = 0.0
+
+    def is_due(self) -> bool:
+        """Whether the last word of a running job is old enough for another one."""
+        return self._clock() - self._written_at >= _WRITE_SECONDS
+
+    def write(self, status: JobStatus) -> None:
+        now = self._clock()
+        if status.state == "running" and not self.is_due():
+            return
+        if not self._folder.is_dir():
+            return  # nothing is recorded yet
+        self._written_at = now
+        with contextlib.suppress(OSError):
+            replace_file(self._path, msgspec.json.encode(replace(status, written_at=now)))
+
+    def remove_old(self, status: JobStatus) -> None:
+        """Remove what jobs of an earlier hour left, and the last word of earlier runs of this one."""
+        now = self._clock()
+        mine = (status.command, status.task, status.part)
+        for path in sorted(self._folder.glob(f"{_PREFIX}*{_SUFFIX}"))[: 10 * _MOST]:
+            with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeError):
+                if now - path.stat().st_mtime > _KEPT_SECONDS:
+                    path.unlink()
+                    continue
+                there = msgspec.json.decode(read_regular_file(path, _MOST_BYTES), type=JobStatus)
+                over = there.state != "running" or there.is_silent(now)
+                if over and (there.command, there.task, there.part) == mine:
+                    path.unlink()
+
+
+def read_jobs(folder: Path, now: float, below: Iterable[Path] = ()) -> tuple[JobStatus, ...]:
+    """The jobs of a folder that are running, or ended within the last hour; the last word first. The files may be anybody's:
+    what is no status is passed over, and texts are cleaned.
+
+    Args:
+        below: further folders, in it.
+    """
+    found: list[JobStatus] = []
+    for place in dict.fromkeys((folder, *below)):
+        with contextlib.suppress(OSError):
+            for path in sorted(place.glob(f"{_PREFIX}*{_SUFFIX}"))[:_MOST]:
+                with contextlib.suppress(OSError, msgspec.MsgspecError, UnicodeError):
+                    status = msgspec.json.decode(read_regular_file(path, _MOST_BYTES), type=JobStatus)
+                    if 0 <= now - status.written_at < _KEPT_SECONDS:
+                        where = "" if place == folder else str(place.relative_to(folder))
+                        found.append(_cleaned(replace(status, place=where)))
+    return tuple(sorted(found, key=lambda status: -status.written_at))
+
+
+def _cleaned(status: JobStatus) -> JobStatus:
+    return replace(
+        status,
+        command=clean_text(status.command, 40),
+        task=clean_text(status.task, 200),
+        part=clean_text(status.part, 20),
+        place=clean_text(status.place, 200),
+        failures=tuple(
+            JobFailure(
+                clean_text(one.items, 200),
+                max(one.count, 0),
+                clean_text(one.message, 500),
+                # Not the spaces before a line, which say what belongs to what.
+                "\n".join(
+                    line[: len(line) - len(line.lstrip(" "))][:40] + clean_text(line, 300)
+                    for line in one.traceback.splitlines()[:200]
+                ),
+            )
+            for one in status.failures[:_MOST_FAILURES]
+        ),
+    )

@@ -1,0 +1,94 @@
+"""Which env is selected, and the table of envs."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from workbench.page.command import Command
+
+
+class SelectEnv(Command, frozen=True):
+    """Select this env."""
+
+    env: int
+
+
+class NextEnv(Command, frozen=True):
+    """Next env."""
+
+    key = "n"
+    context = "live"
+    repeats = True
+
+
+class PreviousEnv(Command, frozen=True):
+    """Previous env."""
+
+    key = "p"
+    context = "live"
+    repeats = True
+
+
+class NextFailedEnv(Command, frozen=True):
+    """Next env whose last episode failed."""
+
+    key = "e"
+    context = "live"
+
+
+class NextFlaggedEnv(Command, frozen=True):
+    """Next flagged env."""
+
+    key = "shift+e"
+    context = "live"
+
+
+class ToggleOnlySelected(Command, frozen=True):
+    """Show all envs or the selected one."""
+
+    key = "o"
+    context = "live"
+
+
+class ShowFirstFlagged(Command, frozen=True):
+    """Select the first flagged env, at its first outlier."""
+
+
+class ShowEnvAtEvent(Command, frozen=True):
+    """Select this env, at the moment that its row is about."""
+
+    env: int
+
+
+class SortEnvs(Command, frozen=True):
+    """Sort the table of envs by a column; by the same again in reverse order."""
+
+    column: str
+
+
+class FilterEnvs(Command, frozen=True):
+    """List these envs only."""
+
+    which: Literal["all", "failed", "running", "flagged"]
+
+
+class ToggleEnvEntry(Command, frozen=True):
+    """Show an entry in the table of envs, or leave it out."""
+
+    name: str
+
+
+class ToggleEnvEntries(Command, frozen=True):
+    """Open or close the list of entries of the table of envs."""
+
+
+class TurnEnvs(Command, frozen=True):
+    """Show the next (1) or the previous (-1) rows of the table of envs."""
+
+    by: int
+
+
+class ShowEnvs(Command, frozen=True):
+    """Show all envs, or the selected one alone."""
+
+    which: Literal["all envs", "the selected env"]

@@ -1,0 +1,1 @@
+"""The history of the batch: moments, curves, one table row per env."""

@@ -1,0 +1,514 @@
+"""The history: the moments since the env was built, within a memory limit."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraKind, Picture
+from workbench.envs.gpu_rules import Finding
+from workbench.envs.outliers import OutlierKind
+from workbench.envs.snapshots.packing import WholeSnapshot
+from workbench.envs.step_result import StepResult
+from workbench.live.history.curves import PREFIX, Columns, StepCurves
+from workbench.live.history.env_table import KEPT_REWARDS, EnvRows, EnvTable
+from workbench.live.messages import PastPictures, Pictures, ReplayPath
+from workbench.task.description import NO_MOMENT, Restored, Stepped
+
+RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, REWARD_NONFINITE = 1, 2, 4, 8, 16, 32
+"""Event flags of an env at a moment. Success, fail and a NaN or infinite reward: only the first in an episode."""
+_OVERHEAD = 2500
+"""Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
+_PICTURES_SHARE = 0.5
+"""Share of the memory limit for pictures: they are by far the largest (a human camera's is 0.8 MB; a step of 16
+PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be rendered again."""
+_RECENT = 200
+"""Newest moments among which a picture's moment is searched: pictures come some steps late."""
+
+
+@dataclass
+class SnapshotPartSet:
+    """The parts of a snapshot, shared by all moments that have the same."""
+
+    keys: tuple[int, ...]
+    content: tuple[bytes, ...] | None
+    """Bytes of the parts; None if some parts went to another history: then the moment has no snapshot."""
+    moments: int = 0
+    """Number of moments with these parts."""
+
+
+class SnapshotParts:
+    """Reference-counted store of snapshot parts.
+
+    A snapshot comes as a body and the keys of its parts (`envs.snapshots.packing`), most of which the moment before has
+    too. So moments refer to a set of parts, sets count their moments, and parts count their sets.
+    """
+
+    def __init__(self) -> None:
+        self._parts: dict[int, bytes] = {}
+        self._references: dict[int, int] = {}
+        self._last = SnapshotPartSet((), ())
+        self.used = 0
+        """Bytes in use."""
+
+    def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> SnapshotPartSet:
+        """Parts of the next moment; `keys` is None if they are those of the moment before."""
+        self._parts.update(new_parts)
+        if keys is not None and keys != self._last.keys:
+            known = self._parts.keys() >= {*keys}
+            self._last = SnapshotPartSet(keys, tuple(self._parts[key] for key in keys) if known else None)
+        parts = self._last
+        if parts.content is not None and parts.moments == 0:
+            for key in parts.keys:
+                self._references[key] = self._references.get(key, 0) + 1
+                if self._references[key] == 1:
+                    self.used += len(self._parts[key])
+        parts.moments += 1
+        return parts
+
+    def release(self, parts: SnapshotPartSet) -> None:
+        """A moment with these parts was dropped."""
+        parts.moments -= 1
+        if parts.moments == 0 and parts.content is not None:
+            for key in parts.keys:
+                self._references[key] -= 1
+                if self._references[key] == 0:
+                    self.used -= len(self._parts[key])
+                    del self._references[key]
+                    # The worker sends a part again unless the newest moment has it, which is never dropped.
+                    del self._parts[key]
+
+
+@dataclass
+class Moment:
+    """The batch after one reset, control step or jump back."""
+
+    serial: int
+    """Number of the moment, counting up over the session."""
+    step: StepResult
+    """Result of the step. Its reward is NaN in an env that was reset, and the recorded one in an env that was put
+    back here."""
+    jumped: NDArray[np.bool_]
+    """(N,) mask as in `Stepped.reset_mask`."""
+    seeds: NDArray[np.int64] | None
+    tick: int
+    """`Curves.serial` of this moment."""
+    event_flags: NDArray[np.uint8]
+    """(N,) event flags (`RESET` ...), combined."""
+    restored: Restored | None
+    number: int
+    """`Stepped.number`."""
+    snapshot: WholeSnapshot | None
+    """Snapshot of the whole batch, or None; shares its bytes with other moments."""
+    parts: SnapshotPartSet
+    size: int
+    """Size in bytes, without parts and pictures."""
+    rows: EnvRows
+    """The table of envs at that moment."""
+    acted_by: str
+    """What chose the action, as in `Stepped.acted_by`."""
+    pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
+    """Pictures by env, kind and name of the camera."""
+    outdated: set[tuple[int, CameraKind, str]] = field(default_factory=set)
+    """Keys of pictures whose camera was moved since."""
+    original_step: StepResult | None = None
+    """`step` before a newer version replaced it; None if none did."""
+
+    @property
+    def as_recorded(self) -> StepResult:
+        """The result of the version that made this moment."""
+        return self.step if self.original_step is None else self.original_step
+
+
+EnvMoment = tuple[Moment, int]
+"""A moment of an episode, and the env's number in it, which is another one where the env continued from another env's
+moment."""
+
+
+@dataclass(frozen=True)
+class ShownMoment:
+    """The moment that the page shows."""
+
+    env: int
+    """The selected env."""
+    num_envs: int
+    poses: NDArray[np.float32] | None
+    """(N, B, 7) poses of a past moment; None while live."""
+
+    def of(self, env: int) -> NDArray[np.float32] | None:
+        """(B, 7) poses of one env; None while live."""
+        return None if self.poses is None else self.poses[env]
+
+
+class History:
+    """The moments of one built task, oldest first, append-only. Not thread-safe: its owner locks.
+
+    A reset is a moment of its own, and so is going back: the envs *jump*, and new moments follow behind the jump. The
+    future that they left stays and can be returned to; undo is going back to the moment before a jump. A *segment* is
+    what an env went through without a jump: it starts from a snapshot and has all actions, so it can be replayed. An
+    *episode* goes from a reset on through the moments that the env was put back to.
+
+    Memory is bounded: pictures beyond half the limit are dropped first, the oldest of them first; then the oldest
+    moments.
+    """
+
+    def __init__(
+        self, table: EnvTable, limit: int, first_serial: int = 0, joints: Sequence[str] = ()
+    ) -> None:
+        """
+        Args:
+            table: of the envs, without events so far.
+            limit: bytes; the newest moment is always kept.
+            first_serial: the number of the first moment.
+            joints: names of `StepResult.qpos`.
+        """
+        self._table, num_envs = table, table.rows().num_envs
+        self.num_envs = num_envs
+        self.limit = limit
+        self._moments: deque[Moment] = deque()
+        self._next_serial = first_serial
+        self._parts = SnapshotParts()
+        self._used = 0
+        self._pictures_used = 0
+        self._pictured: deque[int] = deque()
+        self._jumps: deque[Moment] = deque()
+        self._columns = Columns(num_envs, first_serial)
+        self._ticks = Columns(1, first_serial)
+        self.steps = StepCurves(num_envs, joints)
+
+    # --- events ------------------------------------------------------------------------------------
+
+    def add(self, stepped: Stepped) -> Moment:
+        """Add a moment.
+
+        Without an action (a reset or a jump back) the worker sends reward zero, and no terms of it. The stored ones are NaN
+        after a reset, those of the origin after a jump back, and in all other envs those of the moment before.
+        """
+        restored, jumps = stepped.restored, bool(stepped.reset_mask.any())
+        origin = None if restored is None else self.at(restored.origin)
+        parts = self._parts.take(stepped.part_keys, stepped.new_parts)
+        stepped = replace(stepped, step=self._with_rewards(stepped, origin))
+        rows = self._table.add(
+            stepped,
+            None if origin is None else origin.rows,
+            lambda env: self._rewards_until(env, origin, KEPT_REWARDS),
+        )
+        if not jumps:
+            self.steps.add(stepped.step)
+        snapshot = None
+        if stepped.snapshot and parts.content is not None:
+            snapshot = WholeSnapshot(stepped.snapshot, parts.content)
+        size = _OVERHEAD + len(stepped.snapshot) + stepped.step.nbytes
+        size += EnvRows.bytes_a_step(self.num_envs)
+        moment = Moment(
+            serial=self._next_serial,
+            step=stepped.step,
+            jumped=stepped.reset_mask,
+            seeds=stepped.seeds,
+            tick=self.steps.count,
+            event_flags=self._events(stepped, rows),
+            restored=restored,
+            number=stepped.number,
+            snapshot=snapshot,
+            parts=parts,
+            size=size,
+            rows=rows,
+            acted_by=sys.intern(stepped.acted_by),
+        )
+        self._write(moment)
+        self._next_serial += 1
+        self._moments.append(moment)
+        if jumps:
+            self._jumps.append(moment)
+        self._used += size
+        self._shrink()
+        return moment
+
+    def replace_last(self, step: StepResult) -> StepResult:
+        """Replace the newest moment's result by that of a version that was patched in.
+
+        Returns:
+            The new result; a moment without an action keeps its reward.
+        """
+        if not self._moments:
+            return step
+        moment = self._moments[-1]
+        if moment.original_step is None:
+            moment.original_step = moment.step
+            moment.size += step.nbytes
+            self._used += step.nbytes
+        moment.step = step if step.action is not None else replace(step, reward=moment.step.reward)
+        self._write(moment)
+        return moment.step
+
+    def add_pictures(self, event: Pictures | PastPictures) -> None:
+        """Store pictures with their moment, if it is still kept."""
+        if isinstance(event, PastPictures):
+            moment = self.at(event.origin)
+        else:
+            recent = islice(reversed(self._moments), _RECENT)
+            moment = next((one for one in recent if one.number == event.number), None)
+        if moment is None:
+            return
+        for picture in event.pictures:
+            key = (picture.env, picture.kind, picture.camera)
+            before = moment.pictures.get(key)
+            if before is None:
+                self._pictured.append(moment.serial)
+            moment.pictures[key] = picture
+            moment.outdated.discard(key)
+            change = picture.nbytes - (0 if before is None else before.nbytes)
+            self._pictures_used += change
+            self._used += change
+        self._shrink()
+
+    def camera_moved(self, kind: CameraKind, name: str) -> None:
+        """Mark the stored pictures of this camera as outdated."""
+        for serial in self._pictured:
+            moment = self.at(serial)
+            if moment is not None:
+                moment.outdated.update(key for key in moment.pictures if key[1:] == (kind, name))
+
+    # --- reading -----------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self._moments)
+
+    @property
+    def used(self) -> int:
+        """Bytes in use."""
+        return self._used + self._parts.used
+
+    @property
+    def first(self) -> int:
+        """Serial of the oldest moment; one past `last` if there is none."""
+        return self._next_serial - len(self._moments)
+
+    @property
+    def last(self) -> int:
+        """Serial of the newest moment."""
+        return self._next_serial - 1
+
+    def at(self, serial: int) -> Moment | None:
+        """The moment of this serial, if it is kept."""
+        return self._moments[serial - self.first] if self.first <= serial <= self.last else None
+
+    def serial_of_tick(self, tick: int) -> int:
+        """Serial of the moment after this control step (`Moment.tick`), or of the nearest kept one."""
+        serials = range(self.first, self.last + 1)
+        found = bisect_left(serials, tick, key=lambda serial: self._moments[serial - self.first].tick)
+        return serials[min(found, len(serials) - 1)] if serials else self.last
+
+    def ticks(self, low: int, high: int) -> NDArray[np.int64]:
+        """(K,) `Moment.tick` of the moments of these serials, both kept ones and included."""
+        return self._ticks.between("tick", low, high)[:, 0].astype(np.int64)
+
+    def snapshot_at(self, serial: int) -> bytes | None:
+        """A pickled `envs.snapshots.snapshot.Snapshot` of the whole batch at that moment, or None."""
+        moment = self.at(serial)
+        return None if moment is None or moment.snapshot is None else pickle.dumps(moment.snapshot)
+
+    def between(self, low: int, high: int) -> Iterable[Moment]:
+        """The kept moments of these serials, both included."""
+        start = self.first
+        return (self._moments[k - start] for k in range(max(low, start), min(high, self.last) + 1))
+
+    def env_rows(self) -> EnvRows:
+        """The table of the envs as it is now."""
+        return self._table.rows()
+
+    def rows_at(self, moment: Moment) -> EnvRows:
+        """The table of the envs as it was at a moment."""
+        rewards = np.full((self.num_envs, KEPT_REWARDS), np.nan, np.float32)
+        for env in range(self.num_envs):
+            known = self._rewards_until(env, moment, KEPT_REWARDS)
+            rewards[env, KEPT_REWARDS - len(known) :] = known
+        return replace(moment.rows, rewards=rewards)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """See `EnvTable.findings`."""
+        return self._table.findings
+
+    def begin_version(self, rules: Mapping[str, Finding]) -> None:
+        """See `EnvTable.begin_version`."""
+        self._table.begin_version(rules)
+
+    def events(self, env: int, low: int, high: int) -> list[tuple[int, int]]:
+        """Events of this env between two moments, both included: serials and flags (`RESET` ... added up)."""
+        low = max(low, self.first)
+        event_flags = self._columns.between("event_flags", low, min(high, self.last))[:, env]
+        return [(low + int(k), int(event_flags[k])) for k in np.flatnonzero(event_flags)]
+
+    def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
+        """(K,) rewards of this env between two moments, both included; NaN where it was reset."""
+        return self._columns.between("reward", max(low, self.first), min(high, self.last))[:, env]
+
+    def jumps_back(self, env: int) -> list[tuple[int, int]]:
+        """Serials of the moments at which this env went back, each with the serial that it went back to."""
+        return [
+            (moment.serial, moment.restored.origin)
+            for moment in self._jumps
+            if moment.restored is not None and moment.restored.origin != NO_MOMENT and moment.jumped[env]
+        ]
+
+    def segments(self, env: int) -> list[tuple[int, int]]:
+        """First and last serials of this env's segments, as far as they are kept; oldest first. A segment also contains
+        moments at which only other envs jumped."""
+        if not self._moments:
+            return []
+        jumps = [moment.serial for moment in self._jumps if moment.jumped[env] and moment.serial > self.first]
+        return list(zip([self.first, *jumps], [*(jump - 1 for jump in jumps), self.last], strict=True))
+
+    def segment_at(self, env: int, serial: int) -> tuple[int, int]:
+        """The segment of this env that contains this moment."""
+        return next(segment for segment in reversed(self.segments(env)) if segment[0] <= serial)
+
+    def episode(self, env: int, serial: int, most: int | None = None) -> tuple[EnvMoment, ...]:
+        """The episode of this env that contains a moment, to its end; oldest first, see `episode_backwards`.
+
+        Args:
+            most: at most so many moments, evenly spread, including the first and the last; None for all.
+        """
+        episode_backwards = [*self.episode_backwards(env, self.segment_at(env, serial)[1])][::-1]
+        count = len(episode_backwards) if most is None else min(most, len(episode_backwards))
+        chosen = np.unique(np.linspace(0, len(episode_backwards) - 1, count).round().astype(int))
+        return tuple(episode_backwards[k] for k in chosen)
+
+    def episode_backwards(self, env: int, serial: int) -> Iterator[EnvMoment]:
+        """The episode of this env up to a moment, newest first, through the moments that it was put back to.
+
+        Yields each control step and at the end the first reset, as far as they are kept.
+        """
+        for moment, at in self._moments_back(env, serial):
+            jumped = moment.jumped.any()
+            if not jumped or moment.restored is None:
+                yield moment, at
+            if jumped and moment.restored is None:
+                return
+
+    def replay_path(self, env: int, serial: int, most: int) -> ReplayPath | None:
+        """How to replay this env to a moment from the last exact point; None if unknown or longer than `most` steps.
+
+        Exact points are resets and restored moments: from them on the same actions give the same bits.
+        """
+        rows: list[NDArray[np.float32]] = []
+        for moment, at in self._moments_back(env, serial):
+            jump = moment.restored
+            if not moment.jumped.any():
+                if moment.step.action is None or len(rows) == most:
+                    return None
+                rows.append(moment.step.action[at])
+            elif jump is None or (at not in jump.replayed and jump.origin != NO_MOMENT):
+                if moment.snapshot is None or not rows:
+                    return None
+                return ReplayPath(moment.serial, at, np.stack(rows[::-1]).astype(np.float32))
+        return None
+
+    def _moments_back(self, env: int, serial: int) -> Iterator[EnvMoment]:
+        """The moments that led this env to one, newest first: its control steps and its own jumps, each followed by the
+        moments before the jump's origin; as far as they are kept."""
+        while (moment := self.at(serial)) is not None:
+            jump, serial = moment.restored, moment.serial - 1
+            if not moment.jumped.any():
+                yield moment, env
+            elif moment.jumped[env]:
+                yield moment, env
+                if jump is not None:
+                    serial, env = jump.origin, jump.source[jump.env_idx.index(env)]
+
+    def last_jump(self, env: int) -> Moment | None:
+        """The jump that led this env to its present state, if it can be undone.
+
+        After an undo the env is as before the undone jump, so the search continues before that one; moments of the
+        future that the undo left do not count.
+        """
+        until = self.last
+        for moment in reversed(self._jumps):
+            if moment.serial > until or not moment.jumped[env]:
+                continue
+            if moment.restored is not None and moment.restored.undoes is not None:
+                until = moment.restored.origin
+                continue
+            before = self.at(moment.serial - 1)
+            return moment if before is not None and before.snapshot is not None else None
+        return None
+
+    def envs_still_at(self, jump: Moment) -> tuple[int, ...]:
+        """The envs of this jump that have not jumped since."""
+        moved = (int(env) for env in np.flatnonzero(jump.jumped))
+        return tuple(env for env in moved if self.last_jump(env) is jump)
+
+    # --- private -----------------------------------------------------------------------------------
+
+    def _shrink(self) -> None:
+        while self._pictures_used > self.limit * _PICTURES_SHARE and self._pictured:
+            moment = self.at(self._pictured.popleft())
+            if moment is not None and moment.pictures:
+                self._drop_pictures(moment)
+        while self.used > self.limit and len(self._moments) > 1:
+            oldest = self._moments.popleft()
+            self._used -= oldest.size
+            self._drop_pictures(oldest)
+            self._parts.release(oldest.parts)
+            if self._jumps and self._jumps[0] is oldest:
+                self._jumps.popleft()
+
+    def _drop_pictures(self, moment: Moment) -> None:
+        size = sum(picture.nbytes for picture in moment.pictures.values())
+        moment.pictures = {}
+        self._pictures_used -= size
+        self._used -= size
+
+    def _write(self, moment: Moment) -> None:
+        values = {"event_flags": moment.event_flags, "reward": moment.step.reward}
+        self._columns.write(moment.serial, self.first, values)
+        self._ticks.write(moment.serial, self.first, {"tick": np.array([moment.tick])})
+
+    def _rewards_until(self, env: int, moment: Moment | None, most: int) -> NDArray[np.float32]:
+        """(K,) the newest rewards of this env's episode up to a moment, at most so many, oldest first."""
+        episode_backwards = () if moment is None else self.episode_backwards(env, moment.serial)
+        rewards = (one.step.reward[of] for one, of in episode_backwards if not one.jumped.any())
+        return np.array(list(islice(rewards, most))[::-1], np.float32)
+
+    def _with_rewards(self, stepped: Stepped, origin: Moment | None) -> StepResult:
+        step, jumped, restored = stepped.step, stepped.reset_mask, stepped.restored
+        if step.action is not None or not jumped.any():
+            return step
+        reward = np.full(self.num_envs, np.nan, np.float32)
+        terms: dict[str, NDArray[np.float32]] = {}
+
+        def take(then: StepResult, to: Sequence[int] | NDArray, of: Sequence[int] | NDArray) -> None:
+            """Copy rewards and reward terms of the envs `of` in `then` into the envs `to`."""
+            reward[to] = then.reward[of]
+            for name, values in then.evaluate.items():
+                # evaluate() has no terms: only the hook of the reward adds them, and it is not called here.
+                if name.startswith(PREFIX) and name not in step.evaluate:
+                    terms.setdefault(name, np.full(values.shape, np.nan, np.float32))[to] = values[of]
+
+        kept = np.flatnonzero(~jumped | stepped.resumed)
+        if self._moments and len(kept):
+            take(self._moments[-1].step, kept, kept)
+        if restored is not None and origin is not None:
+            take(origin.step, list(restored.env_idx), list(restored.source))
+        return replace(step, reward=reward, evaluate={**step.evaluate, **terms})
+
+    def _events(self, stepped: Stepped, rows: EnvRows) -> NDArray[np.uint8]:
+        step, jumped = stepped.step, stepped.reset_mask
+        if jumped.any():
+            # Success or fail in a restored state is no event of this moment: it happened at the origin.
+            return np.where(jumped, RESET if stepped.restored is None else WENT_BACK, 0).astype(np.uint8)
+        event_flags = np.where(step.truncated, TRUNCATED, 0).astype(np.uint8)
+        lost = OutlierKind.REWARD_NOT_FINITE
+        for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (REWARD_NONFINITE, lost)):
+            if what in rows.first:
+                event_flags[rows.first[what] == step.elapsed_steps] |= flag
+        return event_flags

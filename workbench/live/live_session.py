@@ -1,0 +1,47 @@
+"""What panels may ask of the session of the open task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+from workbench.live.history.env_table import EnvRows
+from workbench.live.run import Run
+from workbench.live.view import SessionView
+from workbench.page.command import Command
+from workbench.task.reference import TaskName
+
+Value = TypeVar("Value")
+
+
+class LiveSession(Protocol):
+    """The session of the open task, which the app puts together from all features. Any thread may call it."""
+
+    @property
+    def present_reference(self) -> TaskName:
+        """The task as it is named now."""
+        ...
+
+    def do(self, command: Command, page: str = "") -> None:
+        """Carry out a command. Raises `Refused` where it makes no sense now."""
+        ...
+
+    def happen(self, event: Any) -> None:
+        """Take an event of `live.events` or of a feature. Raises `Refused` for a command that makes no sense now."""
+        ...
+
+    def change(self, **settings: Any) -> None:
+        """Change fields of `Settings`."""
+        ...
+
+    def view(self) -> SessionView:
+        """A snapshot of one moment."""
+        ...
+
+    def look(self, read: Callable[[Run], Value]) -> Value:
+        """The value of `read` for the present run; it runs on the loop, since the history is written there."""
+        ...
+
+    def env_rows(self) -> EnvRows | None:
+        """See `Run.env_rows`."""
+        ...

@@ -1,0 +1,516 @@
+"""Requests to the worker and events from it: plain dataclasses with NumPy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraInfo, CameraKey, CameraKind, CameraSettings, Picture
+from workbench.envs.gpu_rules import Finding
+from workbench.envs.inspection import Inspection, Section
+from workbench.envs.recorded_run import RecordedRun
+from workbench.envs.step_result import StepResult
+from workbench.machine.processes.wire import Call, Question
+from workbench.planning.options import PlanOptions
+from workbench.task.description import ActionSource, ShownPictures, Stepped, TaskDescription, TaskOptions
+from workbench.task.problem import Problem
+from workbench.task.reference import TaskName
+
+LoadLevel = Literal["auto", "patched", "cameras", "rebuilt"]
+"""How to load a new version; ``auto`` takes the least that is safe. See `workbench.task.reload_level`."""
+ReloadLevel = Literal["same", "patched", "cameras", "rebuilt", "restarted"]
+SCENE_KEPT: frozenset[ReloadLevel] = frozenset({"same", "patched", "cameras"})
+"""Levels that keep the env, its episodes and its history."""
+EpisodeEnd = Literal["reset", "continue", "pause"]
+"""What happens to an env whose episode ends: reset that env, continue, or pause all."""
+
+
+# --- requests: server to worker, handled in order between control steps ---------------------------
+
+
+@dataclass(frozen=True)
+class Load(Question["Loaded"]):
+    """Import and build the task; it replaces the running one only if all of it succeeds."""
+
+    task: TaskName
+    """A path, ``path:ClassName`` or a registered env id, as a person named it, or a task that a recording names."""
+    options: TaskOptions
+    source: dict[str, str] | None = None
+    """Text to use in place of the files on disk, to bring back the last good version."""
+    level: LoadLevel = "auto"
+    """How to replace a running version of the same task."""
+    snapshot: bytes | None = None
+    """Pickled `envs.snapshots.snapshot.Snapshot` to restore after a build, by name, where shapes match."""
+    any_task: bool = False
+    """If no class is named and the first one fails, open another task of the file."""
+    number: int = 0
+    """Number of the load of the file on disk, counting up; 0 for a version that is brought back."""
+    because: str = ""
+    """Why a new process loads it, for the `ReloadReport`."""
+    same_scene: bool = False
+    """Whether a new process loads the version, and the same code as before builds the scene."""
+
+
+@dataclass(frozen=True)
+class Play:
+    """Start or pause stepping."""
+
+    playing: bool
+
+
+@dataclass(frozen=True)
+class SingleStep:
+    """Pause, and make one control step."""
+
+
+@dataclass(frozen=True)
+class Reset(Question[StepResult]):
+    """Reset envs."""
+
+    env_idx: tuple[int, ...] | None = None
+    """The envs to reset; None for all."""
+    seed: int | None = None
+    """Seed of the reset; None continues the task's own random numbers."""
+
+
+class CameraRequest(NamedTuple):
+    """A picture to draw, in the form of `pictures.render.Request`."""
+
+    name: str
+    kind: CameraKind
+    modalities: tuple[str, ...] = ("rgb",)
+
+    @property
+    def key(self) -> CameraKey:
+        return self.kind, self.name
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How the batch runs and which cameras are watched. Always sent whole; the worker applies what changed."""
+
+    speed: float = 1.0
+    """Simulated seconds per second; ``inf`` runs as fast as possible."""
+    episode_end: EpisodeEnd = "reset"
+    action_source: ActionSource = "random"
+    policy: str | None = None
+    """``module:function`` or ``file.py:function`` when `action_source` is ``policy``; None if not named yet."""
+    policy_folder: str | None = None
+    """Folder in which the policy's file is searched, after the current folder."""
+    plan: PlanOptions = PlanOptions()
+    """How actions are planned while `action_source` is ``solve``."""
+    solve_all: bool = False
+    """Plan for every env in turn; else for the selected one only, and the other envs hold still."""
+    traced: str = ""
+    """Name of the body whose path in the rollouts is shown; empty for the robot's tool."""
+    selected_env: int = 0
+    cameras: tuple[CameraRequest, ...] = ()
+    """Cameras to draw in the selected env; none while no page is open."""
+    pictures: ShownPictures = "auto"
+    """Degree of the pictures of these cameras."""
+
+
+@dataclass(frozen=True)
+class Tell:
+    """Set values of the action of envs, while `Settings.action_source` is ``sliders``; other dimensions keep their
+    value."""
+
+    env_idx: tuple[int, ...]
+    dimensions: tuple[int, ...]
+    """Dimensions to set; without any, the envs hold still."""
+    values: tuple[float, ...]
+    """One value for each dimension, the same for each env."""
+
+
+@dataclass(frozen=True)
+class ReadPolicyAgain:
+    """Import the policy again: its file was saved."""
+
+    play: bool
+    """Start playing if the import succeeds."""
+
+
+@dataclass(frozen=True)
+class FollowPlan:
+    """The answer to a `PlanWanted`: actions to take from that moment on. Dropped if anything else moved the envs since."""
+
+    number: int
+    """Number of the `PlanWanted` that this answers."""
+    env_idx: tuple[int, ...]
+    actions: NDArray[np.float32]
+    """(S, n, A) actions for S control steps of these n envs; the other envs hold still."""
+
+
+@dataclass(frozen=True)
+class PlaceCamera(Question["Placed"]):
+    """Change a camera's pose, lens, size or shader in all envs; followed by a `Placed`.
+
+    Of several waiting requests for one camera only the last is carried out.
+    """
+
+    key: CameraKey
+    settings: CameraSettings | None
+    """The new settings; None restores the task's own."""
+
+
+@dataclass(frozen=True)
+class SetCapture:
+    """Send every step with the batch's state columns and the pictures of all cameras of these envs, for a recording."""
+
+    env_idx: tuple[int, ...]
+    """Envs to capture; empty turns capturing off."""
+    from_reset: bool = False
+    """Begin in each env at its next reset, so that no unused picture is drawn."""
+
+
+@dataclass(frozen=True)
+class ReplayPath:
+    """How an env came to a moment: actions from the state at an exact point."""
+
+    start: int
+    """The server's number of the exact point's moment; the snapshot of it is in `Restore.starts`."""
+    source: int
+    """The env's number at the exact point."""
+    actions: NDArray[np.float32]
+    """(T, A) actions from there."""
+
+
+@dataclass(frozen=True)
+class Restore:
+    """Put envs back to a moment of the history; followed by a `Stepped` that has `Stepped.restored`."""
+
+    snapshot: bytes
+    """A pickled `envs.snapshots.snapshot.Snapshot` of the whole batch."""
+    env_idx: tuple[int, ...]
+    """The envs to put back."""
+    source: tuple[int, ...]
+    """Env of the snapshot whose state each env of `env_idx` gets."""
+    origin: int
+    """The server's number of that moment; returned unchanged."""
+    undoes: int | None = None
+    """The server's number of the jump that this undoes, if any; returned unchanged."""
+    ways: Mapping[int, ReplayPath] = field(default_factory=dict)
+    """Replay paths of those of `env_idx` that can be replayed up to the moment."""
+    starts: Mapping[int, bytes] = field(default_factory=dict)
+    """Pickled snapshots of the whole batch at the beginnings of `ways`, by number of the moment."""
+
+
+@dataclass(frozen=True)
+class EnterRecording:
+    """Put envs into a state of a recorded episode; followed by a `Stepped` that has `Stepped.restored`."""
+
+    run: RecordedRun
+    """The recorded run, up to the state."""
+    env_idx: tuple[int, ...]
+    """The envs to set, all to the same state."""
+    source_file: str | None = None
+    source: Mapping[str, str] = field(default_factory=dict)
+    """The recorded source, to report what changed since; empty for no report."""
+    number: int = 0
+    """The session's number of this request; returned unchanged."""
+
+
+@dataclass(frozen=True)
+class DrawPast:
+    """Draw one env at a past moment without touching its simulation; followed by `PastPictures`."""
+
+    poses: NDArray[np.float32]
+    """(B, 7) poses of that env's bodies, as in `StepResult.poses`."""
+    env: int
+    cameras: tuple[CameraRequest, ...]
+    origin: int
+    """The server's number of that moment; returned unchanged."""
+
+
+@dataclass(frozen=True)
+class WarmUp(Question[None]):
+    """Do the slow parts of a process's first load and first picture; see `warm_up`."""
+
+    options: TaskOptions
+
+
+@dataclass(frozen=True)
+class ListenForDebugger:
+    """Let debugpy listen on this machine; the log tells the result."""
+
+    port: int
+    wait: bool = False
+    """Wait until a debugger has attached."""
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Read one env's state once, between two control steps; followed by an `Inspection`."""
+
+    env: int
+    sections: tuple[Section, ...]
+
+
+@dataclass(frozen=True)
+class Cancel:
+    """Cancel the previous question: its answer is not needed. Wakes the worker: long work stops as soon as a request
+    comes."""
+
+
+@dataclass(frozen=True)
+class Quit:
+    """End the worker."""
+
+
+Request = (
+    Load
+    | Play
+    | SingleStep
+    | Reset
+    | Settings
+    | Tell
+    | ReadPolicyAgain
+    | FollowPlan
+    | PlaceCamera
+    | SetCapture
+    | Restore
+    | EnterRecording
+    | DrawPast
+    | ListenForDebugger
+    | Inspect
+    | Call
+    | Cancel
+    | Quit
+)
+
+
+def without_steps(requests: Iterable[Request]) -> Iterator[Request]:
+    """Waiting requests after an interrupt: without control steps, but with the pause that a `SingleStep` begins with."""
+    for request in requests:
+        if isinstance(request, SingleStep):
+            yield Play(False)
+        elif not (isinstance(request, Play) and request.playing):
+            yield request
+
+
+# --- events: worker to server --------------------------------------------------------------------
+
+
+def hands_over(event: object) -> bool:
+    """Whether the worker ends with this event, so that another worker continues."""
+    return isinstance(event, NewProcessNeeded) or (isinstance(event, LoadFailed) and event.spoiled != "")
+
+
+@dataclass(frozen=True)
+class Loading:
+    """What a load is doing, for the status line."""
+
+    activity: str
+    number: int = 0
+    """Number of the `Load`."""
+
+
+@dataclass(frozen=True)
+class NewProcessNeeded:
+    """The worker's answer to a `Load` that it must not do: the version that runs left something in this process that no
+    reload takes back. The worker ends; the next one loads the file at the newest moment."""
+
+    reason: str
+    same_scene: bool
+    """Whether only code that runs at resets and steps differs, if any does."""
+
+
+@dataclass(frozen=True)
+class ReloadReport:
+    """How a version replaced the previous one."""
+
+    level: ReloadLevel
+    reason: str
+    """Reason of the level, for example ``only compute_dense_reward changed``."""
+    carried: tuple[str, ...] = ()
+    """After a build: names of actors, articulations and attributes that kept their state."""
+    not_carried: dict[str, str] = field(default_factory=dict)
+    """Names of what did not keep its state, each with the reason."""
+    same_scene: bool = False
+    """Whether the same code as before built the scene, see `Load.same_scene`."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A load succeeded."""
+
+    task: TaskDescription
+    first: StepResult
+    milliseconds: dict[str, float]
+    """Time of each part of the load: import, build, rehearse, reset, geometry."""
+    reload: ReloadReport | None = None
+    """How the version replaced the previous one; None for the first version of a task. With ``same``, ``patched`` and
+    ``cameras`` the scene, its episodes and `first`'s poses are unchanged, and the geometry's visuals, which are
+    large, are left out."""
+    options: TaskOptions | None = None
+    """Options of the `Load`."""
+
+
+@dataclass(frozen=True)
+class LoadFailed:
+    """The author's code raised, in a load or later."""
+
+    problem: Problem
+    kept: bool
+    """Whether the previous version still runs."""
+    classes: tuple[str, ...] = ()
+    """Tasks of the file, the one that was tried first; empty where the file has only one or none was tried."""
+    options: TaskOptions | None = None
+    """Options of the `Load` that failed; None if the problem came later."""
+    at_run: bool = False
+    """Whether the running version or its policy failed; no load did."""
+    spoiled: str = ""
+    """What the failed code left in this process, or may have: the worker ends, and the next one brings the version that ran
+    back. Empty if the worker goes on."""
+
+
+@dataclass(frozen=True)
+class PlanWanted:
+    """The worker waits for actions to take; followed by a `FollowPlan`, or by nothing where there is no plan."""
+
+    number: int
+    """`Stepped.number` of the moment to plan from."""
+    env_idx: tuple[int, ...]
+    """The envs to plan for."""
+    snapshot: bytes = b""
+    """A pickled `envs.snapshots.snapshot.Snapshot` of these envs at that moment."""
+    bodies: tuple[dict[str, bytes], ...] = ()
+    """What each of these envs is built of, from `planning.rollouts.bodies_of`."""
+    why_not: str = ""
+    """Why there is no snapshot; empty if there is one."""
+
+
+@dataclass(frozen=True)
+class PlanDropped:
+    """The worker no longer waits for a plan: it was paused, or something else moved the envs."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The newest pictures of the watched cameras of one kind."""
+
+    pictures: tuple[Picture, ...]
+    milliseconds: float | None
+    """Render time; None where steps were made meanwhile, which took part of the time."""
+    number: int
+    """`Stepped.number` of the moment that the pictures show."""
+
+
+@dataclass(frozen=True)
+class CameraFailed:
+    """A camera that cannot be drawn, and is left out until other cameras are watched or another version is loaded."""
+
+    key: CameraKey
+    why: str
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The result of `PlaceCamera`. Later pictures of that camera show it as placed."""
+
+    key: CameraKey
+    settings: CameraSettings | None
+    """Settings of the request."""
+    info: CameraInfo | None
+    """The camera as it is now; `CameraInfo.settings` stays what the task's config has."""
+    reshaped: bool = False
+    """Whether the camera's pictures have another size or other modalities now."""
+    why_not: str = ""
+    """Why the camera was not placed; nothing has changed then."""
+
+
+@dataclass(frozen=True)
+class PastPictures:
+    """The result of `DrawPast`."""
+
+    origin: int
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress of a `wire.Call`."""
+
+    number: int
+    done: int
+    total: int
+    part: bytes = b""
+    """New part of the answer since the last progress message, packed; see `wire.Question.part`."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The end of a `wire.Call`."""
+
+    number: int
+    value: bytes = b""
+    """The answer, packed: only the caller knows its type."""
+    why: str = ""
+    """Why there is no value, for the page; empty if there is one."""
+    problem: Problem | None = None
+    """What the author's code raised, if that is the reason."""
+
+
+class CannotAnswer(Exception):
+    """Raised in a worker that has no answer; the text is a sentence for the page."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Whether and how fast the batch runs."""
+
+    playing: bool
+    steps_per_second: float
+    """Control steps of the whole batch per second of wall time."""
+    real_time_factor: float
+    """Simulated seconds per wall second; below the chosen speed the machine is the limit."""
+    activity: str = ""
+    """Long work that delays requests, if any."""
+    recorded_share: float = 0.0
+    watched_share: float = 0.0
+    """Share (0 to 1) of the time while playing that went into what is recorded with every step, and into pictures for
+    the page."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """The action that sliders send next, while they are the source of actions; sent whenever it may have changed."""
+
+    action: NDArray[np.float32]
+    """(N, A) the action."""
+
+
+@dataclass(frozen=True)
+class RulesBroken:
+    """Rules that the running version breaks without being stopped; sent when the findings change."""
+
+    rows: tuple[Finding, ...]
+    more: int = 0
+    """Number of findings beyond the limit of rows."""
+    new: tuple[Finding, ...] = ()
+    """Rows that the previous event did not have."""
+
+
+Event = (
+    Loading
+    | NewProcessNeeded
+    | Loaded
+    | LoadFailed
+    | Stepped
+    | PlanWanted
+    | PlanDropped
+    | Pictures
+    | CameraFailed
+    | Placed
+    | PastPictures
+    | Inspection
+    | Answer
+    | Progress
+    | Told
+    | Status
+    | RulesBroken
+)

@@ -1,0 +1,283 @@
+"""The folder *How the envs are made*: number of envs, robot, modes and the task's own keyword arguments."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import viser
+
+from workbench.envs.keywords import MODES, HowMade, Keyword, as_json, read_value, shown
+from workbench.envs.recorded_run import HOW_IT_IS_RUN
+from workbench.live.commands import (
+    LONGEST_VALUE,
+    ApplyEnvOptions,
+    DiscardEnvOptions,
+    ResetEnvOptions,
+    SetKeyword,
+    SetNumEnvs,
+)
+from workbench.live.events import OptionsApplied
+from workbench.live.live_session import LiveSession
+from workbench.live.view import SessionView
+from workbench.page.command import Command, Refused
+from workbench.page.widgets.fields import Field, Plain, choice, tick
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+from workbench.task.description import TaskOptions, changed_options, command_line
+from workbench.task.reference import lasting
+
+LABELS = {
+    "robot_uids": "Robot",
+    "control_mode": "Control",
+    "obs_mode": "Observation",
+    "reward_mode": "Reward",
+}
+NONE = "none (null)"
+_FEWEST_DIGITS, _MOST_DIGITS = 4, 9
+"""Minimum and maximum number of decimals of the step of a number."""
+
+
+class EnvOptionsPanel(PagePart[SessionView]):
+    """A form that is applied as a whole: every change rebuilds the envs.
+
+    What is typed stays in the form until it is applied or discarded, also if the task fails with it; then the envs that
+    run stay as they are. The form is written anew when the envs were made in another way.
+    """
+
+    does = (SetNumEnvs, SetKeyword, ApplyEnvOptions, DiscardEnvOptions, ResetEnvOptions)
+
+    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
+        self._server, self._session = server, session
+        self._made: tuple[HowMade, TaskOptions] | None = None
+        """Env and options that the form was last written for."""
+        self._num_envs = 1
+        self._keywords: tuple[Keyword, ...] = ()
+        self._values: dict[str, Plain] = {}
+        """Values in the form, by the name of the keyword."""
+        self._fields: list[Field] = []
+        """Input fields of the keywords."""
+        gui = server.gui
+        with gui.add_folder("How the envs are made", expand_by_default=False):
+            self._envs = Field(server, "Envs", SetNumEnvs, "num_envs", self._num_envs)
+            self._form = gui.add_folder(None)
+            self._tools = gui.add_html("")
+            self._html = gui.add_html("")
+
+    def key(self, view: SessionView) -> object:
+        # The command names the file by its place on the disk, which is not asked for with every step.
+        task = None if view.task is None else (view.task.made, view.task.device)
+        form = self._num_envs, tuple(self._values.items())
+        options = view.options, view.seed, view.options_refused
+        return task, options, form, view.state, self._session.present_reference
+
+    def draw(self, view: SessionView) -> None:
+        made = (HowMade() if view.task is None else view.task.made), replace(view.options, seed=0)
+        before = self._made
+        if made != before:
+            self._made = made
+            self._build(made[0])
+            # What was typed while the first version was loading stays.
+            if before is None or before[1] != made[1]:
+                self._num_envs = made[1].num_envs
+        self._envs.show(self._num_envs)
+        for keyword, field in zip(self._keywords, self._fields, strict=True):
+            field.show(self._values[keyword.name], off=bool(keyword.fixed))
+        changed = self._num_envs != view.options.num_envs or bool(self._changed())
+        apply = tool("Apply", ApplyEnvOptions(), off=not changed or view.state == "stopped", tone="main")
+        discard = tool("Discard", DiscardEnvOptions())
+        self._tools.content = tools_html(
+            [apply, discard] if changed or view.options_refused is not None else [apply]
+        )
+        self._html.content = options_html(self._session.present_reference, view)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case SetNumEnvs(num_envs=num_envs):
+                self._num_envs = num_envs
+            case SetKeyword(name=name, value=value):
+                if not any(keyword.name == name and not keyword.fixed for keyword in self._keywords):
+                    raise Refused(f"There is no {name} that can be changed here.")
+                if isinstance(value, str) and not value.isprintable():
+                    raise Refused(f"The {name} has characters that cannot be shown.")
+                self._values[name] = value
+            case ApplyEnvOptions():
+                self._apply()
+            case DiscardEnvOptions():
+                self._discard()
+            case ResetEnvOptions():
+                self._as_the_task_does()
+
+    # --- the form --------------------------------------------------------------------------------
+
+    def _build(self, made: HowMade) -> None:
+        before, self._keywords = self._keywords, (*made.modes, *made.own)
+        self._values = {keyword.name: _in_effect(keyword) for keyword in self._keywords}
+        if list(map(_input_of, before)) != list(map(_input_of, self._keywords)):
+            for field in self._fields:
+                field.remove()
+            with self._form:
+                self._fields = [_field_for(self._server, keyword) for keyword in self._keywords]
+
+    def _changed(self) -> dict[Keyword, Plain]:
+        """Values in the form that differ from those in effect, by keyword."""
+        now = {keyword: self._values[keyword.name] for keyword in self._keywords}
+        return {keyword: value for keyword, value in now.items() if value != _in_effect(keyword)}
+
+    def _discard(self) -> None:
+        view = self._session.view()
+        self._num_envs = view.options.num_envs
+        self._values = {keyword.name: _in_effect(keyword) for keyword in self._keywords}
+        if view.options_refused is not None:
+            # The task works with what is in effect: loading it takes the problem off the page.
+            self._session.happen(OptionsApplied(view.options))
+
+    def _apply(self) -> None:
+        options = self._session.view().options
+        try:
+            values = {
+                keyword: read_value(keyword, value if isinstance(value, str) else json.dumps(value))
+                for keyword, value in self._changed().items()
+            }
+        except ValueError as why:
+            raise Refused(str(why)) from None
+        wanted = replace(options, num_envs=self._num_envs, env_kwargs=merged(options.env_kwargs, values))
+        if changed_options(options, wanted):
+            self._session.happen(OptionsApplied(wanted))
+
+    def _as_the_task_does(self) -> None:
+        """Drop the keyword arguments that a person gave."""
+        options = self._session.view().options
+        kept = _of_the_machine(options.env_kwargs)
+        self._session.happen(OptionsApplied(replace(options, env_kwargs=kept)))
+
+
+def merged(given: Mapping[str, Any], values: Mapping[Keyword, Any]) -> dict[str, Any]:
+    """The keyword arguments of a form over those that were given.
+
+    What stands as it was is left as it was, and what is the class's own value is not given. A new robot has other control
+    modes, so the old one is dropped unless it was chosen with it.
+    """
+    result = dict(given)
+    changed = {keyword.name for keyword, value in values.items() if not _same(as_json(value), keyword.value)}
+    for keyword, value in values.items():
+        if keyword.name not in changed:
+            continue
+        if keyword.name not in MODES and keyword.default and _same(as_json(value), keyword.default):
+            result.pop(keyword.name, None)
+        else:
+            result[keyword.name] = value
+    if "robot_uids" in changed and "control_mode" not in changed:
+        result.pop("control_mode", None)
+    return result
+
+
+def _same(a: str | None, b: str) -> bool:
+    """Whether two texts are the same value: 1 and 1.0 are, 1 and true are not."""
+    if a is None or a == b:
+        return a == b
+    left, right = json.loads(a), json.loads(b)
+    return left == right and isinstance(left, bool) == isinstance(right, bool)
+
+
+def _of_the_machine(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in kwargs.items() if name in HOW_IT_IS_RUN}
+
+
+# --- inputs ------------------------------------------------------------------------------------------
+
+
+def _input_of(keyword: Keyword) -> object:
+    """Key of the input of a keyword: everything that the input depends on, except its value."""
+    return keyword.name, keyword.kind, keyword.choices, keyword.optional, keyword.fixed
+
+
+def _in_effect(keyword: Keyword) -> Plain:
+    """Value in the input of a keyword when it shows the value in effect."""
+    if keyword.fixed:
+        return keyword.value
+    if keyword.kind == "str":
+        return shown(keyword.value)
+    if keyword.kind == "bool" and not keyword.optional:
+        return keyword.value == "true"
+    if keyword.kind in ("int", "float") and not keyword.optional and _is_number(keyword.value):
+        number = json.loads(keyword.value)
+        return int(number) if keyword.kind == "int" else float(number)
+    return keyword.value
+
+
+def _field_for(server: viser.ViserServer, keyword: Keyword) -> Field:
+    label, value = LABELS.get(keyword.name, keyword.name), _in_effect(keyword)
+    given = {"name": keyword.name}
+    if keyword.fixed:
+        hint = f"Not changed here: {keyword.fixed}"
+        return Field(server, label, SetKeyword, "value", value, given=[given], hint=hint)
+    if keyword.kind == "choice" or (keyword.kind == "bool" and keyword.optional):
+        return choice(server, label, SetKeyword, "value", _options(keyword), value, given=given)
+    if isinstance(value, bool):
+        return tick(server, label, SetKeyword, "value", value, given=given)
+    if isinstance(value, (int, float)):
+        return Field(server, label, SetKeyword, "value", value, given=[given], step=_step(value))
+    hint = "Text" if keyword.kind == "str" else 'A value in JSON: 0.5, true, [1, 2], "text"'
+    hint += "; null for none" if keyword.optional else ""
+    return Field(server, label, SetKeyword, "value", value, given=[given], hint=hint, longest=LONGEST_VALUE)
+
+
+def _options(keyword: Keyword) -> dict[str, Plain]:
+    """Values in JSON, by their label."""
+    texts = keyword.choices or ("true", "false")
+    names = [shown(text) for text in texts]
+    # 1 and "1" look the same.
+    options: dict[str, Plain] = dict(zip(names if len(set(names)) == len(names) else texts, texts))
+    if keyword.optional and "null" not in texts:
+        options[NONE] = "null"
+    return options
+
+
+def _step(value: float) -> float:
+    """Step by which an arrow key changes a number of this size."""
+    if isinstance(value, int):
+        return 1.0
+    size = math.floor(math.log10(abs(value))) if value else 0
+    return 10.0 ** -min(max(_FEWEST_DIGITS, 3 - size), _MOST_DIGITS)
+
+
+def _is_number(text: str) -> bool:
+    value = json.loads(text)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 2**53
+
+
+def options_html(reference: object, view: SessionView) -> str:
+    """HTML of what the form does not show: options that were refused, further arguments, the driver, and the command."""
+    options = replace(view.options, seed=view.seed)
+    refused = view.options_refused
+    made = HowMade() if view.task is None else view.task.made
+    in_form = {keyword.name for keyword in (*made.modes, *made.own)}
+    further = {name: value for name, value in options.env_kwargs.items() if name not in in_form}
+    return render(
+        "env_options",
+        refused=[] if refused is None else _in_words(view.options, refused),
+        further=_pairs(further),
+        given=bool(options.env_kwargs.keys() - HOW_IT_IS_RUN),
+        device="" if view.task is None else view.task.device,
+        command=command_line(lasting(str(reference)), options),
+        reset=ResetEnvOptions(),
+    )
+
+
+def _in_words(now: TaskOptions, tried: TaskOptions) -> list[str]:
+    of_run = {name: getattr(tried, name) for name in ("num_envs", "backend")}
+    values = {**of_run, **tried.env_kwargs}
+    return [
+        f"{name} = {as_json(values[name]) or values[name]}" if name in values else f"no {name}"
+        for name in changed_options(now, tried)
+    ]
+
+
+def _pairs(values: Mapping[str, Any]) -> list[str]:
+    return [f"{name} = {as_json(value) or value}" for name, value in values.items()]

@@ -1,0 +1,483 @@
+"""The table of envs: one row an env, sorted and filtered; a press selects the env and goes to its moment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.live.env_commands import (
+    FilterEnvs,
+    NextFailedEnv,
+    NextFlaggedEnv,
+    ShowEnvAtEvent,
+    ShowFirstFlagged,
+    SortEnvs,
+    ToggleEnvEntries,
+    ToggleEnvEntry,
+    TurnEnvs,
+)
+from workbench.live.events import EpisodeStepShown, SettingsChanged
+from workbench.live.history.env_table import EnvRows, Outcome
+from workbench.live.live_session import LiveSession
+from workbench.live.panels.env_columns import DOT, EnvColumn, levels, wanted_width
+from workbench.live.panels.moment import MomentPart
+from workbench.live.panels.timeline_panel import polylines
+from workbench.live.view import SessionView
+from workbench.machine.text import number_text
+from workbench.page.command import Command, Refused
+from workbench.page.commands import TellUnfolded
+from workbench.page.widgets.paged import Paged
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.visitors import Visitor
+
+Filter = Literal["all", "failed", "running", "flagged"]
+FILTERS: dict[Filter, tuple[str, str, str]] = {
+    "all": ("all", "Every env", "There is no env."),
+    "failed": (
+        "last failed",
+        "The last finished episode ended without success: by fail, or at the time limit",
+        "No env's last episode failed.",
+    ),
+    "running": (
+        "running",
+        "The current episode has not ended yet",
+        "No env is running.",
+    ),
+    "flagged": (
+        "flagged",
+        "Something odd in the current or the previous episode",
+        "No env is flagged.",
+    ),
+}
+"""Label of the button, hint, and text of an empty table. "last failed", not "failed": a running env may have failed
+before, and "failed 16" next to "running 16" confuses."""
+TABLE = "envs"
+"""Name of the panel in the page's report that the panel was unfolded."""
+MOST_ENTRIES = 6
+"""Maximum number of columns of bool entries at first; with more a row is wider than the view. The others can be
+chosen."""
+POINTS = 40
+"""Number of points of a row's small curve."""
+STEP_CHARACTERS = 3
+"""Minimum width of a step number in characters: step numbers are soon that long."""
+REWARD_CURVE = "reward curve"
+"""Name of the column that cannot be sorted by."""
+CURVE_WIDTH, CURVE_HEIGHT = 60, 14
+_GRAVITY = np.array([2, 3, 0, 1])
+"""Sort key of each `Outcome`: failed, then truncated, then running, then solved."""
+
+
+def bool_entries(rows: EnvRows) -> tuple[str, ...]:
+    """The bool entries of `evaluate`, ``success`` and ``fail`` first."""
+    return tuple(sorted(rows.first_true, key=lambda name: (name != "success", name != "fail", name)))
+
+
+def entry_names(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[str, ...]:
+    """Bool entries that get a column: the chosen ones, and the first of those that a person did not set."""
+    chosen = chosen or {}
+    every = bool_entries(rows)
+    return tuple(name for place, name in enumerate(every) if chosen.get(name, place < MOST_ENTRIES))
+
+
+def columns(rows: EnvRows, chosen: Mapping[str, bool] | None = None) -> tuple[str, ...]:
+    """Names of the sortable columns, in the order of the table."""
+    return (
+        "env",
+        "state",
+        "steps",
+        "return",
+        "last",
+        "flags",
+        *(f"first {name}" for name in entry_names(rows, chosen)),
+    )
+
+
+def gives_way(entries: tuple[str, ...], chosen: Mapping[str, bool], sorted_by: str) -> dict[str, int]:
+    """Rank of the columns that are left out where the panel is narrow, 0 first; those without a rank always stay.
+
+    Args:
+        entries: The bool entries of `evaluate` that have a column.
+        chosen: Those that a person switched on stay longer than the others.
+        sorted_by: This column stays.
+    """
+    added = [name for name in reversed(entries) if chosen.get(name)]
+    others = [name for name in reversed(entries) if name not in added]
+    more = [f"first {name}" for name in others if name not in ("success", "fail")]
+    fail, success = ([f"first {name}"] if name in others else [] for name in ("fail", "success"))
+    # What is flagged has a row of its own, too.
+    in_turn = ["flags", *more, "last", *fail, REWARD_CURVE, "steps", *(f"first {name}" for name in added)]
+    ranked = [column for column in (*in_turn, *success, "return") if column != sorted_by]
+    return {column: rank for rank, column in enumerate(ranked)}
+
+
+def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
+    """(N,) whether each env passes a filter.
+
+    ``failed``: the present episode ended without success or, while it runs, the previous one did.
+    ``flagged``: outliers in the present or the previous episode.
+    """
+    everyone = np.ones(rows.num_envs, bool)
+    if wanted == "failed":
+        running = rows.outcome == Outcome.RUNNING
+        bad = (Outcome.FAIL, Outcome.TRUNCATED)
+        return np.where(running, np.isin(rows.last.outcome, bad), np.isin(rows.outcome, bad))
+    if wanted == "running":
+        return rows.outcome == Outcome.RUNNING
+    if wanted == "flagged":
+        return np.isin(np.arange(rows.num_envs), [*rows.outliers, *rows.last.outliers])
+    return everyone
+
+
+def first_flagged(rows: EnvRows) -> int | None:
+    """The first env with an outlier in the present episode, or else in the previous one; None for none."""
+    return min(rows.outliers, default=None) if rows.outliers else min(rows.last.outliers, default=None)
+
+
+def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") -> NDArray[np.int64]:
+    """The envs that pass a filter, sorted by a column.
+
+    Envs without a value come last in both directions. Ties keep the order of the envs, or rows would jump while nothing
+    changes.
+    """
+    envs = np.flatnonzero(mask(rows, wanted))
+    keys = _keys(rows, column)[envs]
+    keys = np.where(np.isnan(keys), np.inf, -keys if descending else keys)
+    return envs[np.argsort(keys, kind="stable")]
+
+
+def moment_of(rows: EnvRows, env: int) -> int | None:
+    """The step of the present episode that a press on an env's row shows: its first outlier, else its end, else None."""
+    if env in rows.outliers:
+        return rows.outliers[env][0].step
+    return int(rows.end[env]) if rows.end[env] >= 0 else None
+
+
+def make_rows(
+    rows: EnvRows, envs: NDArray[np.int64], chosen: Mapping[str, bool] | None = None
+) -> list[dict[str, Any]]:
+    """The cells of these envs. A curve is ``points`` of SVG polylines; flags are oldest first."""
+    names = entry_names(rows, chosen)
+    curves = _curves(rows.rewards, envs)
+    made = []
+    for env, curve in zip(envs.tolist(), curves, strict=True):
+        state, last = (Outcome(int(one)).name.lower() for one in (rows.outcome[env], rows.last.outcome[env]))
+        had_one = rows.last.steps[env] >= 0
+        before = [
+            f"{outlier.text} (previous episode, step {outlier.step})"
+            for outlier in rows.last.outliers.get(env, ())
+        ]
+        now = [f"{outlier.text} (step {outlier.step})" for outlier in rows.outliers.get(env, ())]
+        made.append(
+            {
+                "env": env,
+                "state": state,
+                "total": number_text(float(rows.total[env]), ".3g") if rows.followed[env] else "",
+                "steps": str(int(rows.steps[env])),
+                "first_true": tuple(_step(int(rows.first_true[name][env])) for name in names),
+                "curve": curve,
+                "last": ("cut short" if last == "running" else last) if had_one else "",
+                "last_steps": str(int(rows.last.steps[env])),
+                "last_state": last,
+                "tally": f"{rows.succeeded[env]} of {rows.ended[env]} episodes ended in success",
+                "flags": tuple(now + before),
+            }
+        )
+    return made
+
+
+def _keys(rows: EnvRows, column: str) -> NDArray[np.float64]:
+    """(N,) NaN for no value."""
+    if column == "state":
+        return _GRAVITY[rows.outcome].astype(np.float64)
+    if column == "steps":
+        return rows.steps.astype(np.float64)
+    if column == "return":
+        return rows.total.astype(np.float64)
+    if column == "last":
+        return np.where(rows.last.steps < 0, np.nan, _GRAVITY[rows.last.outcome])
+    if column == "flags":
+        keys = np.full(rows.num_envs, np.nan)
+        keys[list(rows.last.outliers)] = 1.0
+        keys[list(rows.outliers)] = 0.0
+        return keys
+    if column.startswith("first "):
+        steps = rows.first_true.get(column.removeprefix("first "))
+        if steps is not None:
+            return np.where(steps < 0, np.nan, steps)
+    return np.arange(rows.num_envs, dtype=np.float64)
+
+
+def _curves(rewards: NDArray[np.float32], envs: NDArray[np.int64]) -> list[list[str]]:
+    """SVG points of each env's rewards, all on one scale."""
+    chosen = rewards[envs].astype(np.float64)
+    finite = np.isfinite(chosen)
+    if not finite.any():
+        return [[] for _ in envs]
+    # The longest shown episode sets the width.
+    chosen = chosen[:, int(finite.any(axis=0).argmax()) :]
+    every = np.arange(0, chosen.shape[1], -(-chosen.shape[1] // POINTS))
+    # A single step without a number makes a gap, too.
+    finite = np.logical_and.reduceat(np.isfinite(chosen), every, axis=1)
+    chosen = chosen[:, every]
+    if not finite.any():
+        return [[] for _ in envs]
+    low, high = chosen[finite].min(), chosen[finite].max()
+    span = high - low if high > low else 1.0
+    x = np.round(np.linspace(0, CURVE_WIDTH, chosen.shape[1]), 1)
+    y = np.round(CURVE_HEIGHT - 1 - (CURVE_HEIGHT - 2) * (np.where(finite, chosen, low) - low) / span, 1)
+    return [
+        polylines([f"{a:g},{b:g}" if there else None for a, b, there in zip(x, heights, ok, strict=True)])
+        for heights, ok in zip(y, finite, strict=True)
+    ]
+
+
+def _step(step: int) -> str:
+    return "" if step < 0 else str(step)
+
+
+MOST_ROWS = 64
+"""Number of rows of one page of the table."""
+HINTS = {
+    "env": "Click a column to sort by it, again to reverse the order",
+    "state": "Of the current episode: running until it first ends",
+    "steps": "Control steps of the episode",
+    "return": "Sum of the rewards of the episode so far",
+    "last": "How the previous episode ended, and at which step",
+    "flags": "What is odd: NaN or infinite, too fast, fallen, reward out of range",
+}
+
+
+class EnvPanel(MomentPart):
+    """The table of envs in the present container. Sorting and filter are the same for all open pages.
+
+    While it is folded in every page only a new task is drawn: 64 rows were half of what the panels took while a task played.
+    """
+
+    does = (
+        ShowEnvAtEvent,
+        ShowFirstFlagged,
+        NextFailedEnv,
+        NextFlaggedEnv,
+        SortEnvs,
+        FilterEnvs,
+        ToggleEnvEntries,
+        ToggleEnvEntry,
+        TurnEnvs,
+    )
+
+    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
+        self._session = session
+        self._handle = server.gui.add_html("")
+        server.gui.add_html(render("tell", command=TellUnfolded(panel=TABLE)))
+        self._sort = "env", False
+        """Column that a person chose, and whether the order is descending."""
+        self._filter: Filter = "all"
+        self._pages = Paged(MOST_ROWS)
+        self._chosen: dict[str, bool] = {}
+        """Whether a person switched each bool entry on or off."""
+        self._choosing = False
+        """Whether the list of entries is open."""
+        self._pressed = 0
+        """Number of presses that changed the table."""
+        self._is_unfolded = False
+        self._drawn_task = -1
+        """Value of `SessionView.task_serial` at the last drawing."""
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ShowEnvAtEvent(env=env):
+                self._choose_env(env)
+            case ShowFirstFlagged():
+                self._select_first_flagged()
+            case NextFailedEnv():
+                self._select_next("failed")
+            case NextFlaggedEnv():
+                self._select_next("flagged")
+            case SortEnvs(column=column):
+                before, descending = self._sort
+                self._sort = column, column == before and not descending
+                self._pages = self._pages.at(0)
+            case FilterEnvs(which=which):
+                self._filter = which
+                self._pages = self._pages.at(0)
+            case ToggleEnvEntries():
+                self._choosing = not self._choosing
+            case ToggleEnvEntry(name=name):
+                self._toggle_entry(name)
+            case TurnEnvs(by=by):
+                rows = self._session.env_rows()
+                count = 0 if rows is None else int(np.count_nonzero(mask(rows, self._filter)))
+                self._pages = self._pages.turned(by, count)
+        self._pressed += 1
+
+    def unfold(self) -> None:
+        """Draw the table from now on, because a page shows it. Lasts until `fold`, since no page reports that it
+        folds it by itself."""
+        self._is_unfolded = True
+
+    def fold(self) -> None:
+        """Stop drawing the table, because no page shows it."""
+        self._is_unfolded = False
+
+    def key(self, view: SessionView) -> object:
+        return view.task_serial, view.step_serial if self._is_unfolded else None
+
+    def urgent(self, view: SessionView) -> object:
+        return super().urgent(view), self._is_unfolded, self._pressed if self._is_unfolded else None
+
+    def draw(self, view: SessionView) -> None:
+        if not self._is_unfolded and self._drawn_task == view.task_serial:
+            return
+        self._drawn_task = view.task_serial
+        rows = self._session.env_rows()
+        content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
+        self._handle.content = content
+
+    def wanted_width(self) -> float:
+        """Width in pixels of a panel in which every column is seen."""
+        rows = self._session.env_rows()
+        if rows is None:
+            return 0.0
+        return wanted_width(
+            self._measure(rows, make_rows(rows, np.arange(min(rows.num_envs, MOST_ROWS)), self._chosen))
+        )
+
+    def _html(self, rows: EnvRows, selected: int) -> str:
+        envs = order(rows, *self._sorted_by(rows), self._filter)
+        places = self._pages.places(len(envs))
+        shown = make_rows(rows, envs[places.start : places.stop], self._chosen)
+        return render(
+            "envs",
+            none_so=FILTERS[self._filter][2],
+            pills=[
+                {
+                    "name": shown_as,
+                    "hint": means,
+                    "count": int(np.count_nonzero(mask(rows, name))),
+                    "on": name == self._filter,
+                    "press": FilterEnvs(which=name),
+                }
+                for name, (shown_as, means, _) in FILTERS.items()
+            ],
+            choose=ToggleEnvEntries() if rows.first_true else None,
+            entries=self._entries(rows) if self._choosing else (),
+            choosing=self._choosing,
+            pages=self._pages.shown(len(envs), lambda by: TurnEnvs(by=by)),
+            head=self._head(rows),
+            levels=levels(self._measure(rows, shown)),
+            rows=[
+                {
+                    "cells": row,
+                    "selected": row["env"] == selected,
+                    "press": ShowEnvAtEvent(env=row["env"]),
+                }
+                for row in shown
+            ],
+        )
+
+    def _head(self, rows: EnvRows) -> list[dict[str, object]]:
+        names = entry_names(rows, self._chosen)
+        sorted_by, descending = self._sorted_by(rows)
+
+        def sortable(name: str, column: str, hint: str) -> dict[str, object]:
+            arrow = "" if column != sorted_by else f"\N{NO-BREAK SPACE}{'↓' if descending else '↑'}"
+            return {
+                "name": name,
+                "arrow": arrow,
+                "press": SortEnvs(column=column),
+                "hint": hint,
+            }
+
+        entries = [
+            sortable(name, f"first {name}", f"{name}: the first step at which it was true") for name in names
+        ]
+        plain: dict[str, object] = {
+            "name": "reward",
+            "arrow": "",
+            "press": None,
+            "hint": "Over the episode; all rows on one scale",
+        }
+        start = [sortable(name, name, HINTS[name]) for name in ("env", "state", "steps", "return")]
+        end = [sortable(name, name, HINTS[name]) for name in ("last", "flags")]
+        return [*start, plain, *entries, *end]
+
+    def _sorted_by(self, rows: EnvRows) -> tuple[str, bool]:
+        """The chosen order; by number, while the table lacks the column."""
+        return self._sort if self._sort[0] in columns(rows, self._chosen) else ("env", False)
+
+    def _measure(self, rows: EnvRows, shown: list[dict[str, Any]]) -> list[EnvColumn]:
+        """The columns in the order of `_head`."""
+        names = entry_names(rows, self._chosen)
+        ranks = gives_way(names, self._chosen, self._sorted_by(rows)[0])
+
+        def longest(texts: Iterable[str]) -> int:
+            return max(STEP_CHARACTERS, *map(len, texts), 0)
+
+        states = longest(row["state"] for row in shown)
+        last = longest(row["last"] for row in shown)
+        firsts = [
+            EnvColumn(
+                name,
+                longest(row["first_true"][place] for row in shown),
+                rank=ranks.get(f"first {name}"),
+            )
+            for place, name in enumerate(names)
+        ]
+        return [
+            EnvColumn("env", longest(str(row["env"]) for row in shown)),
+            EnvColumn("state", states, states, DOT),
+            EnvColumn("steps", longest(row["steps"] for row in shown), rank=ranks.get("steps")),
+            EnvColumn("return", longest(row["total"] for row in shown), rank=ranks.get("return")),
+            EnvColumn("reward", 0, fixed=CURVE_WIDTH, rank=ranks.get(REWARD_CURVE)),
+            *firsts,
+            EnvColumn("last", last + STEP_CHARACTERS, last, DOT if last else 0.0, ranks.get("last")),
+            EnvColumn("flags", 3, rank=ranks.get("flags")),
+        ]
+
+    def _entries(self, rows: EnvRows) -> list[dict[str, object]]:
+        shown = entry_names(rows, self._chosen)
+        return [
+            {
+                "name": name,
+                "on": name in shown,
+                "press": ToggleEnvEntry(name=name),
+            }
+            for name in bool_entries(rows)
+        ]
+
+    # --- what a person does ------------------------------------------------------------------------
+
+    def _choose_env(self, env: int) -> None:
+        rows = self._session.env_rows()
+        if rows is None or not 0 <= env < rows.num_envs:
+            raise Refused(f"There is no env {env}.")
+        step = moment_of(rows, env)
+        self._session.happen(
+            SettingsChanged({"selected_env": env}) if step is None else EpisodeStepShown(env, step)
+        )
+
+    def _toggle_entry(self, name: str) -> None:
+        rows = self._session.env_rows()
+        if rows is not None:
+            self._chosen = {**self._chosen, name: name not in entry_names(rows, self._chosen)}
+
+    def _select_first_flagged(self) -> None:
+        """Select the first flagged env, at its first outlier."""
+        rows = self._session.env_rows()
+        env = None if rows is None else first_flagged(rows)
+        if env is not None:
+            self._choose_env(env)
+
+    def _select_next(self, wanted: Filter) -> None:
+        """Select the next env, by number and wrapping around, that passes a filter, if any does."""
+        rows = self._session.env_rows()
+        if rows is None:
+            return
+        envs = np.flatnonzero(mask(rows, wanted))
+        if len(envs):
+            later = envs[envs > self._session.view().selected_env]
+            self._choose_env(int(later[0] if len(later) else envs[0]))

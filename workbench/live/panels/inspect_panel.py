@@ -1,0 +1,356 @@
+"""The Inspect tab: joints, contacts, poses, observation or state of one env, and contact forces in the 3-D view."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.envs.inspection import SECTIONS, Inspection, JointReadings, Leaf, Section
+from workbench.live.commands import ChooseInspected, ShowForces
+from workbench.live.events import ReadingChosen
+from workbench.live.live_session import LiveSession
+from workbench.live.reading import READ_EVERY
+from workbench.live.view import SessionView
+from workbench.machine.text import number_text
+from workbench.page.command import Command
+from workbench.page.commands import TellUnfolded
+from workbench.page.scene.env_grid import InView
+from workbench.page.widgets.fields import choice, tick
+from workbench.page.widgets.parts import Clock, DrawDue, PagePart
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.visitors import Visitor
+
+TAB = "Inspect"
+NEAR_A_LIMIT = 0.02
+"""Share of a joint's range within which a joint counts as near its limit."""
+
+Row = dict[str, Any]
+"""A row of the template ``inspect``."""
+
+
+def leaf_rows(leaves: Sequence[Leaf], before: Sequence[Leaf] | None) -> list[Row]:
+    """One row for each array; numbers that differ at all from the previous reading are marked.
+
+    Args:
+        before: the previous reading of the same env; None marks nothing.
+    """
+    known = {leaf.name: leaf.values for leaf in before or ()}
+    rows = []
+    for leaf in leaves:
+        old = known.get(leaf.name)
+        if old is None or old.shape != leaf.values.shape:
+            changed = np.zeros(leaf.values.shape, bool)
+        else:
+            # NaN differs from itself, and an entry that stays NaN has not changed.
+            changed = (old != leaf.values) & ~((old != old) & (leaf.values != leaf.values))
+        count = math.prod(leaf.shape)
+        whole = len(leaf.values) == count
+        rows.append(
+            {
+                "name": leaf.name,
+                "kind": f"{leaf.dtype} {leaf.shape}" if leaf.shape else leaf.dtype,
+                "numbers": tuple(
+                    {"text": number(value), "changed": bool(new)}
+                    for value, new in zip(leaf.values.tolist(), changed.tolist(), strict=True)
+                )
+                if whole
+                else (),
+                "note": "" if whole else f"{count} numbers from {number(leaf.low)} to {number(leaf.high)}",
+            }
+        )
+    return rows
+
+
+def joint_rows(joints: JointReadings) -> list[Row]:
+    rows = []
+    for i, name in enumerate(joints.names):
+        low, high = float(joints.low[i]), float(joints.high[i])
+        unit = "m" if joints.kinds[i] == "prismatic" else "rad"
+        bounded = math.isfinite(low) and math.isfinite(high) and high > low
+        place = _place(float(joints.position[i]), low, high) if bounded else None
+        target = float(joints.target[i])
+        rows.append(
+            {
+                "name": name,
+                "position": number(float(joints.position[i])),
+                "target": "" if math.isnan(target) else number(target),
+                "velocity": number(float(joints.velocity[i])),
+                "limits": f"{number(low)} to {number(high)} {unit}" if bounded else f"no limits, {unit}",
+                "place": place,
+                "target_place": None if place is None or math.isnan(target) else _place(target, low, high),
+                "at_limit": place is not None and not 100 * NEAR_A_LIMIT < place < 100 * (1 - NEAR_A_LIMIT),
+            }
+        )
+    return rows
+
+
+def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
+    """One row for each body of an env; `poses` is (B, 7), p and q (wxyz), NaN for bodies that it lacks."""
+    rows = []
+    for name, pose in zip(names, poses, strict=True):
+        if np.isfinite(pose).all():
+            p, q = pose[:3], pose[3:]
+            code = f"sapien.Pose(p={_code(p)}, q={_code(q)})"
+            rows.append({"name": name, "p": vector(p), "q": vector(q), "code": code})
+    return rows
+
+
+def number(value: object) -> str:
+    """Short text of a value, of a stable width while it changes."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return str(value)
+    if not isinstance(value, float):
+        return str(value)
+    if not math.isfinite(value):
+        return number_text(value)
+    if value and not 1e-3 <= abs(value) < 1e4:
+        return "0.000" if abs(value) < 1e-6 else f"{value:.1e}"
+    return f"{value:.3f}"
+
+
+def vector(values: NDArray) -> str:
+    return ", ".join(number(float(value)) for value in values)
+
+
+def _place(value: float, low: float, high: float) -> float:
+    return round(100 * min(max((value - low) / (high - low), 0.0), 1.0), 1)
+
+
+def strength(values: NDArray) -> str:
+    """Text of the norm of a force or an impulse (3,)."""
+    return number_text(float(np.linalg.norm(values)), ".3g")
+
+
+def _code(values: NDArray[np.float32]) -> str:
+    # Six decimals: a micrometre, and the precision of float32.
+    return "[" + ", ".join(f"{float(value):.6f}".rstrip("0").rstrip(".") or "0" for value in values) + "]"
+
+
+NOTHING, JOINTS, POSES = "nothing", "joints", "poses"
+CHOICES: dict[str, Section | None] = {
+    NOTHING: None,
+    JOINTS: "joints",
+    "contacts": "contacts",
+    POSES: None,
+    "observation": "observation",
+    "state": "state",
+}
+
+
+class InspectPanel(PagePart[SessionView]):
+    """Reads what is chosen, of the selected env, from the worker.
+
+    Nothing is read until a page has opened the tab: reading takes the worker's time.
+    """
+
+    does = (ChooseInspected, ShowForces)
+
+    def __init__(
+        self, server: viser.ViserServer, session: LiveSession, clock: Clock = time.monotonic
+    ) -> None:
+        self._session = session
+        self._chosen, self._shows_forces = JOINTS, False
+        self._show = choice(
+            server,
+            "Show",
+            ChooseInspected,
+            "what",
+            tuple(CHOICES),
+            JOINTS,
+            hint="Read from the selected env, five times a second.",
+        )
+        self._forces = tick(
+            server,
+            "Force arrows",
+            ShowForces,
+            "on",
+            False,
+            hint="Draw the contact forces of the selected env as arrows in the 3D view.",
+        )
+        self._handle = server.gui.add_html("")
+        self._opened = False
+        server.gui.add_html(render("tell", command=TellUnfolded(panel=TAB)))
+        self._now: Inspection | None = None
+        self._before: Inspection | None = None
+        self._due = DrawDue(READ_EVERY, clock)
+
+    def draw(self, view: SessionView) -> None:
+        chosen = self._chosen
+        self._show.show(chosen)
+        self._forces.show(self._shows_forces)
+        self._take(view)
+        no_step = self._no_step_yet(view)
+        wanted = (chosen, view.task_serial, view.selected_env, id(self._now), no_step)
+        if chosen == POSES:
+            wanted = (*wanted, view.step_serial)
+        if not self._due.is_due(wanted, urgent=chosen):
+            return
+        self._handle.content = inspect_html(chosen, view, self._now, self._before, no_step)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseInspected(what=what):
+                self._chosen = what
+                self.unfold()
+            case ShowForces(on=on):
+                self._shows_forces = on
+                self._choose()
+
+    def forces(self, view: SessionView) -> Inspection | None:
+        """The reading whose contacts the 3-D view shows; None while the past is shown: contacts are read live only."""
+        here = self._now is not None and self._now.env == view.selected_env
+        known = view.timeline.shown is None and not self._no_step_yet(view)
+        shown = self._shows_forces and here and known
+        return self._now if shown else None
+
+    def unfold(self) -> None:
+        """Start reading, because a page has opened the tab."""
+        self._opened = True
+        self._choose()
+
+    def _no_step_yet(self, view: SessionView) -> bool:
+        """Whether the selected env has made no step since it was built, reset or put back. PhysX finds contacts while
+        it steps: until then its list is empty or outdated."""
+        if self._now is not None and self._now.env == view.selected_env and self._now.elapsed_steps == 0:
+            return True
+        lived = self._session.look(lambda run: run.segment()) if view.timeline.shown is None else None
+        return lived is not None and lived[0] == lived[1]
+
+    def _choose(self) -> None:
+        """Tell the session what is looked at."""
+        needed = {
+            CHOICES[self._chosen] if self._opened else None,
+            "contacts" if self._shows_forces else None,
+        }
+        self._session.happen(ReadingChosen(tuple(section for section in SECTIONS if section in needed)))
+
+    def _take(self, view: SessionView) -> None:
+        new = view.inspection
+        if new is self._now:
+            return
+        old = self._now
+        if new is None or old is None or old.env != new.env:
+            self._before = None
+        elif old.elapsed_steps != new.elapsed_steps:
+            self._before = old
+        self._now = new
+
+
+def inspect_html(
+    choice: str,
+    view: SessionView,
+    now: Inspection | None,
+    before: Inspection | None,
+    no_step_yet: bool = False,
+) -> str:
+    """The tab's content; without contacts if the env made no step since it was set."""
+    leaves, articulations, contacts, poses = [], [], (), []
+    note = ""
+    env, section = view.selected_env, CHOICES[choice]
+    if view.task is None or view.step is None:
+        note = "There is something to inspect when the task has loaded."
+    elif choice == NOTHING:
+        note = (
+            "Choose what to read of the selected env: its joints, contacts, the poses of its bodies, the observation "
+            "or the simulation state. Nothing is read until then."
+        )
+    elif choice == POSES:
+        names = view.task.geometry.body_names
+        if view.step.poses.shape[:2] == (view.task.num_envs, len(names)):
+            poses = pose_rows(names, view.step.poses[env])
+        note = f"env {env}: metres, quaternions w x y z, in the env's own frame"
+    elif now is None or now.env != env or _reading(now, section) is None:
+        refused = dict(now.refused) if now is not None and now.env == env else {}
+        note = refused.get(section, f"Reading env {env} ...") if section else ""
+    else:
+        note = f"env {env} at step {now.elapsed_steps} of its episode"
+        if section == "joints":
+            articulations = [{"name": a.articulation, "joints": joint_rows(a)} for a in now.joints or ()]
+            note += "; bars show the position between the limits, and the target in orange"
+        elif section == "contacts":
+            contacts = () if no_step_yet else now.contacts or ()
+            if no_step_yet:
+                note += ": contacts are known after the next step"
+            elif not contacts:
+                note += ": nothing touches anything"
+        elif section == "observation":
+            leaves = leaf_rows(now.observation or (), before.observation if before else None)
+        elif section == "state":
+            leaves = leaf_rows(now.state or (), before.state if before else None)
+        if view.timeline.shown is not None:
+            note += "; this is live: of past moments only the poses are kept"
+        if section in ("observation", "state"):
+            note += "; numbers that changed since the previous reading are blue"
+    return render(
+        "inspect",
+        note=note,
+        leaves=leaves,
+        articulations=articulations,
+        contacts=contacts,
+        poses=poses,
+        vector=vector,
+        strength=strength,
+    )
+
+
+def _reading(now: Inspection, section: Section | None) -> object:
+    return None if section is None else getattr(now, section)
+
+
+FORCE_COLOUR = (255, 0, 200)
+"""Magenta, unlike wood, steel, goals and cubes."""
+METRES_AT_ONE_NEWTON = 0.07
+LONGEST = 0.3
+SHAFT, HEAD, HEAD_LENGTH = 0.005, 0.012, 0.028
+"""Metres; viser does not draw an arrow shorter than its head as an arrow."""
+WEAKEST = 1e-3
+"""Minimum force in newtons that is drawn."""
+
+
+class ForceArrows:
+    """Contact forces of one env as arrows in the 3D view.
+
+    One arrow for each contact point, along the force on the first body of the pair. Forces span five decades (a cube's
+    weight on four corners, a hand pressed into a table), so the length grows with the cube root of the force and is
+    bounded; the numbers are in the Inspect tab.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        look = {"shaft_radius": SHAFT, "head_radius": HEAD, "head_length": HEAD_LENGTH}
+        add = partial(server.scene.add_arrows, "/forces", colors=FORCE_COLOUR, **look)
+        self._arrows = InView(add, "points")
+
+    def draw(self, inspection: Inspection | None, offset: NDArray[np.float32]) -> None:
+        """Show the contacts of this reading, or nothing.
+
+        Args:
+            offset: (3,) of the env in the view.
+        """
+        arrows = () if inspection is None else arrows_of(inspection)
+        if len(arrows):
+            self._arrows.draw(arrows + offset)
+        else:
+            self._arrows.draw()
+
+
+def arrows_of(inspection: Inspection) -> NDArray[np.float32]:
+    """(A, 2, 3) start and end of each arrow, metres, in the env's own frame."""
+    pairs = inspection.contacts or ()
+    if not pairs:
+        return np.zeros((0, 2, 3), np.float32)
+    points = np.concatenate([pair.points for pair in pairs])
+    forces = np.concatenate([pair.forces for pair in pairs])
+    size = np.linalg.norm(forces, axis=1)
+    shown = np.isfinite(size) & (size > WEAKEST)
+    points, forces, size = points[shown], forces[shown], size[shown]
+    length = np.minimum(METRES_AT_ONE_NEWTON * np.cbrt(size), LONGEST)
+    return np.stack([points, points + forces / size[:, None] * length[:, None]], axis=1).astype(np.float32)

@@ -1,0 +1,213 @@
+"""The Log tab: captured output of the author's code in its colours, a filter, and memory of the processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import viser
+from rich.color import Color, ColorType
+from rich.color_triplet import ColorTriplet
+from rich.style import Style
+from rich.terminal_theme import TerminalTheme
+
+from workbench.live.commands import ClearLog, FilterLog, PauseLog
+from workbench.live.process.captured_output import PLAIN, SWITCHES, Printed, StyledText
+from workbench.live.process.memory_limit import format_size
+from workbench.live.process.supervisor import Vitals
+from workbench.live.view import SessionView
+from workbench.page.command import Command
+from workbench.page.widgets.fields import Field, tick
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+
+Rgb = tuple[int, int, int]
+LIGHT_PAGE: Rgb = (241, 243, 245)
+DARK_PAGE: Rgb = (66, 66, 66)
+"""Backgrounds of the Log, a little nearer to the text than the real ones."""
+READABLE = 4.5
+"""Minimum contrast of text in WCAG 2.1."""
+MOST_SPANS = 1500
+"""Maximum number of spans in all lines; older lines are shown plain. A line may change its colour with each
+character."""
+SIXTEEN = TerminalTheme(
+    (255, 255, 255), (0, 0, 0),
+    [(0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229)],
+    [(102, 102, 102), (241, 76, 76), (35, 209, 139), (245, 245, 67), (59, 142, 234), (214, 112, 214), (41, 184, 219), (255, 255, 255)],
+)  # fmt: skip
+"""Theme that is used where one of the sixteen colours is a background, or stands on one."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """Text for the template; `look` and `css` take only numbers from the author's output."""
+
+    text: str
+    look: str = ""
+    css: str = ""
+
+
+def spans_of_lines(lines: Sequence[tuple[str, tuple[StyledText, ...]]]) -> list[list[Span]]:
+    """The spans of each line (its text and its runs), at most `MOST_SPANS` in all."""
+    left = MOST_SPANS
+    found: list[list[Span]] = []
+    for text, runs in reversed(lines):
+        left -= len(runs)
+        found.append([_span(run) for run in runs] if runs and left >= 0 else [Span(text)])
+    return found[::-1]
+
+
+def _span(run: StyledText) -> Span:
+    return Span(run.text) if run.style == PLAIN else Span(run.text, *_look(run.style))
+
+
+@lru_cache(maxsize=4096)
+def _look(style: Style) -> tuple[str, str]:
+    """Classes and inline style."""
+    classes = [f"wb-ansi-{name}" for name in SWITCHES if getattr(style, name) and name != "reverse"]
+    colour, background = style.color, style.bgcolor
+    if style.reverse:
+        if colour is None and background is None:
+            return " ".join((*classes, "wb-ansi-reverse")), ""
+        colour, background = background, colour or Color.from_ansi(7)
+    if background is not None:
+        behind = background.get_truecolor(SIXTEEN)
+        text = _plain_on(behind) if colour is None else colour.get_truecolor(SIXTEEN)
+        if contrast(text, behind) < READABLE / 2:
+            text = _plain_on(behind)
+        return " ".join(classes), f"color:{ColorTriplet(*text).hex};background:{behind.hex}"
+    if colour is not None and colour.type is ColorType.STANDARD:
+        classes.append(f"wb-ansi-{colour.number}")
+    elif colour is not None:
+        classes.append("wb-ansi-rgb")
+        own = colour.get_truecolor(SIXTEEN)
+        light, dark = (ColorTriplet(*readable_on(own, page)) for page in (LIGHT_PAGE, DARK_PAGE))
+        return " ".join(classes), f"--on-light:{light.hex};--on-dark:{dark.hex}"
+    return " ".join(classes), ""
+
+
+def readable_on(colour: Rgb, page: Rgb) -> Rgb:
+    """`colour`, moved towards black or white until it can be read on `page`."""
+    end = 255 if _luminance(page) < 0.2 else 0
+    found = colour
+    for share in range(1, 21):
+        if contrast(found, page) >= READABLE:
+            break
+        red, green, blue = (round(value + (end - value) * share / 20) for value in colour)
+        found = red, green, blue
+    return found
+
+
+def contrast(one: Rgb, other: Rgb) -> float:
+    """Contrast of WCAG 2.1: 1 for equal colours, 21 for black on white."""
+    dark, light = sorted((_luminance(one), _luminance(other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+def _luminance(colour: Rgb) -> float:
+    parts = [value / 255 for value in colour]
+    red, green, blue = (p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def _plain_on(behind: Rgb) -> Rgb:
+    return (0, 0, 0) if contrast((0, 0, 0), behind) >= contrast((255, 255, 255), behind) else (255, 255, 255)
+
+
+LINES_SHOWN = 200
+LONGEST_FILTER = 200
+
+
+class LogPanel(PagePart[SessionView]):
+    """The last lines that pass the filter; only those are drawn, so that a task that prints in every hook stays cheap.
+
+    Args:
+        server: The page.
+        clear: Asks the session to forget the output.
+    """
+
+    every = 0.3
+    does = (FilterLog, PauseLog, ClearLog)
+
+    def __init__(self, server: viser.ViserServer, clear: Callable[[], None]) -> None:
+        self._wanted, self._held = "", False
+        self._clear = clear
+        self._filter = Field(
+            server,
+            "Filter",
+            FilterLog,
+            "text",
+            hint="Only lines that contain this; stderr: or stdout: before it selects one stream.",
+            live=True,
+            longest=LONGEST_FILTER,
+        )
+        self._hold = tick(server, "Pause", PauseLog, "on", False, hint="New lines wait while you read.")
+        self._html = server.gui.add_html("")
+        self._tools = server.gui.add_html("")
+        self._vitals = server.gui.add_html("")
+        self._cleared = 0
+        self._drawn: object = None
+        """Filter and number of clears at the last drawing; a change is drawn even while the log is held."""
+
+    def key(self, view: SessionView) -> object:
+        return view.printed.serial, self._held, self._wanted, self._cleared, view.vitals
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case FilterLog(text=text):
+                self._wanted = text
+            case PauseLog(on=on):
+                self._held = on
+            case ClearLog():
+                self._clear()
+                self._cleared += 1
+
+    def draw(self, view: SessionView) -> None:
+        self._vitals.content = vitals_html(view.vitals)
+        # An empty log needs no controls. One that is held needs them as soon as there are lines: to be let go.
+        some = bool(view.printed.lines or view.printed.dropped)
+        self._filter.visible = self._hold.visible = some
+        self._hold.show(self._held)
+        self._tools.content = tools_html([tool("Clear", ClearLog())] if some else [])
+        wanted = self._wanted.strip()
+        if self._held and self._drawn == (wanted, self._cleared):
+            return
+        self._drawn = wanted, self._cleared
+        self._html.content = log_html(view.printed, wanted)
+
+
+def log_html(printed: Printed, wanted: str) -> str:
+    """The last lines that pass the filter.
+
+    Args:
+        wanted: text that a line must contain, case-insensitive; a prefix ``stderr:`` or ``stdout:`` takes one stream.
+    """
+    stream, colon, rest = wanted.partition(":")
+    if not (colon and stream in ("stdout", "stderr")):
+        stream, rest = "", wanted
+    part = rest.strip().lower()
+    fits = [
+        line
+        for line in printed.lines
+        if (not stream or line.stream == stream) and (not part or part in line.text.lower())
+    ]
+    lines = fits[-LINES_SHOWN:]
+    spans = spans_of_lines([(line.text, line.runs) for line in lines])
+    return render(
+        "log",
+        lines=list(zip((line.stream for line in lines), spans)),
+        shown=len(lines),
+        kept=len(printed.lines),
+        wanted=wanted,
+        dropped=printed.dropped,
+    )
+
+
+def vitals_html(vitals: Vitals) -> str:
+    """Memory of the processes, in words that change only when it matters."""
+    if not vitals.memory:
+        return ""
+    return render("vitals", vitals=vitals, format_size=format_size)

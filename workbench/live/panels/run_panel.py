@@ -1,0 +1,219 @@
+"""The Run tab: play, step, reset, speed, seed, env, episode end and the source of actions."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import viser
+
+from workbench.live.commands import (
+    ChooseActions,
+    ChooseEpisodeEnd,
+    ChooseMoved,
+    HoldStill,
+    MoveSlider,
+    ResetAll,
+    ResetSelected,
+    SetPolicy,
+    SetSeed,
+    SetSpeed,
+    Step,
+    TogglePlay,
+)
+from workbench.live.env_commands import NextEnv, PreviousEnv, SelectEnv
+from workbench.live.events import ActionTold
+from workbench.live.live_session import LiveSession
+from workbench.live.messages import EpisodeEnd
+from workbench.live.view import SessionView
+from workbench.page.command import Command, Refused
+from workbench.page.widgets.fields import Field, choice, slider
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+from workbench.task.description import ActionDimension, ActionSource
+
+ENVS = {"the selected env": "selected", "all envs": "all"}
+"""Choices of a field *Envs*, with their values in commands."""
+HOLD = "Hold still"
+MOVED_HINT = "Whose robot a slider moves. The sliders show what the robot of the selected env is told."
+UNBOUNDED = 1.0
+"""Limit of the slider of a dimension without bounds: from -1 to 1."""
+
+
+class ActionSliders:
+    """A folder with one slider for each action dimension of the selected env's robot, shown while the source is
+    ``sliders``. A slider that is moved sets that dimension alone, in the env or envs that the folder names."""
+
+    DOES = (MoveSlider, ChooseMoved, HoldStill)
+
+    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
+        self._server = server
+        self._session = session
+        self._dimensions: tuple[ActionDimension, ...] = ()
+        self._sliders: list[Field] = []
+        self._moved: Literal["selected", "all"] = "selected"
+        self._folder = server.gui.add_folder(None, visible=False)
+        with self._folder:
+            self._which = choice(server, "Moves", ChooseMoved, "envs", ENVS, self._moved, hint=MOVED_HINT)
+            server.gui.add_html(tools_html([tool(HOLD, HoldStill())]))
+
+    def build(self, dimensions: tuple[ActionDimension, ...]) -> None:
+        """Make the sliders of this action space, unless they exist (a reload keeps them)."""
+        if dimensions == self._dimensions:
+            return
+        for one in self._sliders:
+            one.remove()
+        self._dimensions, self._sliders = dimensions, []
+        with self._folder:
+            for number, dimension in enumerate(dimensions):
+                low, high = slider_bounds(dimension)
+                self._sliders.append(
+                    slider(
+                        self._server,
+                        dimension.name,
+                        MoveSlider,
+                        "value",
+                        (low, high),
+                        step=(high - low) / 200,
+                        given={"dimension": number},
+                    )
+                )
+
+    def draw(self, view: SessionView) -> None:
+        self._folder.visible = view.settings.action_source == "sliders" and bool(self._dimensions)
+        self._which.visible = view.task is not None and view.task.num_envs > 1
+        self._which.show(self._moved)
+        if not self._folder.visible or view.told is None:
+            return
+        told = view.told[min(view.selected_env, len(view.told) - 1)]
+        for one, dimension, value in zip(self._sliders, self._dimensions, told, strict=False):
+            low, high = slider_bounds(dimension)
+            # A policy's action may lie outside.
+            # Three digits: the field beside the slider has no place for more.
+            one.show(min(max(float(f"{value:.3g}"), low), high))
+
+    def do(self, command: Command) -> None:
+        envs = None if self._moved == "all" else (self._session.view().selected_env,)
+        match command:
+            case MoveSlider(dimension=dimension, value=value):
+                if dimension >= len(self._dimensions):
+                    raise Refused(f"The robot's action has {len(self._dimensions)} dimensions.")
+                low, high = slider_bounds(self._dimensions[dimension])
+                self._session.happen(ActionTold((dimension,), (min(max(value, low), high),), envs))
+            case HoldStill():
+                self._session.happen(ActionTold((), (), envs))
+            case ChooseMoved(envs=moved):
+                self._moved = moved
+
+
+def slider_bounds(dimension: ActionDimension) -> tuple[float, float]:
+    low = dimension.low if math.isfinite(dimension.low) else -UNBOUNDED
+    high = dimension.high if math.isfinite(dimension.high) else UNBOUNDED
+    return (low, high) if low < high else (low, low + 1e-6)
+
+
+SPEEDS: dict[str, float | None] = {
+    "0.1 ×": 0.1,
+    "0.25 ×": 0.25,
+    "0.5 ×": 0.5,
+    "1 ×": 1.0,
+    "2 ×": 2.0,
+    "4 ×": 4.0,
+    "8 ×": 8.0,
+    "unlimited": None,
+}
+EPISODE_ENDS: dict[str, EpisodeEnd] = {
+    "reset the env": "reset",
+    "keep running": "continue",
+    "pause": "pause",
+}
+SOURCES: dict[str, ActionSource] = {
+    "hold still": "hold",
+    "zero": "zero",
+    "random": "random",
+    "sliders": "sliders",
+    "policy": "policy",
+    "solve": "solve",
+}
+SOURCE_HINT = "solve: planned by rollouts of the task with its own reward."
+STEP, RESET_ALL, RESET_THIS = "Step", "Reset all", "Reset this env"
+PREVIOUS, NEXT = "‹ previous", "next ›"
+CHOOSE = "choose one"
+KNOWN_HINT = "Functions of one parameter in the files where the command was started and beside the task, and policies used before."
+
+
+class RunPanel(PagePart[SessionView]):
+    """The tab's controls. Each shows the session's value, and its command goes to the session."""
+
+    does = ActionSliders.DOES
+
+    def __init__(self, server: viser.ViserServer, session: LiveSession) -> None:
+        self._session = session
+        gui = server.gui
+
+        self._transport = gui.add_html("")
+
+        self._env_folder = gui.add_folder("Environment", visible=False)
+        with self._env_folder:
+            self._env = slider(server, "Selected", SelectEnv, "env", (0, 1))
+            gui.add_html(tools_html([tool(PREVIOUS, PreviousEnv()), tool(NEXT, NextEnv())]))
+
+        with gui.add_folder("Episode"):
+            self._speed = choice(
+                server, "Speed", SetSpeed, "speed", SPEEDS, 1.0, hint="Simulated seconds in one second."
+            )
+            self._seed = Field(server, "Seed", SetSeed, "seed", "0", hint="A new seed resets every env.")
+            self._end = choice(server, "At the end", ChooseEpisodeEnd, "rule", EPISODE_ENDS, "reset")
+
+        with gui.add_folder("Actions"):
+            self._source = choice(
+                server, "Source", ChooseActions, "source", SOURCES, "hold", hint=SOURCE_HINT
+            )
+            self._policy = Field(
+                server,
+                "Policy",
+                SetPolicy,
+                "policy",
+                hint="module:function or file.py:function, given obs, returns the action.",
+            )
+            self._known = choice(server, "Known", SetPolicy, "policy", (CHOOSE,), CHOOSE, hint=KNOWN_HINT)
+            self._policy_hint = gui.add_html(render("policy_hint"))
+            self._policy.visible = self._known.visible = self._policy_hint.visible = False
+            self._sliders = ActionSliders(server, session)
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        self._sliders.do(command)
+
+    # --- drawing ---------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        can_act = view.task is not None and view.state != "stopped"
+        envs = 1 if view.task is None else view.task.num_envs
+        if view.task is not None:
+            self._env_folder.visible = envs > 1
+            self._sliders.build(view.task.actions)
+        play = tool("Pause" if view.playing else "Play", TogglePlay(), off=not can_act, tone="main")
+        transport = (STEP, Step()), (RESET_ALL, ResetAll()), (RESET_THIS, ResetSelected())
+        self._transport.content = tools_html(
+            [play], [tool(name, command, off=not can_act) for name, command in transport]
+        )
+        speed = None if math.isinf(view.settings.speed) else view.settings.speed
+        # The command line takes speeds that are not in the list.
+        speeds = SPEEDS if speed in SPEEDS.values() else SPEEDS | {f"{speed:g} ×": speed}
+        self._env.show(view.selected_env, bounds=(0, max(1, envs - 1)), off=not can_act)
+        self._speed.show(speed, options=speeds, off=not can_act)
+        self._seed.show(str(view.seed))
+        self._end.show(view.settings.episode_end, off=not can_act)
+        self._source.show(view.settings.action_source, off=not can_act)
+        self._policy.show(view.settings.policy or "")
+        policy, known = view.settings.policy, view.known_policies
+        policy_wanted = view.settings.action_source == "policy"
+        self._policy.visible = policy_wanted
+        self._policy_hint.visible = policy_wanted and not policy
+        self._known.visible = policy_wanted and bool(known)
+        self._known.show(
+            policy if policy in known else "", options={CHOOSE: "", **{one: one for one in known}}
+        )
+        self._sliders.draw(view)

@@ -1,0 +1,376 @@
+"""The timeline under the view: a slider over the past, a strip with reward and events, and buttons."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Collection, Sequence
+from itertools import groupby
+from typing import TypeVar
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.live.events import MomentShown
+from workbench.live.history.moments import FAIL, RESET, REWARD_NONFINITE, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.live.live_session import LiveSession
+from workbench.live.panels.moment import MomentPart
+from workbench.live.past import Strip, TimelineView
+from workbench.live.timeline_commands import (
+    ContinueFromHere,
+    GoToFirst,
+    GoToLast,
+    NextEvent,
+    PreviousEvent,
+    Seek,
+    SeekBack,
+    StepBack,
+    StepForward,
+    UndoReset,
+    ZoomTimeline,
+)
+from workbench.live.view import SessionView
+from workbench.machine.text import number_text
+from workbench.page.command import Command
+from workbench.page.widgets.fields import slider
+from workbench.page.widgets.parts import Clock, PagePart
+from workbench.page.widgets.templates import counted, render
+from workbench.page.widgets.tools import Tool, tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+
+GAP = 12
+"""Distance in pixels between floating panels and the view's edges; the same in ``view_width.js``."""
+WIDEST = 760
+HEIGHT = 205
+"""Height in pixels of the view that it covers; framing a scene leaves these out."""
+RANGE_EVERY = 0.5
+"""Seconds between two changes of the slider's range. A slider whose ends move at every step cannot be held."""
+LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, LIVE = "‹ event", "‹ step", "step ›", "event ›", "live"
+EPISODE, EVERYTHING = "this episode", "all episodes"
+GO_ON = "Continue from here"
+UNDO = "undo"
+"""Start of the undo button's label; the name of the undone change follows."""
+View = TypeVar("View", contravariant=True)
+
+
+class TimeBar(PagePart[View]):
+    """A slider over time, a strip under it and a row of buttons, across the bottom of the view.
+
+    Args:
+        name: Of the slider.
+        kind: The command that the slider's value goes into, in its field `field`.
+    """
+
+    def __init__(self, server: viser.ViserServer, name: str, kind: type[Command], field: str) -> None:
+        gui = server.gui
+        self._panel = gui.add_panel(visible=False, order=10.0)
+        with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
+            self._slider = slider(server, name, kind, field, (-1, 0))
+            self._strip = gui.add_html("")
+            self._add_rows(gui)
+            self._walk = gui.add_html("")
+        # Across the bottom of the view: viser docks panels at the sides only.
+        self._panel.float(x=GAP, y=-GAP, width=WIDEST)
+        self._folded = False
+
+    def _add_rows(self, gui: viser.GuiApi) -> None:
+        """Add rows between the strip and the buttons."""
+
+    def fold(self, wanted: bool) -> None:
+        """Fold it to a bar, where it would cover what is looked at, or unfold what this has folded."""
+        if wanted != self._folded:
+            self._folded = wanted
+            (self._panel.minimize if wanted else self._panel.expand)()
+
+    def _draw_panel(self, there: bool) -> bool:
+        self._panel.visible = there
+        return there
+
+    def _show_slider(self, low: int, high: int, value: int) -> None:
+        # Never an empty range. Off, not hidden: the panel would grow at the first step.
+        self._slider.show(value, bounds=(min(low, high - 1), high), off=low >= high)
+
+
+class TimelinePanel(TimeBar[SessionView], MomentPart):
+    """The live page's timeline. It counts control steps backwards: 0 is live and -37 is 37 steps ago, so that the slider
+    rests at its right end while the simulation runs and nothing is sent. Dragging shows moments that the session has in
+    memory; the worker draws pictures only after a while at one moment.
+    """
+
+    does = (SeekBack, ZoomTimeline, GoToFirst)
+
+    def __init__(
+        self, server: viser.ViserServer, session: LiveSession, clock: Clock = time.monotonic
+    ) -> None:
+        super().__init__(server, "step of the past", SeekBack, "steps")
+        self._session, self._clock = session, clock
+        self._episode_only = False
+        self._range = (0, 0)
+        """Ticks of the slider's ends."""
+        self._newest = 0
+        """Tick that the slider shows as 0."""
+        self._range_at = -math.inf
+        self._strip_of: object = None
+        """Key of the data that the strip was drawn for."""
+
+    def _add_rows(self, gui: viser.GuiApi) -> None:
+        # One of these two is shown, and they have the same height: a panel that grows is moved up a moment later, its
+        # last row is cut off until then, and a second press on "step" would hit another button.
+        self._hint = gui.add_html("")
+        self._travel = gui.add_html("", visible=False)
+
+    # --- what a person does ------------------------------------------------------------------------
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        session = self._session
+        match command:
+            case SeekBack(steps=0):
+                session.do(GoToLast())
+            case SeekBack(steps=steps):
+                session.do(self._seek_to(self._newest + steps))
+            case GoToFirst():
+                # The left end of the slider; a slider with the focus goes there too.
+                if self._episode_only:
+                    session.do(self._seek_to(self._range[0]))
+                else:
+                    session.happen(MomentShown(0))
+            case ZoomTimeline(episode_only=wanted):
+                self._episode_only, self._range_at = wanted, -math.inf
+
+    def _seek_to(self, tick: int) -> Seek:
+        return Seek(step=tick, episode_only=self._episode_only)
+
+    # --- drawing -----------------------------------------------------------------------------------
+
+    def urgent(self, view: SessionView) -> object:
+        return super().urgent(view), self._episode_only
+
+    def draw(self, view: SessionView) -> None:
+        there = view.task is not None and view.timeline.moments > 0
+        if self._draw_panel(there):
+            self._draw_slider(view)
+            self._draw_buttons(view)
+            self._draw_strip(view)
+
+    def _draw_slider(self, view: SessionView) -> None:
+        past, now = view.timeline, self._clock()
+        moved = past.shown is not None and not self._range[0] <= past.tick <= self._range[1]
+        if now - self._range_at >= RANGE_EVERY or moved:
+            self._range_at = now
+            episode = self._session.look(lambda run: run.episode_ticks()) if self._episode_only else None
+            self._range = (past.first_tick, past.last_tick) if episode is None else episode
+            self._newest = past.last_tick
+        low, high = (tick - self._newest for tick in self._range)
+        self._show_slider(low, high, 0 if past.shown is None else past.tick - self._newest)
+
+    def _draw_buttons(self, view: SessionView) -> None:
+        past = view.timeline
+        zoom = (
+            (EVERYTHING, ZoomTimeline(episode_only=False))
+            if self._episode_only
+            else (EPISODE, ZoomTimeline(episode_only=True))
+        )
+        walk = [
+            *walk_tools(),
+            tool(LIVE, GoToLast(), off=past.shown is None),
+            Tool(zoom[0], zoom[1], zoom[1].help()),
+            tool(f"{UNDO} {past.undo or ''}".strip(), UndoReset(), off=past.undo is None),
+        ]
+        self._walk.content = tools_html(walk)
+        travel = continue_tools(view) if past.can_continue else []
+        if travel:
+            self._travel.content = tools_html(travel)
+        not_carried = "; ".join(past.not_carried)
+        hint = render("timeline_hint", live=past.shown is None, not_carried=not_carried, arrived=past.arrived)
+        self._hint.content = hint
+        self._travel.visible, self._hint.visible = bool(travel), not travel
+
+    def _draw_strip(self, view: SessionView) -> None:
+        past = view.timeline
+        wanted = (past.first, past.last, past.shown, view.selected_env, self._range, self._episode_only)
+        if wanted == self._strip_of:
+            return
+        self._strip_of = wanted
+        low, high = self._range
+        strip = self._session.look(lambda run: run.strip(low, high))
+        if strip is not None:
+            self._strip.content = strip_html(strip, view, self._seek_to)
+
+
+def walk_tools() -> list[Tool]:
+    """One step or event back or forward."""
+    kinds = {
+        LAST_EVENT: PreviousEvent(),
+        LAST_STEP: StepBack(),
+        NEXT_STEP: StepForward(),
+        NEXT_EVENT: NextEvent(),
+    }
+    return [tool(name, command) for name, command in kinds.items()]
+
+
+def continue_tools(view: SessionView) -> list[Tool]:
+    """The go-on buttons."""
+    if view.task is None or view.task.num_envs == 1:
+        return [tool(GO_ON, ContinueFromHere())]
+    env = f"env {view.selected_env}"
+    return [
+        tool(f"{GO_ON}: {env}", ContinueFromHere()),
+        Tool("all envs", ContinueFromHere(scope="all"), "Each from its own moment"),
+        Tool(
+            f"{env} into all envs", ContinueFromHere(scope="into all"), "All envs from the moment of this one"
+        ),
+    ]
+
+
+POINTS = 240
+"""Number of points of the reward's line, minimum and maximum of each interval in turn: a spike of one step stays
+visible."""
+LINE_HEIGHT = 30.0
+"""Height of the line in the picture's units; the marks are above."""
+FLAGS = {
+    REWARD_NONFINITE: "odd",
+    FAIL: "fail",
+    SUCCESS: "success",
+    TRUNCATED: "limit",
+    WENT_BACK: "back",
+    RESET: "reset",
+}
+"""Style of each event's mark. Where several events coincide, the first of these is drawn."""
+NAMES = {
+    "odd": "reward is NaN or infinite",
+    "fail": "fail",
+    "success": "success",
+    "limit": "time limit",
+    "back": "went back",
+    "reset": "reset",
+    "other": "other event",
+}
+"""Legend text of each style."""
+MOST_MARKS = 250
+"""Maximum number of places of the strip with a mark each: closer places cannot be told apart."""
+
+
+def strip_values(
+    low: int, high: int, reward: NDArray[np.float32], styles: Collection[str]
+) -> dict[str, object]:
+    """The values that the templates of both timelines share.
+
+    Args:
+        low: First place of the strip.
+        high: Last place.
+        reward: (high - low + 1,), NaN where there is none.
+        styles: Of the marks on it.
+    """
+
+    def place(at: float) -> float:
+        """Per cent of the strip's width, clamped."""
+        return round(100 * (min(max(at, low), high) - low) / max(high - low, 1), 3)
+
+    kinds = [(style, name) for style, name in NAMES.items() if style in styles]
+    return {"place": place, "lines": reward_lines(reward), "kinds": kinds}
+
+
+def marks_of(strip: Strip) -> list[tuple[int, str, str]]:
+    """Tick, style and name of each mark. Where several events fall on one place, the first of `FLAGS` is drawn."""
+    rank, names = list(FLAGS), dict(strip.branches)
+    marks: dict[int, tuple[int, int, str]] = {}
+    for tick, flags in strip.events:
+        flag = next(flag for flag in rank if flags & flag)
+        place = MOST_MARKS * (tick - strip.low) // (strip.high - strip.low + 1)
+        if place not in marks or rank.index(flag) < rank.index(marks[place][1]):
+            name = NAMES[FLAGS[flag]]
+            if flag == WENT_BACK:
+                name = (
+                    f"went back {counted(tick - names[tick], 'step')}"
+                    if tick in names
+                    else "from a recording"
+                )
+            marks[place] = tick, flag, name
+    return [(tick, FLAGS[flag], name) for tick, flag, name in marks.values()]
+
+
+def strip_html(
+    strip: Strip, view: SessionView, seek: Callable[[int], Seek] = lambda tick: Seek(step=tick)
+) -> str:
+    """The strip of one env with its shown moment.
+
+    Args:
+        seek: the command that a press on a tick asks for.
+    """
+    has_reward = view.task is None or view.task.reward_mode != "none"
+    # ManiSkill's reward is 0 where a task has none.
+    reward = strip.reward if has_reward else np.full_like(strip.reward, np.nan)
+    marks, finite = marks_of(strip), reward[np.isfinite(reward)]
+    return render(
+        "timeline",
+        strip=strip,
+        seek=seek,
+        past=view.timeline,
+        marks=marks,
+        ago=ago_in_words(view.timeline),
+        where=where(view),
+        span=[_number(float(value)) for value in (finite.min(), finite.max())] if len(finite) else None,
+        megabytes=megabytes,
+        **strip_values(strip.low, strip.high, reward, {style for _, style, _ in marks}),
+    )
+
+
+def _number(value: float) -> str:
+    return number_text(value, ".3g")
+
+
+def ago_in_words(past: TimelineView) -> str:
+    """Age of the shown moment as text: ``7 steps ago``."""
+    # An episode's last step is at the tick of the reset that follows it.
+    return f"{counted(past.steps_ago, 'step')} ago" if past.steps_ago else "before the last reset"
+
+
+def step_in_words(view: SessionView) -> str:
+    """The selected env's step of its episode, as text."""
+    task, step = view.task, view.step
+    if task is None or step is None or view.selected_env >= len(step.elapsed_steps):
+        return ""
+    limit = f" / {task.max_episode_steps}" if task.max_episode_steps else ""
+    env = "" if task.num_envs == 1 else f"env {view.selected_env}: "
+    return f"{env}step {int(step.elapsed_steps[view.selected_env])}{limit}"
+
+
+def where(view: SessionView) -> str:
+    """Env, step of its episode and simulated time of the shown moment."""
+    words = step_in_words(view)
+    if not words or view.task is None or view.step is None:
+        return words
+    return f"{words}, {view.step.elapsed_steps[view.selected_env] * view.task.control_dt:.2f} s"
+
+
+def reward_lines(reward: NDArray[np.float32]) -> list[str]:
+    """SVG polylines of the finite rewards over x 0..100 and y 0..`LINE_HEIGHT` (greatest on top), with gaps. One value
+    alone is a line in the middle."""
+    finite = reward[np.isfinite(reward)]
+    if not len(finite):
+        return []
+    low, high = float(finite.min()), float(finite.max())
+    if low == high:
+        low, high = low - 1.0, high + 1.0
+    known = np.where(np.isfinite(reward), reward, np.nan)
+    if len(known) <= POINTS:
+        places, values = np.arange(len(known)), known
+    else:
+        edges = np.linspace(0, len(known), POINTS // 2 + 1).astype(int)[:-1]
+        values = np.stack([np.fmin.reduceat(known, edges), np.fmax.reduceat(known, edges)], 1).reshape(-1)
+        places = np.repeat(edges, 2)
+    x = 100 * places / max(len(known) - 1, 1)
+    y = LINE_HEIGHT * (1 - (values - low) / (high - low))
+    return polylines([None if np.isnan(b) else f"{a:.2f},{b:.1f}" for a, b in zip(x, y, strict=True)])
+
+
+def polylines(points: Sequence[str | None]) -> list[str]:
+    """``points`` of SVG polylines through these points, with a gap at each None."""
+    runs = [[point for point in run if point] for there, run in groupby(points, key=bool) if there]
+    # A polyline of one point is not drawn; one of length zero with round ends is a dot.
+    return [" ".join(run if len(run) > 1 else run * 2) for run in runs]
+
+
+def megabytes(size: int) -> str:
+    return f"{size / 1024**2:.0f}" if size >= 10 * 1024**2 else f"{size / 1024**2:.1f}"

@@ -1,0 +1,347 @@
+"""The past of the run: which moment of the history is shown, and going back to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraKind, Picture
+from workbench.live.history.env_table import EnvRows
+from workbench.live.history.moments import History, Moment
+from workbench.live.messages import CameraRequest, DrawPast, Restore
+from workbench.task.description import ShownPictures, Stepped
+
+Scope = Literal["this", "all", "into all"]
+"""Which envs go back: the selected one; all, each to its own state; or all to the selected env's state."""
+MOST_STEPS = 400
+"""Most control steps that are replayed to go back to a moment."""
+
+
+@dataclass(frozen=True)
+class TimelineView:
+    """State of the time slider. Moments are named by serials, which count up and are never reused; resets are moments
+    too. A person sees control steps: a tick is the number of control steps since the envs were built, as on the
+    curves."""
+
+    first: int = 0
+    last: int = -1
+    """Serials of the oldest and the newest kept moment; the newest is the live one."""
+    shown: int | None = None
+    """The shown moment; None while live."""
+    first_tick: int = 0
+    tick: int = 0
+    last_tick: int = 0
+    """Ticks of the first, the shown and the live moment."""
+    used: int = 0
+    limit: int = 0
+    """Memory in use and its limit, in bytes."""
+    moments: int = 0
+    can_continue: bool = False
+    """Whether envs can go back to the shown moment."""
+    undo: str | None = None
+    """What `UndoReset` would undo, as text."""
+    not_carried: tuple[str, ...] = ()
+    """State that the last jump could not restore, each with its reason."""
+    arrived: str = ""
+    """How the last jump entered a recording; empty if the jump entered none."""
+    entered: int = 0
+    """Number of the last finished `EnterRun`; 0 for none."""
+    wants_pictures: bool = False
+    """The shown moment lacks pictures of the watched cameras."""
+
+    @property
+    def steps(self) -> int:
+        """Control steps that are kept."""
+        return self.last_tick - self.first_tick
+
+    @property
+    def steps_ago(self) -> int:
+        """Control steps since the shown moment."""
+        return self.last_tick - self.tick
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A part of one env's history, for the strip under the slider. All places are ticks (see `TimelineView`)."""
+
+    low: int
+    high: int
+    """Lowest and highest tick, both included."""
+    events: tuple[tuple[int, int], ...]
+    """Tick and event flags (`history.RESET` ... added up); what happened at one tick is one event."""
+    reward: NDArray[np.float32]
+    """(high - low + 1,) reward after each control step; NaN where there is none."""
+    branches: tuple[tuple[int, int], ...]
+    """Ticks at which the env went back, each with the tick that it went back to."""
+    segments: tuple[tuple[int, int, bool], ...]
+    """First and last tick of each segment (see `History`), and whether it begins with going back."""
+
+
+@dataclass(frozen=True)
+class Past:
+    """The history of the present task, and which of its moments is shown. Methods that change something return another value.
+
+    Live is the newest moment. The slider pins another one, and then all that the page draws of the batch (poses, numbers,
+    pictures) comes from the server's memory, while the worker continues. The worker gets requests only to continue from a
+    moment, to undo a jump, and to draw a moment that has no pictures.
+    """
+
+    history: History
+    """Append-only store: `added` and its kind write into it, and equal values of a past share it."""
+    pinned: int | None = None
+    """Serial of the shown moment; None while live."""
+    entered: int = 0
+    """See `TimelineView.entered`."""
+    requested: tuple[int, int, tuple[CameraRequest, ...]] | None = None
+    """Serial, env and cameras of the last request for pictures."""
+
+    # --- events --------------------------------------------------------------------------------------
+
+    def added(self, stepped: Stepped) -> tuple[Past, Moment]:
+        """The past with one moment more."""
+        moment = self.history.add(stepped)
+        past = self
+        if stepped.restored is not None and stepped.restored.number:
+            past = replace(past, entered=stepped.restored.number)
+        if past.pinned is not None and past.pinned < self.history.first:
+            past = replace(past, pinned=self.history.first)  # the shown moment was dropped
+        return past, moment
+
+    def camera_moved(self, kind: CameraKind, name: str) -> Past:
+        """See `History.camera_moved`; pictures of the shown moment are requested again."""
+        self.history.camera_moved(kind, name)
+        return replace(self, requested=None)
+
+    # --- the shown moment ----------------------------------------------------------------------------
+
+    @property
+    def shown(self) -> Moment | None:
+        """The pinned moment; None while live."""
+        return None if self.pinned is None else self.history.at(self.pinned)
+
+    @property
+    def at(self) -> int:
+        """Serial of the shown moment, the newest while live."""
+        return self.history.last if self.pinned is None else self.pinned
+
+    def seek(self, serial: int | None) -> Past:
+        """Pin a moment, or the nearest kept one; the newest, or None, is live."""
+        if serial is None or serial >= self.history.last:
+            return replace(self, pinned=None)
+        return replace(self, pinned=max(serial, self.history.first))
+
+    def seek_by(self, env: int, steps: int) -> Past:
+        """Go some moments of this env forward (or back, if negative) from the shown one: its control steps, resets and
+        jumps back. Those of other envs are passed by."""
+        history, at = self.history, self.at
+        for _ in range(abs(steps)):
+            at += 1 if steps > 0 else -1
+            while (moment := history.at(at)) is not None and moment.jumped.any() and not moment.jumped[env]:
+                at += 1 if steps > 0 else -1
+        return self.seek(at)
+
+    def seek_step(self, env: int, step: int) -> Past:
+        """Go to a control step of the shown episode of this env, through its jumps back; or the nearest kept."""
+        episode_backwards = self.history.episode_backwards(env, self.history.segment_at(env, self.at)[1])
+        serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in episode_backwards}
+        if not serials:
+            return self
+        return self.seek(serials[min(serials, key=lambda known: abs(known - step))])
+
+    def seek_tick(self, tick: int, episode_of: int | None = None) -> Past:
+        """Go to the moment after a control step (`Curves.serial`), or to the nearest kept one.
+
+        Args:
+            episode_of: within the shown episode of this env: at the tick at which it begins there is the last step of the
+                one before, too.
+        """
+        first = self.history.first if episode_of is None else self.episode(episode_of)[0]
+        return self.seek(max(self.history.serial_of_tick(tick), first))
+
+    def seek_event(self, env: int, direction: int) -> Past:
+        """Go to the next (1) or previous (-1) event of this env; forward from the last one is live."""
+        here = self.at
+        if direction > 0:
+            after = self.history.events(env, here + 1, self.history.last)
+            return self.seek(after[0][0] if after else None)
+        before = self.history.events(env, self.history.first, here - 1)
+        return self.seek(before[-1][0] if before else self.history.first)
+
+    def pictures(self, env: int) -> dict[tuple[CameraKind, str], Picture]:
+        """Stored pictures of the shown moment."""
+        moment = self.shown
+        if moment is None:
+            return {}
+        return {(kind, name): p for (of, kind, name), p in moment.pictures.items() if of == env}
+
+    def view(
+        self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "auto"
+    ) -> TimelineView:
+        history, moment = self.history, self.shown
+        at = moment if moment is not None else history.at(history.last)
+        jump = history.last_jump(env)
+        begin = history.at(history.segment_at(env, self.at)[0]) if at is not None else None
+        # For the shown env and moment: another env, or a reset since, lacks nothing.
+        came = begin.restored if begin is not None and begin.jumped[env] else None
+        missed, how = ({}, "") if came is None else (came.not_carried, came.how)
+        return TimelineView(
+            first=history.first,
+            last=history.last,
+            shown=self.pinned,
+            first_tick=self.tick_of(history.first),
+            tick=0 if at is None else at.tick,
+            last_tick=self.tick_of(history.last),
+            used=history.used,
+            limit=history.limit,
+            moments=len(history),
+            can_continue=moment is not None and moment.snapshot is not None,
+            undo=None if jump is None else self._jump_text(jump),
+            not_carried=tuple(f"{what}: {why}" for what, why in missed.items()),
+            arrived=how,
+            entered=self.entered,
+            wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras, degree)),
+        )
+
+    def env_rows(self) -> EnvRows:
+        """The table of envs at the shown moment."""
+        moment = self.shown
+        return self.history.env_rows() if moment is None else self.history.rows_at(moment)
+
+    def _jump_text(self, jump: Moment) -> str:
+        envs, before = self.history.envs_still_at(jump), self.history.at(jump.serial - 1)
+        if jump.restored is None and before is not None:
+            ended = before.step.terminated | before.step.truncated
+            if ended[jump.jumped].all():
+                return "reset at the end"  # only the task asked for it
+        what = "reset" if jump.restored is None else "jump"
+        if jump.restored is not None and jump.restored.recording:
+            what = "going live"
+        if self.history.num_envs == 1:
+            return what
+        if len(envs) == self.history.num_envs:
+            return f"{what} of all"
+        return f"{what} of env {envs[0]}" if len(envs) == 1 else f"{what} of {len(envs)} envs"
+
+    def tick_of(self, serial: int) -> int:
+        """Tick of a kept moment; 0 if the moment is not kept."""
+        moment = self.history.at(serial)
+        return 0 if moment is None else moment.tick
+
+    def strip(self, env: int, low: int, high: int) -> Strip:
+        """The history of one env between two ticks, both included."""
+        history = self.history
+        ticks = history.ticks(history.first, history.last)
+        low = min(max(low, int(ticks[0])), int(ticks[-1]))
+        high = min(max(high, low), int(ticks[-1]))
+        # The first moment at a tick is the control step that led there; the others are resets and jumps after it.
+        first, end = int(np.searchsorted(ticks, low)), int(np.searchsorted(ticks, high, side="right"))
+        here = slice(first, end)
+        serials, base = (history.first + first, history.first + end - 1), history.first
+        reward = np.full(high - low + 1, np.nan, np.float32)
+        stepped = np.diff(ticks, prepend=ticks[0] - 1)[here] > 0
+        reward[ticks[here][stepped] - low] = history.rewards(env, *serials)[stepped]
+        events: dict[int, int] = {}
+        for serial, flags in history.events(env, *serials):
+            tick = int(ticks[serial - base])
+            events[tick] = events.get(tick, 0) | flags
+
+        def tick_of(serial: int) -> int:
+            return int(ticks[max(serial - base, 0)])
+
+        jumps = dict(history.jumps_back(env))
+        return Strip(
+            low,
+            high,
+            tuple(events.items()),
+            reward,
+            tuple(
+                (tick_of(at), tick_of(origin)) for at, origin in jumps.items() if low <= tick_of(at) <= high
+            ),
+            tuple(
+                (max(begin, low), min(last, high), start in jumps)
+                for start, stop in history.segments(env)
+                for begin, last in [(tick_of(start), tick_of(stop))]
+                if last >= low and begin <= high
+            ),
+        )
+
+    def episode(self, env: int) -> tuple[int, int]:
+        """Serials of the first and the last moment of this env's episode that contains the shown moment. What lies between,
+        where it went back, is part of the way."""
+        end = self.history.segment_at(env, self.at)[1]
+        begin = min((moment.serial for moment, _ in self.history.episode_backwards(env, end)), default=end)
+        return begin, end
+
+    # --- requests to the worker ------------------------------------------------------------------------
+
+    def continue_from_shown(self, env: int, scope: Scope) -> Restore | None:
+        """Request to continue from the shown moment; None if that is not possible."""
+        moment = self.shown
+        snapshot = None if moment is None else self.history.snapshot_at(moment.serial)
+        if moment is None or snapshot is None:
+            return None
+        envs = (env,) if scope == "this" else tuple(range(self.history.num_envs))
+        source = (env,) * len(envs) if scope == "into all" else envs
+        return self._restore(snapshot, envs, source, moment.serial)
+
+    def undo(self, env: int) -> Restore | None:
+        """Request to undo this env's last jump, in all envs that have not jumped since; None if there is none."""
+        jump = self.history.last_jump(env)
+        if jump is None:
+            return None
+        snapshot = self.history.snapshot_at(jump.serial - 1)
+        if snapshot is None:
+            return None
+        envs = self.history.envs_still_at(jump)
+        return self._restore(snapshot, envs, envs, jump.serial - 1, undoes=jump.serial)
+
+    def _restore(
+        self,
+        snapshot: bytes,
+        envs: tuple[int, ...],
+        source: tuple[int, ...],
+        origin: int,
+        undoes: int | None = None,
+    ) -> Restore:
+        history = self.history
+        found = {i: history.replay_path(of, origin, MOST_STEPS) for i, of in zip(envs, source, strict=True)}
+        ways = {i: way for i, way in found.items() if way is not None}
+        beginnings = {way.start for way in ways.values()}
+        starts = {at: taken for at in beginnings if (taken := history.snapshot_at(at)) is not None}
+        return Restore(snapshot, envs, source, origin, undoes, ways, starts)
+
+    def draw(
+        self, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures = "auto"
+    ) -> tuple[Past, DrawPast | None]:
+        """Request the missing pictures of the shown moment; only once for each moment, env and set of cameras.
+
+        Fast ones are missing too, as exact ones, unless fast ones are asked for: they were drawn while something moved.
+        """
+        moment = self.shown
+        if moment is None:
+            return self, None
+        lacking = self._lacking(moment, env, cameras, degree)
+        requested = (moment.serial, env, lacking)
+        if not lacking or requested == self.requested:
+            return self, None
+        return replace(self, requested=requested), DrawPast(
+            moment.step.poses[env].copy(), env, lacking, moment.serial
+        )
+
+    def _lacking(
+        self, moment: Moment, env: int, cameras: tuple[CameraRequest, ...], degree: ShownPictures
+    ) -> tuple[CameraRequest, ...]:
+        def lacks(camera: CameraRequest) -> bool:
+            key = (env, camera.kind, camera.name)
+            picture = moment.pictures.get(key)
+            return (
+                picture is None
+                or key in moment.outdated
+                or (picture.degree == "fast" and degree != "fast")
+                or any(getattr(picture, m) is None for m in camera.modalities)
+            )
+
+        return tuple(camera for camera in cameras if lacks(camera))

@@ -1,0 +1,110 @@
+"""Policies to choose from, listed while the source of actions is *policy* and a page is open."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from workbench.actions.policy import NoPolicy, find_policy, list_policies
+from workbench.live.process.background_jobs import Job, Jobs
+from workbench.live.run import Run
+from workbench.machine.kept_choices import keep_policy, used_policies
+from workbench.machine.loop import Aside, do
+
+LIST_SECONDS = 5.0
+"""Seconds between two searches for policies, which read many files."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is listed."""
+
+    task_folder: Path | None
+    acting: str | None
+    """The policy that is chosen; kept for the next run if there is such a file or module."""
+
+
+@dataclass(frozen=True)
+class KnownPolicies:
+    wanted: Wanted | None = None
+    """None while nothing is listed."""
+    found: tuple[str, ...] = ()
+    """Policies that were used in the folder where the command was started, and functions in its files and those of the
+    task's folder."""
+
+
+@dataclass(frozen=True)
+class PoliciesListed:
+    """A search has ended."""
+
+    found: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ListPolicies:
+    """Effect: list these in place of those before, again and again; nothing if None."""
+
+    wanted: Wanted | None
+
+
+def apply(known: KnownPolicies, event: object, run: Run) -> tuple[KnownPolicies, list[ListPolicies]]:
+    """What is known after an event, and what has to be done.
+
+    Args:
+        run: the run after the event.
+    """
+    if isinstance(event, PoliciesListed) and event.found != known.found:
+        known = replace(known, found=event.found)
+    is_listed = run.pages > 0 and run.settings.action_source == "policy"
+    wanted = Wanted(run.folder, run.policy) if is_listed else None
+    if wanted == known.wanted:
+        return known, []
+    return replace(known, wanted=wanted), [ListPolicies(wanted)]
+
+
+class PolicySearch:
+    """Performs the effect. Used on the loop, but for `close`."""
+
+    def __init__(self, happen: Callable[[PoliciesListed], object]) -> None:
+        self._happen = happen
+        self._here = Path.cwd()
+        self._disk = Aside("policies")
+        self._jobs = Jobs(lambda: None, lambda failure: None)
+
+    def perform(self, effect: ListPolicies) -> None:
+        if effect.wanted is None:
+            self._jobs.stop()
+        else:
+            self._jobs.start("list policies", partial(self._list, effect.wanted))
+
+    def close(self) -> None:
+        """Stop. Called on any thread."""
+        do(self._jobs.close)
+        self._disk.end()
+
+    async def _list(self, wanted: Wanted, job: Job) -> None:
+        await self._disk.run(partial(_keep, self._here, wanted))
+        while True:
+            self._happen(PoliciesListed(await self._disk.run(partial(_find, self._here, wanted))))
+            await asyncio.sleep(LIST_SECONDS)
+
+
+def _keep(here: Path, wanted: Wanted) -> None:
+    if wanted.acting is not None and _is_there(wanted.acting, wanted.task_folder):
+        keep_policy(here, wanted.acting)
+
+
+def _find(here: Path, wanted: Wanted) -> tuple[str, ...]:
+    used = [one for one in used_policies(here) if _is_there(one, wanted.task_folder)]
+    return tuple(dict.fromkeys([*used, *list_policies(here, wanted.task_folder)]))
+
+
+def _is_there(reference: str, task_folder: Path | None) -> bool:
+    with contextlib.suppress(NoPolicy):
+        find_policy(reference, task_folder)
+        return True
+    return False

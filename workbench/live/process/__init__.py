@@ -1,0 +1,1 @@
+"""The worker as a process: started, supervised, asked and logged; and background jobs with their progress."""

@@ -1,0 +1,421 @@
+"""Asks questions of the worker that plays, and of a second process in the background."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import count
+from typing import Any, Literal, TypeVar
+
+from workbench.envs.camera_data import CameraKey
+from workbench.live.messages import Answer, Cancel, Load, PlaceCamera, Progress, Request
+from workbench.live.process.background_jobs import Job, JobFailed, ProcessDied
+from workbench.live.process.worker_process import WorkerProcess
+from workbench.machine import loop
+from workbench.machine.processes.family import describe_exit
+from workbench.machine.processes.watched_thread import report_failure
+from workbench.machine.processes.wire import Call, Question, Unpacker, Unreadable, value_type
+
+_LOOK = 1.0
+"""Seconds between two checks whether a silent process still lives."""
+_NICENESS = 10
+"""Niceness of the background process: the worker that plays comes first where there are fewer cores than work."""
+WAITING = "waiting for other work in the background"
+IDLE_SECONDS = 300.0
+"""Seconds for which an idle process is kept."""
+_KEPT_OF_WORDS = 4096
+"""Bytes that are kept of a process's ``stderr``: its last line is quoted if the process ends with an error."""
+_PATIENCE = 3.0
+_LOAD_PATIENCE = 10.0
+"""Seconds in which a process must answer a cancelled load; then it is ended. For other questions see `_PATIENCE`."""
+Value = TypeVar("Value")
+OnProgress = Callable[[int, int, Any], None]
+"""Callback for progress: gets done, total, and the new part of the answer."""
+
+
+def _ignore(done: int, total: int, part: Any) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A question under way."""
+
+    question: Question[Any]
+    answer: asyncio.Future[Any]
+    on_progress: OnProgress
+
+
+class Asker:
+    """Asks the worker that plays; several questions may be under way. Used on the loop."""
+
+    def __init__(self, send: Callable[[Request], None]) -> None:
+        self._send = send
+        self._numbers = count(1)
+        self._asked: dict[int, _Asked] = {}
+        """Questions under way, by number."""
+
+    async def ask(self, question: Question[Value], on_progress: OnProgress = _ignore) -> Value:
+        """Ask a question and return the answer, unless the caller is cancelled meanwhile.
+
+        Raises:
+            JobFailed: there is no answer.
+        """
+        number = next(self._numbers)
+        asked = _Asked(question, asyncio.get_running_loop().create_future(), on_progress)
+        self._asked[number] = asked
+        try:
+            self._send(Call(number, question))
+            return await asked.answer
+        finally:
+            del self._asked[number]
+
+    def take(self, event: Answer | Progress) -> None:
+        """Handle an event of the worker."""
+        asked = self._asked.get(event.number)
+        if asked is None or asked.answer.done():
+            return
+        try:
+            if isinstance(event, Answer):
+                asked.answer.set_result(_value(event, asked.question))
+            else:
+                part = _unpacked(event.part, asked.question.part) if event.part else None
+                asked.on_progress(event.done, event.total, part)
+        except Exception as error:
+            asked.answer.set_exception(error)
+
+    def _fail(self, error: Exception) -> None:
+        """Fail all questions under way with `error`."""
+        for asked in self._asked.values():
+            if not asked.answer.done():
+                asked.answer.set_exception(error)
+
+
+class GaveWay(Exception):
+    """A job of higher priority needs the process: ask again in another turn."""
+
+
+Priority = Literal["person", "low", "lowest"]
+"""Whether a person waits for the job; else whether its results are wanted soon."""
+_ORDER: dict[Priority, int] = {"person": 2, "low": 1, "lowest": 0}
+_Rank = tuple[int, int]
+"""Rank of a job: its priority and its number; the highest rank comes first."""
+
+
+class Background(Asker):
+    """Asks a process in the background, one question at a time. Jobs share it in turns. Used on the loop.
+
+    Rescoring the past, drawing it and searching cameras take seconds to minutes and move the envs, so they cannot run
+    in the worker that plays. This process has a lower priority; it costs some seconds to start and 0.75 GB. It ends
+    after `IDLE_SECONDS` without a job.
+
+    The job that was begun last comes first, since a person waits for it: the others give way and continue later. A
+    worker answers in order, so a job that stops or gives way leaves one answer that is still to come; the next turn begins when it
+    has, or the process is ended. A process that dies fails its job; the next job starts another.
+    """
+
+    def __init__(self, niceness: int = _NICENESS) -> None:
+        """
+        Args:
+            niceness: as for ``nice``.
+        """
+        super().__init__(self._send_call)
+        self._niceness = niceness
+        self._turn: _Rank | None = None
+        """Rank of the job that has the process, until its last answer has come."""
+        self._waiting: dict[_Rank, asyncio.Future[None]] = {}
+        self._idle: asyncio.TimerHandle | None = None
+        """Timer that ends an idle process."""
+        self._process: _Process | None = None
+        self._ending: set[_Process] = set()
+        self._unanswered: Call | None = None
+        self._overdue: asyncio.TimerHandle | None = None
+        """Timer that ends the process if the answer to a cancelled question does not come."""
+        self._loaded: Load | None = None
+        """The last load; None after a failure."""
+        self._placed: dict[CameraKey, PlaceCamera] = {}
+        self.num_envs = 0
+        """Number of envs of the version that is open in the process; 0 for none."""
+
+    @property
+    def pid(self) -> int | None:
+        """Process id; None without a process. A process that is being ended counts until it has ended."""
+        process = self._process or next(iter(self._ending), None)
+        return None if process is None else process.pid
+
+    # --- turns ---------------------------------------------------------------------------------------
+
+    async def in_turns(
+        self, job: Job, work: Callable[[], Awaitable[Value]], priority: Priority = "person"
+    ) -> Value:
+        """Run `work` while no other job has the process and none of higher priority waits; again after each time it gave way
+        to one; the envs are elsewhere then."""
+        rank = _ORDER[priority], job.number
+        while True:
+            await self._begin_turn(rank)
+            try:
+                return await work()
+            except GaveWay:
+                job.report(0, 0, WAITING)
+            finally:
+                self._end_turn()
+
+    async def _begin_turn(self, rank: _Rank) -> None:
+        granted = self._waiting[rank] = asyncio.get_running_loop().create_future()
+        if self._is_waited_for() and not _is_load(self._question):
+            self._fail(GaveWay())
+        self._grant()
+        try:
+            await granted
+        except asyncio.CancelledError:
+            if self._turn == rank:
+                self._end_turn()  # it was granted at the same moment
+            raise
+        finally:
+            self._waiting.pop(rank, None)
+
+    def _grant(self) -> None:
+        if self._turn is not None or self._unanswered is not None:
+            return
+        if self._idle is not None:
+            self._idle.cancel()
+        # Of two jobs that are stopped at once one may not have left yet.
+        waiting = [rank for rank, granted in self._waiting.items() if not granted.done()]
+        if not waiting:
+            self._idle = loop.later(IDLE_SECONDS, self.end)
+            return
+        self._turn = max(waiting)
+        self._waiting.pop(self._turn).set_result(None)
+
+    def _end_turn(self) -> None:
+        self._turn = None
+        if self._unanswered is not None and self._process is not None:
+            self._process.send(Cancel())
+            patience = _LOAD_PATIENCE if _is_load(self._question) else _PATIENCE
+            self._overdue = loop.later(patience, self.end)
+        self._grant()
+
+    def _is_waited_for(self) -> bool:
+        """Whether a job waits that has a higher priority than the job that has the process."""
+        return self._turn is not None and max(self._waiting, default=self._turn) > self._turn
+
+    @property
+    def _question(self) -> Any:
+        return None if self._unanswered is None else self._unanswered.request
+
+    # --- questions -----------------------------------------------------------------------------------
+
+    def has_loaded(self, load: Load) -> bool:
+        """Whether this version is loaded."""
+        return load.level == "auto" and self._loaded == load
+
+    async def ensure(
+        self, job: Job, load: Load, placed: tuple[PlaceCamera, ...] = (), or_else: Load | None = None
+    ) -> int:
+        """Start the process, load this version and place the cameras, as far as that is not done.
+
+        Args:
+            load: with a level other than ``auto`` it is always loaded.
+            or_else: loaded if `load` fails.
+
+        Returns:
+            the number of envs.
+
+        Raises:
+            JobFailed: one of the steps failed; with the problem, if the author's code raised.
+        """
+        if self._process is None:
+            job.report(0, 0, "starting a process in the background")
+        if not self.has_loaded(load):
+            self._loaded = None
+            job.report(0, 0, "building envs in the background")
+            try:
+                loaded = await self.ask(load)
+            except JobFailed as failure:
+                if failure.problem is None:
+                    raise
+                if or_else is None:
+                    why = f"the task failed in the background: {failure.problem.message}"
+                    raise JobFailed(why, failure.problem) from failure
+                loaded = await self.ask(or_else)
+            self._loaded, self.num_envs = load, loaded.task.num_envs
+            if loaded.reload is None or loaded.reload.level not in ("same", "patched"):
+                self._placed = {}
+        wanted = {request.key: request for request in placed}
+        # A camera that is no longer placed goes back to the file's pose.
+        for key in [key for key in self._placed if key not in wanted]:
+            await self.ask(PlaceCamera(key, None))
+            del self._placed[key]
+        for key, request in wanted.items():
+            if self._placed.get(key) != request:
+                await self.ask(request)
+                self._placed[key] = request
+        return self.num_envs
+
+    async def ask(self, question: Question[Value], on_progress: OnProgress = _ignore) -> Value:
+        """Ask a question as `Asker.ask` does; starts the process if there is none.
+
+        Raises:
+            JobFailed: there is no answer.
+            ProcessDied: for that reason.
+            GaveWay: a job of higher priority waits. A load is finished first: that job most likely needs it too.
+        """
+        # Before the question: the waiting job would wait for it too.
+        if self._is_waited_for() and not _is_load(question):
+            raise GaveWay
+        if self._idle is not None:
+            self._idle.cancel()  # also outside a turn, where a question may take hours
+        if self._process is None:
+            self._process = _Process(self, self._niceness)
+        return await super().ask(question, on_progress)
+
+    def take(self, event: Answer | Progress) -> None:
+        super().take(event)
+        if isinstance(event, Answer) and self._unanswered is not None:
+            if event.number == self._unanswered.number:
+                self._answered()
+
+    def _answered(self) -> None:
+        self._unanswered = None
+        if self._overdue is not None:
+            self._overdue.cancel()
+            self._overdue = None
+        self._grant()
+
+    def _send_call(self, request: Request) -> None:
+        assert self._process is not None and isinstance(request, Call)
+        self._unanswered = request
+        self._process.send(request)
+
+    # --- the process ---------------------------------------------------------------------------------
+
+    @loop.on_loop
+    def end(self) -> None:
+        """End the process, if there is one."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        self._ending.add(process)
+        process.kill()
+        self._forget(ProcessDied("the process in the background was ended"))
+
+    def close(self) -> None:
+        """End the process; returns when it has ended. Called on another thread than the loop."""
+        self.end()
+        for process in loop.do(lambda: tuple(self._ending)):
+            process.join()
+
+    def _ended(self, process: _Process, why: str) -> None:
+        """Handle the end of this process."""
+        self._ending.discard(process)
+        if process is self._process:
+            self._process = None
+            self._forget(ProcessDied(why))
+
+    def _forget(self, error: ProcessDied) -> None:
+        self._loaded, self._placed, self.num_envs = None, {}, 0
+        self._fail(error)
+        self._answered()
+
+
+class _Process:
+    """A worker process, started and read on its own thread; the kernel ends the process with that thread."""
+
+    def __init__(self, background: Background, niceness: int) -> None:
+        self._background, self._niceness = background, niceness
+        self._worker: WorkerProcess | None = None
+        self._unsent: list[Request] = []
+        self._killed = False
+        self._said = b""
+        """The last bytes that the process wrote to ``stderr``."""
+        self._lock = threading.Lock()
+        """Lock for the start: requests sent before it are queued and sent then."""
+        self._thread = threading.Thread(target=self._run, name="background", daemon=True)
+        self._thread.start()
+
+    @property
+    def pid(self) -> int | None:
+        worker = self._worker
+        return None if worker is None else worker.pid
+
+    def send(self, request: Request) -> None:
+        with self._lock:
+            if self._worker is None:
+                self._unsent.append(request)
+            else:
+                self._worker.send(request)
+
+    def kill(self) -> None:
+        with self._lock:
+            self._killed = True
+            if self._worker is not None:
+                self._worker.kill()
+
+    def join(self) -> None:
+        self._thread.join()
+
+    def _run(self) -> None:
+        why = "it failed within the workbench"
+        try:
+            why = self._serve()
+        except OSError as error:
+            why = f"no process could be started in the background: {error}"
+        except Exception as error:
+            report_failure("The process in the background could not be heard", error)
+        finally:
+            loop.do(partial(self._background._ended, self, why))
+
+    def _serve(self) -> str:
+        """Start the process and read its events until it ends; returns why it ended."""
+        # The worker that plays shows the author's output; here it would appear twice. Its last words tell why it died.
+        worker = WorkerProcess(self._hear, self._niceness)
+        code: int | None = None
+        with self._lock:
+            self._worker = worker
+            for request in self._unsent:
+                worker.send(request)
+            if self._killed:
+                worker.kill()
+        try:
+            while True:
+                event: Any = worker.receive(timeout=_LOOK)
+                if isinstance(event, Answer | Progress):
+                    loop.do(partial(self._take, event))
+        except Unreadable as error:
+            why = f"sent unreadable data ({error}) and was ended"
+        except EOFError:
+            code = worker.exit_code()
+            why = describe_exit(code)
+        worker.stop(grace=0.0)  # all that it wrote is read then
+        if (code or 0) > 0 and (last := self._said.decode(errors="replace").strip().rpartition("\n")[2]):
+            why += f": {last}"
+        return f"the process in the background {why}"
+
+    def _take(self, event: Answer | Progress) -> None:
+        if self._background._process is self:
+            self._background.take(event)
+
+    def _hear(self, stream: str, piece: bytes) -> bool:
+        if stream == "stderr":
+            self._said = (self._said + piece)[-_KEPT_OF_WORDS:]
+        return False
+
+
+def _is_load(question: object) -> bool:
+    return isinstance(question, Load)
+
+
+def _value(answer: Answer, question: Question[Value]) -> Value:
+    if answer.why:
+        raise JobFailed(answer.why, answer.problem)
+    return _unpacked(answer.value, value_type(type(question)))
+
+
+def _unpacked(packed: bytes, kind: Any) -> Any:
+    try:
+        return Unpacker().unpack(packed, kind)
+    except Unreadable as error:
+        raise JobFailed(f"the worker answered with unreadable data ({error})") from error

@@ -1,0 +1,311 @@
+"""The worker as a child process: messages, output, stack, memory and exit code."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import get_args
+
+from workbench.live.messages import (
+    Event,
+    Load,
+    PlaceCamera,
+    Play,
+    Quit,
+    Request,
+    Reset,
+    Settings,
+    SingleStep,
+    Tell,
+    without_steps,
+)
+from workbench.live.process.heartbeat import (
+    INTERRUPT_SIGNAL,
+    STACK_SIGNAL,
+    Beat,
+    HeartbeatReader,
+    make_heartbeat,
+)
+from workbench.live.process.memory_limit import FamilyMemory
+from workbench.live.process.worker_start import worker_forks
+from workbench.machine.processes.family import end_family, main_thread_ended
+from workbench.machine.processes.watched_thread import report_failure
+from workbench.machine.processes.wire import MessageSocket
+
+_ONLY_LAST = (Load, Settings)
+"""Types of requests of which only the last counts, if several are queued in a row."""
+_MOST_REQUESTS = 1000
+"""Longest queue while the worker reads nothing; then steps and resets are dropped (a key is held down)."""
+_PIECE = 1 << 20
+_FLOOD_PAUSE = 0.005
+"""Seconds between two reads during a flood: with pieces of a megabyte that drains 200 MB a second."""
+_F_SETPIPE_SZ = 1031
+_BEGINS = 60.0
+"""Start-up timeout of a worker in seconds; generous for a first start on a busy machine."""
+
+Output = Callable[[str, bytes], bool]
+"""Callback for output: gets ``stdout`` or ``stderr`` and new bytes (none at its end); True asks for a pause."""
+
+
+class WorkerProcess:
+    """One worker. `receive` is called on one thread, all else on any.
+
+    Start it on a thread that outlives the worker: where it is no fork (`worker_start`) the kernel ends it with the thread
+    that started it, so that none is left behind when the server is killed.
+
+    It has no standard input, so that a task that reads it gets end of file and does not hang, and its own process group,
+    so that Ctrl-C in the terminal reaches the server alone. The author's code may keep it from reading, writing and
+    ending, so nothing here waits for it: requests go through a queue and a thread (an unread socket is full after some
+    hundred messages, and the page would block), what it does is in shared memory (`heartbeat`), and faulthandler writes
+    its stack from a signal handler into a memory file.
+    """
+
+    def __init__(self, output: Output, niceness: int = 0) -> None:
+        """
+        Args:
+            output: called with its output on threads of this object; see `redirect_output`.
+            niceness: as for ``nice``.
+        """
+        ours, theirs = socket.socketpair()
+        heartbeat = make_heartbeat()
+        self._stacks = os.memfd_create("workbench-stacks")
+        # The worker appends, we read and truncate: the file position is shared.
+        fcntl.fcntl(self._stacks, fcntl.F_SETFL, os.O_APPEND)
+        fds = [theirs.fileno(), heartbeat, self._stacks]
+        try:
+            # This starts the worker's keeper, which starts the worker and ends with its exit code.
+            self._process = worker_forks.start(fds, niceness)
+            self._heartbeat = HeartbeatReader(heartbeat)
+        except BaseException:
+            ours.close()
+            os.close(self._stacks)
+            raise
+        finally:
+            theirs.close()
+            os.close(heartbeat)
+        self._line = MessageSocket(ours, get_args(Event))
+        self._memory = FamilyMemory()
+        self._output = output
+        self._waiting: deque[Request] = deque()
+        self._wake = threading.Condition()
+        self._ending = False
+        self._look_lock = threading.Lock()
+        self._writer = threading.Thread(target=self._write_all, name="worker-requests", daemon=True)
+        self._readers = [
+            threading.Thread(
+                target=self._read_output, args=(name, stream), name=f"worker-{name}", daemon=True
+            )
+            for name, stream in (("stdout", self._process.stdout), ("stderr", self._process.stderr))
+        ]
+        for thread in (self._writer, *self._readers):
+            thread.start()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the process that runs the task. Blocks until it has started: about 50 ms, some seconds for
+        the first worker.
+
+        Raises:
+            ProcessLookupError: it did not.
+        """
+        deadline = time.monotonic() + _BEGINS
+        while self._heartbeat.pid == 0 and self._process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        pid = self._heartbeat.pid or self._process.pid
+        if pid == 0:  # for `os.kill` that is this process and its group
+            raise ProcessLookupError("the worker has not started")
+        return pid
+
+    # --- messages ----------------------------------------------------------------------------------
+
+    def send(self, request: Request) -> None:
+        """Queue a request. Never blocks. Lost if the worker is gone; `receive` reports that."""
+        with self._wake:
+            if self._waiting and _replaces(request, self._waiting[-1]):
+                self._waiting.pop()
+            if len(self._waiting) >= _MOST_REQUESTS:
+                # Not the newest, whatever it is: a load or Pause would be lost. A step pauses first.
+                self._waiting = deque(r for r in self._waiting if not isinstance(r, (SingleStep, Reset)))
+                self._waiting.append(Play(False))
+            self._waiting.append(request)
+            self._wake.notify()
+
+    def receive(self, timeout: float) -> Event | None:
+        """The next event; None after `timeout` seconds without one.
+
+        Raises:
+            Unreadable: it sent no event; `kill` it.
+            EOFError: the worker is gone (see `exit_code`), and all its events were received.
+        """
+        message = self._line.receive(timeout)
+        # A process that the author's code forked may hold the socket open after the worker's death.
+        if message is None and self._process.poll() is not None:
+            message = self._line.receive(0)
+            if message is None:
+                raise EOFError
+        return message
+
+    def redirect_output(self, output: Output) -> None:
+        """Redirect the output from now on."""
+        self._output = output
+
+    # --- looking at it -------------------------------------------------------------------------------
+
+    def beat(self) -> Beat:
+        """What the worker is doing, and since when."""
+        return self._heartbeat.read()
+
+    def memory(self, limit: int | None = None) -> int:
+        """Bytes of memory, with all processes that it started; see `FamilyMemory.measure`."""
+        return self._memory.measure(self._process.pid, limit)
+
+    def main_thread_ended(self) -> bool:
+        """Whether the main thread has ended while another keeps the process alive."""
+        pid = self._heartbeat.pid
+        return pid != 0 and main_thread_ended(pid) and self._process.poll() is None
+
+    def stack(self, patience: float = 0.3) -> str:
+        """The worker's current stack, as faulthandler writes it; empty if the stack does not come within `patience`
+        seconds."""
+        if self.beat().number == 0 or self._process.poll() is not None:
+            return ""  # before its handlers are installed the signal would end it
+        with self._look_lock:
+            start = size = os.fstat(self._stacks).st_size
+            try:
+                os.kill(self.pid, STACK_SIGNAL)
+            except ProcessLookupError:
+                return ""  # it died meanwhile; `receive` reports it
+            deadline = time.monotonic() + patience
+            while time.monotonic() < deadline:
+                time.sleep(0.005)
+                now = os.fstat(self._stacks).st_size
+                if now == size > start:
+                    break
+                size = now
+            dump = os.pread(self._stacks, max(0, size - start), start).decode(errors="replace")
+            if self._process.poll() is None:
+                os.ftruncate(self._stacks, 0)
+        return dump
+
+    def crash_report(self) -> str:
+        """The stack of a crash or of ``os._exit``; empty after a plain kill."""
+        return os.pread(self._stacks, 100_000, 0).decode(errors="replace")
+
+    def interrupt(self) -> None:
+        """Raise Interrupted in the author's code if Python runs it (see `Interrupts`), and drop queued control steps."""
+        with self._wake:
+            self._waiting = deque(without_steps(self._waiting))
+        if self.beat().number > 0 and self._process.poll() is None:
+            signal_main_thread(self.pid, INTERRUPT_SIGNAL)
+
+    # --- its end -----------------------------------------------------------------------------------
+
+    def exit_code(self) -> int | None:
+        """Exit code as in ``subprocess``: negative for the signal that ended the worker. Blocks up to 2 s; None if
+        the worker still runs."""
+        try:
+            return self._process.wait(timeout=2.0)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def kill(self) -> None:
+        """End the worker now with all processes that it started; `receive` then raises EOFError."""
+        self._process.terminate()
+
+    def stop(self, grace: float = 1.0) -> None:
+        """Ask the worker to quit, and after `grace` seconds end it with all processes that it started."""
+        if grace > 0 and self._process.poll() is None:
+            self.send(Quit())
+            try:
+                self._process.wait(timeout=grace)
+            except subprocess.TimeoutExpired:
+                pass
+        end_family(self._process)
+        with self._wake:
+            self._ending = True
+            self._wake.notify()
+        # Or the writer would block for ever if a process that left the group holds the other end.
+        self._line.end.shutdown(socket.SHUT_RDWR)
+        self._writer.join()
+        # What was not forked yet has said nothing, and the fork server holds its pipes while it imports.
+        patience = 1.0 if self._process.pid else 0.0
+        for reader in self._readers:
+            # A process that left the group may hold the pipe: its reader thread is left behind.
+            reader.join(timeout=patience)
+        self._line.end.close()
+        os.close(self._stacks)
+
+    # --- its threads -------------------------------------------------------------------------------
+
+    def _write_all(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._waiting or self._ending)
+                if not self._waiting:
+                    return
+                request = self._waiting.popleft()
+            try:
+                self._line.send(request)
+            except OSError:
+                return  # it is gone; `receive` reports it
+            except Exception as error:
+                report_failure(f"A {type(request).__name__} could not be sent to the worker", error)
+
+    def _read_output(self, name: str, stream: object) -> None:
+        with stream as pipe:  # type: ignore[attr-defined]
+            fd = pipe.fileno()
+            try:
+                fcntl.fcntl(fd, _F_SETPIPE_SZ, _PIECE)
+            except OSError:
+                pass  # the user's limit for pipe memory is reached: smaller pieces then
+            failed = False
+            while True:
+                piece = os.read(fd, _PIECE)
+                try:
+                    too_fast = self._output(name, piece)
+                except Exception as error:
+                    # For example a closed terminal. Keep reading: a worker whose pipe is full blocks.
+                    too_fast = False
+                    if not failed:
+                        report_failure("What the task printed could not be shown", error)
+                    failed = True
+                if not piece:
+                    return
+                if too_fast:
+                    time.sleep(_FLOOD_PAUSE)
+
+
+def _replaces(request: Request, before: Request) -> bool:
+    if isinstance(request, PlaceCamera):
+        return isinstance(before, PlaceCamera) and before.key == request.key
+    if isinstance(request, Tell):
+        return isinstance(before, Tell) and (before.env_idx, before.dimensions) == (
+            request.env_idx,
+            request.dimensions,
+        )
+    return isinstance(request, _ONLY_LAST) and type(before) is type(request)
+
+
+def signal_main_thread(pid: int, number: signal.Signals) -> None:
+    """Send a signal to the main thread of a process, in which Python's handlers run.
+
+    The kernel delivers a signal for the whole process to any thread, on a busy machine also to one of torch's or the
+    renderer's. CPython 3.11 then notes the signal without waking the main thread, whose endless loop continues until
+    another Python thread wants to run: never.
+    """
+    if _libc.tgkill(pid, pid, int(number)) != 0:
+        error = ctypes.get_errno()
+        if error != errno.ESRCH:  # it died meanwhile; `receive` reports it
+            raise OSError(error, os.strerror(error))
+
+
+_libc = ctypes.CDLL(None, use_errno=True)

@@ -1,0 +1,208 @@
+"""Starts worker processes, as forks of a process that has imported what they need."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import IO
+
+from workbench.machine.processes.child_python import child_environment, python_command, start_with_socket
+from workbench.machine.processes.family import Keeper
+from workbench.machine.processes.wire import Unpacker, has_come, pack
+
+_GPUS = ("/dev/nvidiactl", "/dev/dxg")
+"""One of these is there where CUDA may be (the second in WSL). No worker is forked then: CUDA does not work in a fork of a
+process that has used it, and whether an import does is not in our hands."""
+_LONGEST = 1 << 12
+_UNBUFFERED = {"PYTHONUNBUFFERED": "1"}
+
+
+@dataclass(frozen=True)
+class NewWorker:
+    """Request to the fork server for a new worker."""
+
+    niceness: int
+
+
+@dataclass(frozen=True)
+class Forked:
+    """A worker was forked: process id of its keeper."""
+
+    pid: int
+
+
+@dataclass(frozen=True)
+class ForkEnded:
+    code: int
+    """Exit code as in ``subprocess``: negative for the signal that ended the process."""
+
+
+class ForkedKeeper:
+    """The keeper of a forked worker. Any thread may use it."""
+
+    def __init__(self, told: socket.socket, stdout: int, stderr: int) -> None:
+        """
+        Args:
+            told: what the fork server says of it.
+        """
+        self.stdout: IO[bytes] | None = open(stdout, "rb", buffering=0)
+        self.stderr: IO[bytes] | None = open(stderr, "rb", buffering=0)
+        self._told = told
+        self._pid = 0
+        self._code: int | None = None
+        self._terminated = False
+        self._lock = threading.Lock()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the keeper; 0 until it has been forked."""
+        self.poll()
+        return self._pid
+
+    def poll(self) -> int | None:
+        """Exit code; None while the process runs. A fork server that is killed has killed its workers too."""
+        with self._lock:
+            while self._code is None and has_come(self._told):
+                try:
+                    said = self._told.recv(_LONGEST)
+                except ConnectionResetError:
+                    said = b""
+                news = Unpacker((Forked, ForkEnded)).message(said) if said else ForkEnded(-signal.SIGKILL)
+                if isinstance(news, Forked):
+                    self._pid = news.pid
+                else:
+                    self._code = news.code
+            if self._code is None and self._terminated and self._pid == 0:
+                # It will not be forked, which the fork server says when it has done its imports.
+                self._code = -signal.SIGTERM
+            if self._code is not None:
+                self._told.close()
+            return self._code
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait for the end; returns the exit code, and raises as ``subprocess.Popen.wait`` does."""
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            left = None if deadline is None else deadline - time.monotonic()
+            if left is not None and left <= 0:
+                assert timeout is not None
+                raise subprocess.TimeoutExpired("a worker", timeout)
+            has_come(self._told, left)
+        return code
+
+    def terminate(self) -> None:
+        self._terminated = True
+        self._send(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self._terminated = True
+        self._send(signal.SIGKILL)
+
+    def _send(self, number: signal.Signals) -> None:
+        if self.poll() is None:
+            with self._lock:
+                try:
+                    self._told.send(pack(int(number)))
+                except OSError:
+                    pass  # it has ended; `poll` says how
+
+
+class WorkerForks:
+    """The fork server of this process, started with its first worker. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._control: socket.socket | None = None
+        self._from: tuple[dict[str, str], str] | None = None
+        """Environment and current folder with which the fork server was started."""
+
+    def start(self, fds: Sequence[int], niceness: int) -> Keeper:
+        """Start a worker without waiting for it.
+
+        Args:
+            fds: socket, heartbeat and stacks, see `workbench.app.worker.start.run`.
+
+        Raises:
+            OSError
+        """
+        with self._lock:
+            control = None if any(map(os.path.exists, _GPUS)) else self._fork_server()
+            if control is not None:
+                try:
+                    return _forked(control, fds, niceness)
+                except (BrokenPipeError, ConnectionResetError):
+                    self._end()  # it was killed; the next worker starts another
+        return start_anew(fds, niceness)
+
+    def end(self) -> None:
+        """End the fork server and all workers that it forked."""
+        with self._lock:
+            self._end()
+
+    def _fork_server(self) -> socket.socket | None:
+        """Socket of the fork server; None if the environment or the current folder has changed since it was started."""
+        come_from = (child_environment(**_UNBUFFERED), _current_folder())
+        if self._control is None:
+            self._process, self._control = start_with_socket(
+                "workbench.app.worker.fork_workers", come_from[0]
+            )
+            self._from = come_from
+        return self._control if self._from == come_from else None
+
+    def _end(self) -> None:
+        if self._control is not None:
+            self._control.close()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        self._control = self._process = None
+
+
+def _current_folder() -> str:
+    try:
+        return os.getcwd()
+    except FileNotFoundError:  # it was removed
+        return ""
+
+
+def _forked(control: socket.socket, fds: Sequence[int], niceness: int) -> ForkedKeeper:
+    told, tells = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    out, err = os.pipe(), os.pipe()
+    try:
+        socket.send_fds(control, [pack(NewWorker(niceness))], [tells.fileno(), *fds, out[1], err[1]])
+    except BaseException:
+        told.close()
+        os.close(out[0])
+        os.close(err[0])
+        raise
+    finally:
+        tells.close()
+        os.close(out[1])
+        os.close(err[1])
+    return ForkedKeeper(told, out[0], err[0])
+
+
+def start_anew(fds: Sequence[int], niceness: int) -> Keeper:
+    """Start a worker that does the imports itself; see `WorkerForks.start`."""
+    return subprocess.Popen(
+        python_command("-m", "workbench.app.worker.start", *map(str, [*fds, os.getpid(), niceness])),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        bufsize=0,
+        pass_fds=fds,
+        process_group=0,
+        env=child_environment(**_UNBUFFERED),
+    )
+
+
+worker_forks = WorkerForks()
+atexit.register(worker_forks.end)

@@ -1,0 +1,174 @@
+"""Decides what a worker loads: the file after a save, the last good version after a crash."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+from workbench.task.description import TaskDescription
+
+Attempt = Literal["file", "moment", "version", "nothing"]
+Newest = Callable[[], bytes | None]
+"""Returns the newest state of the batch, a pickled `envs.snapshots.snapshot.Snapshot`, or None. Called only when needed,
+since assembling one takes longer than a step."""
+_GOOD_VERSIONS = 2
+_PROVEN_SECONDS = 30.0
+"""Seconds after a load: a version whose process crashes later than this counts as one that worked."""
+
+
+class LoadInputs(NamedTuple):
+    """Source and moment of a load."""
+
+    source: dict[str, str] | None
+    """Texts to use in place of the files; None for those on disk."""
+    snapshot: bytes | None
+    """The moment to restore."""
+    number: int
+    """`Load.number`."""
+
+
+@dataclass(frozen=True)
+class GoodVersion:
+    """A version that was loaded without a failure."""
+
+    file: str | None
+    source: dict[str, str]
+    since: float
+    """When the version was last loaded, in seconds of the session's clock."""
+    crashes: int = 0
+    """Crashes of its process in a row, each soon after the version was loaded."""
+    idle_crashes: int = 0
+    """How many of `crashes` came since its last step, while nothing was asked of the worker."""
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """Chooses what the next worker loads after one has ended. Methods that change something return another value.
+
+    Loading may end the worker again: the version is refused, the moment cannot be restored, importing the file crashes,
+    memory runs out. So the attempts are, in order: the file on disk if no worker has tried it yet, the last good version at
+    its newest moment, the same from its start, and at last nothing, until the file changes. None is tried twice, so that
+    no file can end workers one after the other. A version that crashes twice, each time soon after it was loaded, is no good
+    one: the version before it comes back. Without one it comes back itself, unless it crashed twice without making a step.
+    """
+
+    good: tuple[GoodVersion, ...] = ()
+    """The newest last; at most `_GOOD_VERSIONS`."""
+    attempt: Attempt = "file"
+    asked: int = 1
+    begun: int = 1
+    """Numbers of the newest load of the file that was asked for, and of the newest that a worker has begun."""
+    loading: bool = True
+    """A load is running."""
+    has_env: bool = False
+
+    @property
+    def restoring(self) -> bool:
+        """Whether the running load brings back the last good version."""
+        return self.loading and self.attempt in ("moment", "version")
+
+    @property
+    def good_source(self) -> dict[str, str] | None:
+        """Source of the version that is brought back; None if there is none."""
+        return self.good[-1].source if self.good else None
+
+    @property
+    def file_waits(self) -> bool:
+        """Whether no worker has begun to load the file as it was saved last."""
+        return self.asked > self.begun
+
+    def next_load(self, newest: Newest) -> tuple[Recovery, LoadInputs | None]:
+        """What a new worker has to load; None for nothing."""
+        if self.attempt == "nothing":
+            return self, None
+        good = self.good_source if self.attempt != "file" else None
+        snapshot = newest() if self.attempt in ("file", "moment") else None
+        number = self.asked if good is None else 0
+        return replace(self, loading=True), LoadInputs(good or None, snapshot, number)
+
+    def file_requested(self, newest: Newest) -> tuple[Recovery, LoadInputs]:
+        """The present worker is to load the file on disk."""
+        asked = self.asked + 1
+        inputs = LoadInputs(None, None if self.has_env else newest(), asked)
+        return replace(self, attempt="file", loading=True, asked=asked), inputs
+
+    def began(self, number: int) -> Recovery:
+        """A worker has begun the load of this number."""
+        return replace(self, begun=max(self.begun, number))
+
+    def loaded(self, task: TaskDescription, now: float) -> Recovery:
+        """`task` runs: it is the last good version from now on."""
+        good = self.good
+        if good and good[-1].file != task.file:
+            good = ()  # no version of another file comes back
+        if good and good[-1].source == task.source:
+            good = (*good[:-1], replace(good[-1], since=now))
+        else:
+            good = (*good, GoodVersion(task.file, task.source, now))[-_GOOD_VERSIONS:]
+        return replace(self, good=good, has_env=True, attempt="file", loading=self.file_waits)
+
+    def stepped(self) -> Recovery:
+        """A step was made, which somebody had asked for."""
+        if not self.good or not self.good[-1].idle_crashes:
+            return self
+        return replace(self, good=(*self.good[:-1], replace(self.good[-1], idle_crashes=0)))
+
+    def failed(self, kept: bool, newest: Newest) -> tuple[Recovery, bool]:
+        """A load failed in a worker that continues. True if the worker has no version now, and `next_load` has one to
+        try."""
+        after = replace(self, loading=self.file_waits)
+        if kept or not self.loading or self.file_waits:
+            return after, False
+        after = after._step_down(newest)
+        return after, after.attempt != "nothing"
+
+    def died(self, crashed: bool, idle: bool, now: float, newest: Newest) -> Recovery:
+        """The worker is gone.
+
+        Args:
+            crashed: by itself, and not because it was ended or handed over.
+            idle: nothing was asked of it at the time.
+        """
+        after = self
+        if self.file_waits:
+            after = replace(self, attempt="file")
+        elif self.loading:
+            after = self._step_down(newest)
+        elif self.attempt != "nothing":
+            after = self._after_running(crashed, idle, now)
+        return replace(after, loading=False, has_env=False)
+
+    def restart_requested(self) -> Recovery:
+        """A person restarts the worker, to load the file as it is now; if that is just being loaded (it may loop there), to
+        have the last good version back."""
+        good = tuple(replace(version, crashes=0, idle_crashes=0) for version in self.good)
+        if self.loading and not self.restoring and not self.file_waits and good:
+            return replace(self, good=good)  # `died` goes on from there
+        return replace(self, good=good, attempt="file", loading=False, has_env=False, asked=self.asked + 1)
+
+    def _after_running(self, crashed: bool, idle: bool, now: float) -> Recovery:
+        if not self.good:
+            return replace(self, attempt="nothing")
+        after, version = replace(self, attempt="moment"), self.good[-1]
+        if not crashed:
+            return after
+        proven = now - version.since > _PROVEN_SECONDS
+        version = replace(
+            version,
+            crashes=0 if proven else version.crashes + 1,
+            idle_crashes=0 if proven else version.idle_crashes + idle,
+        )
+        if version.crashes > 1 and len(self.good) > 1:
+            return replace(after, good=self.good[:-1])
+        attempt: Attempt = "nothing" if version.idle_crashes > 1 else "moment"
+        return replace(after, good=(*self.good[:-1], version), attempt=attempt)
+
+    def _step_down(self, newest: Newest) -> Recovery:
+        if not self.good:
+            return replace(self, attempt="nothing")
+        if self.attempt == "file":
+            return replace(self, attempt="moment" if newest() is not None else "version")
+        if self.attempt == "moment" and newest() is not None:
+            return replace(self, attempt="version")
+        return replace(self, attempt="nothing")

@@ -1,0 +1,316 @@
+"""The run of the open task as one value: what is loaded, how it goes, what a person chose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraKey, Picture
+from workbench.envs.inspection import Inspection, Section
+from workbench.envs.step_result import StepResult
+from workbench.live.events import RunEffect, RunToEnter
+from workbench.live.history.env_table import EnvRows
+from workbench.live.history.moments import EnvMoment, ShownMoment
+from workbench.live.messages import (
+    Load,
+    LoadLevel,
+    NewProcessNeeded,
+    ReloadLevel,
+    ReloadReport,
+    RulesBroken,
+    Settings,
+)
+from workbench.live.past import Past, Strip
+from workbench.live.process.heartbeat import Busy, own_files_of
+from workbench.live.recovery import LoadInputs, Recovery
+from workbench.task.description import TaskDescription, TaskOptions
+from workbench.task.problem import Problem
+from workbench.task.reference import TaskName, followed_folder, named_file
+
+RunState = Literal["starting", "loading", "running", "paused", "error", "stopped"]
+"""``starting`` the worker process; ``loading``: a task is being imported or built; ``error``: no version is loaded,
+see `Run.problem`; ``stopped``: there is no worker."""
+
+
+PastAfterLoad = Literal["same", "patched", "gone"]
+"""What a load means for the history: it continues unchanged, it continues with other code, or another history begins."""
+
+
+@dataclass(frozen=True)
+class PastLoad:
+    """One attempt to load the file."""
+
+    at: float
+    """Seconds since the epoch."""
+    level: ReloadLevel | None
+    """Level of the reload; None for the first version, and for one that was refused."""
+    reason: str
+    milliseconds: float = 0.0
+    problem: Problem | None = None
+    """Why the version was refused."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One value for all that is known of the run. Its serials tell a page cheaply which parts are new."""
+
+    reference: TaskName
+    """The requested task: a file, ``file.py:ClassName`` or a registered env id, or a task that a recording names."""
+    options: TaskOptions
+    """Build options in effect; the seed is `seed`."""
+    history_bytes: int
+    """Memory limit of the history."""
+    own_file: Path | None
+    """The named file, even if it never loaded; None for an env id."""
+    own_folder: Path | None
+    """Folder whose modules, and those below it, are watched with the file; None if nothing is watched."""
+    running_reference: TaskName
+    """The running task."""
+    recovery: Recovery = Recovery()
+    past: Past | None = None
+    """None before a task is loaded."""
+    versions: tuple[tuple[int, TaskDescription], ...] = ()
+    """The versions that made the moments of `past`, oldest first, each with the serial of its first one."""
+    needed: NewProcessNeeded = NewProcessNeeded("", False)
+    """Why the next worker is a new process, where the last one said so."""
+    to_enter: RunToEnter | None = None
+    """To be entered as soon as a task is loaded."""
+    first_step_due: bool = False
+    """The next step is the first of a new scene: it does not prove that the task runs."""
+    pages: int = 0
+    """Pages that are open."""
+    tried_options: TaskOptions | None = None
+    """Options that a person applied and that no load has taken or refused yet."""
+    wants_play: bool = False
+    policy_failed: bool = False
+    """Whether a failure of the policy stopped playing, and playing has not begun since. `problem` may be gone: a save
+    that a load follows clears it."""
+    named_policy: str | None = None
+    """The policy that was named last, for when policies act again."""
+
+    state: RunState = "starting"
+    activity: str = "a worker process"
+    """Current step of starting or loading, else empty."""
+    stale: bool = False
+    """The file on disk is newer than the running version, or does not load."""
+    task: TaskDescription | None = None
+    task_serial: int = 0
+    """Grows with every successful load."""
+    scene_serial: int = 0
+    """Grows with every new scene: not with a version that is patched into the present one."""
+    cameras_serial: int = 0
+    """Grows with every new set of cameras."""
+    load_milliseconds: float = 0.0
+    reload: ReloadReport | None = None
+    """How the running version came in; None for the first."""
+    after_load: PastAfterLoad = "same"
+    """What the last load meant for the history."""
+    loads: tuple[PastLoad, ...] = ()
+    """The last loads, newest first."""
+    choices: tuple[str, ...] = ()
+    """Task classes of the file, the chosen one first; empty if it has only one."""
+    step: StepResult | None = None
+    """The newest step."""
+    step_serial: int = 0
+    pictures: Mapping[CameraKey, Picture] = field(default_factory=dict)
+    """The newest pictures of the watched cameras."""
+    pictures_serial: int = 0
+    picture_milliseconds: float | None = None
+    failed_cameras: Mapping[CameraKey, str] = field(default_factory=dict)
+    """Why cameras cannot be drawn, as sentences; they are left out."""
+    problem: Problem | None = None
+    problem_serial: int = 0
+    problem_at_run: bool = False
+    """Whether `problem` came while the task ran, not while a version was loaded."""
+    spoiled: str = ""
+    """Why another process brought the version back that ran when `problem` came, as `LoadFailed` has it."""
+    settings: Settings = Settings()
+    """Settings chosen on the page."""
+    told: NDArray[np.float32] | None = None
+    """(N, A) action that sliders send next; None if unknown."""
+    options_refused: TaskOptions | None = None
+    """Options that were applied last and with which the task failed."""
+    seed: int = 0
+    playing: bool = False
+    steps_per_second: float = 0.0
+    real_time_factor: float = 0.0
+    recorded_share: float = 0.0
+    watched_share: float = 0.0
+    """Speeds and shares of time, as in `Status`."""
+    busy: Busy | None = None
+    """A long-running call in the worker."""
+    rules: RulesBroken | None = None
+    """Rules of GPU simulation that the running version has broken; None for none."""
+    rules_serial: int = 0
+    inspection: Inspection | None = None
+    """The newest reading, of the env that was selected then."""
+    read_sections: tuple[Section, ...] = ()
+    """What is read of the selected env while steps go on."""
+    reading: Literal["none", "soon", "asked"] = "none"
+    read_at: object = None
+    """What was shown when the last reading was asked for."""
+    read_when: float = -math.inf
+    """When that was, in seconds of `Now.monotonic`."""
+
+    # --- reading -----------------------------------------------------------------------------------
+
+    @property
+    def env(self) -> int:
+        """The selected env."""
+        return self.settings.selected_env
+
+    @property
+    def num_envs(self) -> int:
+        """Number of envs; 1 before a task is loaded."""
+        return 1 if self.task is None else self.task.num_envs
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder of the task's own file, where policies are looked for too."""
+        return None if self.own_file is None else self.own_file.parent
+
+    @property
+    def policy(self) -> str | None:
+        """The acting policy, if one is chosen."""
+        return self.settings.policy if self.settings.action_source == "policy" else None
+
+    @property
+    def own_files(self) -> list[str]:
+        """The known files of the author."""
+        return own_files_of(() if self.task is None else self.task.source_files, self.own_file)
+
+    def newest_moment(self) -> bytes | None:
+        """The newest moment, pickled for `Load.snapshot`; None before a task is loaded. Takes longer than a step."""
+        return None if self.past is None else self.past.history.snapshot_at(self.past.history.last)
+
+    def running_load(self) -> Load | None:
+        """The load of the running version, for another worker; None if no task runs."""
+        return None if self.task is None else load_of(self, LoadInputs(dict(self.task.source), None, 0))
+
+    def for_worker(self) -> Settings:
+        """Settings for the worker: without cameras if no page is open."""
+        cameras = tuple(one for one in self.settings.cameras if one.key not in self.failed_cameras)
+        return replace(
+            self.settings,
+            policy_folder=None if self.folder is None else str(self.folder),
+            cameras=cameras if self.pages > 0 else (),
+        )
+
+    def env_rows(self) -> EnvRows | None:
+        """The table of envs at the shown moment; None before a task is loaded. Copies some 100 kB for 256 envs: not for
+        every frame."""
+        return None if self.past is None else self.past.env_rows()
+
+    def strip(self, low: int, high: int) -> Strip | None:
+        """The selected env's history between two ticks; None before a task is loaded."""
+        return None if self.kept is None else self.kept.strip(self.env, low, high)
+
+    def episode_ticks(self) -> tuple[int, int] | None:
+        """First and last tick of the selected env's episode that contains the shown moment, also where it went back."""
+        if self.kept is None:
+            return None
+        begin, end = self.kept.episode(self.env)
+        return self.kept.tick_of(begin), self.kept.tick_of(end)
+
+    def segment(self) -> tuple[int, int] | None:
+        """First and last serial of the selected env's segment that contains the shown moment."""
+        return None if self.kept is None else self.kept.history.segment_at(self.env, self.kept.at)
+
+    @property
+    def stands_at(self) -> object:
+        """What pictures are needed of while a moment of the past is shown; None while live."""
+        if self.past is None or self.past.pinned is None:
+            return None
+        return self.past.pinned, self.env, self.settings.cameras, self.settings.pictures
+
+    @property
+    def kept(self) -> Past | None:
+        """The past, if it has a moment."""
+        return None if self.past is None or not len(self.past.history) else self.past
+
+    def shown_moment(self) -> ShownMoment:
+        """The moment that the page shows."""
+        shown = None if self.past is None else self.past.shown
+        count = 0 if self.task is None else self.task.num_envs
+        return ShownMoment(self.env, count, None if shown is None else shown.step.poses)
+
+    def episode_moments(self, most: int) -> tuple[EnvMoment, ...]:
+        """At most so many moments of the selected env's episode that contains the shown moment."""
+        if self.past is None or not len(self.past.history):
+            return ()
+        return self.past.history.episode(self.env, self.past.at, most)
+
+    def version_of(self, serial: int) -> TaskDescription | None:
+        """The version that made this moment."""
+        return next((task for first, task in reversed(self.versions) if first <= serial), None)
+
+
+Change = tuple[Run, list[RunEffect]]
+"""The run after an event, and what has to be done."""
+
+
+def first_run(task: TaskName, options: TaskOptions, history_bytes: int, settings: Settings) -> Run:
+    """The run before a worker has said anything. Looks at the disk."""
+    return Run(
+        task,
+        options,
+        history_bytes,
+        named_file(task),
+        followed_folder(task),
+        task,
+        seed=options.seed,
+        settings=settings,
+        named_policy=settings.policy,
+    )
+
+
+def load_of(
+    run: Run, inputs: LoadInputs, level: LoadLevel = "auto", because: str = "", same_scene: bool = False
+) -> Load:
+    tried = run.tried_options if inputs.source is None else None
+    options = replace(tried or run.options, seed=run.seed)
+    # The version that ran is brought back even if another class of the file was chosen since.
+    reference = run.reference if inputs.source is None else run.running_reference
+    any_task = run.task is None and isinstance(reference, str)
+    return Load(
+        reference,
+        options,
+        inputs.source,
+        level,
+        inputs.snapshot,
+        any_task,
+        inputs.number,
+        because,
+        same_scene,
+    )
+
+
+def movable_bodies(task: TaskDescription | None) -> list[str]:
+    """Names of the bodies whose path can be drawn."""
+    if task is None:
+        return []
+    kinds = zip(task.geometry.body_names, task.geometry.body_kinds, strict=True)
+    return [name for name, kind in kinds if kind in ("link", "dynamic")]
+
+
+# --- parts of a change ------------------------------------------------------------------------------
+
+
+def with_problem(run: Run, problem: Problem | None, at_run: bool = False, spoiled: str = "") -> Run:
+    serial = run.problem_serial + 1
+    return replace(run, problem=problem, problem_serial=serial, problem_at_run=at_run, spoiled=spoiled)
+
+
+def at_rest(run: Run) -> Run:
+    return replace(run, state="running" if run.playing else "paused")
+
+
+def new_pictures(run: Run) -> Run:
+    """Other pictures are shown."""
+    return replace(run, pictures_serial=run.pictures_serial + 1)

@@ -1,0 +1,153 @@
+"""Snapshot of the session that the page draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraKey, Picture
+from workbench.envs.gpu_rules import Finding
+from workbench.envs.inspection import Inspection
+from workbench.envs.step_result import StepResult
+from workbench.live.history.curves import Curves
+from workbench.live.messages import ReloadReport, RulesBroken, Settings
+from workbench.live.past import TimelineView
+from workbench.live.process.captured_output import NOTHING_PRINTED, Printed
+from workbench.live.process.heartbeat import Busy
+from workbench.live.process.supervisor import Vitals
+from workbench.live.run import PastLoad, Run, RunState
+from workbench.task.description import TaskDescription, TaskOptions
+from workbench.task.problem import Problem
+
+Part = TypeVar("Part")
+
+
+@dataclass(frozen=True)
+class SessionView:
+    """Immutable; its serials tell the redraw loop cheaply which parts are new, so that nothing is drawn twice."""
+
+    state: RunState = "starting"
+    activity: str = ""
+    """Current step of starting or loading, else empty."""
+    stale: bool = False
+    """The file on disk is newer than the running version, or does not load."""
+    task: TaskDescription | None = None
+    task_serial: int = 0
+    """Grows with every successful load."""
+    scene_serial: int = 0
+    """Grows with every new scene: not with a version that is patched into the present one."""
+    cameras_serial: int = 0
+    """Grows with every new set of cameras."""
+    load_milliseconds: float = 0.0
+    reload: ReloadReport | None = None
+    """How the running version came in; None for the first."""
+    timeline_cleared: bool = False
+    """Whether the running version began another history."""
+    loads: tuple[PastLoad, ...] = ()
+    """The last loads, newest first."""
+    choices: tuple[str, ...] = ()
+    """Task classes of the file, the chosen one first; empty if it has only one."""
+    step: StepResult | None = None
+    """The shown step: the newest, or a past one (`timeline`)."""
+    step_serial: int = 0
+    """Serial of the shown moment."""
+    pictures: Mapping[CameraKey, Picture] = field(default_factory=dict)
+    pictures_serial: int = 0
+    picture_milliseconds: float | None = None
+    failed_cameras: Mapping[CameraKey, str] = field(default_factory=dict)
+    """Why cameras cannot be drawn, as sentences; they are left out."""
+    problem: Problem | None = None
+    problem_serial: int = 0
+    problem_at_run: bool = False
+    """Whether `problem` came while the task ran, not while a version was loaded."""
+    spoiled: str = ""
+    """Why another process brought the version back that ran when `problem` came, as `LoadFailed` has it."""
+    refused: Problem | None = None
+    """Why the present version of the file does not run."""
+    curves: Curves | None = None
+    settings: Settings = Settings()
+    """Settings chosen on the page."""
+    told: NDArray[np.float32] | None = None
+    """(N, A) action that sliders send next; of a past moment, the action that led there. None if unknown."""
+    options: TaskOptions = TaskOptions()
+    """How the envs are made; the seed is `seed`."""
+    options_refused: TaskOptions | None = None
+    """Options that were applied last and with which the task failed."""
+    seed: int = 0
+    playing: bool = False
+    steps_per_second: float = 0.0
+    real_time_factor: float = 0.0
+    recorded_share: float = 0.0
+    watched_share: float = 0.0
+    """Speeds and shares of time, as in `Status`."""
+    timeline: TimelineView = TimelineView()
+    """The history. While one of its moments is shown, `step` and `pictures` are of that moment."""
+    busy: Busy | None = None
+    """A long-running call in the worker."""
+    rules: RulesBroken | None = None
+    """Rules of GPU simulation that the running version has broken; None for none."""
+    rules_serial: int = 0
+    odd: tuple[Finding, ...] = ()
+    """Rules that the running version broke by outliers, one a rule."""
+    inspection: Inspection | None = None
+    """As `Run.inspection`."""
+    printed: Printed = NOTHING_PRINTED
+    """The last lines that the author's code printed."""
+    vitals: Vitals = Vitals()
+    """Memory of the processes."""
+    known_policies: tuple[str, ...] = ()
+    """Policies to choose from, as they were listed last."""
+    features: Mapping[type[Any], Any] = field(default_factory=dict)
+    """The view of each feature, by its class."""
+
+    def of(self, kind: type[Part]) -> Part:
+        """The view of a feature, such as ``of(StudioView)``; one with default values where the session has none."""
+        return self.features[kind] if kind in self.features else kind()
+
+    @property
+    def played(self) -> tuple[Finding, ...]:
+        """Findings while playing: broken rules of GPU simulation, and outliers."""
+        return (*(() if self.rules is None else self.rules.rows), *self.odd)
+
+    @property
+    def selected_env(self) -> int:
+        """The env whose pictures and numbers are shown."""
+        return self.settings.selected_env
+
+
+_OF_RUN = {one.name for one in fields(SessionView)} & {one.name for one in fields(Run)}
+"""Fields that a view has from the run as they are."""
+
+
+def view_of(run: Run, **known: Any) -> SessionView:
+    """What a page shows of the run, at the shown moment.
+
+    Args:
+        known: further fields of the view.
+    """
+    refused = run.problem if run.stale and not run.problem_at_run else None
+    now = SessionView(**{name: getattr(run, name) for name in _OF_RUN}, refused=refused, **known)
+    past = run.past
+    if past is None:
+        return now
+    view = replace(
+        now,
+        curves=past.history.steps.curves(run.env),
+        timeline_cleared=run.after_load == "gone",
+        timeline=past.view(run.env, run.settings.cameras, run.settings.pictures),
+        odd=past.history.findings,
+    )
+    moment = past.shown
+    if moment is None:
+        return view
+    return replace(
+        view,
+        step=moment.step,
+        step_serial=moment.serial,
+        pictures=past.pictures(run.env),
+        told=moment.step.action,
+    )

@@ -1,0 +1,1 @@
+"""Parts of the worker process: it owns the env and is the only one that steps it."""

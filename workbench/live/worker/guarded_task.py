@@ -1,0 +1,147 @@
+"""Calls into the author's code from the worker, with their errors handled."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+from workbench.envs.snapshots.snapshot import restore_snapshot
+from workbench.live.messages import LoadFailed
+from workbench.live.process.heartbeat import Doing, HeartbeatWriter, Interrupts
+from workbench.live.worker.connection import ServerConnection
+from workbench.live.worker.process_state import ProcessState, changed_settings, read_process_state, some_of
+from workbench.live.worker.step_events import StepEvents
+from workbench.task.modules import is_own_file
+from workbench.task.open import OpenedTask
+from workbench.task.problem import Interrupted, Problem, TaskError, problem_from_exception
+
+REFUSED = "a refused version had run in the process"
+
+_STAGE: dict[Doing, str] = {"loading": "build", "stepping": "step", "resetting": "reset"}
+
+
+class GuardedTask:
+    """The open task. All parts of the worker call the author's code through this, so that each failure ends the same way:
+    an interrupt drops the waiting steps, the server gets the problem with the author's line, and the batch is put back to
+    the end of the last step."""
+
+    def __init__(
+        self,
+        line: ServerConnection,
+        interrupts: Interrupts,
+        heartbeat: HeartbeatWriter,
+        steps: StepEvents,
+        on_failure: Callable[[], None],
+    ) -> None:
+        """
+        Args:
+            steps: has the snapshot of the last step.
+            on_failure: called after a failure was sent.
+        """
+        self.line, self.interrupts, self.heartbeat, self.steps = line, interrupts, heartbeat, steps
+        self._on_failure = on_failure
+        self.opened: OpenedTask | None = None
+        self.requested_file: Path | None = None
+        """The file that was requested last, loaded or not."""
+        self.failed = False
+        """Whether `opened` has failed while it ran; what it was doing may be half done."""
+        self.when_loaded: ProcessState | None = None
+        """Settings of the process when the load of `opened` ended."""
+        self.spoiled = False
+        """Whether the author's code left something in this process that cannot be taken back: the process has to end."""
+
+    def run(self, doing: Doing | None, work: Callable[[], object], loads: bool = False) -> Problem | None:
+        """Run `work`; if `doing` is not None it may run the author's code, and can be interrupted. Returns the failure,
+        which was sent.
+
+        Args:
+            loads: `work` loads a version, which a failure refuses.
+
+        A BaseException that is no Exception (KeyboardInterrupt, which only the author's code raises here, or a class of
+        theirs) is a failure; an Exception is the workbench's own, and ends the process.
+        """
+        if doing is None:
+            work()
+            return None
+        self.heartbeat.begin(doing)
+        self.interrupts.begin()
+        try:
+            try:
+                self.interrupts.allowed = True
+                work()
+            finally:
+                self.interrupts.allowed = False
+        except Exception:
+            raise
+        except BaseException as error:
+            # Outside of `blamed`: between two hooks, or in the workbench's own code.
+            if isinstance(error, Interrupted):
+                self.line.drop_steps()
+            problem = problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error))
+            if loads:
+                self.refuse(LoadFailed(problem, kept=self.opened is not None, spoiled=REFUSED))
+            else:
+                self.fail(problem)
+            return problem
+        finally:
+            self.heartbeat.begin("idle")
+        return None
+
+    def _own_files(self, error: BaseException) -> list[Path]:
+        """The author's files, and the files of the traceback in the task's folder, whose import may not have finished."""
+        known = [] if self.opened is None else list(self.opened.loaded.source_files)
+        if self.requested_file is not None:
+            folder, frames = self.requested_file.parent, traceback.extract_tb(error.__traceback__)
+            known += [Path(frame.filename) for frame in frames if is_own_file(frame.filename, folder)]
+        return known
+
+    def guarded(self, do: Callable[[OpenedTask], object]) -> None:
+        """Call `do` with the task, if there is one; a TaskError is sent as a failure."""
+        if self.opened is None:
+            return
+        try:
+            do(self.opened)
+        except TaskError as error:
+            self.drop_steps_if_interrupted(error)
+            self.fail(error.problem)
+
+    def drop_steps_if_interrupted(self, error: TaskError) -> bool:
+        """Whether a person interrupted the author's code; then the waiting steps are dropped."""
+        interrupted = isinstance(error.__cause__, Interrupted)
+        if interrupted:
+            self.line.drop_steps()
+        return interrupted
+
+    def fail(self, problem: Problem) -> None:
+        """Send a failure while the task runs, and stop playing. The batch is put back to the end of the last step, in another
+        process if this one cannot be trusted with it."""
+        self.failed = self.failed or problem.stage != "policy"
+        spoiled = self._settings_changed()
+        if not spoiled and problem.stage != "policy" and self.restore_last_step() is not None:
+            spoiled = "the last step could not be put back"
+        self._send_failure(LoadFailed(problem, self.opened is not None, at_run=True, spoiled=spoiled))
+        self._on_failure()
+
+    def _settings_changed(self) -> str:
+        changed = changed_settings(self.when_loaded, read_process_state()) if self.when_loaded else []
+        return f"{some_of(changed)} changed since the version was loaded" if changed else ""
+
+    def refuse(self, failed: LoadFailed) -> None:
+        """Report that a version was refused."""
+        self._send_failure(failed)
+
+    def _send_failure(self, failed: LoadFailed) -> None:
+        self.spoiled = self.spoiled or failed.spoiled != ""
+        self.line.send(failed)
+
+    def restore_last_step(self) -> Problem | None:
+        """Put the batch back to the end of the last step, after one that was cut short. Returns why that failed."""
+        if self.opened is None or self.steps.moment is None:
+            return None
+        try:
+            # Not `TaskEnv.restore`: that calls `evaluate`, which may be what did not end.
+            restore_snapshot(self.opened.env.env, self.steps.moment)
+        except Exception as error:  # the failed code may have put anything in place of what is restored
+            return problem_from_exception(error, "reset", self.opened.loaded.source_files)
+        return None

@@ -1,0 +1,288 @@
+"""Builds the HTTP responses: headers, refusals, files, and viser's page with our scripts in its head."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import gzip
+import html
+import mimetypes
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from pathlib import Path
+from urllib.parse import unquote
+
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from workbench.machine.folders import web_assets_folder
+from workbench.machine.text import short_line
+from workbench.page.door import access, viser_private
+from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.file_response import FileReply, send_file
+
+Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
+"""Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns status, content type
+and body, or a file. Runs in a thread, so it may read files."""
+
+SCRIPTS = (
+    "browser.js",
+    "input.js",
+    "panels.js",
+    "curve_clicks.js",
+    "view_width.js",
+)
+"""Names of the scripts in ``web_assets/`` that the page runs."""
+STYLES = "panels/page.css"
+"""Style sheet in ``web_assets/``. It goes into the page's head: viser removes an HTML element while its panel is
+folded."""
+
+LONGEST_NAME = 255
+"""Maximum length of a file's name in bytes, in every usual file system."""
+LONGEST_PATH = 3000
+"""Maximum length in bytes of a path below a folder."""
+
+
+def request_parts(request: Request) -> access.RequestParts:
+    """The parts of a request that `access` checks."""
+    get = request.headers.get_all
+    return access.RequestParts(
+        path=request.path,
+        host=get("Host"),
+        origin=get("Origin"),
+        cookie=get("Cookie"),
+        fetch_site=get("Sec-Fetch-Site"),
+        fetch_mode=get("Sec-Fetch-Mode"),
+        fetch_dest=get("Sec-Fetch-Dest"),
+        # Exactly viser's own test: what viser takes for a handshake must have been checked as one.
+        websocket=get("Upgrade") == ["websocket"],
+    )
+
+
+def refusals(example: str) -> Callable[[str], Response]:
+    """Returns a function that makes 403 replies with a reason; ``example`` is the address that they tell to open."""
+    folder = web_assets_folder()
+    page = (folder / "refused.html").read_text(encoding="utf-8")
+    page = page.replace("{{logo}}", (folder / "logo.svg").read_text(encoding="utf-8"))
+    page = page.replace("{{example}}", html.escape(example))
+
+    def refuse(reason: str) -> Response:
+        body = page.replace("{{reason}}", html.escape(reason)).encode()
+        return reply(403, "text/html; charset=utf-8", body, PAGE_OF_OURS)
+
+    return refuse
+
+
+def reply(status: int, kind: str, body: bytes, headers: Mapping[str, str], gzipped: bool = False) -> Response:
+    extra = {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"} if gzipped else {}
+    fields = {"Content-Type": kind, "Content-Length": str(len(body)), **EVERY_REPLY, **extra, **headers}
+    return Response(status, HTTPStatus(status).phrase, Headers(fields), body)
+
+
+def entered_reply(entered: access.Entered) -> Response:
+    cookie = {"Set-Cookie": entered.set_cookie, **PAGE_OF_OURS}
+    if not entered.by_page:
+        return reply(303, "text/plain; charset=utf-8", b"", {"Location": entered.location, **cookie})
+    onward = f'<!doctype html><title>Workbench</title><meta http-equiv="refresh" content="0;url={html.escape(entered.location)}">'
+    return reply(200, "text/html; charset=utf-8", onward.encode(), cookie)
+
+
+async def admitted_reply(
+    routes: Mapping[str, tuple[Handler, Mapping[str, str]]],
+    viser_hook: viser_private.Hook,
+    connection: ServerConnection,
+    request: Request,
+    authority: str,
+    told: RareLog,
+) -> Response:
+    page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
+    # Decoded once, as viser does: what is still encoded is part of a file's name.
+    path = unquote(request.path.partition("?")[0]).replace("\\", "/")
+    if not _is_path_of_files(path):
+        return _no_such_file(page)
+    prefix = max((prefix for prefix in routes if path.startswith(prefix)), key=len, default=None)
+    if prefix is None:
+        response = viser_hook(connection, request)
+        if response is None:  # viser took for a handshake what was not checked as one
+            return reply(400, "text/plain; charset=utf-8", b"Bad request.", page)
+        if response.headers.get("Content-Type", "").startswith("text/html"):
+            zipped = response.headers.get("Content-Encoding") == "gzip"
+            # In a thread: packing viser's page takes a while, the first time.
+            response.body = await asyncio.to_thread(with_our_head, bytes(response.body), zipped)
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
+        for name, value in {**EVERY_REPLY, **page}.items():
+            response.headers[name] = value
+        return response
+    handler, headers = routes[prefix]
+    accepts_gzip = any("gzip" in value for value in request.headers.get_all("Accept-Encoding"))
+
+    def work() -> Response | FileReply:
+        try:
+            made = handler(path[len(prefix) :])
+        except Exception as error:
+            told.happened(("route", prefix), f"The route {prefix} failed on {short_line(path, 200)}.", error)
+            made = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
+        if isinstance(made, FileReply):
+            return made
+        status, kind, body = made
+        zip_it = accepts_gzip and len(body) > 1024 and _compresses(kind)
+        return reply(status, kind, gzip.compress(body, 6) if zip_it else body, {**page, **headers}, zip_it)
+
+    # In a thread: reading and compressing would block every page's websocket.
+    made = await asyncio.to_thread(work)
+    if isinstance(made, Response):
+        return made
+    fields = {**EVERY_REPLY, **page, **headers}
+    return await send_file(connection, made, fields, accepts_gzip, lambda: _no_such_file(page))
+
+
+def _is_path_of_files(path: str) -> bool:
+    """Whether a file could have this path: the system raises on a name that is too long or holds a NUL."""
+    parts = path.encode("utf-8", "surrogatepass").split(b"/")
+    return (
+        b".." not in parts
+        and "\0" not in path
+        and all(len(part) <= LONGEST_NAME for part in parts)
+        and sum(map(len, parts)) <= LONGEST_PATH
+    )
+
+
+def _no_such_file(headers: Mapping[str, str]) -> Response:
+    return reply(404, "text/plain; charset=utf-8", b"There is no such file.", headers)
+
+
+@functools.lru_cache(maxsize=4)
+def with_our_head(page: bytes, zipped: bool) -> bytes:
+    """viser's page with `STYLES` and `SCRIPTS` in its head; viser itself offers no way to add one.
+
+    Raises:
+        ValueError: it has no head, so this is another version of viser.
+    """
+    plain = gzip.decompress(page) if zipped else page
+    before, head_end, after = plain.partition(b"</head>")
+    if not head_end:
+        raise ValueError("viser's page has no </head>, which every tested version has.")
+    tags = f'<link rel="stylesheet" href="/workbench/{STYLES}">'
+    tags += "".join(f'<script src="/workbench/{name}"></script>' for name in SCRIPTS)
+    plain = before + tags.encode() + head_end + after
+    return gzip.compress(plain, 6) if zipped else plain
+
+
+def _compresses(kind: str) -> bool:
+    plain = kind.partition(";")[0]
+    return plain.startswith("text/") or plain in (
+        "application/json",
+        "application/javascript",
+        "application/wasm",
+        "image/svg+xml",
+    )
+
+
+def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
+    """A handler that serves the files below ``folder``, but no target of a link that lies outside."""
+    root = folder.resolve()
+
+    def handle(path: str) -> tuple[int, str, bytes]:
+        try:
+            file = (root / path.lstrip("/")).resolve()
+        except RuntimeError:  # a link that leads to itself
+            file = root
+        if not file.is_relative_to(root) or not file.is_file():
+            return 404, "text/plain; charset=utf-8", b"There is no such file."
+        return 200, content_type(file.name), file.read_bytes()
+
+    return handle
+
+
+def content_type(name: str) -> str:
+    """Content type by suffix. The system's table may call JavaScript plain text, which browsers refuse to run."""
+    known = {
+        ".css": "text/css; charset=utf-8",
+        ".html": "text/html; charset=utf-8",
+        ".js": "text/javascript; charset=utf-8",
+        ".json": "application/json",
+        ".svg": "image/svg+xml",
+        ".wasm": "application/wasm",
+        ".webp": "image/webp",
+    }
+    return known.get(Path(name).suffix.lower()) or mimetypes.guess_type(name)[0] or "application/octet-stream"
+
+
+# --- The headers that tell a browser what a served page may do --------------------------------
+
+
+def _scripts() -> str:
+    """Source list of the scripts that may run in the page. All scripts may run in the page of an unknown viser
+    (`unknown_page_text`)."""
+    known = viser_private.page_scripts()
+    if known is None:
+        return "'unsafe-inline'"
+    return " ".join(f"'sha256-{one}'" for one in known)
+
+
+# Everything is forbidden that is not listed, and each exception is needed: `tests/ui/server/test_page_policy.py` removes
+# them one by one and finds the page broken.
+# - script-src: our own files and viser's program, by the hashes of its two scripts (`_scripts`). Not unsafe-inline: HTML from a name,
+#   a note or a file that slipped past escaping still would not run. wasm-unsafe-eval is for
+#   the program that unpacks the server's messages. eval stays forbidden: viser needs it for Gaussian splats and Plotly, which the workbench has not (web_assets/browser.js).
+# - worker-src blob: viser's connection and its sorting run in workers made from texts.
+# - style-src 'unsafe-inline': viser's widgets and our HTML have styles in their tags; a style runs no code.
+# - img-src data: blob: pictures from the websocket, and viser's icons.
+# - connect-src: this server only. viser's page obeys another one in its address (?websocket=, ?playbackPath=). data: and
+#   blob: are textures and programs of the page. The websocket is named for browsers where 'self' excludes ws:.
+# - frame-src 'self': rerun's viewer.
+DIRECTIVES: dict[str, str] = {
+    "default-src": "'none'",
+    "script-src": f"'self' 'wasm-unsafe-eval' {_scripts()}",
+    "worker-src": "blob:",
+    "style-src": "'self' 'unsafe-inline'",
+    "img-src": "'self' data: blob:",
+    "connect-src": "'self' data: blob: ws://{authority} wss://{authority}",
+    "frame-src": "'self'",
+    "base-uri": "'none'",
+    "form-action": "'none'",
+    "frame-ancestors": "'self'",
+}
+
+
+def page_policy(authority: str) -> str:
+    """Content-Security-Policy of viser's page on ``authority`` (``host:port``, known to be ours)."""
+    parts = (f"{name} {sources}" for name, sources in DIRECTIVES.items())
+    return "; ".join(parts).replace("{authority}", authority)
+
+
+EVERY_REPLY = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "SAMEORIGIN",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Permissions-Policy": ", ".join(
+        f"{feature}=()"
+        for feature in (
+            *("accelerometer", "autoplay", "browsing-topics", "camera", "display-capture", "encrypted-media"),
+            *("gamepad", "geolocation", "gyroscope", "hid", "identity-credentials-get", "idle-detection"),
+            *("local-fonts", "magnetometer", "microphone", "midi", "payment", "picture-in-picture"),
+            *(
+                "publickey-credentials-get",
+                "screen-wake-lock",
+                "serial",
+                "storage-access",
+                "usb",
+                "xr-spatial-tracking",
+            ),
+        )
+    )
+    + ", clipboard-write=(self), fullscreen=(self)",
+    "Connection": "close",
+}
+"""Headers of every reply, refusals included: no guessing of types, no referrer, no framing, opening or embedding
+by other sites, no devices."""
+PAGE_OF_OURS = {
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'self'",
+    "Cache-Control": "no-store",
+}
+"""Headers of a refusal and of the reply that sets the cookie."""

@@ -1,0 +1,281 @@
+"""The page's viewpoint: framing the grid or one env, and lights."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable, Set
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser.transforms import SO3
+
+from workbench.envs.camera_data import Picture
+from workbench.page.door.viser_private import remove_nodes_but
+from workbench.page.scene.bodies import NAMES as BODIES
+from workbench.page.scene.bodies import SceneView
+from workbench.page.scene.env_grid import EnvLayout, box_corners
+from workbench.page.scene.software_rendering import InSoftware
+from workbench.page.widgets.parts import Clock
+
+FOV = 0.75
+"""Vertical field of view in radians. viser's own 75 degrees distorts the edges of a grid."""
+USUAL_ASPECT = 1.25
+"""Aspect (width over height) of the view in a 1280 x 720 window, used until a page has sent its own."""
+USUAL_HEIGHT = 720.0
+"""Height of the view in pixels, used until a page has sent its own."""
+MOST_COVERED = 0.45
+FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
+"""ManiSkill's robots face +x, so they are seen from there; a little from the side."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera in the page: metres, z up, always upright."""
+
+    position: NDArray[np.float64]
+    look_at: NDArray[np.float64]
+
+
+def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT, covered: float = 0.0) -> Viewpoint:
+    """The nearest upright view from the front and above with the whole box in its uncovered part.
+
+    Let the camera stand at ``target - d * forward - k * up``. A corner c, as seen from the target, is inside the
+    picture when ``|right . c| <= tan(fov_x / 2) * (d + forward . c)``, and when ``up . c + k`` lies between
+    ``-(1 - 2 * covered)`` and 1 times ``tan(fov_y / 2) * (d + forward . c)``. So d is the largest of the bounds that
+    the corners and the pairs of corners give, and k the middle of what is left to it.
+
+    Args:
+        covered: Part of the picture's height, from below, that the timeline covers.
+    """
+    target = (np.asarray(low, np.float64) + high) / 2
+    forward = -FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    corners = box_corners(low, high) - target
+    tall = np.tan(FOV / 2)
+    wide = tall * float(np.clip(aspect, 0.3, 4.0))
+    below = tall * (1 - 2 * float(np.clip(covered, 0.0, MOST_COVERED)))
+    ahead, height = corners @ forward, corners @ up
+    pairs = height[:, None] - height - tall * ahead[:, None] - below * ahead
+    distance = 1.04 * max(
+        float((np.abs(corners @ right) / wide - ahead).max()),
+        float(pairs.max()) / (tall + below),
+        0.3,
+    )
+    least = float((-below * (distance + ahead) - height).max())
+    most = float((tall * (distance + ahead) - height).min())
+    look_at = target - up * (least + most) / 2
+    return Viewpoint(position=look_at - forward * distance, look_at=look_at)
+
+
+def frame_all(layout: EnvLayout, aspect: float = USUAL_ASPECT, covered: float = 0.0) -> Viewpoint:
+    return frame_box(*layout.box_of_all(), aspect, covered)
+
+
+def frame_one(
+    layout: EnvLayout,
+    picture: Picture | None,
+    aspect: float = USUAL_ASPECT,
+    covered: float = 0.0,
+    fovy: float = FOV,
+    acting: tuple[NDArray, NDArray] | None = None,
+) -> Viewpoint:
+    """The view of one env at the origin, in the uncovered part of the picture.
+
+    With a human camera: from its direction, at a distance at which its picture fits the uncovered part, centred there.
+
+    Args:
+        picture: Of the human camera; only its pose is used.
+        covered: As of `frame_box`.
+        fovy: The human camera's vertical field of view, radians.
+        acting: Box to frame where there is no human camera; None takes the whole env.
+    """
+    if picture is None:
+        low, high = (layout.low, layout.high) if acting is None else acting
+        return frame_box(low, high, aspect, covered)
+    covered = float(np.clip(covered, 0.0, MOST_COVERED))
+    position = picture.pose[:3].astype(np.float64)
+    forward = SO3(picture.pose[3:].astype(np.float64)).apply(np.array([1.0, 0.0, 0.0]))
+    centre = (layout.low + layout.high) / 2
+    # The page orbits around its look-at point, so that has to be at the depth of the env.
+    depth = max(float((centre - position) @ forward), 0.2)
+    tall = float(np.tan(FOV / 2))
+    left = min(1 - covered, float(np.clip(aspect, 0.3, 4.0)))
+    away = depth * float(np.tan(fovy / 2)) / (tall * left)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(right))
+    up = np.cross(right / length, forward) if length > 1e-6 else np.zeros(3)
+    look_at = position + forward * depth - up * covered * tall * away
+    return Viewpoint(position=look_at - forward * away, look_at=look_at)
+
+
+Frame = Callable[[float, float], Viewpoint]
+"""Gives the viewpoint for a view of this aspect (width over height) and height in pixels."""
+
+
+MOST_LEFT = 8
+"""Maximum number of scenes whose viewpoints are remembered."""
+
+
+class Framing:
+    """Points the open pages at the scene until a person has moved the view.
+
+    A page's panels take their places some moments after it has come (later on a busy machine), and a person opens
+    more: as long as the view is untouched it is framed for its present shape.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._pointed: dict[int, tuple[np.ndarray, float]] = {}
+        self._framed: Hashable = None
+        self._left: dict[Hashable, dict[int, tuple[NDArray, NDArray]]] = {}
+        """Position and look-at of pages on which a person had moved the view, by framed object and client id."""
+        self._came_back: frozenset[int] = frozenset()
+        """Pages that returned to the viewpoint that they had when the framed object was left."""
+
+    def is_new(self, what: Hashable) -> bool:
+        """Whether this differs from the last call's: then it has to be framed. Where a person had moved the view of it
+        before, the page looks from there again, and `frame` leaves it so."""
+        if what == self._framed:
+            return False
+        clients = self._server.get_clients()
+        if self._framed is not None:
+            self._left[self._framed] = {
+                number: (np.array(client.camera.position), np.array(client.camera.look_at))
+                for number, client in clients.items()
+                if not self._is_untouched(client)
+            }
+            while len(self._left) > MOST_LEFT:
+                del self._left[next(iter(self._left))]
+        self._framed = what
+        back = {} if what is None else self._left.pop(what, {})
+        self._came_back = frozenset(back.keys() & clients.keys())
+        for number in self._came_back:
+            clients[number].camera.position, clients[number].camera.look_at = back[number]
+        return True
+
+    def frame_new(self, frame: Frame) -> None:
+        """Point every open page, and those to come, at the new scene, except pages that returned to their earlier
+        viewpoint."""
+        self.frame(frame, but=self._came_back)
+
+    def follow(self) -> int:
+        """Forget closed pages; returns the number of open ones."""
+        clients = self._server.get_clients()
+        for number in self._pointed.keys() - clients.keys():
+            del self._pointed[number]
+        return len(clients)
+
+    @property
+    def pointed(self) -> frozenset[int]:
+        """The open pages that were pointed at the scene."""
+        return frozenset(self._pointed)
+
+    def frame(self, frame: Frame, untouched_only: bool = False, but: Set[int] = frozenset()) -> None:
+        """Point every open page (or only untouched ones), and those to come."""
+        usual = frame(USUAL_ASPECT, USUAL_HEIGHT)
+        self._server.initial_camera.position = usual.position
+        self._server.initial_camera.look_at = usual.look_at
+        for number, client in self._server.get_clients().items():
+            if number not in but and (not untouched_only or self._is_untouched(client)):
+                self._point(client, frame)
+
+    def frame_untouched(self, frame: Frame) -> None:
+        """Frame each untouched page again whose viewpoint or shape is not the framed one."""
+        for number, client in self._server.get_clients().items():
+            position, aspect = self._pointed.get(number, (self._server.initial_camera.position, USUAL_ASPECT))
+            as_framed = _is_at(client, position) and abs(aspect_of(client) / aspect - 1) <= 0.05
+            # Not as framed: it lost its connection and came back, or the person was quicker.
+            if not as_framed and self._is_untouched(client):
+                self._point(client, frame)
+
+    def _is_untouched(self, client: viser.ClientHandle) -> bool:
+        """True while the page looks from where it was last pointed, or from where every page begins.
+
+        The latter, since the initial viewpoint may reach a new page after the one that it was pointed at.
+        """
+        position, _ = self._pointed.get(client.client_id, (None, None))
+        begins = self._server.initial_camera.position
+        return _is_at(client, begins) or (position is not None and _is_at(client, position))
+
+    def _point(self, client: viser.ClientHandle, frame: Frame) -> None:
+        viewpoint = frame(aspect_of(client), client.camera.image_height or USUAL_HEIGHT)
+        client.camera.position = viewpoint.position
+        client.camera.look_at = viewpoint.look_at
+        # Last: a caller that waits for it may close the page, and viser warns of writes to a closed page.
+        self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
+
+
+def _is_at(client: viser.ClientHandle, position: NDArray[np.float64]) -> bool:
+    return np.allclose(client.camera.position, position, atol=0.02)
+
+
+def aspect_of(client: viser.ClientHandle) -> float:
+    """Width over height of the view in this page."""
+    camera = client.camera
+    if not camera.image_height or not camera.image_width:
+        return USUAL_ASPECT
+    return camera.image_width / camera.image_height
+
+
+def light(server: viser.ViserServer) -> None:
+    """Add the lights to the scene; once a server.
+
+    viser's own lights burn out white plastic and textures; an environment map or shadows would make a browser without
+    a graphics card pay for each pixel.
+    """
+    server.scene.configure_default_lights(enabled=False, cast_shadow=False)
+    server.scene.configure_environment_map(None)
+    server.scene.add_light_hemisphere(
+        "/lights/sky", sky_color=(255, 255, 255), ground_color=(125, 125, 135), intensity=1.5
+    )
+    server.scene.add_light_directional(
+        "/lights/lamp", color=(255, 251, 244), intensity=1.5, position=(3.0, -2.0, 5.0), cast_shadow=False
+    )
+
+
+class Stage:
+    """Bodies, lights and viewpoint on this server, shared by the pages.
+
+    The bodies stay in the browser while one page replaces the other, so that equal ones are not sent again, and the view
+    is empty only until a task has loaded. Labels, frustums, marks and handles go with their page.
+    """
+
+    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
+        self._server = server
+        server.scene.set_up_direction("+z")
+        light(server)
+        server.initial_camera.fov = FOV
+        # Depth has 24 bits: with viser's near plane of a centimetre a goal painted a millimetre above a table flickers
+        # from a few metres on.
+        server.initial_camera.near = 0.05
+        server.initial_camera.far = 300.0
+        self.scene = SceneView(server, clock)
+        self.framing = Framing(server)
+        self.in_software = InSoftware(server)
+        self.choice = ViewChoice()
+
+    def clear(self) -> None:
+        """Remove everything of a page but the bodies and lights."""
+        # Callbacks first: a click that comes now has no page to answer it.
+        self._server.scene.remove_click_callback("all")
+        remove_nodes_but(self._server, (*BODIES, "/lights"))
+        for client in self._server.get_clients().values():
+            remove_nodes_but(client, ())
+
+
+DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
+"""Number of triangles in the view, by level of detail. A browser without a graphics card needs the fewest."""
+ALL, ONE = "all envs", "the selected env"
+
+
+@dataclass
+class ViewChoice:
+    """Choices in the View panel. They outlive a page, which is built again with each change between review and
+    live page."""
+
+    show: str = ALL
+    detail: str = "normal"

@@ -1,0 +1,35 @@
+"""Keeps which tab of the main panel each page has open, and opens another."""
+
+from __future__ import annotations
+
+import viser
+
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.visitors import Visitor, Visitors
+
+
+class OpenTabs:
+    """Open tab of each page. Only the browser knows it and reports it when asked (``panels.js``)."""
+
+    def __init__(self, visitors: Visitors) -> None:
+        self._visitors = visitors
+        self._open: dict[str, str] = {}
+        """Name of the open tab, by page."""
+        self._opening: dict[str, viser.GuiHtmlHandle] = {}
+        """Element that opened a tab last, by page."""
+
+    def pages_at(self, name: str) -> frozenset[int]:
+        """The pages that have this tab open, by client id."""
+        here = self._visitors.all()
+        return frozenset(one.client.client_id for one in here if self._open.get(one.name) == name)
+
+    def open(self, visitor: Visitor, name: str, fold: str = "") -> None:
+        """Open a tab on a page, and a fold in it."""
+        before = self._opening.pop(visitor.name, None)
+        if before is not None:
+            before.remove()
+        self._opening[visitor.name] = visitor.client.gui.add_html(render("open_tab", tab=name, fold=fold))
+
+    def said(self, visitor: Visitor, name: str) -> None:
+        """Store the open tab that a page reports."""
+        self._open[visitor.name] = name

@@ -1,0 +1,112 @@
+"""Parts of a page, each drawn again when what it shows has changed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from typing import ClassVar, Generic, TypeVar
+
+from workbench.page.command import Command, Refused
+from workbench.page.widgets.visitors import Done, Visitor
+
+Clock = Callable[[], float]
+"""Seconds: `time.monotonic`, or a test's own clock. All parts of a page share one."""
+View = TypeVar("View", contravariant=True)
+
+
+class PagePart(Generic[View]):
+    """One part of a page, drawn from an immutable view.
+
+    It is drawn again when its `key` changes, at most once per `every` seconds, and at once when `urgent` changes.
+    By default every view is drawn: viser sends no value that is equal (``tests/ui/test_assigning.py``), so a part
+    needs a key only where what it shows is expensive to make.
+    """
+
+    every: ClassVar[float] = 0.0
+    """Minimum seconds between two drawings."""
+    does: tuple[type[Command], ...] = ()
+    """Commands that this part carries out."""
+    of_the_moment: ClassVar[bool] = False
+    """It shows numbers of the shown moment. Such parts are drawn together, from one view: while a task plays, a page whose
+    parts are drawn at rates of their own shows several moments at once."""
+
+    def key(self, view: View) -> object:
+        """Key of what it shows of the view; equal keys mean equal drawings."""
+        return object()
+
+    def urgent(self, view: View) -> object:
+        """Value that a person waits for; a change is drawn at once."""
+        return None
+
+    def draw(self, view: View) -> None:
+        raise NotImplementedError
+
+    def do(self, command: Command, visitor: Visitor) -> Done:
+        """Carry out a command in `does`. Runs on the loop (`machine.loop`), and must not block. Raises `Refused`."""
+        raise NotImplementedError
+
+
+class DrawDue:
+    """When to draw one thing.
+
+    Args:
+        every: Seconds between two drawings at least.
+        clock: Of the page.
+    """
+
+    def __init__(self, every: float, clock: Clock = time.monotonic) -> None:
+        self._every, self._clock = every, clock
+        self._drawn: tuple[object, object, float] | None = None
+        """Key, urgent value and time of the last drawing."""
+
+    def drawn(self, key: object, urgent: object = None) -> None:
+        """Remember this as drawn."""
+        self._drawn = key, urgent, self._clock()
+
+    def is_due(self, key: object, urgent: object = None) -> bool:
+        """Whether to draw now; if so, remembers this as drawn."""
+        if self._drawn is not None:
+            drawn, was_urgent, at = self._drawn
+            if urgent == was_urgent and (key == drawn or self._clock() - at < self._every):
+                return False
+        self.drawn(key, urgent)
+        return True
+
+
+class Parts(Generic[View]):
+    """The parts of a page, in the order in which they are drawn."""
+
+    def __init__(self, parts: Iterable[PagePart[View]], clock: Clock = time.monotonic) -> None:
+        self._clock = clock
+        self._parts: list[tuple[PagePart[View], DrawDue]] = []
+        self._owners: dict[type[Command], PagePart[View]] = {}
+        for part in parts:
+            self.add(part)
+
+    def add(self, part: PagePart[View]) -> None:
+        """Draw this one too, after the others."""
+        self._parts.append((part, DrawDue(part.every, self._clock)))
+        for kind in part.does:
+            assert kind not in self._owners, f"two parts do {kind.__name__}"
+            self._owners[kind] = part
+
+    @property
+    def does(self) -> frozenset[type[Command]]:
+        """Commands that these parts carry out."""
+        return frozenset(self._owners)
+
+    def do(self, command: Command, visitor: Visitor) -> Done:
+        """Let the part carry out the command that has it in `does`. Raises `Refused`, also for a command that no
+        part has."""
+        owner = self._owners.get(type(command))
+        if owner is None:
+            raise Refused(f"Not on this page: {command.help()}.")
+        return owner.do(command, visitor)
+
+    def draw(self, view: View) -> None:
+        due = [is_due.is_due(part.key(view), part.urgent(view)) for part, is_due in self._parts]
+        together = any(now and part.of_the_moment for now, (part, _) in zip(due, self._parts, strict=True))
+        for now, (part, is_due) in zip(due, self._parts, strict=True):
+            if now or (together and part.of_the_moment):
+                is_due.drawn(part.key(view), part.urgent(view))
+                part.draw(view)

@@ -1,0 +1,111 @@
+"""HTML of the panels, rendered from the templates in ``web_assets/panels`` with every value escaped."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
+
+import jinja2
+
+from workbench.machine.folders import web_assets_folder
+from workbench.machine.text import plain_text, rate_text
+from workbench.page.command import Command
+
+
+def render(template: str, **values: Any) -> str:
+    """``web_assets/panels/<template>.html`` with these values, all of them escaped.
+
+    viser puts the text of ``add_html`` into the page as it is: an exception message with a ``<script>`` would run
+    there. So all HTML is made here; no other module writes a tag. Invisible characters are shown: one that turns the
+    direction of writing makes a name look like another, and half of a surrogate pair, as in a file name that is not
+    UTF-8, cannot be sent to a page at all.
+    """
+    return _environment().get_template(f"{template}.html").render(**values)
+
+
+class _HasFileLine(Protocol):
+    @property
+    def file(self) -> str | None: ...
+    @property
+    def line(self) -> int | None: ...
+
+
+def place(thing: _HasFileLine | None) -> str:
+    """``push.py:88`` of a problem, a finding or a busy worker; empty where no file is known."""
+    if thing is None or not thing.file:
+        return ""
+    return Path(thing.file).name + (f":{thing.line}" if thing.line else "")
+
+
+def size(count: float) -> str:
+    """Bytes to three digits: ``640 B``, ``2.5 MB``, ``1.2 GB`` (1 kB is 1000 B)."""
+    for unit in ("B", "kB", "MB"):
+        if count < 999.5:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} GB"
+
+
+def percent(done: float, total: float) -> int:
+    """The done part of a total; 0 while the total is not known."""
+    return round(100 * done / total) if total else 0
+
+
+COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
+
+
+def letter(index: int) -> str:
+    """Label of a recording on the page: A to Z, then AA, AB."""
+    return ("" if index < 26 else letter(index // 26 - 1)) + chr(ord("A") + index % 26)
+
+
+def colour(index: int) -> str:
+    """Colour of a compared recording, in legends, curves and the view."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def short_text(text: str, longest: int = 120) -> str:
+    return text if len(text) <= longest else text[: longest - 1] + "…"
+
+
+def sentence(why: str) -> str:
+    """The text with a capital and a full stop."""
+    end = "" if why.endswith((".", "?", "!", "…")) else "."
+    return f"{why[:1].upper()}{why[1:]}{end}" if why else ""
+
+
+def counted(count: int, what: str) -> str:
+    """``1 step``, ``7 steps``."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
+def asks(command: Command) -> str:
+    """The value of ``data-do``: a press asks for this command (``web_assets/input.js``)."""
+    return json.dumps(command.encode())
+
+
+def _shown(value: Any) -> Any:
+    # Not Markup: that is a template's own text, whose values were escaped already.
+    return plain_text(value, "\n\t") if type(value) is str else value
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(web_assets_folder() / "panels"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=_shown,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        auto_reload=False,  # else every panel looks at its file on every drawing
+    )
+    filters = (place, size, percent, counted, rate_text, short_text, letter, colour, asks)
+    environment.filters.update({filter.__name__: filter for filter in filters})
+    macros = environment.get_template("can_be_pressed.html").module
+    environment.globals.update(
+        {name: getattr(macros, name) for name in ("press", "to_copy", "at_line", "badge", "with_code")}
+    )
+    return environment

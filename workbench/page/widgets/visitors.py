@@ -1,0 +1,153 @@
+"""The open pages, and their numbered commands on a WebSocket of ours: in order, one reply each."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+import viser
+from websockets.asyncio.server import ServerConnection
+
+from workbench.commands import COMMANDS
+from workbench.machine.loop import submit
+from workbench.page.command import Command, Refused
+from workbench.page.door.connection_limits import RareLog
+from workbench.page.widgets.templates import render
+
+log = logging.getLogger(__name__)
+
+PATH = "/do"
+TOLD_SECONDS = 8.0
+"""Seconds for which a refusal is shown."""
+
+
+class Message(msgspec.Struct, forbid_unknown_fields=True):
+    """``{"n": 3, "do": ["select_env", {"env": 3}]}``"""
+
+    n: int
+    do: tuple[str, dict[str, Any]]
+
+
+class Reply(msgspec.Struct, omit_defaults=True):
+    n: int
+    refused: str = ""
+
+
+_decoder = msgspec.json.Decoder(Message)
+
+
+@dataclass(eq=False)
+class Visitor:
+    """One open page: a browser's tab."""
+
+    name: str
+    """Random name, sent to the page only."""
+    client: viser.ClientHandle
+    page_width: int = 0
+    """Width of the page in CSS pixels when it connected last; 0 before."""
+
+    def tell(self, text: str, title: str = "Not possible") -> None:
+        self.client.add_notification(title, text, color="orange", auto_close_seconds=TOLD_SECONDS)
+
+
+Done = Coroutine[Any, Any, None] | None
+"""The rest of a command that waits for something; None if it is carried out."""
+Do = Callable[[Command, Visitor], Done]
+"""Carries out a command of a page, on the loop (`machine.loop`). Raises `Refused` with a sentence for the person."""
+
+
+class Visitors:
+    """The open pages of a server, and the one way by which they ask for anything: `do`.
+
+    Args:
+        do: Changes with the page that is shown.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.do: Do = _nothing
+        self._told = RareLog()
+        self._by_name: dict[str, Visitor] = {}
+        self._by_client: dict[int, Visitor] = {}
+        server.on_client_connect(self._came)
+        server.on_client_disconnect(self._left)
+
+    async def _came(self, client: viser.ClientHandle) -> None:
+        # viser counts its clients from 0 at each start, and again when one reconnects.
+        visitor = Visitor(secrets.token_urlsafe(12), client)
+        self._by_name[visitor.name] = self._by_client[client.client_id] = visitor
+        client.gui.add_html(render("page_name", name=visitor.name))
+
+    async def _left(self, client: viser.ClientHandle) -> None:
+        visitor = self._by_client.pop(client.client_id)
+        del self._by_name[visitor.name]
+
+    def all(self) -> list[Visitor]:
+        """The open pages."""
+        return list(self._by_name.values())
+
+    def on(self, command: Command) -> Callable[[viser.CommandEvent], Coroutine[Any, Any, None]]:
+        """A callback for an entry of viser's palette."""
+
+        async def asked(event: viser.CommandEvent) -> None:
+            visitor = event.client and self._by_client.get(event.client.client_id)
+            if visitor:
+                await self.ask(command, visitor)
+
+        return asked
+
+    async def ask(self, command: Command, visitor: Visitor) -> str:
+        """Do it after what any page asked for before. Returns why it was refused, or an empty text; the page is told."""
+        try:
+            await asyncio.wrap_future(submit(self._carry_out(command, visitor)))
+        except Refused as reason:
+            visitor.tell(str(reason))
+            return str(reason)
+        except Exception:
+            log.exception("Failed: %r", command)
+            visitor.tell("It failed; the reason is in the terminal.", "Failed")
+            return "it failed"
+        return ""
+
+    async def _carry_out(self, command: Command, visitor: Visitor) -> None:
+        rest = self.do(command, visitor)
+        if rest is not None:
+            await rest
+
+    async def serve(self, connection: ServerConnection) -> None:
+        """Answer one page's commands until it leaves."""
+        assert connection.request is not None
+        query = parse_qs(urlsplit(connection.request.path).query)
+        visitor = self._by_name.get(query.get("page", [""])[0])
+        if visitor is None:
+            await connection.close(1008, "no such page")
+            return
+        width = query.get("width", [""])[0]
+        visitor.page_width = int(width) if width.isdecimal() and len(width) < 6 else 0
+        async for raw in connection:
+            try:
+                message = _decoder.decode(raw)
+                refused = ""
+                try:
+                    command = COMMANDS.decode(*message.do)
+                except Refused as reason:
+                    refused = str(reason)
+                    visitor.tell(refused)
+                else:
+                    refused = await self.ask(command, visitor)
+            except (msgspec.DecodeError, UnicodeDecodeError, KeyError) as fault:
+                self._told.happened(
+                    "malformed", f"Closed a page's connection: it sent no command of ours ({fault!r})."
+                )
+                await connection.close(1008, "malformed message or unknown command")
+                return
+            await connection.send(msgspec.json.encode(Reply(message.n, refused)).decode())
+
+
+def _nothing(command: Command, visitor: Visitor) -> None:
+    raise Refused("Nothing is shown yet.")

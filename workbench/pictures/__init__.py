@@ -1,0 +1,1 @@
+"""Cameras of a running env: placed, rendered, measured and searched for."""

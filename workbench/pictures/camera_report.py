@@ -1,0 +1,326 @@
+"""Camera reports: what a camera sees of each object, as arrays over envs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraKey, CameraKind, CameraSettings, Picture
+from workbench.pictures.camera_conventions import intrinsic_of
+
+DEPTH_EDGES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
+"""Metres, (41,). Ten bins a decade, the same for every camera, so that histograms can be compared; values outside count
+in the first or last bin."""
+ENOUGH_PIXELS = 100.0
+"""An object of fewer pixels counts as small: a cube of ten by ten still shows its rotation."""
+
+
+@dataclass(frozen=True)
+class ObjectToSee:
+    """One object that a search can name: of the task, or a robot, whose single links can be named too."""
+
+    name: str
+    """An actor's or an articulation's."""
+    hidden: bool
+    """The task hides it from the sensors (a goal marker): only human cameras see it."""
+    links: tuple[str, ...] = ()
+    """Names of an articulation's bodies, if it has several. Of a robot those that are drawn, its hand first."""
+    robot: bool = False
+
+
+@dataclass(frozen=True)
+class ObjectSummary:
+    """One object over all envs that have it; shares are 0..1, NaN where undefined."""
+
+    present: int
+    """Envs that have the object."""
+    seen: float
+    """Share of them in which at least one of its pixels is in the picture."""
+    median_pixels: float
+    cut: float
+    """Share of them in which the border of the picture cuts it."""
+    hidden: float
+    """Share of it that the robot covers, averaged over the envs where it would be seen without the robot."""
+    wholly_hidden: float
+    """Share of the envs that have it in which only the robot hides it."""
+    covered: float
+    """Share of it that other things than the robot cover, averaged over the envs where it is in the picture."""
+
+
+@dataclass(frozen=True)
+class ObjectSeen:
+    """One object of the task in the pictures of E envs."""
+
+    name: str
+    """An actor's or an articulation's."""
+    never_drawn: bool
+    """The task hides it from this kind of camera (a goal marker from the sensors)."""
+    scenery: bool
+    """Part of the room (a table, a static body), which a policy need not find."""
+    present: NDArray[np.bool_]
+    """(E,) whether the env has it at all."""
+    pixels: NDArray[np.float32]
+    """(E,) visible pixels, at the camera's own size, even if smaller pictures were measured."""
+    unhindered: NDArray[np.float32]
+    """(E,) pixels without the robot."""
+    alone: NDArray[np.float32]
+    """(E,) pixels with nothing else drawn; `unhindered` for scenery, which is not measured alone."""
+    cut: NDArray[np.bool_]
+    """(E,) whether it reaches the border of the picture, drawn alone."""
+    margin: NDArray[np.float32]
+    """(E,) from it to the nearest border, as a share of the picture's shorter side; 0 where it is cut or not seen."""
+
+    @property
+    def hidden_share(self) -> NDArray[np.float32]:
+        """(E,) share that the robot covers; NaN where it would not be seen without the robot either."""
+        return _share_lost(self.pixels, self.unhindered)
+
+    @property
+    def covered_share(self) -> NDArray[np.float32]:
+        """(E,) share that other things than the robot cover; NaN where it is out of the picture."""
+        return _share_lost(self.unhindered, self.alone)
+
+    def marks(self) -> NDArray[np.float32]:
+        """(E,) mark from 0 (not seen) to 1 (whole, uncovered and large enough); NaN where it is absent.
+
+        Product of the share that nothing covers, one half if the border cuts it, and for small objects the square root of
+        their pixels (a length: twice as far away is half as good).
+        """
+        size = np.sqrt(np.clip(self.alone / ENOUGH_PIXELS, 0, 1))
+        open_share = np.clip(self.pixels / np.maximum(self.alone, 1e-6), 0, 1)
+        marks = np.where(self.pixels > 0, size * open_share * np.where(self.cut, 0.5, 1.0), 0.0)
+        return np.where(self.present, marks, np.nan).astype(np.float32)
+
+    def summary(self) -> ObjectSummary:
+        here = self.present
+        count = int(here.sum())
+        if not count:
+            return ObjectSummary(0, *[float("nan")] * 6)
+        could, inside = here & (self.unhindered > 0), here & (self.alone > 0)
+        return ObjectSummary(
+            present=count,
+            seen=float((self.pixels[here] > 0).mean()),
+            median_pixels=float(np.median(self.pixels[here])),
+            cut=float(self.cut[here].mean()),
+            hidden=float(self.hidden_share[could].mean()) if could.any() else float("nan"),
+            wholly_hidden=float((could & (self.pixels == 0)).sum() / count),
+            covered=float(self.covered_share[inside].mean()) if inside.any() else float("nan"),
+        )
+
+
+@dataclass(frozen=True)
+class DepthReport:
+    """Depth of all that the camera sees, the robot included."""
+
+    counts: NDArray[np.int64]
+    """(E, 40) pixels of the measured pictures between `DEPTH_EDGES`, without background."""
+    background: NDArray[np.float32]
+    """(E,) share of the picture where a ray meets nothing (depth 0)."""
+    beyond: NDArray[np.float32]
+    """(E,) share farther away than robot and objects: far floor and walls."""
+    nearest: NDArray[np.float32]
+    """(E,) metres; NaN where the picture is all background."""
+    farthest_object: NDArray[np.float32]
+    """(E,) metres, of robot and objects without scenery; NaN where none is seen."""
+
+    @property
+    def suggested_near(self) -> float | None:
+        """Metres: half of the nearest depth seen, rounded down. None if nothing was seen."""
+        nearest = _least(self.nearest)
+        return None if nearest is None else _rounded(nearest / 2, up=False)
+
+    @property
+    def suggested_far(self) -> float | None:
+        """Metres: 1.5 times the farthest object seen, rounded up; what is behind becomes background."""
+        farthest = _least(-self.farthest_object)
+        return None if farthest is None else _rounded(-farthest * 1.5, up=True)
+
+
+@dataclass(frozen=True)
+class CameraReport:
+    """What one camera, or a placement that does not exist yet, sees in E envs."""
+
+    camera: CameraKey
+    size: tuple[int, int]
+    """Width and height of the camera's own picture."""
+    measured_size: tuple[int, int]
+    """Width and height of the measured pictures. In smaller ones, anything below a pixel is not seen."""
+    envs: tuple[int, ...]
+    """(E,) an env may come several times: at several moments, or with several seeds."""
+    objects: tuple[ObjectSeen, ...]
+    depth: DepthReport
+    pictures: int
+    """Number of rendered pictures."""
+    milliseconds: float
+
+    def env_marks(self, wanted: Collection[str] | None = None) -> NDArray[np.float32]:
+        """(E,) the mark of the worst object in each env; see `ObjectSeen.marks`. NaN without objects.
+
+        Args:
+            wanted: names of the objects that must be seen; None for all that are drawn, without scenery.
+
+        Raises:
+            ValueError: there is no such object.
+        """
+        marks = [thing.marks() for thing in self.wanted_objects(wanted)]
+        if not marks:
+            return np.full(len(self.envs), np.nan, np.float32)
+        worst = np.min(np.nan_to_num(marks, nan=np.inf), axis=0)
+        return np.where(np.isinf(worst), np.nan, worst).astype(np.float32)
+
+    def worst_first(self, wanted: Collection[str] | None = None) -> tuple[int, ...]:
+        """Positions in `envs`, the worst mark first; equal marks as they come, envs with nothing to see last."""
+        return tuple(
+            int(i) for i in np.argsort(np.nan_to_num(self.env_marks(wanted), nan=2.0), kind="stable")
+        )
+
+    def wanted_objects(self, wanted: Collection[str] | None = None) -> tuple[ObjectSeen, ...]:
+        """The objects of these names; None for all that are drawn, without scenery."""
+        if wanted is None:
+            return tuple(thing for thing in self.objects if not (thing.never_drawn or thing.scenery))
+        unknown = sorted(set(wanted) - {thing.name for thing in self.objects})
+        if unknown:
+            there = ", ".join(thing.name for thing in self.objects) or "none"
+            raise ValueError(f"there is no object {', '.join(unknown)}; there are: {there}")
+        return tuple(thing for thing in self.objects if thing.name in wanted)
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """Objects, box and lens of a search for placements."""
+
+    objects: tuple[str, ...]
+    """Names of actors, articulations and single links (``cabinet/handle``) that must be seen."""
+    low: tuple[float, float, float]
+    """Lower corner of the box for the eye, metres in the frame of the mount, or the env's if there is none."""
+    high: tuple[float, float, float]
+    lens: CameraSettings
+    """The camera without its pose; on a mount, the pose gives which way the picture is up."""
+    kind: CameraKind = "sensor"
+    candidates: int = 100
+    """Placements that the first round draws."""
+    best: int = 5
+    """Placements that are offered at most."""
+    apart: float | None = None
+    """Least distance between two offered eyes, metres; None for a seventh of the box's diagonal."""
+    seed: int = 0
+    mount: str | None = None
+    """Name of the body that the camera is mounted on."""
+
+    def check(self) -> None:
+        """Raises ValueError for a space that cannot be searched."""
+        box = np.array([self.low, self.high], np.float64)
+        if not np.isfinite(box).all() or (box[0] > box[1]).any():
+            raise ValueError(
+                f"the box for the eye goes from {self.low} to {self.high}: each low must be below its high"
+            )
+        if not self.objects:
+            raise ValueError("name at least one object that must be seen")
+        if self.candidates < 1 or self.best < 1:
+            raise ValueError("a search draws at least one placement and offers at least one")
+        intrinsic_of(self.lens)
+
+
+@dataclass(frozen=True)
+class OfferedPlacement:
+    """One of the best placements of a search."""
+
+    settings: CameraSettings
+    """In the frame of the camera's mount, or the env's if it has none."""
+    target: tuple[float, float, float]
+    """A point on its line of sight, for a look-at."""
+    score: float
+    """0..1, higher is better; see `search.score_of`."""
+    words: str
+    """What it sees, in a sentence."""
+    report: CameraReport
+    picture: Picture
+    """Picture from the placement, in its worst env."""
+
+
+_Part = TypeVar("_Part", ObjectSeen, DepthReport)
+
+
+def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
+    """One report over all envs of several reports of one camera: steps of an episode, or several seeds.
+
+    Raises:
+        ValueError: there is no report, or they are of several cameras or scenes.
+    """
+    if not reports:
+        raise ValueError("there is no report to join")
+    first = reports[0]
+    for other in reports[1:]:
+        if (other.camera, other.size, other.measured_size) != (first.camera, first.size, first.measured_size):
+            raise ValueError(
+                "reports of different cameras, or of pictures of different sizes, cannot be joined"
+            )
+        if [thing.name for thing in other.objects] != [thing.name for thing in first.objects]:
+            raise ValueError("the reports are of different scenes: their objects are not the same")
+    return replace(
+        first,
+        envs=tuple(env for report in reports for env in report.envs),
+        objects=tuple(
+            _end_to_end(same) for same in zip(*(report.objects for report in reports), strict=True)
+        ),
+        depth=_end_to_end([report.depth for report in reports]),
+        pictures=sum(report.pictures for report in reports),
+        milliseconds=sum(report.milliseconds for report in reports),
+    )
+
+
+def _end_to_end(parts: Sequence[_Part]) -> _Part:
+    """One part with the concatenated arrays of all."""
+    first = parts[0]
+    arrays = [f.name for f in fields(first) if isinstance(getattr(first, f.name), np.ndarray)]
+    return replace(
+        first, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
+    )
+
+
+def size_text(pixels: float, size: tuple[int, int]) -> str:
+    """The share of a picture of this width and height, to two digits: ``0.13 %``."""
+    share = 100 * pixels / (size[0] * size[1])
+    if 0 < share < 0.01:
+        return "< 0.01 %"
+    return f"{share:.0f} %" if share >= 10 else f"{share:.2g} %"
+
+
+def report_text(report: CameraReport, objects: tuple[str, ...]) -> str:
+    """Text about these objects: ``cube: in 8 of 8 envs, about 210 pixels``."""
+    texts = []
+    for thing in report.wanted_objects(objects):
+        all_envs = thing.summary()
+        if not all_envs.present:
+            continue
+        seen = round(all_envs.seen * all_envs.present)
+        size = f"{all_envs.median_pixels:.0f} pixels ({size_text(all_envs.median_pixels, report.size)})"
+        words = f"{thing.name}: in {seen} of {all_envs.present} envs, about {size}"
+        if all_envs.cut > 0:
+            words += f", cut by the border in {all_envs.cut:.0%}"
+        if all_envs.hidden > 0.005:
+            words += f", {all_envs.hidden:.0%} behind the robot"
+        texts.append(words)
+    return "; ".join(texts)
+
+
+def _share_lost(left: NDArray[np.float32], whole: NDArray[np.float32]) -> NDArray[np.float32]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = 1 - left / whole
+    return np.where(whole > 0, np.clip(share, 0, 1), np.nan).astype(np.float32)
+
+
+def _least(values: NDArray[np.float32]) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known.min()) if len(known) else None
+
+
+def _rounded(value: float, up: bool) -> float:
+    """Round up or down to two digits."""
+    step = 10.0 ** (np.floor(np.log10(value)) - 1)
+    digits = (np.ceil if up else np.floor)(np.round(value / step, 6))
+    return float(np.round(digits * step, 9))

@@ -1,0 +1,451 @@
+"""Gathers the episodes of each env from the steps of a batch, and writes their files."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraKey, CameraSettings, Picture
+from workbench.envs.recorded_run import STATE, states_of
+from workbench.envs.step_result import OtherEntry, StepResult
+from workbench.episodes.columns import BatchPacker
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.side_files import side_files
+from workbench.episodes.writing.episode_writer import NO_OTHERS, EpisodeFiles, EpisodeWriter
+from workbench.episodes.writing.files_process import FilesProcess
+from workbench.episodes.writing.publish import RecordingError
+from workbench.jobs.worker_files import relocated
+from workbench.machine.processes.watched_thread import report_failure
+from workbench.machine.versions import package_versions
+from workbench.task.description import Stepped, TaskDescription
+
+NOWHERE: Mapping[str, str] = MappingProxyType({})
+
+
+@dataclass
+class GatheredEpisode:
+    """An episode with its writer; only its journal is on disk so far."""
+
+    writer: EpisodeWriter
+    env: int
+    seed: int
+    """Seed of the reset; negative if unknown."""
+    steps: int = 0
+    total_reward: float = 0.0
+    success: bool | None = None
+    """Success at its last state; None for a task without ``success``."""
+    state_names: frozenset[str] = frozenset()
+    """Names of the env states in its first row."""
+    acted_by: str = ""
+    """Source of its last action."""
+    placed: Mapping[CameraKey, CameraSettings] = field(default_factory=dict)
+    """Cameras that are placed by hand, at its last state."""
+    begun: bool = False
+    """Whether it has its first state."""
+
+    @classmethod
+    def of(
+        cls,
+        folder: Path,
+        task: TaskDescription,
+        env: int,
+        seed: int,
+        reset_options: Mapping[str, Any] | None = None,
+        acted_by: str = "",
+        id: str = "",
+        origin: Mapping[str, str] = NOWHERE,
+        observed_by: str = "",
+    ) -> GatheredEpisode:
+        """A new episode with a writer into `folder`; `id` if not a random one, `origin` as of `EpisodeGatherer`. Raises
+        RecordingError."""
+        info = relocated(episode_info(task, env, seed, reset_options, acted_by), origin)
+        info = replace(info, observed_by=observed_by)
+        writer = EpisodeWriter(
+            folder,
+            replace(info, id=id) if id else info,
+            task.geometry,
+            task.segmentation,
+            [dimension.name for dimension in task.actions],
+            task.cameras,
+        )
+        return cls(writer, env, seed, acted_by=acted_by)
+
+    def set_source(self, what: str) -> None:
+        """Set the source of the next action; empty for no change. Raises RecordingError."""
+        if what and what != self.acted_by:
+            self.writer.acted_by(what)
+            self.acted_by = what
+
+    def set_placed(
+        self, placed: Mapping[CameraKey, CameraSettings], in_file: Mapping[CameraKey, CameraSettings] = {}
+    ) -> None:
+        """Set the cameras that are placed by hand from the next state on. Raises RecordingError.
+
+        Args:
+            in_file: what the recorded source says of cameras for which the task's description says something else.
+        """
+        for key in self.placed.keys() | placed.keys() | in_file.keys():
+            if key in in_file or self.placed.get(key) != placed.get(key):
+                self.writer.placed(key, placed.get(key), in_file.get(key))
+        self.placed = placed
+
+    def take(
+        self,
+        packer: BatchPacker,
+        step: StepResult,
+        row: int,
+        columns: Mapping[str, NDArray],
+        pictures: Sequence[Picture],
+    ) -> None:
+        """Append row `row` of a batch as the next state; the first is that after a reset. Raises as
+        `EpisodeWriter.append`."""
+        if not self.begun:
+            self.state_names = frozenset(states_of(columns, row))
+            count = len(step.reward)
+            no, nothing = np.zeros(count, np.bool_), np.zeros((count, self.writer.actions), np.float32)
+            step = replace(
+                step, action=nothing, reward=np.zeros(count, np.float32), terminated=no, truncated=no
+            )
+        batch = batch_columns(step, columns, self.state_names)
+        layout, (packed,) = packer.pack([(name, values[row : row + 1]) for name, values in batch])
+        self.writer.append(layout, packed, _of_env(pictures, row), others_of(step.others, row))
+        self.steps += self.begun
+        self.begun = True
+
+
+class EpisodeGatherer:
+    """Gathers the episodes of some envs of one task, for the page, ``workbench record`` and `workbench.Recorder`.
+
+    An episode begins with a reset and ends when its env terminates, is truncated or is reset. `on_episode` then decides
+    whether it becomes files (`EpisodeWriter.finish` takes a fraction of a second, and may run on another thread).
+
+    It also checks the stream: `elapsed_steps` counts 0, 1, 2 ...; with a lost step or an unseen reset the file would look
+    right and be wrong.
+    """
+
+    def __init__(
+        self,
+        task: TaskDescription,
+        env_idx: Sequence[int],
+        folder: Path,
+        on_episode: Callable[[GatheredEpisode], object],
+        *,
+        ends: Literal["over", "reset"] = "over",
+        one_each: bool = False,
+        reset_options: Mapping[str, Any] | None = None,
+        origin: Mapping[str, str] = NOWHERE,
+    ) -> None:
+        """
+        Args:
+            on_episode: called with each episode that is over, and its writer.
+            ends: ``over`` ends an episode also where it terminates or is truncated; ``reset`` only where its env is
+                reset, for callers that continue after that.
+            one_each: only the next episode of each env.
+            origin: as `pool.deal.ItemQueue.origin`: an episode names the author's files where they came from.
+        """
+        self._task, self._folder, self._on_episode = task, folder, on_episode
+        self._ends, self._one_each, self._origin = ends, one_each, origin
+        self.reset_options: Mapping[str, Any] = reset_options or {}
+        """Options of the next resets."""
+        self.acted_by = ""
+        """Source of the actions of the next episodes, where the steps do not name it."""
+        self.next_id = ""
+        """Id of the next episode; empty for a random one."""
+        self._episodes: dict[int, GatheredEpisode | None] = {int(env): None for env in env_idx}
+        self._packer = BatchPacker()
+
+    @property
+    def env_idx(self) -> tuple[int, ...]:
+        """The envs that are still gathered."""
+        return tuple(self._episodes)
+
+    @property
+    def under_way(self) -> tuple[GatheredEpisode, ...]:
+        """Episodes that have begun."""
+        return tuple(episode for episode in list(self._episodes.values()) if episode is not None)
+
+    def take(self, stepped: Stepped) -> None:
+        """Append the next reset or step of the batch.
+
+        Raises:
+            ValueError: it does not follow from the one before, or holds values that no file can; what came before can
+                still be finished.
+            RecordingError: it cannot be written.
+        """
+        step = stepped.step
+        reset = stepped.reset_mask.tolist()
+        if step.action is not None:
+            going_on = [e for e in self._episodes.values() if e is not None and not reset[e.env]]
+            for names in {episode.state_names for episode in going_on}:
+                self._append([e for e in going_on if e.state_names == names], names, stepped)
+        for env in [env for env in self._episodes if reset[env]]:
+            self.end(env)
+            # Not after a jump into the middle of an episode: no seed starts one there.
+            if env in self._episodes and step.elapsed_steps[env] == 0:
+                self._begin(env, stepped)
+
+    def finish(self) -> None:
+        """End all episodes under way."""
+        for env in list(self._episodes):
+            self.end(env)
+
+    def end(self, env: int) -> None:
+        """End the episode of `env`; without a step it is dropped."""
+        episode = self._episodes.get(env)
+        if episode is None:
+            return
+        self._episodes[env] = None
+        if episode.steps == 0:
+            episode.writer.discard()
+            return
+        if self._one_each:
+            del self._episodes[env]
+        self._on_episode(episode)
+
+    def drop(self, env: int) -> None:
+        """Drop the episode of `env`, if it has one."""
+        episode = self._episodes.get(env)
+        if episode is not None:
+            self._episodes[env] = None
+            episode.writer.discard()
+
+    def _begin(self, env: int, stepped: Stepped) -> None:
+        seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
+        id, self.next_id = self.next_id, ""
+        begun = GatheredEpisode.of(
+            self._folder, self._task, env, seed, self.reset_options, self.acted_by, id, self._origin
+        )
+        try:
+            begun.set_placed(stepped.placed)
+            begun.take(self._packer, stepped.step, env, stepped.columns, stepped.captured)
+        except BaseException:
+            begun.writer.discard()
+            raise
+        self._episodes[env] = begun
+
+    def _append(self, episodes: list[GatheredEpisode], state_names: frozenset[str], stepped: Stepped) -> None:
+        """Append the rows of envs with the same state names."""
+        step = stepped.step
+        elapsed, reward = step.elapsed_steps.tolist(), step.reward.tolist()
+        over = (step.terminated | step.truncated).tolist()
+        successes = step.evaluate.get("success")
+        success: list[bool] | None = None
+        if successes is not None:
+            # One value an env, or several.
+            success = np.any(successes.reshape(len(successes), -1), axis=1).tolist()
+        captured, others, acted_by = stepped.captured, step.others, stepped.acted_by
+        layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
+        for episode in episodes:
+            env = episode.env
+            if elapsed[env] != episode.steps + 1:
+                raise _lost_step(env, episode.steps + 1, elapsed[env])
+            if acted_by != episode.acted_by:
+                episode.set_source(acted_by)
+            if stepped.placed != episode.placed:
+                episode.set_placed(stepped.placed)
+            episode.writer.append(layout, rows[env], _of_env(captured, env), others_of(others, env))
+            episode.steps += 1
+            episode.total_reward += reward[env]
+            episode.success = None if success is None else success[env]
+            if over[env] and self._ends == "over":
+                self.end(env)
+
+
+def _lost_step(env: int, expected: int, came: int) -> ValueError:
+    return ValueError(
+        f"env {env}: step {expected} was expected and step {came} came; a step was lost or the env was reset unseen"
+    )
+
+
+def batch_columns(
+    step: StepResult, columns: Mapping[str, NDArray], state_names: frozenset[str]
+) -> list[tuple[str, NDArray]]:
+    """A control step of the batch as columns for `BatchPacker`."""
+    assert step.action is not None
+    count = len(step.reward)
+    rows = [
+        ("poses", step.poses),
+        ("action", step.action.reshape(count, -1)),
+        ("reward", step.reward),
+        ("terminated", step.terminated),
+        ("truncated", step.truncated),
+    ]
+    rows += [("evaluate/" + name, values) for name, values in step.evaluate.items()]
+    rows += [
+        ("batch/" + name, np.broadcast_to(entry.numbers, (count, *entry.numbers.shape)))
+        for name, entry in step.others.items()
+        if entry.numbers is not None
+    ]
+    rows += [
+        (name, values)
+        for name, values in columns.items()
+        if name[: len(STATE)] != STATE or name[len(STATE) :] in state_names
+    ]
+    return rows
+
+
+def _of_env(pictures: Sequence[Picture], env: int) -> Sequence[Picture]:
+    return [picture for picture in pictures if picture.env == env] if pictures else ()
+
+
+def others_of(others: Mapping[str, OtherEntry], env: int) -> Mapping[str, OtherEntry]:
+    """`StepResult.others` of one env."""
+    return {name: entry.of_env(env) for name, entry in others.items()} if others else NO_OTHERS
+
+
+def episode_info(
+    task: TaskDescription,
+    env: int,
+    seed: int,
+    reset_options: Mapping[str, Any] | None = None,
+    acted_by: str = "",
+) -> EpisodeInfo:
+    """The description that is needed to repeat an episode of this task."""
+    return EpisodeInfo(
+        task=task.env_id,
+        env_index=env,
+        seed=seed,
+        source_file=task.file,
+        source_hash=task.source_hash,
+        source=task.source,
+        control_dt=task.control_dt,
+        control_mode=task.control_mode,
+        backend=task.backend,
+        versions=dict(package_versions()),
+        env_kwargs=dict(task.env_kwargs),
+        reset_options=dict(reset_options or {}),
+        max_episode_steps=task.max_episode_steps,
+        side_files=side_files(task.file, task.source),
+        acted_by=((0, acted_by),) if acted_by else (),
+        pictures=task.pictures,
+    )
+
+
+@dataclass(frozen=True)
+class Finished:
+    """Episodes written so far."""
+
+    count: int = 0
+    bytes_written: int = 0
+    last: EpisodeFiles | None = None
+    problem: str | None = None
+    """Reason why the last failed episode failed."""
+
+
+class EpisodeFinisher:
+    """Writes the files of finished episodes one by one on a thread. Thread-safe.
+
+    A second thread would take turns with it for the interpreter: also at the end, when nothing else wants it, two take a quarter longer
+    (measured). A process does not; then the one that closes makes files too.
+    """
+
+    def __init__(
+        self,
+        on_change: Callable[[], None] = lambda: None,
+        first: Callable[[], None] | None = None,
+        then: Callable[[EpisodeFiles], None] | None = None,
+        in_process: bool = False,
+    ) -> None:
+        """
+        Args:
+            on_change: called when an episode's files are written, or have failed: on the thread, or by `close`.
+            first: called first on the thread.
+            then: called with the files of each episode, which is not finished before.
+            in_process: make the files in a process, for a caller that needs the interpreter: it takes a second of a core to start.
+        """
+        self._on_change, self._then = on_change, then
+        self._lock = threading.Lock()
+        self._finished = Finished()
+        self._waiting: deque[tuple[GatheredEpisode, Future[EpisodeFiles | str]]] = deque()
+        self._at_work = 0
+        self._process: FilesProcess | None = None
+        if in_process:
+            with suppress(OSError):  # no memory, or too many processes: the thread makes them
+                self._process = FilesProcess()
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="episode-files")
+        if first is not None:
+            self._pool.submit(first)
+
+    @property
+    def finished(self) -> Finished:
+        with self._lock:
+            return self._finished
+
+    @property
+    def waiting(self) -> int:
+        """Episodes whose files are not written yet."""
+        with self._lock:
+            return len(self._waiting) + self._at_work
+
+    def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | str]:
+        """Write the files; the future gives the reason as text if writing failed. `finished` also holds the
+        reason, until another episode succeeds."""
+        made: Future[EpisodeFiles | str] = Future()
+        with self._lock:
+            self._waiting.append((episode, made))
+        self._pool.submit(self._finish_next)
+        return made
+
+    def close(self) -> None:
+        """Wait for the files under way."""
+        while self._process is not None and self._process.is_ready and self._finish_one(None):
+            pass
+        self._pool.shutdown(wait=True)
+        if self._process is not None:
+            self._process.close()
+
+    def _finish_next(self) -> None:
+        self._finish_one(self._process if self._process is not None and self._process.is_ready else None)
+
+    def _finish_one(self, process: FilesProcess | None) -> bool:
+        """Write the files of one waiting episode; returns whether one waited."""
+        with self._lock:
+            if not self._waiting:
+                return False
+            episode, made = self._waiting.popleft()
+            self._at_work += 1
+        try:
+            files, size = self._finish(episode, process)
+        except BaseException as error:
+            made.set_exception(error)
+            raise
+        finally:
+            with self._lock:
+                self._at_work -= 1
+        with self._lock:
+            before = self._finished
+            if isinstance(files, str):
+                self._finished = replace(before, problem=files)
+            else:
+                self._finished = Finished(before.count + 1, before.bytes_written + size, files, None)
+        self._on_change()
+        made.set_result(files)
+        return True
+
+    def _finish(
+        self, episode: GatheredEpisode, process: FilesProcess | None
+    ) -> tuple[EpisodeFiles | str, int]:
+        """The files, or the reason why writing failed, and the number of bytes."""
+        try:
+            made = episode.writer.finish(process)
+            size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))
+            if self._then is not None:
+                self._then(made)
+        except BaseException as error:
+            if isinstance(error, (KeyboardInterrupt, SystemExit)):
+                raise
+            # A panic of rerun's Rust code is no Exception. The journal stays; the next start tries again.
+            if not isinstance(error, (RecordingError, OSError, ValueError)):
+                report_failure(f"An episode of env {episode.env} could not be written", error)
+            return f"an episode of env {episode.env} could not be written: {error}", 0
+        return made, size

@@ -1,0 +1,314 @@
+"""Records episodes without a page, on a batch of envs in one process or several."""
+
+from __future__ import annotations
+
+import os
+import sys
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+from workbench.actions.choose import needed_by
+from workbench.envs.broken_rule import warn_of
+from workbench.envs.gpu_rules import Finding
+from workbench.episodes.writing.upload import remove_uploaded
+from workbench.jobs.local_processes import Processes
+from workbench.jobs.scheduler import Deal, Executor, Failure, ItemQueue, ThisProcess, Work
+from workbench.record.job_worker import (
+    RecordOptions,
+    RecordSetup,
+    RecordUpdate,
+    Written,
+    record_items,
+    with_given_actions,
+)
+
+TRIES = 2
+"""Maximum number of times that a chunk of episodes is started when its workers die, before they are tried one by one."""
+_LONG_JOB = 256
+"""Number of batches from which on a chunk holds several: the envs of a batch wait for each other only at the end
+of a chunk."""
+_BATCHES = 4
+
+
+@dataclass(frozen=True)
+class RecordProgress:
+    """Progress of a recording."""
+
+    kept: int
+    """Episodes kept so far."""
+    steps: int
+    """Control steps so far, over all envs with an episode."""
+    over: tuple[int, Written | None] | None = None
+    """Number of the episode that has just ended, and its files (None if they were not kept); None where none has
+    ended."""
+    running: Mapping[int, int] = field(default_factory=dict)
+    """Control steps so far of the running episodes, by number, in all processes."""
+    limit: int = 0
+    """Maximum number of control steps of an episode."""
+    done: float = 0.0
+    """Episodes kept so far; where every episode is kept, running episodes count in part."""
+    failures: tuple[Failure, ...] = ()
+    """Episodes so far, by number, that gave no result."""
+    was_there: bool = False
+    """Whether the episode that has ended comes from an earlier run of the job."""
+
+    def by_seed(self, first: int) -> dict[int, int]:
+        """`running` by seed, where episode 0 has seed `first`."""
+        return {first + number: steps for number, steps in self.running.items()}
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The result of a recording."""
+
+    written: tuple[Written, ...]
+    """By number."""
+    tried: int
+    """Number of episodes that were run."""
+    stopped: bool
+    """Whether it was stopped early."""
+    start_corrected: int = 0
+    """Episodes with `Written.start_corrected`."""
+    failures: tuple[Failure, ...] = ()
+    """Episodes, by number, in which the author's code failed or whose workers died."""
+    missing: int = 0
+    """Number of requested episodes that did not end."""
+
+
+def chunk_of(episodes: int, num_envs: int) -> int:
+    """Number of episodes that a worker with `num_envs` envs runs together, for `episodes` episodes in all."""
+    return num_envs * (_BATCHES if episodes >= _LONG_JOB * num_envs else 1)
+
+
+def record(
+    what: RecordOptions,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_progress: Callable[[RecordProgress], None] = lambda progress: None,
+    stop: Callable[[], bool] = lambda: False,
+    on_finding: Callable[[Finding], None] = warn_of,
+    executor: Executor | None = None,
+    run: str = "",
+    on_notice: Callable[[str], None] = lambda notice: None,
+) -> Recorded:
+    """Record into ``what.out``.
+
+    Each episode starts with a reset of its env alone with a seed of its own, and has actions of its own
+    (`RecordActionChooser`): episode k is the one that ``gym.make(...).reset(seed=seed + k)`` starts, for any number of envs and
+    processes.
+
+    Args:
+        on_finding: called once for each place where the task breaks a rule without being stopped.
+        stop: called between steps; after True the finished episodes are kept, and the others dropped.
+        executor: None for this process, or for spawned processes with several workers.
+        run: as of `RecordSetup`, where the job goes on.
+        on_notice: called with what the author should know of the task, each sentence once.
+
+    Raises:
+        TaskError: the task cannot be opened, or fails in every chunk of episodes, or in several alike one after another.
+        RecordingError: a file cannot be written.
+        PoolError: a process that records failed, or processes die again and again.
+        FileNotFoundError, ValueError: the request is invalid.
+    """
+    what, given = with_given_actions(what)
+    recording = _Recording(what, on_activity, on_progress, stop, on_finding, on_notice)
+    run_items = record_items
+    if executor is None:
+        executor = ThisProcess() if what.workers == 1 else Processes(what.workers)
+    if isinstance(executor, ThisProcess):
+        run_items = partial(record_items, given=given)
+    do_record([what], sys.maxsize, run, executor, recording.deal, run_items)
+    recording.deal.require_results()
+    return recording.so_far(stop())
+
+
+def collect(what: RecordOptions, known: Mapping[int, Written | None]) -> Recorded:
+    """Recording from the results of these episodes. Runs nothing.
+
+    Args:
+        what: as `with_given_actions` completes it.
+    """
+    recording = _Recording(
+        what,
+        lambda activity: None,
+        lambda progress: None,
+        lambda: False,
+        lambda finding: None,
+        lambda _: None,
+    )
+    recording.deal.go_on(known, lambda number, written: None)
+    return recording.so_far(stopped=False)
+
+
+def do_record(
+    wanted: Sequence[RecordOptions],
+    stride: int,
+    run: str,
+    executor: Executor,
+    deal: Deal[Written | None, RecordUpdate],
+    run_items: Callable[[RecordSetup, ItemQueue], None] = record_items,
+) -> None:
+    """Record the items of a deal, of one or several recordings. Arguments as of `RecordSetup`; raises as `record`."""
+    run = run or uuid.uuid4().hex
+    needed = [needed_by(what.task, what.actions, what.options.imports) for what in wanted]
+    folders = [what.out.absolute() for what in wanted]
+    mark = f".{run}" if executor.elsewhere else ""
+    work = Work(
+        run_items,
+        RecordSetup(tuple(wanted), tuple(map(os.fsencode, folders)), stride, run, mark),
+        result=Written | None,
+        update=RecordUpdate,
+        name="that records",
+        folders=[folder for one in needed for folder in one.folders],
+        files=[file for one in needed for file in one.files],
+    )
+    marks = [folder / mark for folder, what in zip(folders, wanted, strict=True) if mark and not what.upload]
+    for file in marks:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    try:
+        executor.run(work, deal)
+    finally:
+        for file in marks:
+            file.unlink(missing_ok=True)
+
+
+class ToldByWorkers:
+    """Collects the workers' messages about episodes, and computes the progress of the job."""
+
+    def __init__(
+        self,
+        on_activity: Callable[[str], None],
+        on_finding: Callable[[Finding], None],
+        on_notice: Callable[[str], None],
+    ) -> None:
+        self._on_activity, self._on_finding, self._on_notice = on_activity, on_finding, on_notice
+        self._running: dict[int, int] = {}
+        """Control steps so far of each running item."""
+        self._steps = self._limit = 0
+        self._found: set[object] = set()
+        """Findings and notices of all workers, to report each once."""
+        self._failures: tuple[Failure, ...] = ()
+
+    def take(self, update: RecordUpdate) -> bool:
+        """Handle a message of a worker; returns whether the progress has changed."""
+        if update.activity:
+            self._on_activity(update.activity)
+        if (finding := update.finding) is not None and finding.key not in self._found:
+            self._found.add(finding.key)
+            self._on_finding(finding)
+        if update.notice and update.notice not in self._found:
+            self._found.add(update.notice)
+            self._on_notice(update.notice)
+        if (underway := update.underway) is None:
+            return False
+        self._steps, self._limit = self._steps + underway.made, underway.limit
+        self._running.update(underway.steps)
+        return True
+
+    def over(self, number: int) -> None:
+        """Handle that an item has ended."""
+        self._running.pop(number, None)
+
+    def failed(self, failure: Failure) -> None:
+        """Handle items that gave no result."""
+        self._failures += (failure,)
+        for number in failure.numbers:
+            self._running.pop(number, None)
+
+    def progress(
+        self,
+        kept: int,
+        over: tuple[int, Written | None] | None,
+        deal: Deal[Written | None, RecordUpdate],
+        counts_parts: bool,
+    ) -> RecordProgress:
+        """
+        Args:
+            counts_parts: whether what is under way counts in part.
+        """
+        limit = deal.limit()
+        running = {number: steps for number, steps in self._running.items() if number < limit}
+        part = sum(min(steps / max(self._limit, 1), 1.0) for steps in running.values())
+        done = kept + (part if counts_parts else 0.0)
+        return RecordProgress(
+            kept, self._steps, over, running, self._limit, done, self._failures, deal.is_going_on
+        )
+
+
+class _Recording:
+    """Collects the results of all processes.
+
+    Of the successes the K with the lowest numbers are kept. With many envs or processes a later episode may succeed before
+    an earlier one has ended; its files are removed when K others come before it.
+    """
+
+    def __init__(
+        self,
+        what: RecordOptions,
+        on_activity: Callable[[str], None],
+        on_progress: Callable[[RecordProgress], None],
+        stop: Callable[[], bool],
+        on_finding: Callable[[Finding], None],
+        on_notice: Callable[[str], None],
+    ) -> None:
+        self._out, self._folder, self._wanted = what.out, what.out.absolute(), what.successes
+        self._upload = what.upload
+        self._on_progress = on_progress
+        self._told = ToldByWorkers(on_activity, on_finding, on_notice)
+        self._kept: dict[int, Written] = {}
+        self._ended = 0
+        most = what.episodes if what.successes is None else what.tries
+        assert most is not None
+        self._most = most
+        self.deal: Deal[Written | None, RecordUpdate] = Deal(
+            range(most),
+            self._over,
+            self._on_update,
+            stop,
+            chunk=chunk_of(most, what.options.num_envs),
+            tries=TRIES,
+            on_failure=self._failed,
+        )
+
+    def so_far(self, stopped: bool) -> Recorded:
+        enough = self._wanted is not None and len(self._kept) == self._wanted
+        written = tuple(self._kept[number] for number in sorted(self._kept))
+        start_corrected = sum(episode.start_corrected for episode in written)
+        tried = written[-1].index + 1 if enough else self._ended
+        missing = 0 if enough else self._most - self._ended
+        return Recorded(written, tried, stopped, start_corrected, tuple(self.deal.failures), missing)
+
+    def _over(self, number: int, written: Written | None) -> None:
+        self._ended += 1
+        self._told.over(number)
+        if written is not None:
+            # The path as the person wrote the folder.
+            self._kept[number] = replace(written, path=self._out / written.path.name)
+        if self._wanted is not None and len(self._kept) >= self._wanted:
+            last = sorted(self._kept)[self._wanted - 1]
+            self.deal.lower(last + 1)
+            for surplus in [number for number in self._kept if number > last]:
+                self._remove(self._kept.pop(surplus))
+        self._tell((number, self._kept.get(number)))
+
+    def _failed(self, failure: Failure) -> None:
+        self._ended += len(failure.numbers)
+        self._told.failed(failure)
+        self._tell()
+
+    def _on_update(self, update: RecordUpdate) -> None:
+        if self._told.take(update):
+            self._tell()
+
+    def _tell(self, over: tuple[int, Written | None] | None = None) -> None:
+        kept = len(self._kept)
+        self._on_progress(self._told.progress(kept, over, self.deal, self._wanted is None))
+
+    def _remove(self, episode: Written) -> None:
+        if self._upload:
+            remove_uploaded(self._upload, episode.path.stem)
+            return
+        for suffix in (".json", ".h5", ".rrd"):  # the .json first: without it there is no episode
+            (self._folder / episode.path.name).with_suffix(suffix).unlink(missing_ok=True)

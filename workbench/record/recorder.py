@@ -1,0 +1,284 @@
+"""``workbench.Recorder``: a gymnasium wrapper that records the episodes of an env of `workbench.make`."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import warnings
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.gym_utils import find_max_episode_steps_value
+
+from workbench.envs import action_vector as actions
+from workbench.envs.camera_data import Picture
+from workbench.envs.maniskill_private import draws_its_own_seeds, last_observation, open_env, task_class
+from workbench.envs.simulation.stepping import usable_cores
+from workbench.envs.state_columns import StateReading, copy_states
+from workbench.envs.step_result import StepResult
+from workbench.envs.task_env import TaskEnv
+from workbench.episodes.episode import NO_SEED
+from workbench.episodes.reader.reading import recovered_text
+from workbench.episodes.writing.episode_writer import EpisodeFiles
+from workbench.episodes.writing.finish import recover
+from workbench.episodes.writing.journal import before_writing
+from workbench.episodes.writing.publish import RecordingError
+from workbench.pictures.render import Request, recorded_pictures, step_pictures
+from workbench.record.gather import EpisodeFinisher, EpisodeGatherer, GatheredEpisode
+from workbench.task.description import Stepped, TaskDescription
+from workbench.task.load import task_of_class
+from workbench.task.open import describe
+
+logger = logging.getLogger(__name__)
+_MOST_PENDING = 2048
+"""Maximum number of steps times envs that wait for the gatherer: 3 MB. Fewer wait after half a second, or when an
+episode begins."""
+_MOST_PICTURES = 1 << 25
+"""Maximum size in bytes of the pictures that wait for the gatherer."""
+
+_MANY_ENVS = 4
+"""Env count from which a subprocess makes the files; below it, start-up costs more than it saves."""
+
+
+class _PendingStep(NamedTuple):
+    """A step that waits for the gatherer."""
+
+    step: StepResult
+    reset_mask: np.ndarray
+    pictures: list[Picture]
+    seeds: np.ndarray | None
+    states: StateReading
+
+    def stepped(self) -> Stepped:
+        columns = self.states.columns()
+        return Stepped(self.step, self.reset_mask, tuple(self.pictures), self.seeds, columns=columns)
+
+
+class Recorder(gym.Wrapper):
+    """Records the episodes of an env that `workbench.make` gave::
+
+        env = workbench.make("PickCube-v1", num_envs=16)
+        env = workbench.Recorder(env, "recordings/")
+        env = ManiSkillVectorEnv(env, auto_reset=True)  # goes around it: training, evaluation, anything
+        env.reset(seed=0)
+        for _ in range(200):
+            env.step(policy(obs))
+        env.close()  # waits for the files
+
+    Writes the files of the page and of ``workbench record``, one set per episode: .rrd, .h5 and .json. An episode of an env
+    lasts from its reset to its next one, so partial resets, auto-resets and wrappers that continue after success work. The
+    env's own state, observation and reward are recorded, so it goes directly around the env of `make`, inside all wrappers
+    that change actions. From four envs on, a process makes the files.
+
+    A training loop must not end because a disk is full: an error of the files is one warning, ends the recording, and is
+    kept in `problem`.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        folder: str | Path,
+        *,
+        env_idx: Sequence[int] | None = None,
+        pictures: bool | Sequence[str] = False,
+        acted_by: str = "a program",
+    ) -> None:
+        """
+        Args:
+            env: as `workbench.make` gives it.
+            folder: created if it is missing. Half-written files of an earlier recording in it are recovered.
+            env_idx: which envs; None for all.
+            pictures: record every camera at every step, or the cameras of these names; False for none. Sensors that the
+                env observes are rendered already; any other picture takes 25 to 50 ms without a GPU.
+            acted_by: what chooses the actions, such as the name of a policy; for readers of the recordings.
+
+        Raises:
+            TypeError: `env` is not a ManiSkill env, or is wrapped as a vector env already.
+            IndexError: there is no such env.
+            RecordingError: `folder` cannot be written to.
+        """
+        if not isinstance(env, gym.Env) or isinstance(env, gym.vector.VectorEnv):
+            raise TypeError(
+                f"Recorder goes around the env that workbench.make gives, inside a vector env: not {type(env).__name__}"
+            )
+        super().__init__(env)
+        base: BaseEnv = open_env(env)
+        chosen = list(range(base.num_envs)) if env_idx is None else [int(i) for i in env_idx]
+        if any(not 0 <= i < base.num_envs for i in chosen):
+            raise IndexError(f"env_idx {chosen} is out of range for {base.num_envs} envs")
+        self._folder, self._envs, self._pictures = Path(folder).absolute(), chosen, pictures
+        self._acted_by = acted_by
+        if self._folder.is_dir():
+            recovered = [str(files.rrd) for files in recover(self._folder)]
+            if notice := recovered_text(recovered):
+                logger.warning("%s", notice)
+        self._task = TaskEnv(base)
+        many = len(chosen) >= _MANY_ENVS and usable_cores() > 1
+        self._finisher = EpisodeFinisher(in_process=many)
+        self._made: list[Future[EpisodeFiles | str]] = []
+        """Files of finished episodes that are being written."""
+        self._gatherer: EpisodeGatherer | None = None
+        self._pending: deque[_PendingStep] = deque()
+        """Steps that the gatherer does not have yet. Gathering them one by one, while the env waits and the caches
+        are full of physics, costs twice as much."""
+        self._waiting_pictures = 0
+        """Approximate bytes of the waiting pictures: another thread may gather at the same time."""
+        self._gathering = threading.Lock()
+        self._failure: Exception | None = None
+        """Exception that gathering raised, perhaps on another thread."""
+        before_writing(self._gather)
+        self._scene: Any = None
+        self._description: TaskDescription | None = None
+        self._seeds = np.full(base.num_envs, NO_SEED, np.int64)
+        self._elapsed = np.zeros(base.num_envs, np.int32)
+        self._finished = False
+        self.problem: str | None = None
+        """Reason why an error ended the recording; None if no error did."""
+
+    @property
+    def episodes_written(self) -> int:
+        return self._finisher.finished.count
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        count = self._task.num_envs
+        mask = np.zeros(count, bool)
+        chosen = (options or {}).get("env_idx")
+        mask[slice(None) if chosen is None else np.asarray([int(i) for i in chosen])] = True
+        self._seeds[mask] = self._seeds_of_reset(seed)[mask]
+        self._task.obs, none = last_observation(self._task.env), np.zeros(count, bool)
+        step = self._task.result(info, np.zeros(count), None, none, none, look=False)
+        if self._scene is not self._task.env.scene and not self._finished:
+            self._begin()
+        if self._gatherer is not None:
+            self._gather()  # with the options of earlier resets
+            kept = {k: v for k, v in (options or {}).items() if k != "env_idx"}
+            self._gatherer.reset_options = kept
+        self._add_step(step, mask)
+        return obs, info
+
+    def _seeds_of_reset(self, seed: Any) -> np.ndarray:
+        """(N,) seeds of the envs of a reset; NO_SEED without one.
+
+        A reset without a seed, such as an auto-reset, continues the random generators, while ManiSkill still reports the seed
+        of an earlier episode.
+        """
+        task = self._task
+        if seed is None and not draws_its_own_seeds(task.env):
+            return np.full(task.num_envs, NO_SEED, np.int64)
+        # (N,), or shorter: one for each env of a partial reset, which ManiSkill counts from 0.
+        seeds = task.episode_seeds
+        return np.concatenate([seeds, np.full(max(0, task.num_envs - len(seeds)), NO_SEED, np.int64)])
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        task = self._task
+        made = actions.to_flat_action(task.env, task.parts, action) if task.parts else None
+        given = self.env.step(action)
+        if self._gatherer is not None:
+            obs, reward, terminated, truncated, info = given
+            if made is None:
+                made = np.zeros((task.num_envs, 0), np.float32)
+            task.obs = last_observation(task.env)
+            step = task.result(info, reward, made, terminated, truncated, look=False)
+            self._add_step(step, np.zeros(task.num_envs, bool))
+        return given  # type: ignore[return-value]
+
+    def finish(self) -> None:
+        """End the recording: running episodes end here, and their files are waited for. The env stays usable."""
+        if not self._finished:
+            self._finished = True
+            self._end()
+            self._finisher.close()
+            self._report_failures()
+
+    def close(self) -> None:
+        """`finish`, and close the env."""
+        self.finish()
+        super().close()
+
+    def _begin(self) -> None:
+        """Start gathering for a new scene."""
+        self._end()
+        base = self._task.env
+        self._scene = base.scene
+        spec = base.spec
+        env_id = type(base).__name__ if spec is None else spec.id
+        loaded = task_of_class(task_class(base), env_id)
+        given = {} if spec is None else dict(spec.kwargs)
+        self._description = describe(loaded, self._task, given, find_max_episode_steps_value(self.env))
+        if self.problem is None:
+            self._gatherer = EpisodeGatherer(
+                self._description, self._envs, self._folder, self._on_episode_end, ends="reset"
+            )
+            self._gatherer.acted_by = self._acted_by
+
+    def _add_step(self, step: StepResult, reset_mask: np.ndarray) -> None:
+        gatherer, task = self._gatherer, self._task
+        if gatherer is None or self._description is None:
+            return
+        requests = self._picture_requests()
+        pictures = step_pictures(task, self._envs, requests)
+        seeds = self._seeds.copy() if reset_mask.any() else None
+        self._pending.append(_PendingStep(step, reset_mask, pictures, seeds, copy_states(task)))
+        self._waiting_pictures += sum(picture.nbytes for picture in pictures)
+        follows = np.array_equal(step.elapsed_steps, self._elapsed + 1)
+        self._elapsed = step.elapsed_steps
+        full = len(self._pending) * len(reset_mask) > _MOST_PENDING or self._waiting_pictures > _MOST_PICTURES
+        # A step that does not continue its episode raises at once.
+        if full or not follows:
+            self._gather()
+        self._report_failures()
+
+    def _gather(self) -> None:
+        with self._gathering:
+            self._waiting_pictures = 0
+            try:
+                while self._pending and self._gatherer is not None:
+                    self._gatherer.take(self._pending.popleft().stepped())
+            except Exception as error:  # raised by the next step: this may be another thread
+                self._pending.clear()
+                self._failure = error
+
+    def _picture_requests(self) -> Sequence[Request]:
+        if not self._pictures or self._description is None:
+            return ()
+        cameras = self._description.cameras
+        if self._pictures is not True:
+            cameras = [camera for camera in cameras if camera.name in self._pictures]
+        return recorded_pictures(cameras)
+
+    def _stop_recording(self, error: Exception) -> None:
+        self._end()
+        self.problem = str(error)
+        warnings.warn(f"the recording ended: {error}", stacklevel=4)
+
+    def _on_episode_end(self, episode: GatheredEpisode) -> None:
+        self._made.append(self._finisher.finish(episode))
+
+    def _end(self) -> None:
+        self._gather()
+        gatherer, self._gatherer = self._gatherer, None
+        if gatherer is not None:
+            gatherer.finish()
+
+    def _report_failures(self) -> None:
+        failure, self._failure = self._failure, None
+        if isinstance(failure, (RecordingError, ValueError)):
+            self._stop_recording(failure)
+        elif failure is not None:
+            raise failure
+        done = [future for future in self._made if future.done()]
+        if not done:
+            return
+        self._made = [future for future in self._made if future not in done]
+        problems = [result for future in done if isinstance(result := future.result(), str)]
+        if problems and self.problem is None:
+            self.problem = problems[0]
+            self._gatherer = None
+            warnings.warn(f"the recording ended: {self.problem}", stacklevel=4)

@@ -1,0 +1,275 @@
+"""Which past episodes are saved, and what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from workbench.live.effects import Asked
+from workbench.live.events import VersionLoaded
+from workbench.live.history.moments import EnvMoment, History
+from workbench.live.messages import Load
+from workbench.live.process.ask import WAITING
+from workbench.live.process.background_jobs import JobProgress
+from workbench.live.run import Run
+from workbench.page.command import Command, Refused
+from workbench.record.commands import SavePreviousEpisode, SaveSolved, ToggleSavePast
+from workbench.task.description import TaskDescription
+
+DOES: frozenset[type[Command]] = frozenset({ToggleSavePast, SavePreviousEpisode, SaveSolved})
+"""Commands that `apply` takes."""
+
+
+@dataclass(frozen=True)
+class SaveStatus:
+    """Progress and result of recording a past episode."""
+
+    message: str = ""
+    """Result of the last job that ended."""
+    failed: bool = False
+    """Whether `message` is an error."""
+    refused_at: object = None
+    """What was shown when nothing could be recorded of it; the message holds only there. None for any other message."""
+    progress: JobProgress | None = None
+    """Progress in moments; None while no job runs."""
+
+
+@dataclass(frozen=True)
+class Saving:
+    """Past episodes are saved by one job at a time."""
+
+    status: SaveStatus = SaveStatus()
+    job: int = 0
+    """Number of the last job."""
+
+    def status_of(self, run: Run) -> SaveStatus:
+        """The status for what is shown now."""
+        if self.status.refused_at in (None, _shown(run)):
+            return self.status
+        return SaveStatus(progress=self.status.progress)
+
+
+@dataclass(frozen=True)
+class PastEpisode:
+    """The moments of one env's episode, oldest first; the first is its reset.
+
+    It runs through the moments that the env was put back to, until it terminated, was truncated, was reset or was left.
+    """
+
+    env: int
+    moments: tuple[EnvMoment, ...]
+    seed: int
+    """Seed of the episode; negative if unknown."""
+    played_by: TaskDescription | None = None
+    """The version that made the last moment; None for the running one."""
+
+    @property
+    def steps(self) -> int:
+        return len(self.moments) - 1
+
+    @property
+    def ended(self) -> bool:
+        """Whether the task ended the episode; False if it still runs or was reset early."""
+        moment, env = self.moments[-1]
+        step = moment.as_recorded
+        return bool(step.terminated[env] or step.truncated[env])
+
+
+@dataclass(frozen=True)
+class SaveRequest:
+    """Episodes to record and what a worker needs for it. Independent of the history, which moves on meanwhile."""
+
+    task: TaskDescription
+    load: Load
+    """The load of the running version, for another worker."""
+    episodes: tuple[PastEpisode, ...]
+
+
+# --- events and effects -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SaveWanted:
+    """Save for each of these envs (all if None) the episode that contains the shown moment.
+
+    While live, the running episode is saved; if it has no step yet, the one before.
+    """
+
+    env_idx: tuple[int, ...] | None = None
+    before: bool = False
+    """Save the episode before that one."""
+
+
+@dataclass(frozen=True)
+class SaveProgressed:
+    job: int
+    progress: JobProgress
+
+
+@dataclass(frozen=True)
+class EpisodesSaved:
+    job: int
+    message: str
+    """What was saved, for the page."""
+
+
+@dataclass(frozen=True)
+class SaveFailed:
+    job: int
+    why: str
+
+
+SaveEvent = SaveProgressed | EpisodesSaved | SaveFailed
+"""What comes of a job."""
+
+
+@dataclass(frozen=True)
+class BeginSaving:
+    """Begin this job; cancel the one before."""
+
+    job: int
+    what: SaveRequest
+
+
+@dataclass(frozen=True)
+class EndSaving:
+    """Cancel the job; it writes no file."""
+
+
+SaveEffect = BeginSaving | EndSaving
+
+
+def apply(
+    saving: Saving, event: object, run: Run, chosen: tuple[int, ...] | None, solved: tuple[int, ...]
+) -> tuple[Saving, list[SaveEffect]]:
+    """The saving after an event, and what has to be done.
+
+    Args:
+        chosen: envs that a person chose for recording; None for all.
+        solved: envs whose episode is solved.
+
+    Raises:
+        Refused: the command makes no sense now; nothing has changed.
+    """
+    runs = saving.status.progress is not None
+    match event:
+        case Asked(command=ToggleSavePast()) if runs:
+            return Saving(SaveStatus("stopped; nothing was saved"), saving.job), [EndSaving()]
+        case Asked(command=ToggleSavePast()):
+            return _save(saving, run, chosen)
+        case Asked(command=SavePreviousEpisode()):
+            return _save(saving, run, chosen, before=True)
+        case Asked(command=SaveSolved()):
+            if runs:
+                raise Refused("An episode is being saved.")
+            if not solved:
+                raise Refused("No episode is solved.")
+            return _save(saving, run, solved)
+        case SaveWanted(env_idx=env_idx, before=before):
+            return _save(saving, run, env_idx, before)
+        case VersionLoaded(loaded=loaded) if loaded.reload is None or loaded.reload.level != "same":
+            return without_message(saving), []
+        case SaveProgressed(job=saving.job, progress=progress) if runs:
+            return replace(saving, status=replace(saving.status, progress=progress)), []
+        case EpisodesSaved(job=saving.job, message=message) if runs:
+            return Saving(SaveStatus(message), saving.job), []
+        case SaveFailed(job=saving.job, why=why) if runs:
+            return Saving(SaveStatus(why, failed=True), saving.job), []
+    return saving, []
+
+
+def without_message(saving: Saving) -> Saving:
+    """The last result is dropped: something else is recorded, or another version runs."""
+    if not saving.status.message:
+        return saving
+    return replace(saving, status=SaveStatus(progress=saving.status.progress))
+
+
+def _save(
+    saving: Saving, run: Run, env_idx: tuple[int, ...] | None, before: bool = False
+) -> tuple[Saving, list[SaveEffect]]:
+    what = request_of(run, env_idx, before)
+    if isinstance(what, str):
+        status = SaveStatus(what, True, refused_at=_shown(run), progress=saving.status.progress)
+        return replace(saving, status=status), []
+    job = saving.job + 1
+    return Saving(SaveStatus(progress=JobProgress(WAITING, 0, 0)), job), [BeginSaving(job, what)]
+
+
+def _shown(run: Run) -> object:
+    """The version, env and moment that are shown."""
+    past = run.past
+    return run.task_serial, run.env, None if past is None else (past.at, past.pinned)
+
+
+# --- the episodes -----------------------------------------------------------------------------------
+
+
+def request_of(run: Run, env_idx: tuple[int, ...] | None, before: bool = False) -> SaveRequest | str:
+    """What to record of these envs (all if None): for each the episode that contains the shown moment; or the reason why
+    there is nothing.
+
+    Args:
+        before: record the episode before that one.
+    """
+    load = run.running_load()
+    if run.task is None or run.past is None or load is None:
+        return "no task is loaded"
+    shown = run.past.shown
+    serial = None if shown is None else shown.serial
+    envs = range(run.num_envs) if env_idx is None else env_idx
+    found = {env: find_episode(run.past.history, env, serial, before) for env in envs}
+    episodes = tuple(
+        replace(episode, played_by=run.version_of(episode.moments[-1][0].serial))
+        for episode in found.values()
+        if isinstance(episode, PastEpisode)
+    )
+    if not episodes:
+        env, why = next(iter(found.items()))
+        return f"nothing was saved of env {env}: {why}"
+    return SaveRequest(run.task, load, episodes)
+
+
+def find_episode(history: History, env: int, serial: int | None, before: bool = False) -> PastEpisode | str:
+    """The episode of this env that contains a moment, up to its end; or the reason why none can be recorded.
+
+    Args:
+        serial: None for the running episode, or the one before if that has no step yet.
+        before: the one before that.
+    """
+    if not len(history):
+        return "there is no step yet"
+    found = _episode_at(history, env, history.last if serial is None else serial)
+    if isinstance(found, PastEpisode) and found.steps == 0 and serial is None:
+        found = _episode_before(history, env, found) or found
+    if before and isinstance(found, PastEpisode):
+        found = _episode_before(history, env, found)
+        while isinstance(found, PastEpisode) and found.steps == 0:  # it was reset at once
+            found = _episode_before(history, env, found)
+        found = found or "there is no episode before it in memory"
+    if isinstance(found, PastEpisode) and found.steps == 0:
+        return "the previous episode has no step: it was reset at once" if before else "it has no step yet"
+    return found
+
+
+def _episode_before(history: History, env: int, episode: PastEpisode) -> PastEpisode | str | None:
+    """The episode before; None if it is no longer in memory."""
+    begin = episode.moments[0][0].serial
+    return _episode_at(history, env, begin - 1) if begin > history.first else None
+
+
+def _episode_at(history: History, env: int, serial: int) -> PastEpisode | str:
+    moments = history.episode(env, serial)
+    if not moments:
+        return "there is no step yet"
+    first, of = moments[0]
+    if not first.jumped[of] or first.step.elapsed_steps[of] != 0:
+        return "its beginning is no longer in memory"
+    if any(moment.snapshot is None for moment, _ in moments):
+        return "the state of this task cannot be kept, so it cannot be replayed"
+    for count, (moment, at) in enumerate(moments):
+        step = moment.as_recorded
+        if count > 0 and (step.terminated[at] or step.truncated[at]):
+            moments = moments[: count + 1]
+            break
+    seed = -1 if first.seeds is None else int(first.seeds[of])
+    return PastEpisode(env, moments, seed)

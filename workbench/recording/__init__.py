@@ -1,1 +1,0 @@
-"""Episodes on disk: written, read, listed, and made into films and datasets."""

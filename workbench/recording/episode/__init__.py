@@ -1,1 +1,0 @@
-"""One episode as columns, and what its files say of it."""

@@ -1,1 +1,0 @@
-"""All recordings below a folder, as a table."""

@@ -1,0 +1,1 @@
+"""Rescores the history and recordings with today's code."""

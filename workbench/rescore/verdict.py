@@ -1,0 +1,278 @@
+"""Compares a run's recorded reward and evaluate with those of today's code."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.step_result import StepResult
+from workbench.episodes.equal_numbers import gap, too_far
+from workbench.episodes.row import Source
+from workbench.machine.processes.wire import Question
+from workbench.task.description import TaskOptions
+from workbench.task.problem import Problem
+from workbench.task.reference import TaskName
+
+DOUBTFUL_METRES, DOUBTFUL_RADIANS = 1e-3, 1e-2
+"""A body further than this from the recorded state makes a comparison doubtful."""
+FLAGS = ("success", "fail")
+MAIN = ("reward", *FLAGS)
+Of = TypeVar("Of")
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Reward of a run, and the entries of evaluate that are one number or flag."""
+
+    reward: NDArray
+    """(T,); empty if none was recorded."""
+    evaluate: Mapping[str, NDArray]
+    """(T + 1,) values of each entry; NaN in a state without it."""
+    has_reward: bool = True
+    """False for a task without a reward (``reward_mode="none"``), whose `reward` is zeros."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict(Generic[Of]):
+    """The comparison of one run: T control steps and T + 1 states. It ends with the shorter of both scores, also where
+    today's code would have ended the episode earlier.
+
+    The run was replayed for it, so the verdict also has the distance from the recorded states.
+    """
+
+    of: Of
+    """The run: a recording, or an env's part of the history."""
+    task: str = ""
+    seed: int = -1
+    length: int = 0
+    """Control steps."""
+    success: tuple[int | None, int | None] = (None, None)
+    """First step of the episode after which success was true, then and now; None if never."""
+    fail: tuple[int | None, int | None] = (None, None)
+    has: tuple[str, ...] = ("reward",)
+    """Names among reward, success and fail that the record or today's code has."""
+    returns: tuple[float, float] = (0.0, 0.0)
+    largest: float = 0.0
+    """Largest change of one reward."""
+    first_difference: int | None = None
+    """The first step whose reward, success or fail differs; None if all are equal."""
+    look_at: int | None = None
+    """Step to show: where success or fail differs, else where the reward differs most."""
+    differing: tuple[str, ...] = ()
+    """``reward`` and the entries of ``evaluate`` that differ somewhere."""
+    metres: float | None = None
+    """Largest distance in metres of a body from the recorded state; None if there are no states."""
+    radians: float = 0.0
+    """Largest rotation in radians of a body or joint from the recorded state."""
+    drift_at: int | None = None
+    """Step after which the body was furthest from the recorded state."""
+    start_differs: bool = False
+    """Whether the reset with its seed gave another first state, and the recorded one was restored."""
+    missed: dict[str, str] = field(default_factory=dict)
+    """Name and reason of each part of the state that could not be put into the env."""
+    why_not: str = ""
+    """Reason why the run was not rescored; all other fields are then empty."""
+    damaged: bool = False
+    """Whether some of its files cannot be read."""
+    old_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    new_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+
+    @property
+    def has_success(self) -> bool:
+        return "success" in self.has
+
+    @property
+    def differs(self) -> bool:
+        """Whether reward, success or fail differs."""
+        return self.first_difference is not None
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """`differing` without reward, success and fail."""
+        return tuple(name for name in self.differing if name not in MAIN)
+
+    @property
+    def drifted(self) -> bool:
+        """Whether a difference may come from different states and not from the code."""
+        return self.metres is not None and not (
+            self.metres <= DOUBTFUL_METRES and self.radians <= DOUBTFUL_RADIANS
+        )
+
+
+def compare(
+    of: Of,
+    old: Scores,
+    new: Scores,
+    drift: NDArray | None = None,
+    *,
+    begin: int = 0,
+    task: str = "",
+    seed: int = -1,
+    start_differs: bool = False,
+    missed: Mapping[str, str] | None = None,
+    damaged: bool = False,
+) -> Verdict[Of]:
+    """Compare recorded scores with new ones.
+
+    Args:
+        old: as long as `new`, or longer.
+        drift: (T + 1, 2) metres and radians of the furthest body from each recorded state; None if unknown.
+        begin: steps of the episode before the run.
+    """
+    steps = len(new.reward)
+    has = {"reward": old.has_reward or new.has_reward}
+    has |= {name: name in old.evaluate or name in new.evaluate for name in FLAGS}
+    both = [n for n, values in new.evaluate.items() if len(old.evaluate.get(n, ())) >= len(values)]
+    names = ("reward", *both)
+    # In one array, since this runs for hundreds of runs several times a second.
+    was, now = np.full((2, len(names), steps + 1), np.nan)
+    if len(old.reward):
+        was[0, 1:], now[0, 1:] = old.reward[:steps], new.reward
+    for row, name in enumerate(both, 1):
+        length = len(new.evaluate[name])
+        was[row, :length], now[row, :length] = old.evaluate[name][:length], new.evaluate[name]
+    apart = gap(was, now)
+    differs = too_far(was, apart, axis=1)
+    # Many files have no values for a run's first state.
+    differs[:, 0] &= ~np.isnan(was[:, 0])
+    others = {name: differs[row].nonzero()[0] for row, name in enumerate(names)}
+    turned: dict[str, tuple[int | None, int | None]] = {}
+    for name in FLAGS:
+        flags = [_flag(scores.evaluate.get(name), steps + 1) for scores in (old, new)]
+        others[name] = (flags[0] != flags[1]).nonzero()[0]
+        turned[name] = _first(flags[0], begin), _first(flags[1], begin)
+    differing = tuple(name for name in dict.fromkeys((*MAIN, *new.evaluate)) if len(others.get(name, ())))
+    first = min((begin + int(others[name][0]) for name in MAIN if name in differing), default=None)
+    look_at = first
+    if "reward" in differing:
+        look_at = begin + int(apart[0].argmax())
+    for then, now in (turned["fail"], turned["success"]):
+        if then != now:
+            look_at = then if now is None else now
+    metres, radians, drift_at = None, 0.0, None
+    if drift is not None:
+        far = int(drift[:, 0].argmax())
+        metres, radians = float(drift[far, 0]), float(drift[:, 1].max())
+        drift_at = begin + far if metres else None
+    return Verdict(
+        of=of,
+        task=task,
+        seed=seed,
+        length=steps,
+        success=turned["success"],
+        fail=turned["fail"],
+        has=tuple(name for name, there in has.items() if there),
+        returns=(float(was[0, 1:].sum()), float(np.asarray(new.reward, np.float64).sum())),
+        largest=float(apart[0].max()),
+        first_difference=first,
+        look_at=look_at,
+        differing=differing,
+        metres=metres,
+        radians=radians,
+        drift_at=drift_at,
+        start_differs=start_differs,
+        missed=dict(missed or {}),
+        damaged=damaged,
+        old_reward=was[0, 1:].astype(np.float32),
+        new_reward=np.asarray(new.reward, np.float32),
+    )
+
+
+def by_change(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
+    """The largest change first: success, fail, then return; unchanged runs and those not rescored last."""
+
+    def key(verdict: Verdict[Of]) -> tuple[bool, bool, int, float]:
+        moved = 2 * (verdict.success[0] != verdict.success[1]) + (verdict.fail[0] != verdict.fail[1])
+        change = float(gap(*map(np.atleast_1d, verdict.returns))[0])
+        return bool(verdict.why_not), not verdict.differs, -moved, -change
+
+    return sorted(verdicts, key=key)
+
+
+def scalar_entries(evaluate: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """The entries of `evaluate`, (n, ...) each, that are one number or flag in each row, as (n,)."""
+    return {
+        # An author's entry may be called "reward" too, and is not the reward.
+        "evaluate/reward" if name == "reward" else name: values.reshape(len(values))
+        for name, values in evaluate.items()
+        if values.dtype.kind in "fiub" and values.shape in ((len(values),), (len(values), 1))
+    }
+
+
+def _first(flag: NDArray[np.bool_], begin: int) -> int | None:
+    return begin + int(flag.argmax()) if flag.any() else None
+
+
+def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
+    """(states,) of an entry that is a flag; False where it is missing."""
+    found = np.zeros(states, bool)
+    if values is not None:
+        found[: len(values)] = values[:states] > 0.5
+    return found
+
+
+# --- questions to a worker -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rescored:
+    """Part of the result of rescoring some episodes."""
+
+    verdicts: tuple[Verdict[Source], ...]
+    steps: int
+    """Control steps since the part before, over all episodes."""
+    problem: Problem | None = None
+    """Exception of the task's code; the rescoring ends with it."""
+
+
+@dataclass(frozen=True)
+class Rescore(Question[Rescored]):
+    """Open a task in a worker without one, and read and rescore these episodes with it. The first part is sent when the task
+    is open; the answer holds only what is not in the parts."""
+
+    part: ClassVar[Any] = Rescored
+    task: TaskName
+    options: TaskOptions
+    or_else: TaskOptions
+    """Options to use where the task cannot be opened with `options`."""
+    files: tuple[Source, ...]
+    use_env_states: bool
+
+
+# The server keeps the history and hands over snapshots and actions: the batch makes its steps together again, since they may
+# depend on each other by a generator that all envs share. Only for a worker that does not play: its envs move.
+
+
+@dataclass(frozen=True)
+class MomentToRescore:
+    """A past moment to replay: a control step, or a jump if it has a snapshot."""
+
+    action: NDArray[np.float32] | None
+    """(N, A) action; None for a jump, or a task without robots."""
+    snapshot: bytes | None = None
+    """A pickled `envs.snapshots.snapshot.Snapshot` of the whole batch."""
+    env_idx: tuple[int, ...] = ()
+    """The envs that are put back to the snapshot."""
+
+
+@dataclass(frozen=True)
+class RescoredMoments:
+    """Reward and evaluate of past moments by today's code."""
+
+    steps: tuple[StepResult, ...]
+    """One for each moment; fewer if one raised."""
+    not_carried: dict[str, str]
+    """What jumps of all envs could not restore, each with the reason."""
+    problem: Problem | None = None
+    """What the moment after `steps` raised."""
+
+
+@dataclass(frozen=True)
+class RescoreMoments(Question[RescoredMoments]):
+    """Replay these moments in order."""
+
+    moments: tuple[MomentToRescore, ...]

@@ -1,0 +1,1 @@
+"""Open recordings, played along one time axis."""

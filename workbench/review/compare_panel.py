@@ -1,0 +1,133 @@
+"""The Compare tab: where two recordings differ first, entry by entry."""
+
+from __future__ import annotations
+
+import viser
+
+from workbench.episodes.episode import NO_SEED
+from workbench.live.history.curves import PREFIX
+from workbench.live.timeline_commands import Seek
+from workbench.machine.text import length
+from workbench.page.command import Command, Refused
+from workbench.page.widgets.fields import choice
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import letter, render
+from workbench.page.widgets.tools import Tool, tools_html
+from workbench.page.widgets.visitors import Visitor
+from workbench.review.commands import ChooseTolerance, CompareWith, SwapWithFirst
+from workbench.review.differences import TOLERANCES, USUAL_TOLERANCE, Difference, FirstDifference, difference
+from workbench.review.playback import Review
+from workbench.review.view import Opened, ReviewView
+
+TOLERANCE_NAMES = {length(way): way for way in TOLERANCES}
+MOST_ROWS = 30
+
+
+class ReviewComparePanel(PagePart[ReviewView]):
+    """Compares the first recording with another; a row goes to the first state at which its entry differs."""
+
+    does = (CompareWith, SwapWithFirst, ChooseTolerance)
+
+    def __init__(self, server: viser.ViserServer, review: Review) -> None:
+        self._review = review
+        self._wish, self._metres = 1, USUAL_TOLERANCE
+        """Recording that was chosen last, kept while fewer are open, and the tolerance."""
+        self._other = choice(server, "A against", CompareWith, "index", {"B": 1}, 1)
+        self._swap = server.gui.add_html("")
+        self._tolerance = choice(
+            server,
+            "Tolerance",
+            ChooseTolerance,
+            "metres",
+            TOLERANCE_NAMES,
+            USUAL_TOLERANCE,
+            hint="How far apart a body must be to count as different.",
+        )
+        self._html = server.gui.add_html("")
+        self._differing: list[FirstDifference] = []
+        """First difference of each row of the table."""
+
+    def key(self, view: ReviewView) -> object:
+        return view.opened_serial, len(view.opened), view.anchors, self._wish, self._metres
+
+    def draw(self, view: ReviewView) -> None:
+        several = len(view.opened) > 1
+        other = self._wish if self._wish < len(view.opened) else 1
+        self._other.visible = len(view.opened) > 2
+        self._other.show(other, options={letter(index): index for index in range(1, len(view.opened))})
+        self._tolerance.visible = several
+        self._tolerance.show(self._metres)
+        swap = Tool(f"Swap A and {letter(other)}", SwapWithFirst(index=other), "Makes the other recording A")
+        self._swap.content = tools_html([swap] if several else [])
+        if not several:
+            self._html.content = render("note", text="Open two recordings to see where they diverge.")
+            return
+        a, b = view.opened[0], view.opened[other]
+        found = difference(a.episode, b.episode, (view.anchors[0], view.anchors[other]), self._metres)
+        self._html.content = self._content(a, b, other, found, view)
+
+    def _content(self, a: Opened, b: Opened, other: int, found: Difference, view: ReviewView) -> str:
+        differences = [*([found.bodies] if found.bodies else []), *found.numbers]
+        self._differing = [p for p in differences if p.position is not None]
+        presses = [Seek(step=p.position) for p in self._differing[:MOST_ROWS] if p.position is not None]
+        one_sided = [f"{p.name} ({p.values})" for p in differences if p.position is None and p.values]
+        return render(
+            "review_compare",
+            a=a,
+            b=b,
+            other=other,
+            view=view,
+            found=found,
+            headline=headline(found),
+            notes=notes(a, b, found),
+            totals=next((p.totals for p in found.numbers if p.name == "reward"), ""),
+            rows=list(zip(self._differing, presses, strict=False)),
+            more=len(self._differing) - len(presses),
+            same=", ".join(
+                p.name.removeprefix(PREFIX) for p in differences if p.position is None and not p.values
+            ),
+            one_sided=", ".join((*one_sided, *found.not_in_both)),
+            prefix=PREFIX,
+        )
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case CompareWith(index=index) if index >= len(self._review.view().opened):
+                raise Refused("It is not open any more.")
+            case CompareWith(index=index):
+                self._wish = index
+            case ChooseTolerance(metres=metres):
+                self._metres = metres
+            case _:
+                self._review.do(command, visitor.name)
+
+
+def headline(found: Difference) -> str:
+    if not found.compared:
+        return "Aligned like this, the two recordings do not overlap."
+    if found.bodies is None:
+        return "One of them has no scene; only numbers are compared."
+    if found.bodies.position is None:
+        apart = "" if found.bodies.largest == "0" else f", at most {found.bodies.largest} apart"
+        return f"All bodies move alike{apart}."
+    return (
+        f"They diverge at step {found.bodies.position} ({found.bodies.values}), up to {found.bodies.largest}."
+    )
+
+
+def notes(a: Opened, b: Opened, found: Difference) -> list[str]:
+    said = []
+    if a.episode.info.task != b.episode.info.task:
+        said.append("They are from different tasks.")
+    elif without := [name for name, one in (("A", a), ("B", b)) if one.episode.info.seed <= NO_SEED]:
+        said.append(f"{' and '.join(without)} {'has' if len(without) == 1 else 'have'} no seed.")
+    elif not found.same_seed:
+        said.append("They have different seeds.")
+    if a.length != b.length:
+        said.append(f"{a.length} and {b.length} steps; {found.compared} states are compared.")
+    of_batch = dict.fromkeys(name for each in (a, b) for name in (*each.episode.batch, *each.episode.texts))
+    if of_batch:
+        said.append(f"Not compared, because they are not per env: {', '.join(of_batch)}.")
+    if abs(a.episode.info.control_dt - b.episode.info.control_dt) > 1e-9:
+        said.append("A step does not last equally long in both.")
+    return said

@@ -1,0 +1,244 @@
+"""The Curves tab of a review: numbers of the recordings at the position, and curves over their steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.envs.step_result import StepResult
+from workbench.episodes.episode import Episode
+from workbench.live.history.curves import spans_of
+from workbench.live.panels.reward_panel import COLOURS as LINE_COLOURS
+from workbench.live.panels.reward_panel import NumberRow, number_rows
+from workbench.live.timeline_commands import Seek
+from workbench.page.command import Command, Refused, name_of
+from workbench.page.widgets.fields import by_name, choice
+from workbench.page.widgets.line_chart import ChartLine, LineChart, span_of
+from workbench.page.widgets.parts import PagePart
+from workbench.page.widgets.templates import colour, letter, render
+from workbench.page.widgets.visitors import Visitor
+from workbench.review.commands import ChooseReviewCurve
+from workbench.review.scene_view import shown_together
+from workbench.review.view import ACTION, REWARD, TERMS, ReviewView, column_at, curves
+
+CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
+"""Height of each chart in pixels, from the top."""
+Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
+
+
+class ReviewNumbers(PagePart[ReviewView]):
+    """The table of numbers at the position."""
+
+    every = 0.09
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._html = server.gui.add_html("")
+
+    def key(self, view: ReviewView) -> object:
+        return view.opened_serial, view.selected, view.position, view.anchors
+
+    def draw(self, view: ReviewView) -> None:
+        chosen = view.chosen
+        if chosen is None:
+            self._html.content = render("note", text="Numbers and curves appear when a recording is open.")
+            return
+        own = number_rows(
+            step_of(chosen.episode, view.states[view.selected]), 0, chosen.length, _mode_of(chosen.episode)
+        )
+        beside = [(own, view.states[view.selected])]
+        together = shown_together(view)
+        if len(together) > 1:
+            episodes = [(view.opened[i].episode, view.states[i]) for i in together]
+            beside = [
+                (number_rows(step_of(episode, state), 0, None, _mode_of(episode)), state)
+                for episode, state in episodes
+            ]
+        self._html.content = render("review_numbers", rows=compared(own, beside), of=together)
+
+
+class ReviewCurves(PagePart[ReviewView]):
+    """Charts of one entry each, with a line for each recording, aligned: the reward, and one that is chosen.
+
+    An action and the reward terms have many lines, so they are drawn for the selected recording only. The position is a
+    dot on one line: a line at the position would have to be sent with every frame.
+    """
+
+    every = 0.15
+    does = (ChooseReviewCurve,)
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        folder = server.gui.add_folder(None)
+        self._entry = choice(server, "Also", ChooseReviewCurve, "curve", (), "")
+        self._charts = {
+            name: LineChart(server, folder, height, order)
+            for order, (name, height) in enumerate(CHARTS.items(), start=1)
+        }
+        self._hint = server.gui.add_html("", visible=False)
+        self._lines_drawn: object = None
+        self._found: dict[str, dict[str, Lines]] = {}
+        self._offered: dict[str, tuple[str, str]] = {}
+        """Entry and line of each choice; the line is empty where the entry has a single line."""
+        self._wish = ""
+        """Entry that was chosen last, kept while recordings without it are open."""
+
+    def key(self, view: ReviewView) -> object:
+        which = view.opened_serial, len(view.opened), view.selected
+        return *which, view.position, view.anchors, self._wish
+
+    def draw(self, view: ReviewView) -> None:
+        # By id: a recording that gets its scene later stays the same recording.
+        self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
+        shown = shown_together(view)
+        self._hint.visible = bool(shown)
+        self._hint.content = render("curve_hint", curve=name_of(Seek), gone=None, kept=0)
+        also = self._offer(view, shown)
+        self._draw_entry("reward", REWARD, view, shown)
+        self._draw_entry("also", also, view, shown)
+        lines = (view.opened_serial, view.selected, view.anchors, len(view.opened))
+        if lines != self._lines_drawn:
+            # They do not follow the position, and a chart that is sent again is drawn again.
+            self._lines_drawn = lines
+            self._draw_lines("terms", TERMS, view)
+            self._draw_lines("action", ACTION, view)
+
+    # --- charts --------------------------------------------------------------------------------------
+
+    def do(self, command: Command, visitor: Visitor) -> None:
+        match command:
+            case ChooseReviewCurve(curve=curve):
+                if curve not in self._offered:
+                    raise Refused("The open recordings have no such entry.")
+                self._wish = curve
+
+    def _offer(self, view: ReviewView, shown: Sequence[int]) -> str:
+        """Chosen entry; empty if there is none."""
+        found = [self._found[view.opened[index].id] for index in shown]
+        self._offered = {
+            name if len(lines) == 1 else f"{name}: {line}": (name, "" if len(lines) == 1 else line)
+            for entries in found
+            for name, lines in entries.items()
+            if name not in (REWARD, TERMS, ACTION)
+            for line in lines
+        }
+        for entries in found:
+            for group in (TERMS, ACTION):
+                self._offered |= {f"{group}: {line}": (group, line) for line in entries.get(group, {})}
+        wishes = self._wish, "success", *self._offered
+        chosen = next((one for one in wishes if one in self._offered), "")
+        self._entry.visible = bool(chosen)
+        self._entry.show(chosen, options=by_name(tuple(self._offered)))
+        return chosen
+
+    def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
+        """Draw one entry of all compared recordings."""
+        group, line = self._offered.get(entry, (entry, ""))
+        drawn: list[ChartLine] = []
+        cursor = 0
+        for index in shown:
+            one = view.opened[index]
+            lines = self._found[one.id].get(group)
+            if not lines or (line and line not in lines):
+                continue
+            if index == view.selected:
+                cursor = len(drawn)
+            states, values = lines[line] if line else next(iter(lines.values()))
+            name = letter(index) if len(view.opened) > 1 else entry
+            over = column_at(states, values, view.anchors[index], axis_of(view))
+            drawn.append(ChartLine(name, over, colour(index), 1.7))
+        self._put(chart, entry, view, drawn, drawn[cursor] if drawn else None)
+
+    def _draw_lines(self, chart: str, entry: str, view: ReviewView) -> None:
+        """Draw an entry with several lines, of the selected recording."""
+        chosen, axis = view.chosen, axis_of(view)
+        lines = {} if chosen is None else self._found[chosen.id].get(entry, {})
+        drawn = [
+            ChartLine(name, column_at(states, values, view.anchors[view.selected], axis), tone, 1.7)
+            for (name, (states, values)), tone in zip(lines.items(), LINE_COLOURS, strict=False)
+        ]
+        whose = f", {letter(view.selected)}" if len(view.opened) > 1 else ""
+        self._put(chart, f"{entry}{whose}", view, drawn)
+
+    def _put(
+        self,
+        chart: str,
+        title: str,
+        view: ReviewView,
+        drawn: list[ChartLine],
+        dotted: ChartLine | None = None,
+    ) -> None:
+        """Draw the lines, with their peaks where there are many positions, and the dot of one at the present position."""
+        # First, since the steps are those of the first line's peaks.
+        ordered = sorted(drawn, key=lambda line: line is not dotted)
+        if not ordered:
+            self._charts[chart].hide()
+            return
+        x, values = spans_of(np.stack([line.values for line in ordered]), first=view.first).points()
+        found = {id(line): own for line, own in zip(ordered, values, strict=True)}
+        lines = [replace(line, values=found[id(line)]) for line in drawn]
+        dot = None
+        if dotted is not None and len(x):
+            dot = np.full(len(x), np.nan)
+            dot[np.abs(x - view.position).argmin()] = dotted.values[view.position - view.first]
+        self._charts[chart].draw(title, x, lines, dot, span_of([line.values for line in lines]))
+
+
+def _mode_of(episode: Episode) -> str:
+    """The mode of the reward for `number_rows`: only whether there is one is shown."""
+    return "" if episode.info.has_reward else "none"
+
+
+def step_of(episode: Episode, state: int) -> StepResult:
+    """One state of a recording as a batch of one env."""
+    before = state - 1
+    return StepResult(
+        elapsed_steps=np.array([state], np.int32),
+        reward=np.asarray(episode.reward[before : before + 1] if state else [0.0], np.float32),
+        terminated=np.asarray(episode.terminated[before : before + 1] if state else [False], bool),
+        truncated=np.asarray(episode.truncated[before : before + 1] if state else [False], bool),
+        evaluate={name: values[state : state + 1] for name, values in episode.evaluate.items()},
+        poses=np.zeros((1, 0, 7), np.float32) if episode.poses is None else episode.poses[state : state + 1],
+        action=episode.action[before : before + 1] if state else None,
+        others=episode.other_entries_at(state),
+    )
+
+
+def known(number: str, state: int) -> str:
+    """The text of a number: NaN at state 0 is a dash, since no step came before it; later the task returned it."""
+    return "—" if number == "NaN" and state == 0 else number
+
+
+def compared(
+    rows: Sequence[NumberRow], beside: Sequence[tuple[Sequence[NumberRow], int]]
+) -> list[dict[str, Any]]:
+    """Rows of the table: those of the selected recording, then what only others have.
+
+    Args:
+        beside: of each recording with a column, its rows and their state.
+    """
+    moods = {row.name: row.mood for row in rows}
+    for others, _ in beside:
+        for row in others:
+            moods.setdefault(row.name, "")
+    columns = [
+        {row.name: known(row.whole or row.selected, state) for row in others} for others, state in beside
+    ]
+    hints = {row.name: row.hint for others, _ in reversed(beside) for row in others if row.whole}
+    return [
+        {
+            "name": name,
+            "mood": mood,
+            "whole": name in hints,
+            "hint": hints.get(name, ""),
+            "values": [column.get(name, "—") for column in columns],
+        }
+        for name, mood in moods.items()
+    ]
+
+
+def axis_of(view: ReviewView) -> NDArray[np.int64]:
+    return np.arange(view.first, view.last + 1)

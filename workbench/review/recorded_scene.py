@@ -1,0 +1,98 @@
+"""Makes the 3-D scene of recordings without one (ManiSkill's own), from the env that they name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from workbench.envs.recorded_run import HOW_IT_IS_RUN
+from workbench.episodes.episode import Episode
+from workbench.live.process.ask import Background, OnProgress
+from workbench.live.process.background_jobs import JobFailed, ProcessDied
+from workbench.live.questions import MakeScene, SceneMade
+from workbench.machine.loop import result_of
+from workbench.trust.clearance import paths_in_arguments
+
+_NOT_PASSED_ON = HOW_IT_IS_RUN | {
+    "obs_mode", "reward_mode", "backend", "parallel_in_single_scene", "sensor_configs",
+    "human_render_camera_configs", "viewer_camera_configs", "enable_shadow", "max_episode_steps",
+}  # fmt: skip
+"""Keywords of ``gym.make`` that do not change where bodies are."""
+
+
+class SceneError(RuntimeError):
+    """Why a recording's scene cannot be made, as a sentence."""
+
+
+class SceneProcess:
+    """Makes scenes in a process of its own, which ends with the call.
+
+    ManiSkill's own recordings hold the states of actors and joints, but neither meshes nor poses of links. So the env is
+    made, reset with the recorded seed, and set to each recorded state. Its code may be missing or broken, and the server
+    imports no simulator: hence the process. Several episodes of one file share its env.
+    """
+
+    def __init__(self, files: Sequence[Path] = (), imports: tuple[str, ...] = ()) -> None:
+        """
+        Args:
+            files: Task files in which the envs of recordings may be found.
+            imports: As `TaskOptions.imports`.
+        """
+        self._imports = imports
+        self._files = tuple(str(Path(file).absolute()) for file in files)
+
+    def __call__(
+        self, episodes: Sequence[Episode], check: Callable[[], None], on_progress: Callable[[int, str], None]
+    ) -> Iterator[tuple[Episode, tuple[str, ...]] | SceneError]:
+        """Yield each episode with its scene and what could not be restored, or why it gets none.
+
+        Args:
+            check: called a few times a second; an exception in it ends the work.
+            on_progress: called with an index into `episodes` and what is being done for that one.
+        """
+        process = Background(niceness=0)
+        try:
+            for number, episode in enumerate(episodes):
+                on_progress(number, "making its scene")
+                try:
+                    made = self._make(
+                        process,
+                        episode,
+                        check,
+                        lambda done, total, words, number=number: on_progress(number, words),
+                    )
+                except SceneError as error:
+                    yield error
+                else:
+                    yield replace(episode, geometry=made.geometry, poses=made.poses), made.missed
+        finally:
+            process.close()
+
+    def _make(
+        self, process: Background, episode: Episode, check: Callable[[], None], on_progress: OnProgress
+    ) -> SceneMade:
+        info = episode.info
+        if named := paths_in_arguments(info):
+            # Opening a row must not let an env read files that a recording names: native code may parse them.
+            raise SceneError(
+                f"It names files for {info.task} to read ({', '.join(named[:3])}), which is not done for looking at it, so "
+                "there are numbers and curves only."
+            )
+        kwargs = {name: value for name, value in info.env_kwargs.items() if name not in _NOT_PASSED_ON}
+        question = MakeScene(
+            info.task,
+            self._files,
+            kwargs,
+            info.seed,
+            dict(info.reset_options),
+            dict(episode.env_states),
+            self._imports,
+        )
+        try:
+            return result_of(process.ask(question, on_progress), check)
+        except ProcessDied as failure:
+            why = f"The scene of {info.task} could not be made ({failure}), so there are only numbers and curves."
+            raise SceneError(why) from failure
+        except JobFailed as failure:
+            raise SceneError(str(failure)) from failure

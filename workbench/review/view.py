@@ -1,0 +1,322 @@
+"""Snapshots of the open recordings for the review page: position, events, curves and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraInfo, CameraKey, Picture, PictureDegree
+from workbench.episodes.episode import CameraTrack, Episode
+from workbench.episodes.reader.reader_process import ReaderBusy
+from workbench.episodes.row import is_stopped
+from workbench.live.history.curves import PREFIX
+from workbench.live.messages import CameraRequest
+
+START = "start"
+"""The alignment that every recording has."""
+Style = Literal["reset", "success", "fail", "limit", "odd", "other"]
+"""Colour of an event on the strip under the slider."""
+REWARD = "reward"
+TERMS = "terms of the reward"
+ACTION = "action"
+MOST_LINES = 12
+"""Most columns of one entry; more cannot be told apart."""
+_MOST_RUNS = 40
+"""Most events of one entry; an entry that flickers at every step is no event."""
+
+
+@dataclass(frozen=True)
+class EpisodeEvent:
+    """The first state of a run in which something is true."""
+
+    state: int
+    name: str
+    style: Style
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """One open recording. Two are equal only if they are the same one, opened once."""
+
+    id: str
+    """Id of the library's row."""
+    name: str
+    """Name of the file, as shown."""
+    episode: Episode
+    events: tuple[EpisodeEvent, ...]
+    scene: str = ""
+    """Message about a missing 3-D scene: it is being made, or why it cannot be."""
+    making: bool = False
+    """Whether the scene is being made in the background."""
+
+    @property
+    def length(self) -> int:
+        """Number of control steps; there is one state more."""
+        return len(self.episode.reward)
+
+    @property
+    def has_scene(self) -> bool:
+        return self.episode.geometry is not None and self.episode.poses is not None
+
+    def first(self, name: str) -> int | None:
+        """The first state with an event of this name; None without one."""
+        return next((event.state for event in self.events if event.name == name), None)
+
+
+@dataclass(frozen=True)
+class Playback:
+    """Position and time at which playing began."""
+
+    position: int
+    at: float
+    """Clock time in seconds."""
+
+
+@dataclass(frozen=True)
+class ReviewView:
+    """Immutable snapshot of the open recordings and of the position.
+
+    Recordings differ in length and in when things happen. So all share one *position*, counted from the moment at which
+    they are aligned (their starts, the first success of each, ...): position 0 is that moment in each. Before its start
+    an episode shows its first state, after its end its last.
+    """
+
+    opened: tuple[Opened, ...] = ()
+    opened_serial: int = 0
+    """Grows when other recordings are open, or one of them has got its scene."""
+    selected: int = 0
+    """Index into `opened` of the recording whose cameras and numbers are shown."""
+    align: str = START
+    alignments: tuple[str, ...] = (START,)
+    """What the open recordings can be aligned at."""
+    anchors: tuple[int, ...] = ()
+    """State of each recording that is at position 0."""
+    position: int = 0
+    first: int = 0
+    last: int = 0
+    """First and last position, both included."""
+    playback: Playback | None = None
+    """None while nothing plays."""
+    speed: float = 1.0
+    loop: bool = False
+    loading: str = ""
+    """What is being opened."""
+    problems: tuple[str, ...] = ()
+    """Recordings that could not be opened, and files that changed since; a sentence each."""
+    changed_symbols: str = ""
+    """Symbols of the selected recording's task that changed since the recording."""
+    not_opened: tuple[str, ...] = ()
+    """Ids of the recordings that the last opening could not read."""
+    library_stays: bool = False
+    """Whether the library stays unfolded next to what is open, or is being opened."""
+
+    @property
+    def playing(self) -> bool:
+        return self.playback is not None
+
+    @property
+    def states(self) -> tuple[int, ...]:
+        """State of each recording that is shown at the position."""
+        return tuple(
+            state_at(self.position, a, o.length) for o, a in zip(self.opened, self.anchors, strict=True)
+        )
+
+    @property
+    def chosen(self) -> Opened | None:
+        return self.opened[self.selected] if self.opened else None
+
+
+def state_at(position: int, anchor: int, length: int) -> int:
+    """State at a position of an episode with `length` steps; its first or last state beyond its ends."""
+    return min(max(position + anchor, 0), length)
+
+
+def column_at(
+    states: NDArray[np.integer], values: NDArray[np.float64], anchor: int, axis: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """One episode's numbers over the positions of `axis`; NaN where it has none."""
+    line = np.full(len(axis), np.nan)
+    if len(axis):
+        places = states.astype(np.int64) - anchor - int(axis[0])
+        inside = (places >= 0) & (places < len(axis))
+        line[places[inside]] = values[inside]
+    return line
+
+
+# --- events and curves ---------------------------------------------------------------------------------
+
+
+def find_events(episode: Episode) -> tuple[EpisodeEvent, ...]:
+    """Events in order of time, the start first: success, fail and every other bool of ``evaluate`` that turns true,
+    time limits, and rewards that are not finite."""
+    found = [EpisodeEvent(0, "reset", "reset")]
+    for name, values in episode.evaluate.items():
+        yes = None if name.startswith(PREFIX) else _flag(values)
+        if yes is not None:
+            style: Style = "success" if name == "success" else "fail" if name == "fail" else "other"
+            found += [EpisodeEvent(state, name, style) for state in _turns_true(yes)]
+    found += [
+        EpisodeEvent(state + 1, "time limit", "limit")
+        for state in _turns_true(np.asarray(episode.truncated, bool))
+    ]
+    found += [
+        EpisodeEvent(state + 1, "reward is NaN or infinite", "odd")
+        for state in _turns_true(~np.isfinite(np.asarray(episode.reward, np.float64)))
+    ]
+    return tuple(sorted(found, key=lambda event: (event.state, event.style == "other")))
+
+
+def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]]:
+    """All numbers over time: by entry, then by line, the states (K,) and the numbers (K,) at them.
+
+    Entries with several numbers a state (an action, the terms of a reward) have a line each.
+    """
+    states = np.arange(len(episode.reward) + 1)
+    after = states[1:]
+    found: dict[str, dict[str, tuple[NDArray, NDArray]]] = {}
+    if episode.info.has_reward:
+        found[REWARD] = {REWARD: (after, _numbers(episode.reward))}
+    terms: dict[str, tuple[NDArray, NDArray]] = {}
+    for name, values in episode.evaluate.items():
+        if values.dtype.kind not in "fiub":
+            continue
+        if name.startswith(PREFIX):
+            if values.ndim == 1 and len(terms) < MOST_LINES:
+                terms[name.removeprefix(PREFIX)] = (after, _numbers(values)[1:])
+            continue
+        label = f"{name} (evaluate)" if name in (REWARD, TERMS, ACTION) else name
+        found[label] = dict(_lines(name, values, states))
+    for name, values in episode.batch.items():
+        label = f"{name} (not per env)"
+        found[label] = dict(_lines(label, values, states))
+    if terms:
+        found[TERMS] = terms
+    if episode.action.shape[1:] and episode.action.shape[1]:
+        action = np.asarray(episode.action, np.float64)[:, :MOST_LINES]
+        found[ACTION] = {
+            name: (after, action[:, index]) for index, name in enumerate(episode.action_names[:MOST_LINES])
+        }
+    return found
+
+
+def outcome_text(episode: Episode) -> tuple[str, str]:
+    """How the episode ended, and the colour for it: ``good``, ``bad``, ``warn`` or none."""
+    success, fail = (_flag(episode.evaluate.get(name)) for name in ("success", "fail"))
+    if fail is not None and len(fail) and fail[-1]:
+        return "failed", "bad"
+    if success is None or not len(success):
+        return "no success defined", ""
+    if success[-1]:
+        return "success", "good"
+    if len(once := np.flatnonzero(success)):
+        return f"success lost (it was there at step {once[0]})", "warn"
+    if is_stopped(episode.length, episode.info.max_episode_steps):
+        return "stopped, no success yet", ""
+    return "no success", "bad"
+
+
+def _lines(name: str, values: NDArray, states: NDArray) -> Iterator[tuple[str, tuple[NDArray, NDArray]]]:
+    flat = _numbers(values.reshape(len(values), -1))
+    for column in range(min(flat.shape[1], MOST_LINES)):
+        label = name if values.ndim == 1 else f"{name}[{column}]"
+        yield label, (states, flat[:, column])
+
+
+def _numbers(values: NDArray) -> NDArray[np.float64]:
+    return np.asarray(values, np.float64)
+
+
+def _flag(values: NDArray | None) -> NDArray[np.bool_] | None:
+    """(T + 1,) values of a bool entry; None for any other entry."""
+    if values is None or not len(values) or values.size != len(values):
+        return None
+    flat = values.reshape(len(values))
+    if flat.dtype.kind == "b":
+        return flat
+    if flat.dtype.kind != "f":
+        return None
+    # An entry that only some states had is stored as 0.0 and 1.0, with NaN for the others.
+    known = flat[np.isfinite(flat)]
+    return np.nan_to_num(flat) != 0 if len(known) and np.isin(known, (0.0, 1.0)).all() else None
+
+
+def _turns_true(yes: NDArray[np.bool_]) -> list[int]:
+    before = np.concatenate([[False], yes[:-1]])
+    starts = np.flatnonzero(yes & ~before)
+    return starts[:1].tolist() if len(starts) > _MOST_RUNS else starts.tolist()
+
+
+# --- pictures ------------------------------------------------------------------------------------------
+
+
+class PictureReader:
+    """Decodes the pictures of one recording at a time. Not thread-safe: the page's loop owns it.
+
+    A picture takes some milliseconds to decode and an episode of four cameras has thousands. So only the shown one of
+    each camera is decoded and kept: the page asks for the same one thirty times a second.
+    """
+
+    def __init__(self) -> None:
+        self._episode: Episode | None = None
+        self._cache: dict[CameraKey, tuple[int, tuple[str, ...], Picture]] = {}
+        self.problem = ""
+        """Why a picture cannot be shown, as a sentence; else empty."""
+
+    def cameras(self, episode: Episode) -> tuple[CameraInfo, ...]:
+        """Cameras of the episode, each with the modalities that were recorded."""
+        return tuple(
+            replace(track.info, modalities=tuple(track.pictures))
+            for track in episode.cameras
+            if track.pictures and len(track.frame)
+        )
+
+    def pictures(
+        self, episode: Episode, state: int, requests: Iterable[CameraRequest], env: int
+    ) -> dict[CameraKey, Picture]:
+        """The newest picture of each camera at or before `state`, labelled as a picture of `env`.
+
+        A camera whose picture cannot be decoded has none; `problem` says why.
+        """
+        if episode is not self._episode:
+            self._episode, self._cache, self.problem = episode, {}, ""
+        tracks = {track.info.key: track for track in episode.cameras}
+        found: dict[CameraKey, Picture] = {}
+        for request in requests:
+            track = tracks.get((request.kind, request.name))
+            if track is None:
+                continue
+            index = int(np.searchsorted(track.frame, state, side="right")) - 1
+            modalities = tuple(m for m in track.pictures if m in request.modalities)
+            if index < 0 or not modalities:
+                continue
+            kept = self._cache.get(track.info.key)
+            if kept is None or kept[:2] != (index, modalities) or kept[2].env != env:
+                try:
+                    degree = "fast" if episode.info.pictures == "fast" else None
+                    picture = decode_picture(track, index, modalities, env, degree)
+                except ReaderBusy:
+                    # Another recording is being opened by the reader: the last picture stays until it is done.
+                    if kept is not None:
+                        found[track.info.key] = kept[2]
+                    continue
+                except (OSError, ValueError, EOFError, IndexError) as error:
+                    self.problem = f"A picture of {track.info.name} cannot be read: {error}."
+                    continue
+                kept = (index, modalities, picture)
+                self._cache[track.info.key] = kept
+            found[track.info.key] = kept[2]
+        return found
+
+
+def decode_picture(
+    track: CameraTrack, index: int, modalities: tuple[str, ...], env: int, degree: PictureDegree | None
+) -> Picture:
+    """Picture `index` of a camera."""
+    planes: dict[str, Any] = {
+        m: np.asarray(encoded[index]) for m, encoded in track.pictures.items() if m in modalities
+    }
+    return Picture(track.info.name, track.info.kind, env, track.pose[index], **planes, degree=degree)

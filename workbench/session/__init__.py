@@ -1,1 +1,0 @@
-"""The live session and the review: what the page asks for and what it sees."""

@@ -1,1 +1,0 @@
-"""The history of the batch: moments, curves, one table row an env."""

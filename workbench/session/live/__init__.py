@@ -1,1 +1,0 @@
-"""The session of the open task: its state, its versions, its timeline."""

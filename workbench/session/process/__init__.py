@@ -1,1 +1,0 @@
-"""The worker as a process: started, supervised, asked and logged; and jobs in the background with their progress."""

@@ -1,1 +1,0 @@
-"""The messages between the server and its worker."""

@@ -1,1 +1,0 @@
-"""Records episodes of a live session, while they happen or afterwards."""

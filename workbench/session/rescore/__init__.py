@@ -1,1 +1,0 @@
-"""Rescores past moments and recordings with today's code."""

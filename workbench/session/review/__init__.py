@@ -1,1 +1,0 @@
-"""Recordings that are open, along one time axis."""

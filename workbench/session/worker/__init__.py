@@ -1,1 +1,0 @@
-"""The worker process: it owns the env and is the only one that steps it."""

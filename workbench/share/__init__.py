@@ -1,0 +1,1 @@
+"""Films, pages, sheets and datasets made from recordings, and rerun's viewer."""

@@ -1,0 +1,427 @@
+"""Makes films, moving 3-D pages, sheets of pictures and datasets from recordings, in a process of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import signal
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL.PngImagePlugin import PngInfo
+
+from workbench.envs.camera_data import moved_cameras_text
+from workbench.episodes.episode import Episode, file_part
+from workbench.episodes.films import (
+    FilmEye,
+    camera_of,
+    cameras_by_name,
+    contact_sheet,
+    enlarged,
+    frames,
+    scene_frames,
+    write_mp4,
+)
+from workbench.episodes.lerobot.export import ExportOptions, export_lerobot
+from workbench.episodes.maniskill.export import export_maniskill
+from workbench.episodes.reader.reading import read_recording
+from workbench.episodes.reader.scan import SUFFIXES
+from workbench.episodes.row import Source, UnreadableRecording
+from workbench.jobs.local_processes import Processes
+from workbench.jobs.scheduler import Deal, ItemQueue, PoolError, Work
+from workbench.machine.files import new_file
+from workbench.machine.loop import Aside, begin, on_loop, post, result_of
+from workbench.machine.software_vulkan import ensure_render_device
+from workbench.machine.text import plain_text
+from workbench.page.widgets.templates import counted, sentence
+from workbench.share.commands import What
+from workbench.share.scene_html import seconds_a_step, write_scene_html
+
+MOST_SAID = 5
+"""Maximum number of sentences about recordings that the page shows."""
+EVERY_CAMERA = ""
+
+
+@dataclass(frozen=True)
+class MakeRequest:
+    """What to make, and from which recordings."""
+
+    what: What
+    sources: tuple[Source, ...]
+    folder: Path
+    """Folder of the files; for a dataset the folder that becomes the dataset, for ManiSkill's demonstrations their
+    ``.h5`` file."""
+    camera: str = EVERY_CAMERA
+    """Camera of a film."""
+    eye: FilmEye | None = None
+    """The viewpoint of a scene; None: a usual one."""
+    export: ExportOptions = ExportOptions()
+    """Options of a dataset."""
+
+    @property
+    def is_dataset(self) -> bool:
+        """Whether all recordings become one dataset."""
+        return self.what in ("lerobot", "maniskill")
+
+
+@dataclass(frozen=True)
+class Made:
+    """The files that were made."""
+
+    paths: tuple[Path, ...]
+    words: str
+    """Summary of what was made."""
+    left_out: tuple[str, ...] = ()
+    """A sentence for each recording that nothing was made of, with its name and the reason."""
+    damaged: tuple[str, ...] = ()
+    """A sentence for each damaged file of a recording of which the rest was used."""
+    incomplete: tuple[str, ...] = ()
+    """A sentence for each recording that lacks something of what was made."""
+    sizes: tuple[int, ...] = ()
+    """Bytes of each file, for downloads."""
+
+    @property
+    def said(self) -> tuple[str, ...]:
+        """Sentences that the page shows."""
+        said = (*self.damaged, *self.left_out, *self.incomplete)
+        more = len(said) - MOST_SAID
+        return said[:MOST_SAID] + ((f"And {more} more.",) if more > 0 else ())
+
+
+OnProgress = Callable[[float, str], None]
+
+
+def make(wanted: MakeRequest, on_progress: OnProgress = lambda done, doing: None) -> Made:
+    """Make what is wanted from each recording that has it. Used by the page and the command line.
+
+    Args:
+        on_progress: called with the part that is done, 0..1, and the current work.
+
+    Raises:
+        UnreadableRecording: a recording is damaged, and nothing can be made.
+        ValueError: it can be made from none of the recordings; the message says which lacks what.
+        OSError: it cannot be written; the message says why. Finished files stay.
+        RuntimeError: this machine has nothing to render with.
+    """
+    if wanted.what == "lerobot":
+        return _dataset(wanted, on_progress)
+    if wanted.what == "maniskill":
+        return _demonstrations(wanted, on_progress)
+    if wanted.what == "zip":
+        return _zip(wanted, on_progress)
+    paths: list[Path] = []
+    not_made: list[str] = []
+    damaged: list[str] = []
+    unreadable = False
+    for number, source in enumerate(wanted.sources):
+        part_done = _part(on_progress, number, len(wanted.sources))
+        part_done(0.0, source.stem)
+        broken: list[str] = []
+        try:
+            with _reading():
+                episode = read_recording(source)
+            broken = [one.sentence for one in episode.broken_files]
+            paths += _of_one(wanted, source, episode, part_done)
+            damaged += broken
+        except ValueError as error:
+            unreadable = unreadable or bool(broken) or isinstance(error, UnreadableRecording)
+            # It does not lack pictures, they cannot be read.
+            why = " ".join(broken) or str(error)
+            not_made.append(why if source.stem in why else f"{source.stem}: {why}")
+    if not paths:
+        raise (UnreadableRecording if unreadable else ValueError)("\n".join(not_made))
+    on_progress(1.0, "done")
+    words = counted(len(paths), "file")
+    if not_made:
+        words += f"; {len(not_made)} could not be made"
+    return Made(tuple(paths), words, tuple(not_made), tuple(damaged))
+
+
+def file_name(what: What, source: str, camera: str = "") -> str:
+    """File name of what is made from the recording `source`, and from its `camera` for a film."""
+    suffix = {"film": f".{file_part(camera)}.mp4", "scene": ".scene.mp4", "page": ".html"}
+    return source + suffix.get(what, ".sheet.png")
+
+
+@contextlib.contextmanager
+def _reading() -> Iterator[None]:
+    """Raise an error of the system within the block as an error of the recording, not of the disk that is written to."""
+    try:
+        yield
+    except OSError as error:
+        raise UnreadableRecording(str(error)) from error
+
+
+def _of_one(wanted: MakeRequest, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
+    name, fps = source.stem, 1.0 / seconds_a_step(episode)
+    if wanted.what == "film":
+        cameras = [wanted.camera] if wanted.camera != EVERY_CAMERA else list(cameras_by_name(episode))
+        if not cameras:
+            raise ValueError(f"{name} was recorded without pictures, so there is no video of it.")
+        paths = []
+        for number, camera in enumerate(cameras):
+            path = wanted.folder / file_name("film", name, camera)
+            seen = (enlarged(picture) for picture in frames(episode, camera_of(episode, camera)))
+            told = _part(on_progress, number, len(cameras))
+            counting = _counted(seen, episode, f"{name}: {camera}", told)
+            write_mp4(path, counting, fps, comment=_moved(episode))
+            paths.append(path)
+        return paths
+    path = wanted.folder / file_name(wanted.what, name)
+    if wanted.what == "scene":
+        seen = _counted(scene_frames(episode, wanted.eye), episode, f"{name}: the 3D view", on_progress)
+        write_mp4(path, seen, fps)
+    elif wanted.what == "page":
+        write_scene_html(
+            path, episode, wanted.eye, lambda done: on_progress(done, f"{name}: the animated page")
+        )
+    else:
+        with _reading():
+            sheet = contact_sheet(episode)
+        with new_file(path) as temporary:
+            about = PngInfo()
+            about.add_itxt("Comment", _moved(episode))
+            sheet.save(temporary, format="PNG", pnginfo=about)
+    return [path]
+
+
+def _moved(episode: Episode) -> str:
+    """Text: which cameras were moved by hand during the recording; empty if none."""
+    moved = moved_cameras_text(episode.info.moved_cameras)
+    return moved and f"Cameras moved by hand: {moved}"
+
+
+def _dataset(wanted: MakeRequest, on_progress: OnProgress) -> Made:
+    count = len(wanted.sources)
+    made = export_lerobot(
+        [(source.stem, partial(read_recording, source)) for source in wanted.sources],
+        wanted.folder,
+        wanted.export,
+        lambda done, doing: on_progress(done / max(count, 1), doing),
+    )
+    words = f"{counted(made.episodes, 'episode')}, {counted(made.frames, 'frame')}"
+    if made.left_out:
+        words += f"; {made.left_out} without success left out"
+    if made.not_fitting:
+        words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
+    return Made((made.folder,), " ".join([f"{words}.", *made.notes]), tuple(made.not_fitting))
+
+
+def _demonstrations(wanted: MakeRequest, on_progress: OnProgress) -> Made:
+    count = len(wanted.sources)
+    made = export_maniskill(
+        [(source.stem, partial(read_recording, source)) for source in wanted.sources],
+        wanted.folder,
+        wanted.export.only_successes,
+        wanted.export.only_fitting,
+        lambda done, doing: on_progress(done / max(count, 1), doing),
+    )
+    words = f"{counted(made.episodes, 'episode')}, {counted(made.steps, 'step')}"
+    if made.left_out:
+        words += f"; {made.left_out} without success left out"
+    if made.not_fitting:
+        words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
+    words += ". Colour pictures are as recorded, from JPEG." if made.lossy else "."
+    return Made((made.file,), words, tuple(made.not_fitting), incomplete=tuple(made.incomplete))
+
+
+def zip_name(names: Sequence[str]) -> str:
+    """Name of the archive of recordings with these names."""
+    return f"{names[0]}.zip" if len(names) == 1 else f"{names[0]}_and_{len(names) - 1}_more.zip"
+
+
+def _zip(wanted: MakeRequest, on_progress: OnProgress) -> Made:
+    """The recordings' own files in one archive: unpacked they are recordings again."""
+    # A file that holds several recordings is taken once.
+    files = list(dict.fromkeys(file for source in wanted.sources for file in _files_of(source)))
+    # Below what all have in common: recordings in two folders may have the same name.
+    root = Path(os.path.commonpath([source.path.parent for source in wanted.sources]))
+    path = wanted.folder / zip_name([source.stem for source in wanted.sources])
+    # A file may be older than the years that an archive knows.
+    with new_file(path) as temporary, zipfile.ZipFile(temporary, "w", strict_timestamps=False) as archive:
+        for number, file in enumerate(files):
+            on_progress(number / len(files), file.name)
+            # What takes space in it, meshes and pictures, is compressed already.
+            # An archive holds no name that is not UTF-8.
+            archive.write(file, plain_text(str(file.relative_to(root))), zipfile.ZIP_STORED)
+    on_progress(1.0, "done")
+    return Made((path,), f"{counted(len(files), 'file')} of {counted(len(wanted.sources), 'recording')}")
+
+
+def _files_of(source: Source) -> list[Path]:
+    """The files of a recording; a link is none. Raises ValueError if there are none."""
+    if source.kind == "lerobot":
+        found = sorted(source.path.rglob("*"))
+    else:
+        found = [source.path.with_suffix(suffix) for suffix in SUFFIXES]
+    files = [file for file in found if file.is_file() and not file.is_symlink()]
+    if not files:
+        raise ValueError(f"{source.stem}: its files are gone")
+    return files
+
+
+def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:
+    """Progress callback of one of several recordings."""
+    return lambda done, doing: on_progress((number + done) / count, doing)
+
+
+def _counted(
+    pictures: Iterable[NDArray[np.uint8]], episode: Episode, doing: str, on_progress: OnProgress
+) -> Iterator[NDArray[np.uint8]]:
+    numbered = enumerate(pictures)
+    while True:
+        with _reading():
+            state, picture = next(numbered, (0, None))
+        if picture is None:
+            return
+        on_progress(state / (episode.length + 1), doing)
+        yield picture
+
+
+# --- Making in a process of its own, while the page continues ------------------------------------
+
+
+END_SECONDS = 5.0
+SAY_EVERY = 0.1
+"""Seconds between two progress messages. For a sheet of pictures, a message a frame would cost more than the frame."""
+
+
+@dataclass(frozen=True)
+class MakingView:
+    """State of the work."""
+
+    running: bool = False
+    done: float = 0.0
+    """Part that is done, 0..1."""
+    doing: str = ""
+    problem: str = ""
+    """Why it failed, in a sentence; empty if it succeeded or was stopped."""
+    made: tuple[Made, ...] = ()
+    """Results so far, newest first."""
+
+
+class Making:
+    """Makes one thing at a time, in another process.
+
+    Encoding a film takes a core for a while, and drawing a scene takes a renderer that the server's process must not
+    import: a crash in a driver would take the page along. Work that is stopped leaves no files.
+    """
+
+    def __init__(self) -> None:
+        self._view = MakingView()
+        self._stopped = False
+        self._aside = Aside("making")
+        """Waits for the process."""
+        self._task: asyncio.Task[None] | None = None
+        self._scratch: Path | None = None
+
+    def view(self) -> MakingView:
+        return self._view
+
+    @on_loop
+    def start(self, wanted: MakeRequest, download: bool = False) -> bool:
+        """Begin; False if something is being made already.
+
+        Args:
+            download: make it in a new temporary folder, which `close` deletes, and not in `wanted.folder`.
+        """
+        if self._view.running:
+            return False
+        self._stopped = False
+        self._view = MakingView(running=True, doing="starting", made=self._view.made)
+        self._task = begin(self._make(wanted, download))
+        return True
+
+    def stop(self) -> None:
+        """End the present work and leave no files of it. Returns at once."""
+        self._stopped = True
+
+    def close(self) -> None:
+        """Stop, wait for the end of the process, and delete the downloads. Called on another thread than the loop."""
+        self.stop()
+        if self._task is not None:
+            # One that hangs is ended with this process, by its `machine.processes.family`.
+            result_of(asyncio.wait([self._task], timeout=END_SECONDS))
+        self._aside.end()
+        if self._scratch is not None:
+            shutil.rmtree(self._scratch, ignore_errors=True)
+
+    async def _make(self, wanted: MakeRequest, download: bool) -> None:
+        came = await self._aside.run(lambda: self._run(wanted, download))
+        made = tuple(one for one in came if isinstance(one, Made))
+        problem = "".join(one for one in came if isinstance(one, str) and not self._stopped)
+        self._view = MakingView(problem=problem, made=(*made, *self._view.made))
+
+    def _run(self, wanted: MakeRequest, download: bool) -> list[Made | str]:
+        """What was made, and why not. Runs beside the loop."""
+        came: list[Made | str] = []
+
+        def take(number: int, one: Made | str) -> None:
+            if download and isinstance(one, Made):
+                one = replace(one, sizes=tuple(path.stat().st_size for path in one.paths))
+            came.append(one)
+
+        def hear(news: tuple[float, str]) -> None:
+            post(lambda: self._hear(*news))
+
+        try:
+            if download:
+                self._scratch = self._scratch or Path(tempfile.mkdtemp(prefix="workbench-shared-"))
+                # A new folder each time: a file of the same name may exist from before.
+                wanted = replace(wanted, folder=Path(tempfile.mkdtemp(dir=self._scratch)))
+            work = Work(_make, wanted, Made | str, tuple[float, str], "that makes it")
+            Processes(1).run(work, Deal(range(1), take, hear, lambda: self._stopped))
+        except OSError as error:
+            came.append(f"It could not be started: {error}.")
+        except PoolError as error:
+            came.append(sentence(str(error)))
+        return came
+
+    def _hear(self, done: float, doing: str) -> None:
+        self._view = replace(self._view, done=done, doing=doing)
+
+
+class _Stopped(BaseException):
+    """Unwinds the blocks that delete half-written files."""
+
+
+def _make(wanted: MakeRequest, queue: ItemQueue) -> None:
+    """Runs in the other process."""
+    said_at = 0.0
+
+    def on_progress(done: float, doing: str) -> None:
+        nonlocal said_at
+        if time.monotonic() - said_at >= SAY_EVERY:
+            said_at = time.monotonic()
+            queue.send_update((done, doing))
+
+    def look(number: int, frame: FrameType | None) -> None:
+        if queue.limit() == 0:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            raise _Stopped
+
+    if queue.next() is None:
+        return
+    # By a signal: encoding a film has long stretches without progress in which it must be possible to stop.
+    signal.signal(signal.SIGALRM, look)
+    signal.setitimer(signal.ITIMER_REAL, SAY_EVERY, SAY_EVERY)
+    if wanted.what == "scene":
+        os.environ.update(ensure_render_device(install=False).env)
+    made: Made | str
+    with contextlib.suppress(_Stopped):
+        try:
+            made = make(wanted, on_progress)
+        except (ValueError, OSError, RuntimeError) as error:
+            made = str(error)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        queue.send_result(0, made)

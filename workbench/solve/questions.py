@@ -1,0 +1,57 @@
+"""Questions to a worker for plans. Only for a worker that does not play: its envs are the rollouts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.machine.processes.wire import Question
+from workbench.planning.options import PlanArguments
+
+
+@dataclass(frozen=True)
+class PlannedEnv:
+    """What was found for one env, and what the last round of its K rollouts earned."""
+
+    env: int
+    actions: NDArray[np.float32]
+    """(S, A) actions for the control steps before the next plan."""
+    horizon: int
+    """H, control steps of a rollout."""
+    returns: NDArray[np.float32]
+    """(K,) return of each rollout, best first, NaN last."""
+    plan: int
+    """Index of the rollout that is the earlier plan, unchanged."""
+    hold: int
+    """Index of the rollout that holds still."""
+    success_at: NDArray[np.int32]
+    """(K,) the step of the horizon at which each succeeded, from 1 on; 0 if it did not."""
+    paths: NDArray[np.float32]
+    """(P, H + 1, 3) path of the traced body in some of the rollouts, best first; metres in the env's frame."""
+    drawn: tuple[int, ...]
+    """(P,) indices of the rollouts in `paths`."""
+    traced: str
+    """Name of the traced body; empty if the task has none to trace."""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Plans for the envs that were asked for, in their order."""
+
+    envs: tuple[PlannedEnv, ...]
+
+
+@dataclass(frozen=True)
+class PlanActions(Question[Planned]):
+    """Plan the next actions of some envs, continuing their last plans. A later request ends the planning."""
+
+    snapshot: bytes
+    """A pickled `envs.snapshots.snapshot.Snapshot` of these envs."""
+    bodies: tuple[dict[str, bytes], ...]
+    """What each of these envs is built of, from `planning.rollouts.bodies_of`."""
+    options: PlanArguments
+    traced: str = ""
+    """Name of the body to trace, as in `Settings.traced`."""

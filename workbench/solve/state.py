@@ -1,0 +1,347 @@
+"""Plans the actions of the live envs in a separate process, for the source of actions *solve*."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.checks.state import load_version
+from workbench.envs.step_result import StepResult
+from workbench.live.commands import PauseRun
+from workbench.live.effects import Asked, Then
+from workbench.live.events import FileSaved, Send, SettingsChanged, WorkerDied
+from workbench.live.messages import FollowPlan, Load, PlanDropped, PlanWanted
+from workbench.live.process.ask import Background
+from workbench.live.process.background_jobs import Job, JobFailed, Jobs
+from workbench.live.run import Run, movable_bodies
+from workbench.machine.loop import do
+from workbench.page.command import Command, Refused
+from workbench.planning.options import PlanOptions
+from workbench.solve.commands import (
+    ChooseMethod,
+    ChoosePlannedEnvs,
+    FollowBody,
+    SetHorizon,
+    SetNoise,
+    SetPlanEvery,
+    SetRollouts,
+    SetTemperature,
+)
+from workbench.solve.questions import PlanActions, Planned, PlannedEnv
+from workbench.task.description import Stepped
+from workbench.task.problem import Problem
+
+_NICENESS = 5
+"""Niceness of the planning process: between the worker that plays and work that nobody waits for."""
+_NOTHING = np.zeros(0, np.float32)
+_NEW_PLAN = ChooseMethod, SetRollouts, SetHorizon, SetNoise, SetTemperature, SetPlanEvery
+DOES: frozenset[type[Command]] = frozenset({ChoosePlannedEnvs, FollowBody, *_NEW_PLAN})
+"""Commands that `apply` takes."""
+
+
+SolveState = Literal["none", "starting", "planning", "failed"]
+
+
+@dataclass(frozen=True)
+class SolveView:
+    """The plans of one env, and how its episode went so far."""
+
+    state: SolveState = "none"
+    """``starting`` the envs of the rollouts; ``failed``: see `why`."""
+    serial: int = 0
+    """Grows with every change."""
+    activity: str = ""
+    """What is being started."""
+    why: str = ""
+    """Why there is no plan, as text."""
+    problem: Problem | None = None
+    """What the author's code raised in a rollout."""
+    plan: PlannedEnv | None = None
+    """The last plan of the env."""
+    plan_step: int = 0
+    """Control step of the episode that the plan was made for, from 0 on."""
+    predicted: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
+    """(T,) predicted reward a step of the best rollout from each step of the episode on; NaN where nothing was planned."""
+    achieved: NDArray[np.float32] = field(default_factory=lambda: _NOTHING)
+    """(T,) achieved reward a step, over the horizon from each step on, as far as the horizon is over."""
+    begins: int = 0
+    """The control step of the episode that `predicted` and `achieved` begin with."""
+    solved_at: int = 0
+    """The step of the episode's first success, from 1 on; 0 without one."""
+    solved: tuple[tuple[int, int], ...] = ()
+    """Env and step of every env whose episode is solved."""
+    steps_per_second: float = 0.0
+    """Env-steps of rollouts that the last plan made a second, restoring and planning included."""
+
+
+@dataclass(frozen=True)
+class RunningEpisode:
+    """What is known of the running episode of an env."""
+
+    begins: int = 0
+    """Control steps of the env's episode before the first one that is kept here."""
+    rewards: tuple[float, ...] = ()
+    predicted: Mapping[int, float] = field(default_factory=dict)
+    """Predicted reward a step, by index into `rewards`."""
+    horizon: int = 1
+    plan: PlannedEnv | None = None
+    plan_step: int = 0
+    solved_at: int = 0
+    rate: float = 0.0
+
+
+@dataclass(frozen=True)
+class Solving:
+    """What is known of the plans."""
+
+    shared: SolveView = SolveView()
+    """The view without the fields of a single env."""
+    episodes: Mapping[int, RunningEpisode] = field(default_factory=dict)
+    """By env."""
+
+    @property
+    def solved(self) -> tuple[int, ...]:
+        """Envs whose episode is solved."""
+        return tuple(env for env, episode in sorted(self.episodes.items()) if episode.solved_at)
+
+    def view(self, env: int) -> SolveView:
+        """The view of this env."""
+        episode = self.episodes.get(env, RunningEpisode())
+        predicted, achieved = _curves(episode)
+        return replace(
+            self.shared,
+            plan=episode.plan,
+            plan_step=episode.plan_step,
+            predicted=predicted,
+            achieved=achieved,
+            begins=episode.begins,
+            solved_at=episode.solved_at,
+            solved=tuple((e, self.episodes[e].solved_at) for e in self.solved),
+            steps_per_second=episode.rate,
+        )
+
+
+# --- events and effects -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RolloutsStart:
+    """The version with the envs of the rollouts is not loaded yet in the planning process."""
+
+
+@dataclass(frozen=True)
+class PlanActivity:
+    """What the job does now."""
+
+    activity: str
+
+
+@dataclass(frozen=True)
+class PlanMade:
+    """The job has its result."""
+
+    wanted: PlanWanted
+    envs: tuple[PlannedEnv, ...]
+    steps_per_second: float
+    """Env-steps of rollouts."""
+
+
+@dataclass(frozen=True)
+class PlanFailed:
+    """The job failed."""
+
+    why: str
+    problem: Problem | None
+
+
+@dataclass(frozen=True)
+class BeginPlan:
+    """Plan in place of the wish before."""
+
+    wanted: PlanWanted
+    load: Load
+    """Loads the running version with one env."""
+    options: PlanOptions
+    traced: str
+    """The body to trace."""
+
+
+@dataclass(frozen=True)
+class EndPlan:
+    """Stop the job."""
+
+
+SolverEvent = RolloutsStart | PlanActivity | PlanMade | PlanFailed
+SolverEffect = BeginPlan | EndPlan
+Change = tuple[Solving, list[SolverEffect | Then | Send]]
+"""The plans after an event, and what has to be done."""
+
+
+def apply(solving: Solving, event: object, run: Run) -> Change:
+    """The plans after an event, and what has to be done. The last plan stays visible when planning ends.
+
+    Args:
+        run: the run after the event.
+    """
+    state = solving.shared.state
+    runs = state in ("starting", "planning")
+    match event:
+        case PlanWanted() if (load := run.running_load()) is not None:
+            if event.why_not:
+                refused, asks = _refuse(solving, event.why_not, None)
+                return refused, [EndPlan(), *asks] if runs else asks
+            # One env of the task is enough to make the rollouts' envs like it, and its seed decides nothing.
+            alone = replace(load, options=replace(load.options, num_envs=1, seed=0))
+            settings = run.settings
+            begun = _changed(solving, state="planning", activity="", why="", problem=None)
+            return begun, [BeginPlan(event, alone, settings.plan, settings.traced)]
+        case PlanDropped() | FileSaved() | WorkerDied() if runs:
+            return _changed(solving, state="none", activity=""), [EndPlan()]
+        case Asked(command=ChoosePlannedEnvs(envs=chosen)):
+            return solving, [_set(solve_all=chosen == "all")]
+        case Asked(command=FollowBody(body=body)):
+            if body and body not in movable_bodies(run.task):
+                raise Refused("There is no such body that moves.")
+            return solving, [_set(traced=body)]
+        case Asked(command=command) if isinstance(command, _NEW_PLAN):
+            plan = replace(run.settings.plan, **msgspec.structs.asdict(command))
+            return solving, [_set(plan=plan)]
+        case Stepped():
+            return _stepped(solving, event, run.settings.action_source == "solve"), []
+        case RolloutsStart() if runs:
+            return _changed(solving, state="starting"), []
+        case PlanActivity(activity=activity) if state == "starting":
+            return _changed(solving, activity=activity), []
+        case PlanMade(wanted=wanted, envs=envs) if runs:
+            follow = FollowPlan(wanted.number, wanted.env_idx, np.stack([one.actions for one in envs], 1))
+            return _planned(solving, event), [Send(follow)]
+        case PlanFailed(why=why, problem=problem) if runs:
+            return _refuse(solving, why, problem)
+    return solving, []
+
+
+def _set(**settings: Any) -> Then:
+    return Then(SettingsChanged(settings))
+
+
+def _refuse(solving: Solving, why: str, problem: Problem | None) -> Change:
+    """There is no plan to follow: the worker that plays is paused."""
+    return _changed(solving, state="failed", activity="", why=why, problem=problem), [Then(Asked(PauseRun()))]
+
+
+def _planned(solving: Solving, made: PlanMade) -> Solving:
+    episodes = dict(solving.episodes)
+    for one in made.envs:
+        episode = episodes.get(one.env, RunningEpisode())
+        place = len(episode.rewards)
+        episodes[one.env] = replace(
+            episode,
+            plan=one,
+            horizon=one.horizon,
+            plan_step=episode.begins + place,
+            predicted={**episode.predicted, place: float(one.returns[0]) / one.horizon},
+            rate=made.steps_per_second,
+        )
+    return _changed(replace(solving, episodes=episodes), state="planning", activity="")
+
+
+def _stepped(solving: Solving, event: Stepped, planned: bool) -> Solving:
+    """Note what the worker that plays came to.
+
+    Args:
+        planned: the source of its actions is *solve*.
+    """
+    if not planned and not solving.episodes:
+        return solving
+    episodes: dict[int, RunningEpisode] = {}
+    for env, jumped in enumerate(event.reset_mask if planned else ()):
+        known = None if jumped else solving.episodes.get(env)
+        episodes[env] = _noted(known, env, event.step)
+    return _changed(replace(solving, episodes=episodes))
+
+
+def _noted(episode: RunningEpisode | None, env: int, step: StepResult) -> RunningEpisode:
+    elapsed = int(step.elapsed_steps[env])
+    if episode is None:
+        return RunningEpisode(elapsed)
+    solved_at, success = episode.solved_at, step.evaluate.get("success")
+    if success is not None and bool(np.all(success[env])) and not solved_at:
+        solved_at = elapsed
+    return replace(episode, rewards=(*episode.rewards, float(step.reward[env])), solved_at=solved_at)
+
+
+def _changed(solving: Solving, **values: Any) -> Solving:
+    shared = solving.shared
+    return replace(solving, shared=replace(shared, serial=shared.serial + 1, **values))
+
+
+class PlanJobs:
+    """Performs the effects: one plan at a time. Used on the loop, but for `close`.
+
+    A process of its own has the same version of the task with the envs of the rollouts. It is started with the first plan,
+    and ends a while after the last.
+    """
+
+    def __init__(self, happen: Callable[[SolverEvent], object]) -> None:
+        """
+        Args:
+            happen: takes what a job comes to.
+        """
+        self._happen = happen
+        self._process = Background(_NICENESS)
+        self._jobs = Jobs(self._on_progress, self._failed)
+
+    def perform(self, effect: SolverEffect) -> None:
+        match effect:
+            case BeginPlan():
+                if not self._process.has_loaded(effect.load):
+                    self._happen(RolloutsStart())
+                self._jobs.start("planning", lambda job: self._plan(job, effect))
+            case EndPlan():
+                self._jobs.stop()
+
+    def close(self) -> None:
+        """Stop; returns when the process has ended. Called on another thread than the loop."""
+        do(self._jobs.stop)
+        self._process.close()
+
+    async def _plan(self, job: Job, what: BeginPlan) -> None:
+        began = time.monotonic()
+
+        async def ask() -> Planned:
+            await load_version(self._process, job, what.load)
+            question = PlanActions(what.wanted.snapshot, what.wanted.bodies, what.options, what.traced)
+            return await self._process.ask(question, lambda done, total, part: job.report(done, total))
+
+        planned = await self._process.in_turns(job, ask)
+        seconds = time.monotonic() - began
+        made = sum(len(one.returns) * one.horizon for one in planned.envs) * what.options.rounds
+        self._happen(PlanMade(what.wanted, planned.envs, made / max(seconds, 1e-6)))
+
+    def _on_progress(self) -> None:
+        if (progress := self._jobs.progress) is not None:
+            self._happen(PlanActivity(progress.what))
+
+    def _failed(self, failure: JobFailed) -> None:
+        self._happen(PlanFailed(str(failure), failure.problem))
+
+
+def _curves(episode: RunningEpisode) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Predicted and achieved reward a step, from each step of the episode on."""
+    rewards = np.array(episode.rewards, np.float32)
+    count = max(len(rewards), max(episode.predicted, default=-1) + 1)
+    predicted = np.full(count, np.nan, np.float32)
+    for place, value in episode.predicted.items():
+        predicted[place] = value
+    achieved = np.full(count, np.nan, np.float32)
+    sums = np.concatenate([[0.0], np.cumsum(rewards, dtype=np.float64)])
+    ends = np.minimum(np.arange(len(rewards)) + episode.horizon, len(rewards))
+    begins = np.arange(len(rewards))
+    achieved[: len(rewards)] = (sums[ends] - sums[begins]) / np.maximum(ends - begins, 1)
+    return predicted, achieved

@@ -1,0 +1,1 @@
+"""The list of tasks to open, and new tasks."""

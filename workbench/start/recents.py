@@ -1,0 +1,137 @@
+"""Remembers which tasks were opened last, and how their envs were made, in the user's state folder."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from workbench.live.commands import MOST_ENVS
+from workbench.machine.folders import locked, read_private, state_folder, write_private
+from workbench.task.description import TaskOptions
+from workbench.task.reference import lasting, named_file, split_reference
+
+log = logging.getLogger(__name__)
+
+RECENT_FILE = "recent_tasks.json"
+MOST_KEPT = 20
+LONGEST = 4096
+"""Longest reference, in characters."""
+LARGEST_KWARGS = 20_000
+"""Most bytes of the keyword arguments of one task."""
+
+
+class RecentTask(msgspec.Struct, frozen=True):
+    """A task that was opened, and the options that may be used again."""
+
+    reference: str
+    """An absolute file with or without a class, or a registered id."""
+    num_envs: int = 16
+    env_kwargs: dict[str, Any] = {}
+    when: str = ""
+    """ISO time of the last opening."""
+
+    @property
+    def file(self) -> Path | None:
+        """The task's file; None for a registered id."""
+        return named_file(self.reference)
+
+
+class _Document(msgspec.Struct):
+    tasks: list[msgspec.Raw]
+    format: int = 1
+
+
+class RecentTasks:
+    """The tasks that this user opened last, the newest first. Thread-safe; other processes may write too.
+
+    A file that is missing, broken, or that others may write to gives no tasks. An entry that cannot be one is dropped. If
+    the file cannot be written, entries last until the program ends.
+
+    Args:
+        folder: gives the folder; raises OSError if there is none.
+    """
+
+    def __init__(self, folder: Callable[[], Path] = state_folder) -> None:
+        self._folder = folder
+        self._lock = threading.Lock()
+        self._this_run: list[RecentTask] = []
+        self._warned: set[str] = set()
+
+    def list(self) -> list[RecentTask]:
+        """The tasks, newest first, each reference once."""
+        with self._lock:
+            return _newest([*self._this_run, *self._read()])
+
+    def add(self, reference: str, options: TaskOptions) -> None:
+        """Note that a task was opened with these options."""
+        now = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+        task = _checked(RecentTask(lasting(reference), options.num_envs, dict(options.env_kwargs), now))
+        if task is None:
+            return
+        with self._lock:
+            self._this_run = _newest([task, *self._this_run])
+            try:
+                folder = self._folder()
+                with locked(RECENT_FILE, folder):
+                    kept = _newest([task, *self._read()])
+                    encoded = [msgspec.Raw(msgspec.json.encode(one)) for one in kept]
+                    text = msgspec.json.format(msgspec.json.encode(_Document(encoded)), indent=1)
+                    write_private(RECENT_FILE, text, folder)
+            except OSError as error:
+                self._warn_once(f"The tasks that you opened cannot be kept for the next run: {error}")
+
+    def _read(self) -> list[RecentTask]:
+        try:
+            content = read_private(RECENT_FILE, self._folder())
+        except OSError as error:
+            self._warn_once(f"The tasks that you opened before are not known: {error}")
+            return []
+        if content is None:
+            return []
+        try:
+            rows = msgspec.json.decode(content, type=_Document).tasks
+        except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+            self._warn_once(f"The list of tasks that you opened before is broken and is made anew: {error}")
+            return []
+        return [task for row in rows[: 10 * MOST_KEPT] if (task := _decoded(row)) is not None]
+
+    def _warn_once(self, what: str) -> None:
+        if what not in self._warned:
+            self._warned.add(what)
+            log.warning("%s", what)
+
+
+def _newest(tasks: list[RecentTask]) -> list[RecentTask]:
+    first: dict[str, RecentTask] = {}
+    for task in tasks:
+        first.setdefault(task.reference, task)
+    return list(first.values())[:MOST_KEPT]
+
+
+def _decoded(row: msgspec.Raw) -> RecentTask | None:
+    try:
+        return _checked(msgspec.json.decode(row, type=RecentTask))
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+        return None
+
+
+def _checked(task: RecentTask) -> RecentTask | None:
+    """The task, unless its values cannot be those of one: the file may have been written by anybody."""
+    text = task.reference
+    if not 0 < len(text) <= LONGEST or not text.isprintable() or not 1 <= task.num_envs <= MOST_ENVS:
+        return None
+    try:
+        # A module's name would find another file in another folder.
+        if split_reference(text) is not None or (task.file is not None and not text.startswith("/")):
+            return None
+        if len(msgspec.json.encode(task.env_kwargs)) > LARGEST_KWARGS:
+            return None
+    except (OSError, ValueError, TypeError, RuntimeError, RecursionError, msgspec.MsgspecError):
+        return None
+    return task if all(name.isidentifier() for name in task.env_kwargs) else None

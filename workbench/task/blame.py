@@ -1,0 +1,103 @@
+"""Turns an exception of the author's code, wherever it was raised, into a `TaskError` at their line."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.envs.broken_rule import WrongReturn
+from workbench.envs.error_notes import AuthorCall
+from workbench.envs.task_env import TaskEnv
+from workbench.task.load import LoadedTask
+from workbench.task.problem import (
+    Interrupted,
+    Problem,
+    TaskError,
+    check_step_returns,
+    is_ctrl_c,
+    problem_from_exception,
+    problem_from_return,
+)
+
+_DTYPE_AT_START = torch.get_default_dtype()
+
+
+class blamed:
+    """A context that turns an exception of the author's code into a TaskError with their line."""
+
+    def __init__(self, stage: str, loaded: LoadedTask, task: TaskEnv | None = None) -> None:
+        self._stage, self._loaded, self._task = stage, loaded, task
+        self._call = AuthorCall()
+
+    def __enter__(self) -> None:
+        self._call.__enter__()
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        self._call.__exit__(kind, error, trace)
+        if isinstance(error, Interrupted):
+            # Call no more of the author's code to explain the error: it may be what does not end.
+            files, cls = self._loaded.source_files, self._loaded.cls
+            raise TaskError(problem_from_exception(error, self._stage, files, cls)) from error
+        # Also SystemExit and an author's BaseException, which must not end the worker. Here and not in a caller: the
+        # previous version and its texts may be restored by then.
+        if error is None or isinstance(error, TaskError) or is_ctrl_c(error) or self._is_closed(error):
+            return
+        raise TaskError(self._problem(error)) from error
+
+    def _is_closed(self, error: BaseException) -> bool:
+        """Whether one of our generators is being closed, and not the author's code raised GeneratorExit."""
+        if not isinstance(error, GeneratorExit):
+            return False
+        files = {str(file) for file in self._loaded.source_files}
+        return not any(frame.filename in files for frame in traceback.extract_tb(error.__traceback__))
+
+    def _problem(self, error: BaseException) -> Problem:
+        loaded = self._loaded
+        if isinstance(error, WrongReturn):
+            return problem_from_return(loaded.cls, error.hook, error.problem, loaded.source_files)
+        problem = self._wrong_return(error) or problem_from_exception(
+            error, self._stage, loaded.source_files, loaded.cls
+        )
+        dtype = torch.get_default_dtype()
+        if problem.line is not None or dtype == _DTYPE_AT_START:
+            return problem
+        # It fails in ManiSkill's lines, far from the one that changed it.
+        was = f"torch's default dtype is {dtype}, and was {_DTYPE_AT_START} before the task was imported"
+        return replace(problem, message=f"{problem.message} ({was})")
+
+    def _wrong_return(self, error: BaseException) -> Problem | None:
+        """What ``evaluate`` returns and ManiSkill cannot use, if `error` comes from ManiSkill's use of it."""
+        loaded, env = self._loaded, _env_that_reads(error)
+        if env is None:
+            return None
+        try:
+            returned = env.evaluate()
+        except Exception:
+            return None  # the first error is the one to tell
+        return check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
+
+
+def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
+    """The check that `TaskEnv` calls with the returns of ``evaluate`` and the reward; raises TaskError for wrong shapes."""
+
+    def check(evaluate: Mapping[str, Any], reward: Any) -> None:
+        problem = check_step_returns(loaded.cls, num_envs, evaluate, reward, loaded.source_files)
+        if problem is not None:
+            raise TaskError(problem)
+
+    return check
+
+
+_READERS = tuple(getattr(BaseEnv, name).__code__ for name in ("step", "get_info", "compute_sparse_reward"))
+"""ManiSkill's functions that use what ``evaluate`` returned, and check nothing of it."""
+
+
+def _env_that_reads(error: BaseException) -> BaseEnv | None:
+    """The env whose ManiSkill code failed while it used what ``evaluate`` returned; None for any other error."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return frames[-1].f_locals.get("self") if frames and frames[-1].f_code in _READERS else None

@@ -1,0 +1,246 @@
+"""Options, description and step results of a task as plain data, without torch."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.envs.camera_data import CameraInfo, CameraKey, CameraSettings, Picture, PictureDegree
+from workbench.envs.gpu_rules import Degree, Finding
+from workbench.envs.keywords import HowMade
+from workbench.envs.scene.shapes import SceneGeometry
+from workbench.envs.step_result import StepResult
+from workbench.pictures.camera_report import ObjectToSee
+
+Backend = Literal["auto", "cpu", "gpu"]
+ShownPictures = Literal["auto", "exact", "fast"]
+"""What the page shows of the cameras. ``auto``: fast pictures while something moves, exact ones when it stands still."""
+ActionSource = Literal["hold", "zero", "random", "sliders", "policy", "solve"]
+"""``solve``: planned by rollouts of the task, outside of `ActionChooser`."""
+
+
+@dataclass(frozen=True)
+class TaskOptions:
+    """Options of a task, for the page, recordings and benchmarks."""
+
+    num_envs: int = 16
+    backend: Backend = "auto"
+    seed: int = 0
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
+    pictures: PictureDegree = "exact"
+    """Quality of the pictures that the envs draw for observations and recordings."""
+    rules: Degree | None = None
+    """Degree of all rules of GPU simulation; None keeps each rule's own degree, see `envs.gpu_rules`."""
+    imports: tuple[str, ...] = ()
+    """Modules to import before the task; they may register its id."""
+
+
+def changed_options(before: TaskOptions, after: TaskOptions) -> list[str]:
+    """Names of the options that differ, except the seed; keyword arguments are listed by their own names."""
+    names = [
+        one.name
+        for one in fields(TaskOptions)
+        if one.name not in ("seed", "env_kwargs") and getattr(before, one.name) != getattr(after, one.name)
+    ]
+    absent = object()
+    given = dict.fromkeys((*before.env_kwargs, *after.env_kwargs))
+    differs = (n for n in given if before.env_kwargs.get(n, absent) != after.env_kwargs.get(n, absent))
+    return [*names, *differs]
+
+
+def command_line(reference: str, options: TaskOptions) -> str:
+    """What to type, in any folder, to open a task with these options."""
+    words = ["workbench", "open", reference]
+    usual = TaskOptions()
+    for name in ("num_envs", "backend", "seed", "rules"):
+        if (value := getattr(options, name)) != getattr(usual, name):
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    for module in options.imports:
+        words += ["--import", module]
+    for name, value in options.env_kwargs.items():
+        words += ["--env", f"{name}={_argument_text(value)}"]
+    return shlex.join(words)
+
+
+def _argument_text(value: Any) -> str:
+    """The text that ``--env`` reads as this value: JSON, or a text that is none."""
+    if isinstance(value, str):
+        try:
+            json.loads(value)
+        except ValueError:
+            return value
+    return json.dumps(value)
+
+
+@dataclass(frozen=True)
+class ActionDimension:
+    """One number of the action of one env."""
+
+    name: str
+    """For example ``arm/panda_joint1`` or ``gripper``."""
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class TaskDescription:
+    """A loaded task, for the page."""
+
+    env_id: str
+    """Registered id, or the class name of an unregistered task."""
+    class_name: str
+    file: str | None
+    """Source file of the class."""
+    source_files: tuple[str, ...]
+    """The task's file and the modules that it imported from its folder: the watcher follows these."""
+    source_hash: str
+    """sha256 over `source_files`, 12 hex digits."""
+    source: dict[str, str]
+    """Path to text of `source_files`."""
+    backend: str
+    """For example ``cpu (batched)`` or ``gpu``."""
+    device: str
+    """For example ``cpu`` or ``cuda:0``; with the render device's name."""
+    num_envs: int
+    max_episode_steps: int | None
+    obs_mode: str
+    reward_mode: str
+    control_mode: str | None
+    control_dt: float
+    """Seconds of simulated time in one control step."""
+    actions: tuple[ActionDimension, ...]
+    geometry: SceneGeometry
+    cameras: tuple[CameraInfo, ...]
+    segmentation: dict[int, str]
+    """Segmentation id to body name."""
+    can_render: bool
+    pictures: PictureDegree = "exact"
+    """What its envs draw for observations and recordings."""
+    chosen: str = ""
+    """Its name in the file: the class, or a robot that is shown in a scene."""
+    others: tuple[str, ...] = ()
+    """The other tasks of the file."""
+    in_place_of: str | None = None
+    """The class of the file that was tried first and failed."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keywords of ``gym.make`` for such an env, as far as JSON can hold them."""
+    objects: tuple[ObjectToSee, ...] = ()
+    """Objects that a camera can be measured on."""
+    joints: tuple[str, ...] = ()
+    """Names of `StepResult.qpos`."""
+    notices: tuple[str, ...] = ()
+    """Notices about a task that works, as sentences."""
+    parse_cameras: str = "parse_camera_configs"
+    """ManiSkill's function for what a camera hook returns, by the name that the installed version has."""
+    outlier_rules: Mapping[str, Finding] = field(default_factory=dict)
+    """The rules that an outlier can break, by id, each as a finding without a breach at the hook that it guards; without
+    those that are off, or silenced there."""
+    made: HowMade = HowMade()
+    """How the envs are made: robot, modes and the task's own keyword arguments."""
+
+    def camera(self, key: CameraKey) -> CameraInfo | None:
+        return next((camera for camera in self.cameras if camera.key == key), None)
+
+
+NO_MOMENT = -1
+"""The `Restored.origin` of a state that is not of this history."""
+
+
+@dataclass(frozen=True)
+class Restored:
+    """The result of a `Restore` or an `EnterRecording`."""
+
+    env_idx: tuple[int, ...]
+    source: tuple[int, ...]
+    origin: int
+    undoes: int | None
+    not_carried: dict[str, str]
+    """What could not be restored, with the reason; empty within one version of a task."""
+    recording: str = ""
+    """Description of the episode and the state that an `EnterRecording` restored; `origin` is then `NO_MOMENT`."""
+    how: str = ""
+    """How the state was reached, as a sentence; empty if it was restored."""
+    number: int = 0
+    """Number of the `EnterRecording` that this result answers; 0 for a `Restore`."""
+    replayed: tuple[int, ...] = ()
+    """Indices of the envs that were replayed up to the state. For them the state is not an exact point, from which
+    the same actions give the same bits; a restored state is one."""
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """One reset, control step or restore of the batch, always sent, in order."""
+
+    step: StepResult
+    reset_mask: NDArray[np.bool_]
+    """(N,) True where this result does not follow from the one before: the first of a new episode, or a past moment
+    (`restored`)."""
+    captured: tuple[Picture, ...] = ()
+    """Pictures of exactly this step (only while capturing)."""
+    seeds: NDArray[np.int64] | None = None
+    """(N,) episode seed of each env, if this has a reset."""
+    snapshot: bytes = b""
+    """The body of the snapshot of the whole batch at this moment (see `envs.snapshots.packing`): opaque to the
+    server, whose `History.snapshot_at` makes a pickled `Snapshot` of it."""
+    part_keys: tuple[int, ...] | None = None
+    """The parts of the snapshot; None if they are those of the previous event."""
+    new_parts: dict[int, bytes] = field(default_factory=dict)
+    """Parts that were not sent before."""
+    number: int = 0
+    """Counts these events since the worker began; `Pictures.number` refers to it."""
+    restored: Restored | None = None
+    columns: dict[str, NDArray] = field(default_factory=dict)
+    """(N, ...) each, as `envs.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
+    capturing."""
+    acted_by: str = ""
+    """Source of this step's action, for a recording; empty if the source is known before the episode."""
+    placed: dict[CameraKey, CameraSettings] = field(default_factory=dict)
+    """The cameras that are placed by hand (only while capturing)."""
+    resumed: bool = False
+    """The envs have the state that the previous worker left: the result follows from none of this worker's, but nothing
+    was reset."""
+
+
+@dataclass(frozen=True)
+class RecordArguments:
+    """
+    Args:
+        task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
+        out: folder for the files.
+        upload: an address of fsspec, such as s3://bucket/folder: each episode goes there when it is over, and not into
+            the folder.
+        episodes: how many, over all envs; 4, or as many as a file of actions has.
+        successes: continue until so many episodes succeeded, and keep no others.
+        tries: give up after so many episodes where successes are wanted; 100 for each.
+        actions: random, zero, hold; solve, which plans them by rollouts of the task with its own reward; a policy as
+            module:function or file.py:function; or a file: .npy or .npz with actions, or .h5 with ManiSkill's
+            demonstrations, which begin from their own seeds.
+        use_env_states: put every env state of a demonstration back after its step.
+        pictures: record what every camera sees (--no-pictures is much faster).
+        fast_pictures: draw simplified meshes: several times as many pictures a second without a GPU, which differ a little
+            from a GPU's. The recordings say so, in their .json and in the review.
+        max_steps: longest episode; else the task's own limit, or 200 steps where it has none.
+        seconds_per_seed: wall time after which an episode ends at its next step, solved or not. Which ones that cuts off
+            depends on the machine and on what else it does, so a second run may record others.
+    """
+
+    task: str
+    out: Path = Path("recordings")
+    episodes: int | None = None
+    successes: int | None = None
+    tries: int | None = None
+    actions: str = "random"
+    use_env_states: bool = False
+    pictures: bool = True
+    fast_pictures: bool = False
+    max_steps: int | None = None
+    seconds_per_seed: float | None = None
+    upload: str = ""

@@ -1,0 +1,220 @@
+"""``workbench.make``: a ManiSkill task, batched on the CPU, as a standard gymnasium env."""
+
+from __future__ import annotations
+
+import linecache
+import traceback
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec, WrapperSpec
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.envs.backends import BackendUnavailable, find_renderer
+from workbench.envs.broken_rule import class_is_installed, warn_of
+from workbench.envs.camera_data import PictureDegree
+from workbench.envs.cpu_scene import BatchedCpuMixin
+from workbench.envs.gpu_rules import Degree
+from workbench.envs.task_env import Backend, EnvOptions, build_env, default_reward_mode
+from workbench.machine.library_files import is_installed
+from workbench.pictures.render import findings_of_shaders, list_cameras
+from workbench.task import registry
+from workbench.task.load import LoadedTask, class_of_module, load_task, task_of_class
+from workbench.task.problem import definition_line
+from workbench.task.reference import split_reference
+
+_STATE_MODES = {"state", "state_dict", "none"}
+"""The parts of an ``obs_mode`` for which nothing is drawn."""
+
+
+def make(
+    task: str | Path | type[BaseEnv],
+    num_envs: int = 1,
+    *,
+    backend: Backend = "auto",
+    max_episode_steps: int | None = None,
+    threads: int | None = None,
+    rules: Degree | None = None,
+    pictures: PictureDegree = "exact",
+    **kwargs: Any,
+) -> gym.Env:
+    """A gymnasium env of `num_envs` envs, as ``gym.make`` gives it for a GPU.
+
+    gymnasium's own ``make`` is called with a spec whose entry point builds the batched env, so training code, ManiSkill's
+    wrappers and its baselines find the usual spec, time limit and class. Nothing is registered or replaced: ``gym.make`` of
+    the same id stays ManiSkill's, and the arguments in ``env.spec`` are those of stock ManiSkill, so that its own tools
+    replay what ``RecordEpisode`` writes. It differs from ``gym.make`` where stock would fail:
+
+    * ``num_envs`` above 1 works without a GPU.
+    * A task whose first reward mode is not implemented (its ``step`` raises NotImplementedError in stock) gets the richest
+      one that is. Else the default is stock's: the first of ``SUPPORTED_REWARD_MODES``.
+    * ``render_backend`` is found if it is not given; without a driver an env without pictures is made as with
+      ``render_backend="none"``, and one that needs pictures is refused.
+    * ``max_episode_steps=-1`` gives an env without a limit; ManiSkill's wrapper would end every episode.
+    * Assets to download are named in an error, not asked for on standard input.
+
+    Args:
+        task: a registered id (``PickCube-v1``), a file (``push.py``, ``push.py:PushEnv``), a class of a module
+            (``lab.tasks:PushEnv``) or a class that inherits BaseEnv. A file is executed again by each call, as by the
+            page; an id that it registers is then known to ``gym.make`` too. A module is imported as by ``import``.
+        num_envs: number of envs in the batch.
+        backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation, which needs CUDA and PhysX's GPU
+            library. ``auto``: the CPU, also if there is a GPU, since the tests of GPU simulation have passed nowhere
+            so far. Replaces ``sim_backend``.
+        max_episode_steps: the time limit; None for the registered one, -1 for none.
+        threads: threads that step the envs on the CPU; None for one per core that the process may use.
+        rules: of GPU simulation, checked on the CPU: ``stop`` raises where one is broken, ``warn`` warns, ``off``
+            checks none. None stops if other envs' state is overwritten and warns otherwise; for an installed task it
+            only warns.
+        pictures: ``exact``: those of stock ManiSkill, to the bit. ``fast``: several times as many a second on the CPU,
+            since robots and other heavy meshes are simplified to what the cameras can see of them; it warns that a policy
+            trained on them sees other pictures than on a GPU.
+        kwargs: arguments of ``gym.make`` for the task: ``obs_mode``, ``reward_mode``, ``control_mode``,
+            ``render_mode``, ``robot_uids``, ``sensor_configs``, ``reconfiguration_freq``, ``sim_config`` ...
+
+    Raises:
+        TaskError: no such id, file or class, or the file cannot be imported; says where and why.
+        MissingAssets: a download is needed; names it and the command.
+        BackendUnavailable: this machine has no GPU simulation, or no renderer for the requested pictures.
+        ValueError, TypeError: arguments that contradict each other.
+    """
+    _refuse_contradictions(num_envs, kwargs)
+    found = _find_task(task)
+    given = {**found.default_kwargs, **kwargs}
+    if rules is None and not found.followed and class_is_installed(found.cls):
+        rules = "warn"  # an installed task cannot be fixed here
+    if given.get("reward_mode") is None and not _stock_reward_works(found.cls):
+        # Among the spec's arguments, so that a replay by gym.make has a reward too.
+        kwargs["reward_mode"] = default_reward_mode(found.cls)
+    limits = ()
+    if max_episode_steps == -1:
+        max_episode_steps = limit = None
+    else:
+        limit = found.max_episode_steps
+        # As ``register_env`` does. This wrapper removes gymnasium's own limit, which gives one bool for all envs.
+        entry = "mani_skill.utils.registration:TimeLimitWrapper"
+        limits = (WrapperSpec("MSTimeLimit", entry_point=entry, kwargs={"max_episode_steps": limit}),)
+    if pictures == "fast":
+        warnings.warn(_FAST_PICTURES, stacklevel=2)
+    options = EnvOptions(int(num_envs), backend, threads=threads, rules=rules, pictures=pictures)
+    spec = EnvSpec(
+        id=found.env_id,
+        entry_point=partial(_build, found.cls, found.asset_ids, options),
+        max_episode_steps=limit,
+        disable_env_checker=True,  # it knows nothing of batches
+        kwargs=dict(found.default_kwargs),
+        additional_wrappers=limits,
+    )
+    try:
+        return gym.make(spec, max_episode_steps=max_episode_steps, num_envs=int(num_envs), **kwargs)
+    except _RaisedInConstructor as raised:
+        raise raised.error from raised.error.__cause__
+
+
+_FAST_PICTURES = (
+    'pictures="fast" draws simplified meshes: a policy that is trained on these pictures sees others on a GPU, with stock '
+    "ManiSkill and with the default, exact. In ManiSkill's tabletop tasks they differ by 0.3 of 255 on average, and by more "
+    "than 10 in 0.4 % of the pixels (128 x 128; more in `workbench help benchmarks`)."
+)
+
+
+class _RaisedInConstructor(Exception):
+    """Carries a TypeError past gymnasium, which would replace it by one without the author's frames."""
+
+    def __init__(self, error: TypeError) -> None:
+        super().__init__(error)
+        self.error = error
+
+
+def _build(
+    cls: type[BaseEnv], asset_ids: Sequence[str], options: EnvOptions, num_envs: int, **kwargs: Any
+) -> BaseEnv:
+    try:
+        return _built(cls, asset_ids, options, num_envs, **kwargs)
+    except TypeError as error:
+        if (place := _line_of(cls, error)) is not None:
+            error.add_note(f"{place[0]}:{place[1]}: {linecache.getline(*place).strip()}")
+        raise _RaisedInConstructor(error) from error
+
+
+def _line_of(cls: type[BaseEnv], error: TypeError) -> tuple[str, int] | None:
+    """The author's line that raised `error`; else (as for an unknown keyword) that of the constructor."""
+    lines = [(frame.filename, frame.lineno or 1) for frame in traceback.extract_tb(error.__traceback__)]
+    raised_at = next((line for line in reversed(lines) if not is_installed(line[0])), None)
+    return raised_at or definition_line(cls.__init__)
+
+
+def _built(
+    cls: type[BaseEnv], asset_ids: Sequence[str], options: EnvOptions, num_envs: int, **kwargs: Any
+) -> BaseEnv:
+    if "render_backend" not in kwargs and find_renderer() is None:
+        needs = _what_needs_pictures(cls, kwargs)
+        if needs is not None:
+            raise BackendUnavailable(
+                f"{needs} needs a renderer, and SAPIEN finds no Vulkan driver on this machine: "
+                "`workbench doctor` says which one to install."
+            )
+    # gym.make(env.spec, num_envs=2) may change the number.
+    env = build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
+    if isinstance(env, BatchedCpuMixin):
+        for finding in findings_of_shaders(list_cameras(env)):
+            warn_of(finding)
+    return env
+
+
+def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
+    whole = isinstance(num_envs, (int, float, np.integer)) and not isinstance(num_envs, bool)
+    if not whole or num_envs != num_envs // 1 or num_envs < 1:
+        raise ValueError(f"num_envs must be a whole number from 1 on, not {num_envs!r}")
+    if "sim_backend" in kwargs:
+        raise ValueError(
+            f"sim_backend={kwargs['sim_backend']!r}: leave it out. backend= names the simulation here: "
+            'backend="cpu" (batched on the CPU), "gpu" (ManiSkill\'s GPU simulation) or "auto". '
+            "For stock ManiSkill use gym.make."
+        )
+    if kwargs.get("render_backend", "found") in (None, "none"):
+        needs = _what_needs_pictures(None, kwargs)
+        if needs is not None:
+            raise ValueError(f"{needs} needs pictures, and render_backend='none' says that none are made")
+
+
+def _what_needs_pictures(cls: type[BaseEnv] | None, kwargs: Mapping[str, Any]) -> str | None:
+    """The argument, as text, that needs rendering; None if there is none."""
+    if kwargs.get("render_mode") is not None:
+        return f"render_mode={kwargs['render_mode']!r}"
+    obs_mode = kwargs.get("obs_mode") or (cls.SUPPORTED_OBS_MODES[0] if cls is not None else "state")
+    if set(obs_mode.split("+")) - _STATE_MODES:
+        return f"obs_mode={obs_mode!r}"
+    return None
+
+
+def _stock_reward_works(cls: type[BaseEnv]) -> bool:
+    """Whether the class implements ManiSkill's default reward mode."""
+    mode = cls.SUPPORTED_REWARD_MODES[0]
+    hook = f"compute_{mode}_reward"
+    return mode not in ("dense", "normalized_dense") or getattr(cls, hook) is not getattr(BaseEnv, hook)
+
+
+def _find_task(task: str | Path | type[BaseEnv]) -> LoadedTask:
+    if not isinstance(task, (str, Path, type)):
+        raise TypeError(
+            f"make() takes a registered id, a file or a class that inherits BaseEnv, not {type(task).__name__}"
+        )
+    cls = task if isinstance(task, type) else None
+    if cls is None and registry.environment(str(task)) is None:
+        named = split_reference(str(task))
+        cls = None if named is None else class_of_module(*named)
+    if cls is not None:
+        if not registry.is_task(cls):
+            raise TypeError(f"{cls.__name__} does not inherit mani_skill.envs.sapien_env.BaseEnv")
+        return task_of_class(cls, registry.id_of(cls) or cls.__name__)
+    loaded = load_task(str(task))
+    for notice in loaded.notices:
+        warnings.warn(notice, stacklevel=3)
+    return loaded

@@ -1,0 +1,234 @@
+"""Writes a new task into the user's folder: from an example, which is its template, or from an installed task."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import importlib.util
+import keyword
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+from workbench.machine.files import create_file, read_regular_file, replace_file
+from workbench.machine.folders import example_tasks
+from workbench.machine.parse_python import parse_python
+from workbench.task.copy import CannotCopy, NewNames, copied_text, registrations_in
+from workbench.task.find import find_task_files, read_task_file
+from workbench.task.library_names import is_library
+from workbench.task.modules import read_exactly
+
+TemplateName = Literal["minimal", "tabletop", "articulated", "multi-robot", "locomotion"]
+LONGEST_NAME = 60
+_MOST_BLANK = 64 * 1024
+"""Most bytes of a file that may be filled; a larger file holds something."""
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_WORD = re.compile(r"[A-Za-z0-9]+")
+
+
+@dataclass(frozen=True)
+class Template:
+    """An example that a new task may begin from."""
+
+    name: TemplateName
+    """Name for ``workbench new --from``."""
+    example: str
+    """File of the template among the examples."""
+    about: str
+
+
+TEMPLATES = (
+    Template("minimal", "minimal.py", "the least that a task can be: a robot, a cube, and when it is done"),
+    Template("tabletop", "push_cube.py", "a whole task on a table: reward, cameras, observations, fail"),
+    Template("articulated", "articulated.py", "a drawer that is built in code, and pulled open"),
+    Template("multi-robot", "two_robots.py", "two arms that lift one bar together"),
+    Template("locomotion", "locomotion.py", "a four-legged robot that walks, rewarded at each step"),
+)
+
+
+@dataclass(frozen=True)
+class NewTask:
+    """A task that was written."""
+
+    file: Path
+    env_id: str
+    class_name: str
+    is_default: bool
+    """Whether the file opens with this class; else its reference must name it."""
+
+    @property
+    def reference(self) -> str:
+        """Argument of ``workbench open`` in the folder of the file."""
+        return self.file.name if self.is_default else f"{self.file.name}:{self.class_name}"
+
+
+class CannotBegin(ValueError):
+    """No task was written; the message is a sentence that says what to do."""
+
+
+def write_new_task(name: str, origin: str, folder: Path) -> NewTask:
+    """Write ``NAME.py`` into a folder.
+
+    Args:
+        name: of the file; class and id are made of it: ``stack_two`` gives ``StackTwoEnv`` and ``StackTwo-v1``.
+        origin: a template's name, or the id of a task of ManiSkill.
+
+    Raises:
+        CannotBegin: nothing was written.
+    """
+    _check_name(name, folder)
+    file = folder / f"{name}.py"
+    text, encoding, made = _new_text(file, camel_case(name), origin)
+    try:
+        created = create_file(file, text.encode(encoding))
+    except OSError as error:
+        raise CannotBegin(f"{file} cannot be written: {error.strerror}.") from error
+    if not created:
+        raise CannotBegin(_taken(file))
+    return made
+
+
+def is_blank(file: Path) -> bool:
+    """Whether a file holds nothing but comments and blank lines; False if it cannot be read."""
+    return _blank_content(file) is not None
+
+
+def fill_blank_file(file: Path) -> None:
+    """Write the first template into a file that holds nothing but comments and blank lines; they stay above it.
+
+    Class and id are made of the file's name.
+
+    Raises:
+        CannotBegin: the file is unchanged.
+    """
+    content = _blank_content(file)
+    if content is None:
+        raise CannotBegin(f"{file.name} is not empty any more, and was not written over.")
+    text, _, _ = _new_text(file, camel_case(file.stem), TEMPLATES[0].name)
+    above = content.rstrip()
+    try:
+        done = replace_file(file, (above + b"\n\n" if above else b"") + text.encode(), expected=content)
+    except OSError as error:
+        raise CannotBegin(f"{file} cannot be written: {error.strerror}.") from error
+    if not done:
+        raise CannotBegin(f"{file.name} was saved meanwhile, and was not written over.")
+
+
+def _blank_content(file: Path) -> bytes | None:
+    try:
+        content = read_regular_file(file, _MOST_BLANK)
+        lines = content.decode().splitlines()
+    except (OSError, ValueError):
+        return None
+    return content if all(not line.strip() or line.lstrip().startswith("#") for line in lines) else None
+
+
+def why_not_name(name: str, folder: Path) -> str:
+    """Why a new task cannot have this name, as a sentence; empty if it can."""
+    try:
+        _check_name(name, folder)
+        _check_id(f"{camel_case(name)}-v1", folder / f"{name}.py")
+    except CannotBegin as error:
+        return str(error)
+    return ""
+
+
+def _check_name(name: str, folder: Path) -> None:
+    if not _NAME.fullmatch(name) or len(name) > LONGEST_NAME or keyword.iskeyword(name):
+        words = _WORD.findall(name.removesuffix(".py"))
+        better = "_".join(words)[:LONGEST_NAME]
+        if not _NAME.fullmatch(better) or keyword.iskeyword(better):
+            better = "stack_two"
+        raise CannotBegin(
+            f"{name[:LONGEST_NAME]!r} cannot be the name of a task: take letters, digits and underscores, at most "
+            f"{LONGEST_NAME}, with a letter first, such as {better}."
+        )
+    if (folder / f"{name}.py").exists():
+        raise CannotBegin(_taken(folder / f"{name}.py"))
+    if is_library(name):
+        raise CannotBegin(
+            f"{name} is the name of a library, and no import would find {name}.py: take another name, such as {name}_task."
+        )
+
+
+def _taken(file: Path) -> str:
+    return f"There is a file {file.name} already, and it is not written over: take another name, or move it."
+
+
+def camel_case(name: str) -> str:
+    """``stack_two`` becomes ``StackTwo``; a name that begins with a digit gets a word before it."""
+    joined = "".join(word[0].upper() + word[1:] for word in _WORD.findall(name))
+    return joined if joined[:1].isalpha() else f"Task{joined}"
+
+
+def _new_text(file: Path, bare: str, origin: str) -> tuple[str, str, NewTask]:
+    """Text and encoding of a new task, whose names begin with `bare`, and what it will be."""
+    env_id = f"{bare}-v1"
+    class_name = bare if bare.endswith("Env") else f"{bare}Env"
+    template = next((one for one in TEMPLATES if one.name == origin), None)
+    installed = maniskill_ids()
+    _check_id(env_id, file)
+    if template is None and origin not in installed:
+        names = [one.name for one in TEMPLATES]
+        close = difflib.get_close_matches(origin, [*names, *installed], 1, 0.5)
+        more = f" Did you mean {close[0]}?" if close else ""
+        raise CannotBegin(
+            f"There is neither a template nor a task of ManiSkill named {origin!r}: take {', '.join(names)}, or an id such "
+            f"as PickCube-v1.{more}"
+        )
+    source = installed[origin] if template is None else _example(template)
+    try:
+        _, text, encoding = read_exactly(source)
+    except (OSError, SyntaxError) as error:
+        raise CannotBegin(f"{source} cannot be read: {error}.") from error
+    known = [
+        (cls.name, uid.value)
+        for cls, _, uid in registrations_in(parse_python(text))
+        if isinstance(uid, ast.Constant) and isinstance(uid.value, str)
+    ]
+    ids = {uid: f"{bare}{uid}" for _, uid in known}
+    if template is not None:
+        origin = known[-1][1]
+    ids[origin] = env_id
+    old_class = next(cls for cls, uid in known if uid == origin)
+    try:
+        text, _ = copied_text(source, text, names=NewNames(ids, {old_class: class_name}))
+    except CannotCopy as error:
+        raise CannotBegin(f"{origin} cannot be copied: {error}.") from error
+    return text, encoding, NewTask(file, env_id, class_name, known[-1][0] == old_class)
+
+
+def _check_id(env_id: str, file: Path) -> None:
+    here = [path for path in sorted(file.parent.glob("*.py")) if path != file]
+    owners = dict.fromkeys(maniskill_ids(), "ManiSkill")
+    for path in (*example_tasks(), *here):
+        task = read_task_file(path)
+        owners.update(dict.fromkeys(() if task is None else task.ids, path.name))
+    if env_id in owners:
+        raise CannotBegin(
+            f"The task would register {env_id}, which is an id of {owners[env_id]} already: take another name, such as "
+            f"my_{file.stem}."
+        )
+
+
+def _example(template: Template) -> Path:
+    for file in example_tasks():
+        if file.name == template.example:
+            return file
+    raise CannotBegin(f"The example {template.example} is missing: install the workbench again.")
+
+
+@cache
+def maniskill_ids() -> Mapping[str, Path]:
+    """File of each id of the installed ManiSkill, as the texts say; nothing is imported. Empty without ManiSkill."""
+    spec = importlib.util.find_spec("mani_skill")
+    folders = [] if spec is None else spec.submodule_search_locations or ()
+    return {
+        uid: task.path
+        for folder in folders
+        for task in find_task_files(Path(folder) / "envs").files
+        for uid in task.ids
+    }

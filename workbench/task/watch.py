@@ -1,0 +1,177 @@
+"""Calls back when an author's file has new content, once per burst of saves."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import cycle, islice
+from pathlib import Path
+
+from workbench.machine.files import MOST_SOURCE_BYTES, read_regular_file, real_path
+from workbench.machine.processes.watched_thread import report_failure, watched_thread
+from workbench.task.modules import decode
+
+POLL_S = 0.04
+"""Seconds between two polls."""
+QUIET_S = 0.03
+"""Seconds without a change after which a burst of saves is over."""
+BURST_S = 0.2
+"""Longest wait in seconds for the end of a burst."""
+READ_S = 0.25
+"""How often the files are read even if their ``stat`` is the same: a network mount may be late with it, and two saves
+within one tick of a file system's clock have the same one."""
+GONE_S = 0.3
+"""Seconds for which a file must be missing or empty before that counts as its new content, and not as half of a save."""
+STOP_S = 1.0
+"""Longest wait in seconds for the end of the thread: reading a file on a disk that hangs cannot be ended."""
+POLL_SHARE, READ_SHARE = 0.003, 0.001
+"""Shares of one core for ``stat`` and for reading; with hundreds of files both are done less often."""
+NEWEST, TURN = 8, 32
+"""Files checked at every poll, which are those saved last; and how many of the others are checked in turn."""
+
+Content = str | bytes | None
+"""Text; bytes if they are not text; None for a missing or unreadable file (a device, a pipe, too large)."""
+Statuses = dict[Path, tuple[int, ...]]
+"""Fields of ``stat`` that change with a file's content, by file, modification time first; empty if there is no file."""
+
+
+class SourceWatcher:
+    """Calls `on_change` with the followed files whose content is new, on a thread of its own.
+
+    One save is many events of the file system: truncate and write; a temporary file renamed over it; delete and create; a
+    formatter that repeats all of it 20 ms later. So the paths are polled 25 times a second by ``stat``, which takes
+    microseconds. Of hundreds of files those saved last are polled every time, all of them after a rename, creation or
+    deletion in their folder (as most editors save), and the others in turns. Once ``stat`` is quiet the texts are compared:
+    a ``touch``, a ``git checkout`` of the same content or a line-end conversion is no change.
+
+    `on_change` may call `follow` and `stop`. What it raises is reported, and watching continues.
+    """
+
+    def __init__(self, on_change: Callable[[set[Path]], None]) -> None:
+        self._on_change = on_change
+        self._lock = threading.Lock()
+        self._known: dict[Path, Content] = {}
+        self._seen: Statuses | None = {}
+        """``stat`` of the files when they were last read, the last saved one first; None: read them at the next poll."""
+        self._folders: Statuses = {}
+        self._others: Iterator[Path] = iter(())
+        self._stopped = threading.Event()
+        self._thread = watched_thread("source-watcher", self._run)
+        self._thread.start()
+
+    def follow(self, paths: Iterable[Path], texts: Mapping[str, str] | None = None) -> None:
+        """Follow `paths` from now on, and no others.
+
+        Args:
+            paths: files, which need not exist.
+            texts: their known texts by path, so that a save between a load's reading and this call is noticed. Paths that
+                are not in it and not followed yet are read now.
+        """
+        texts = texts or {}
+        followed = [_real(Path(path).expanduser()) for path in paths]
+        with self._lock:
+            self._known = {
+                path: texts[str(path)]
+                if str(path) in texts
+                else self._known[path]
+                if path in self._known
+                else _read(path)
+                for path in followed
+            }
+            self._seen = None  # something may have been saved since `texts` was read
+
+    def stop(self) -> None:
+        """Return when the thread has ended; at once, when called from `on_change`, and soon, where it reads a disk that hangs."""
+        self._stopped.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout=STOP_S)
+
+    def _run(self) -> None:
+        pause = read_again = 0.0
+        while not self._stopped.is_set():
+            # Waking is most of the cost of an idle watcher; sleep() is a third cheaper than waiting for the event.
+            time.sleep(pause)
+            began = time.thread_time()
+            new = self._has_new_status()
+            pause = max(POLL_S, (time.thread_time() - began) / POLL_SHARE)
+            if new:
+                self._settle()
+            elif time.monotonic() < read_again:
+                continue
+            began = time.thread_time()
+            changed = self._changes()
+            read_again = time.monotonic() + max(READ_S, (time.thread_time() - began) / READ_SHARE)
+            if changed and not self._stopped.is_set():
+                try:
+                    self._on_change(changed)
+                except Exception as error:
+                    report_failure("The handler of a saved file failed; the file is still watched", error)
+
+    def _has_new_status(self) -> bool:
+        """Whether the ``stat`` of a file that is polled this time has changed."""
+        seen, folders = self._seen, {folder: _status(folder) for folder in self._folders}
+        if seen is None:
+            return True
+        paths = list(seen)
+        if folders == self._folders:
+            paths = paths[:NEWEST] + list(islice(self._others, min(TURN, len(paths[NEWEST:]))))
+        self._folders = folders
+        return any(_status(path) != seen[path] for path in paths)
+
+    def _settle(self) -> None:
+        """Wait for the end of a burst of saves."""
+        before, deadline = None, time.monotonic() + BURST_S
+        now = self._statuses()
+        while now != before and time.monotonic() < deadline:
+            self._stopped.wait(QUIET_S)
+            before, now = now, self._statuses()
+        newest = sorted(now, key=now.__getitem__, reverse=True)
+        with self._lock:  # `follow` may have been called meanwhile
+            self._seen = {path: now[path] for path in newest} if now.keys() == self._known.keys() else None
+        self._folders = {folder: self._folders.get(folder, ()) for folder in {path.parent for path in now}}
+        self._others = cycle(newest[NEWEST:])
+
+    def _statuses(self) -> Statuses:
+        with self._lock:
+            paths = list(self._known)
+        return {path: _status(path) for path in paths}
+
+    def _changes(self) -> set[Path]:
+        """Files whose content differs from the known one, which is updated."""
+        deadline = time.monotonic() + GONE_S
+        while not self._stopped.is_set():
+            with self._lock:
+                now = {path: _read(path) for path in self._known}
+                changed = {path for path, content in now.items() if content != self._known[path]}
+                if all(now[path] for path in changed) or time.monotonic() > deadline:
+                    self._known.update(now)
+                    return changed
+            self._stopped.wait(QUIET_S)
+        return set()
+
+
+def _real(path: Path) -> Path:
+    """The file behind links. A link to something else (a device, by mistake) is watched itself, until it is a file again."""
+    real = real_path(path)
+    return real if os.path.isfile(real) else real_path(path.parent) / path.name
+
+
+def _status(path: Path) -> tuple[int, ...]:
+    try:
+        found = os.stat(path)
+    except OSError:
+        return ()
+    return found.st_mtime_ns, found.st_ctime_ns, found.st_size, found.st_ino, found.st_dev
+
+
+def _read(path: Path) -> Content:
+    try:
+        raw = read_regular_file(path, MOST_SOURCE_BYTES)
+    except OSError:
+        return None
+    try:
+        return decode(str(path), raw)
+    except SyntaxError:
+        return raw

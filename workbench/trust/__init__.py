@@ -1,0 +1,1 @@
+"""Decides whether code that a recording names or holds may run."""

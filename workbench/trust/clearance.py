@@ -1,0 +1,440 @@
+"""Decides whether code that a recording names or holds, or a listed file, may run, and asks a person if need be."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from workbench.episodes.episode import EpisodeInfo
+from workbench.episodes.recorded_source import NoRecordedSource, relative_sources
+from workbench.episodes.seal import MadeHere, made_here
+from workbench.machine.text import short_line
+from workbench.task.content import CannotRead, TaskContent, read_content
+from workbench.task.reference import RecordedTask, TaskName, looks_like_file
+from workbench.trust.store import TrustStore
+
+SHORT_HASH = 12
+LONGEST = 400
+"""Longest name that is shown, in characters."""
+FOLLOWED = (
+    "While it is open live, every save of this file and of the modules beside it runs without asking, whoever saves it. "
+    "Rescore uses the file as it is then."
+)
+"""Warning before going live with a file that a recording names."""
+
+
+class Consent(Enum):
+    NO = "no"
+    NONE = "none"
+    """No to this and to all other questions of the same call."""
+    ONCE = "once"
+    """Yes, until the program ends."""
+    ALWAYS = "always"
+
+
+class Since(Enum):
+    """How a file differs from the version that was trusted before."""
+
+    SAME = "same"
+    CHANGED = "changed"
+    NEW = "new"
+
+
+@dataclass(frozen=True)
+class CodeFile:
+    """A source text that would run."""
+
+    name: str
+    """Path of the task's own file; of a module, relative to it."""
+    hash: str
+    """First digits of its SHA-256."""
+    text: str
+    """The text, not escaped: escape it before showing it."""
+    since: Since = Since.SAME
+
+
+@dataclass(frozen=True)
+class TrustQuestion:
+    """A question to a person. Texts from recordings are made printable, not escaped."""
+
+    task: str
+    """Task of the recording that names the code; empty for a listed file."""
+    recorded_text: bool
+    """Whether the texts are those that the recording holds, not files on disk."""
+    files: tuple[CodeFile, ...]
+    """Files that would run; the task's own file first."""
+    unseen: tuple[str, ...] = ()
+    """Code that may run and is not among `files`."""
+    computed: bool = False
+    """Whether the task computes what it imports, so that its modules are all files of its folder."""
+    trusted_before: bool = False
+    """Whether another version of the same files was trusted; see `CodeFile.since`, unless `nothing_known`."""
+    gone: tuple[str, ...] = ()
+    """Modules of the version trusted before that no longer exist."""
+    followed: bool = False
+    """Whether later saves of these files run too."""
+    agreed: bool = False
+    """Whether these texts may run already; only `followed` is new."""
+    more: int = 0
+    """Number of questions after this one."""
+    listed: bool = False
+    """Whether a person chose the file from a list; no recording names it."""
+
+    @property
+    def file(self) -> str:
+        """A path, or the name of a file that a recording holds."""
+        return self.files[0].name
+
+    @property
+    def hash(self) -> str:
+        """Hash of the task's own file."""
+        return self.files[0].hash
+
+    @property
+    def modules(self) -> tuple[CodeFile, ...]:
+        """The files besides the task's own."""
+        return self.files[1:]
+
+    @property
+    def nothing_known(self) -> bool:
+        """Whether the version trusted before is not known file by file."""
+        return self.trusted_before and not self.gone and all(one.since is Since.SAME for one in self.files)
+
+
+class NotCleared(Exception):
+    """Code may not run; the message is the reason.
+
+    Attributes:
+        question: The question whose yes would allow it, if there is one.
+        trust_helps: No question is asked about it, but ``--trust`` allows it.
+    """
+
+    def __init__(self, why: str, question: TrustQuestion | None = None, trust_helps: bool = False) -> None:
+        super().__init__(why)
+        self.question, self.trust_helps = question, trust_helps
+
+
+class NotTrusted(Exception):
+    """Nothing was run: some code has no consent (`questions`) or would need ``--trust`` (`reasons`)."""
+
+    def __init__(self, questions: Sequence[TrustQuestion], reasons: Sequence[str] = ()) -> None:
+        super().__init__("; ".join((*map(question_text, questions), *reasons)))
+        self.questions, self.reasons = tuple(questions), tuple(reasons)
+
+
+Ask = Callable[[TrustQuestion, Callable[[], bool]], Consent]
+"""Asks a person and waits for the answer. Answers no as soon as its second argument, "stopped", returns true."""
+
+
+@dataclass(frozen=True)
+class CodeToRun:
+    """Code that a recording names or holds."""
+
+    reference: TaskName
+    """The task to open; ignored if `recorded_text` is True."""
+    info: EpisodeInfo
+    """Info of the recording."""
+    recorded_text: bool = False
+    """Whether to run the text that the recording holds."""
+    followed: bool = False
+    """Whether later saves of the file run too."""
+
+
+@dataclass(frozen=True)
+class _Undecided:
+    """Texts that a person has to be asked about."""
+
+    content: TaskContent
+    agreed: bool
+    """Whether the texts may run, but not be followed."""
+
+
+class Clearances:
+    """Decides about all code of recordings; each text is asked about once.
+
+    A recording is untrusted unless its seal says that it was made here. Its task is opened without a question if it is an
+    id of an installed package, a file that a person named (on the command line, or open live), or the file that this
+    installation had open when it recorded. Of anything else the texts are read, not run, and a person is asked about
+    them; the answer is stored by their hash. The agreed texts run even if the file changes. Only where the file is
+    followed (going live) later saves run too, which is a question of its own.
+
+    Args:
+        named: The files that a person named: on the command line, or by having them open live.
+        ask: Asks a person; None if there is none: the answer is no then.
+        all_trusted: Every answer is yes, for this run (``--trust``).
+    """
+
+    def __init__(
+        self,
+        named: Callable[[], Iterable[Path]] = tuple,
+        ask: Ask | None = None,
+        all_trusted: bool = False,
+    ) -> None:
+        self._named, self._ask, self._all_trusted = named, ask, all_trusted
+        self._store = TrustStore()
+
+    @property
+    def asks(self) -> bool:
+        """Whether there is a person to ask."""
+        return self._ask is not None
+
+    def clear(self, code: CodeToRun, stopped: Callable[[], bool] = lambda: False) -> TaskName:
+        """What to open for it; asks if need be, and waits for the answer.
+
+        Raises:
+            NotCleared: it may not run.
+        """
+        (cleared,) = self.clear_all([code], stopped)
+        if isinstance(cleared, NotCleared):
+            raise cleared
+        return cleared
+
+    def clear_all(
+        self, codes: Sequence[CodeToRun], stopped: Callable[[], bool] = lambda: False
+    ) -> list[TaskName | NotCleared]:
+        """What to open for each of several, or the refusal; asks about each text once."""
+        decisions = [self._without_asking(one) for one in codes]
+        to_ask: dict[str, tuple[CodeToRun, _Undecided]] = {}
+        for one, decision in zip(codes, decisions):
+            if isinstance(decision, _Undecided):
+                to_ask.setdefault(decision.content.hash, (one, decision))
+        refused: dict[str, NotCleared] = {}
+        none_of_them = False
+        for place, (hash, (code, undecided)) in enumerate(to_ask.items()):
+            question = replace(self._question(code, undecided), more=len(to_ask) - place - 1)
+            answer = Consent.NO
+            if not none_of_them:
+                answer = self._answer(question, undecided.content, stopped)
+            none_of_them = none_of_them or answer is Consent.NONE
+            if answer in (Consent.NO, Consent.NONE):
+                refused[hash] = NotCleared(f"{question_text(question)} is not trusted", question)
+        cleared: list[TaskName | NotCleared] = []
+        for one, decision in zip(codes, decisions):
+            if not isinstance(decision, _Undecided):
+                cleared.append(decision)
+            elif decision.content.hash in refused:
+                cleared.append(refused[decision.content.hash])
+            elif not one.recorded_text and not _is_unchanged(decision.content):
+                cleared.append(_changed(decision.content))
+            else:
+                cleared.append(_approved(one, decision.content))
+        return cleared
+
+    def clear_file(
+        self, file: Path, class_name: str | None = None, stopped: Callable[[], bool] = lambda: False
+    ) -> TaskName:
+        """What to open for a file that a person chose from a list, to be followed; asks if need be, as `clear`.
+
+        Raises:
+            NotCleared: it may not run.
+        """
+        name = str(file) if class_name is None else f"{file}:{class_name}"
+        if self._all_trusted or _is_named(str(file), self._named()):
+            return name
+        try:
+            content = read_content(file)
+        except CannotRead as error:
+            raise NotCleared(str(error)) from error
+        if not self._store.follows(content):
+            agreed = self._store.trusts(content)
+            before = None if agreed else self._store.trusted_before(content)
+            question = _question(content, before, followed=True, agreed=agreed, listed=True)
+            if self._answer(question, content, stopped) in (Consent.NO, Consent.NONE):
+                raise NotCleared(f"{question_text(question)} is not trusted", question)
+            if not _is_unchanged(content):
+                raise _changed(content)
+        # These very texts, until the next save: the file may change before it is loaded.
+        return RecordedTask(file.name, content.main, class_name, content.texts)
+
+    def _answer(self, question: TrustQuestion, content: TaskContent, stopped: Callable[[], bool]) -> Consent:
+        """Ask the question, and store the answer if it is yes."""
+        answer = Consent.NO if self._ask is None or stopped() else self._ask(question, stopped)
+        if answer is Consent.ALWAYS:
+            self._store.trust(content, question.followed)
+        elif answer is Consent.ONCE:
+            self._store.trust_once(content, question.followed)
+        return answer
+
+    def refused_arguments(self, info: EpisodeInfo, made: MadeHere | None = None) -> str | None:
+        """Why an env must not get the arguments of this recording; None if it may. Recordings from elsewhere may name
+        no files."""
+        if self._all_trusted or (made or made_here(info)) is not MadeHere.NO:
+            return None
+        named = [_printable(text) for text in paths_in_arguments(info)]
+        if not named:
+            return None
+        return (
+            f"a recording of {_printable(info.task)} that was not made here names files for its env to read "
+            f"({', '.join(named[:3])}), which it may only with --trust on the command line"
+        )
+
+    def _without_asking(self, code: CodeToRun) -> TaskName | NotCleared | _Undecided:
+        """The decision, if it needs no question."""
+        made = made_here(code.info)
+        if (why := self.refused_arguments(code.info, made)) is not None:
+            return NotCleared(why, trust_helps=True)
+        if code.recorded_text:
+            try:
+                content = recorded_content(code.info)
+            except NoRecordedSource as error:
+                return NotCleared(str(error))
+            trusted = made is not MadeHere.NO
+        else:
+            reference = code.reference
+            if isinstance(reference, str):
+                return reference
+            if reference.file is None:
+                return _registered(reference)
+            if made is MadeHere.CONTENT_AND_PLACE and reference.file == code.info.source_file:
+                return str(reference)
+            if _is_named(reference.file, self._named()):
+                return str(reference)
+            try:
+                content = read_content(Path(reference.file))
+            except CannotRead as error:
+                return NotCleared(str(error))
+            trusted = made is not MadeHere.NO and _equals_recorded(content, code.info)
+        agreed = trusted or self._all_trusted or self._store.trusts(content)
+        if agreed and (not code.followed or self._all_trusted or self._store.follows(content)):
+            return _approved(code, content)
+        return _Undecided(content, agreed)
+
+    def _question(self, code: CodeToRun, undecided: _Undecided) -> TrustQuestion:
+        content = undecided.content
+        before = None if code.recorded_text or undecided.agreed else self._store.trusted_before(content)
+        question = _question(content, before, followed=code.followed, agreed=undecided.agreed)
+        return replace(question, task=_printable(code.info.task), recorded_text=code.recorded_text)
+
+
+def _question(
+    content: TaskContent,
+    before: Mapping[str, str] | None,
+    *,
+    followed: bool,
+    agreed: bool,
+    listed: bool = False,
+) -> TrustQuestion:
+    return TrustQuestion(
+        task="",
+        recorded_text=False,
+        files=code_files(content, before),
+        unseen=tuple(map(_printable, content.unseen)),
+        computed=content.computed,
+        trusted_before=before is not None,
+        gone=tuple(_printable(name) for name in before or () if name not in content.file_sums),
+        followed=followed,
+        agreed=agreed,
+        listed=listed,
+    )
+
+
+def _changed(content: TaskContent) -> NotCleared:
+    return NotCleared(
+        f"the code of {_printable(content.main)} was changed while you were asked about it; try it again"
+    )
+
+
+def code_files(content: TaskContent, before: Mapping[str, str] | None = None) -> tuple[CodeFile, ...]:
+    """The files that would run: the task's own first, then changed modules, then the others.
+
+    Args:
+        before: `TaskContent.file_sums` of the version trusted before, if any; empty if its files are not known.
+    """
+    paths = {content.name(path): path for path in content.texts}
+    files: list[CodeFile] = []
+    for name, found in content.file_sums.items():
+        since = Since.SAME
+        if before and before.get(name) != found:
+            since = Since.CHANGED if name in before else Since.NEW
+        shown = content.main if paths[name] == content.main else name
+        files.append(CodeFile(_printable(shown), found[:SHORT_HASH], content.texts[paths[name]], since))
+    # Changed modules first: they are hard to find in a long list.
+    return (*files[:1], *sorted(files[1:], key=lambda file: file.since is Since.SAME))
+
+
+def _registered(reference: RecordedTask) -> TaskName | NotCleared:
+    """The reference, unless its env id is a path."""
+    if not looks_like_file(reference.env_id):
+        return reference
+    return NotCleared(
+        f"a recording names the file {_printable(reference.env_id)} as its task, and a path that a recording names in place of "
+        "an id is never opened: if you know the task's file, name it yourself with --task FILE"
+    )
+
+
+def _is_unchanged(content: TaskContent) -> bool:
+    """Whether the file and its modules still have these texts."""
+    try:
+        return read_content(Path(content.main)).hash == content.hash
+    except CannotRead:
+        return False
+
+
+def paths_in_arguments(info: EpisodeInfo) -> list[str]:
+    """Texts in the recorded arguments of an env that look like a path: a task may open them."""
+    found: list[str] = []
+    waiting: list[Any] = [info.env_kwargs, info.reset_options, info.control_mode]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict):
+            waiting += [*value.keys(), *value.values()]
+        elif isinstance(value, (list, tuple)):
+            waiting += value
+        elif isinstance(value, str) and _is_like_a_path(value):
+            found.append(value)
+    return found
+
+
+def _is_like_a_path(text: str) -> bool:
+    if "/" in text or "\\" in text or text.startswith("~"):
+        return True
+    try:
+        return "." in text and os.path.lexists(text)
+    except ValueError:  # a null byte
+        return True
+
+
+def recorded_content(info: EpisodeInfo) -> TaskContent:
+    """The source text that a recording holds.
+
+    Raises:
+        NoRecordedSource: it has none.
+    """
+    if not info.source or info.source_file is None:
+        raise NoRecordedSource("this recording does not hold the text of its task")
+    main, texts = relative_sources(info.source_file, info.source)
+    return TaskContent(main, {main: texts[main], **texts})
+
+
+def _approved(code: CodeToRun, content: TaskContent) -> TaskName:
+    if code.recorded_text or isinstance(code.reference, str):
+        return code.reference
+    return replace(code.reference, file=content.main, approved=content.texts)
+
+
+def _equals_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
+    """Whether a file has the recorded text; then the recording's seal covers the file, in any folder."""
+    try:
+        return content.hash == recorded_content(info).hash
+    except NoRecordedSource:
+        return False
+
+
+def _printable(text: str) -> str:
+    return short_line(text, LONGEST)
+
+
+def _is_named(file: str, named: Iterable[Path]) -> bool:
+    real = os.path.realpath(file)
+    return any(os.path.realpath(one) == real for one in named)
+
+
+def question_text(question: TrustQuestion) -> str:
+    """Name and hash of the code that a question is about."""
+    if question.recorded_text:
+        return f"the text of {question.file} in recordings of {question.task} ({question.hash})"
+    return f"{question.file} ({question.hash})"

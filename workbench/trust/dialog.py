@@ -1,0 +1,142 @@
+"""The dialog that asks whether code named by a recording may run."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import viser
+
+from workbench.machine.loop import result_of
+from workbench.page.command import Refused
+from workbench.page.commands import AnswerTrust
+from workbench.page.widgets.dialog import Dialog
+from workbench.page.widgets.templates import render
+from workbench.page.widgets.tools import Tool, tools_html
+from workbench.trust.clearance import FOLLOWED, Consent, TrustQuestion
+
+TITLE = "Run this code?"
+DO_NOT, ONCE, ALWAYS = (
+    "Don't run it",
+    "Run it, and ask again next time",
+    "Run it, and don't ask again unless it changes",
+)
+MOST_OF_ONE, MOST_OF_ALL = 200_000, 1_000_000
+"""Maximum number of characters of one text, and of all texts, that go to the page; the page says how much is left
+out."""
+_LOOK = 0.1
+"""Seconds between two checks whether the answer is still wanted."""
+
+
+@dataclass
+class _Pending:
+    question: TrustQuestion
+    name: str = field(default_factory=lambda: secrets.token_urlsafe(12))
+    """Random: a page that was open before this program was started has no question of this name."""
+    answer: asyncio.Future[Consent] = field(default_factory=asyncio.Future)
+
+
+class TrustDialog:
+    """Asks one question at a time, on every open page; the first answer counts.
+
+    Only a press of one of its buttons is a yes: Escape, a page that closes, and a request that is withdrawn are a no.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._waiting: list[_Pending] = []
+        """Pending questions; the first is shown."""
+        self._window: Dialog | None = None
+        self._closed = False
+
+    def say_no(self) -> bool:
+        """Answer the question that is shown with a no; False if there is none."""
+        if not self._waiting:
+            return False
+        self._take(Consent.NO)
+        return True
+
+    def answer(self, command: AnswerTrust) -> None:
+        """Answer the question that is shown. Raises `Refused` if it is another one, or answered already."""
+        is_shown = self._waiting and self._waiting[0].name == command.question
+        if not is_shown or not self._take(Consent(command.answer)):
+            raise Refused("This question was answered or withdrawn before.")
+
+    def _take(self, answer: Consent) -> bool:
+        """Answer the first question; False if it is answered already."""
+        shown = self._waiting[0]
+        if shown.answer.done():
+            return False
+        shown.answer.set_result(answer)
+        return True
+
+    def ask(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
+        """Show the question and wait for the answer; called on another thread than the loop.
+
+        Args:
+            stopped: called often; True withdraws the question.
+        """
+        return result_of(self._asked(question, stopped))
+
+    async def _asked(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
+        pending = _Pending(question)
+        self._waiting.append(pending)
+        try:
+            while not self._closed and not stopped():
+                self._keep_shown()
+                await asyncio.wait([pending.answer], timeout=_LOOK)
+                if pending.answer.done():
+                    return pending.answer.result()
+            return Consent.NO
+        finally:
+            if self._waiting[0] is pending:
+                self._take_down()
+            self._waiting.remove(pending)
+
+    def close(self) -> None:
+        """Withdraw every question."""
+        self._closed = True
+
+    def _keep_shown(self) -> None:
+        """Open the dialog of the first question, again if a page switch has removed it."""
+        if self._window is not None and not self._window.modal.closed:
+            return
+        pending = self._waiting[0]
+        gui = self._server.gui
+        with self._server.atomic():
+            self._window = Dialog(self._server, TITLE)
+            with self._window.modal:
+                gui.add_html(buttons_html(pending.name, pending.question.more))
+                # After the buttons, so that nothing in it has the focus; page.css puts it above them.
+                gui.add_html(question_html(pending.question))
+
+    def _take_down(self) -> None:
+        window, self._window = self._window, None
+        if window is not None:
+            window.close()
+
+
+def buttons_html(name: str, more: int) -> str:
+    """The answers to the question of this name, after which so many others come."""
+    # The first button has the focus: Enter must not run anything.
+    rows = [[Tool(DO_NOT, AnswerTrust(question=name, answer="no"), tone="main")]]
+    if more:
+        rows.append([Tool(f"Don't run the other {more} either", AnswerTrust(question=name, answer="none"))])
+    rows.append([Tool(ONCE, AnswerTrust(question=name, answer="once"))])
+    rows.append([Tool(ALWAYS, AnswerTrust(question=name, answer="always"))])
+    return tools_html(*rows)
+
+
+def question_html(question: TrustQuestion) -> str:
+    """The code that would run, as HTML."""
+    files: list[dict[str, object]] = []
+    left = MOST_OF_ALL
+    for file in question.files:
+        shown = file.text[: min(MOST_OF_ONE, left)]
+        left -= len(shown)
+        left_out = len(file.text) - len(shown)
+        said = {"name": file.name, "hash": file.hash, "since": file.since.value, "text": shown}
+        files.append({**said, "left_out": left_out})
+    return render("trust_question", asked=question, files=files, followed=FOLLOWED)

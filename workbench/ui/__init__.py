@@ -1,1 +1,0 @@
-"""The page. Nothing else knows viser."""

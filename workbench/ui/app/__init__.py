@@ -1,1 +1,0 @@
-"""The start page, the live page, the review page, and switching between them."""

@@ -1,1 +1,0 @@
-"""Panels and 3-D view of the review page."""

@@ -1,1 +1,0 @@
-"""Serves the page on one port: who may connect, what a browser may ask, and what it gets."""
