@@ -11,7 +11,7 @@ import viser
 from tests.drive.panels import Clock, Panels, forget_what_was_drawn
 from tests.drive.waiting import until
 from workbench.app.review_page import ReviewPage
-from workbench.app.server import Workplace
+from workbench.app.server import App
 from workbench.app.session import Session
 from workbench.live.timeline_commands import Seek
 from workbench.page.door.gated_server import GatedServer
@@ -28,12 +28,14 @@ class Reviewed(Panels):
 
     def __init__(self, gated_server: GatedServer, folder: Path) -> None:
         super().__init__(gated_server.server)
-        self.place = Workplace(gated_server, folder, no_session, TaskOptions())
-        self.come_to(self.place.visitors)
-        self.review, self.library = self.place.shelf.review, self.place.shelf.library
+        self.app = App(gated_server, folder, no_session, TaskOptions())
+        self.come_to(self.app.shared.visitors)
+        self.review, self.library = self.app.shared.recordings.review, self.app.shared.recordings.library
         self.library.refresh()
         self.clock = Clock()
-        self.page = ReviewPage(self.place, clock=self.clock)
+        self.page = ReviewPage(
+            self.app.shared, self.app.open_task, self.app.review_tools, self.app.does, clock=self.clock
+        )
         self.visitors.do = self.page.do
 
     def draw(self) -> None:
@@ -76,4 +78,4 @@ def review_of(gated_server: GatedServer, folder: Path) -> Iterator[Reviewed]:
     try:
         yield reviewed
     finally:
-        reviewed.place.close()
+        reviewed.app.close()

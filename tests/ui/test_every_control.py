@@ -15,7 +15,7 @@ from tests.drive.panels import inputs_of
 from tests.drive.scripted import scripted
 from tests.drive.session import wait_until
 from tests.ui.knocking import client
-from workbench.app.server import Workplace
+from workbench.app.server import App
 from workbench.app.session import Session
 from workbench.commands import COMMANDS
 from workbench.library.commands import OpenRow
@@ -36,20 +36,20 @@ LEAVES = (ShowRecordings, ShowLive, ContinueLive, OpenRow, OpenListedTask, OpenF
 
 
 @pytest.fixture(scope="module")
-def place(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Workplace]:
+def app(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[App]:
     folder = tmp_path_factory.mktemp("recordings")
     write(folder, made(5))
     gated_server = open_server(ServerOptions(port=0))
     make_session = functools.partial(Session, recordings=folder, make_worker=scripted(2))
     session = make_session(str(folder / "push.py"), TaskOptions(num_envs=2))
-    place = Workplace(gated_server, folder, make_session, TaskOptions(), session)
+    app = App(gated_server, folder, make_session, TaskOptions(), session)
     # Else a process would list ManiSkill's tasks.
-    place.open_task.catalogue.registered.close()
-    place.pages.start("live")
+    app.open_task.catalogue.registered.close()
+    app.shared.pages.start("live")
     wait_until(session, lambda view: view.task is not None, "the task")
     with client(gated_server):
-        yield place
-    place.close()
+        yield app
+    app.close()
     session.close()
     gated_server.close()
 
@@ -75,18 +75,18 @@ def with_values(kind: type[Command], seed: int) -> Iterator[Command]:
 
 
 @pytest.mark.parametrize("which", ["start", "live", "review"])
-def test_no_command_fails_otherwise_than_by_a_sentence(place: Workplace, which: Any) -> None:
-    place.pages.show(which).result(60)
-    assert inputs_of(place.server.gui) == [], "viser's own have no order beside commands"
-    (visitor,), done = place.visitors.all(), 0
+def test_no_command_fails_otherwise_than_by_a_sentence(app: App, which: Any) -> None:
+    app.shared.pages.show(which).result(60)
+    assert inputs_of(app.shared.server.gui) == [], "viser's own have no order beside commands"
+    (visitor,), done = app.shared.visitors.all(), 0
     for kind in COMMANDS:
         if kind in LEAVES:
             continue
         for command in with_values(kind, seed=1):  # the same values each time
             try:
-                place.visitors.do(command, visitor)
+                app.shared.visitors.do(command, visitor)
                 done += 1
             except Refused as reason:
                 assert str(reason).strip()
     assert done > {"start": 3, "live": 60, "review": 30}[which]
-    assert place.pages.shown == which
+    assert app.shared.pages.shown == which

@@ -7,11 +7,11 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import viser
 
 from workbench.app.session import Session
+from workbench.app.shared import Shared
 from workbench.envs.recorded_run import RecordedRun
 from workbench.episodes.episode import EpisodeInfo
 from workbench.episodes.recorded_source import (
@@ -39,10 +39,6 @@ from workbench.review.view import ReviewView
 from workbench.task.description import TaskOptions
 from workbench.task.reference import TaskName
 from workbench.trust.clearance import Clearances, CodeToRun, NotCleared
-
-if TYPE_CHECKING:
-    from workbench.app.server import Workplace
-
 
 ONE, ALL = "the selected env", "all envs"
 NEW_ENVS = 4
@@ -102,7 +98,7 @@ class GoLive:
     show. Used on the loop, but for `close`.
 
     Args:
-        place: The pages, and the open session, if any.
+        shared: The pages, and the open session, if any.
         make_session: Opens a task; gets what `Session` gets.
         clearances: Decide which code named by recordings may run.
         base: Options that all opened tasks share.
@@ -110,12 +106,12 @@ class GoLive:
 
     def __init__(
         self,
-        place: Workplace,
+        shared: Shared,
         make_session: MakeSession,
         clearances: Clearances,
         base: TaskOptions,
     ) -> None:
-        self._place, self._make, self._clearances, self._base = place, make_session, clearances, base
+        self._shared, self._make, self._clearances, self._base = shared, make_session, clearances, base
         self._own: tuple[Session, Path | None] | None = None
         self.recorded_source, self.everywhere = False, False
         self._way: _Way | None = None
@@ -128,7 +124,7 @@ class GoLive:
         if self._way is not None:
             self._give_up()
             return
-        review = self._place.shelf.review.view()
+        review = self._shared.recordings.review.view()
         one = next((one for one in review.opened if one.id == id), None)
         if one is None:
             return
@@ -162,12 +158,12 @@ class GoLive:
 
     def _open_already(self, info: EpisodeInfo) -> Session | None:
         """An open session with this task in today's code."""
-        session = self._place.session
+        session = self._shared.session
         if session is not None and (self._own is None or self._own[1] is None):
             task = session.view().task
             if task is None or not why_not_enter(task, info):
                 return session
-        known = self._place.home if self._place.home is not session else None
+        known = self._shared.home if self._shared.home is not session else None
         task = None if known is None else known.view().task
         return known if task is not None and not why_not_enter(task, info) else None
 
@@ -186,8 +182,8 @@ class GoLive:
             if recorded_source:
                 folder, reference = write_source(info)
             if not way.given_up:
-                if self._place.home is not None:
-                    self._place.home.do(PauseRun())
+                if self._shared.home is not None:
+                    self._shared.home.do(PauseRun())
                 return self._make(reference, options), folder
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -205,13 +201,13 @@ class GoLive:
 
     async def _enter(self, session: Session, way: _Way) -> None:
         """Put the recorded state into the env, and show the live page once it is there."""
-        self._place.session = session
+        self._shared.session = session
         way.problems = session.view().problem_serial
         way.number = session.enter_recording(way.run, self.everywhere, way.info.source_file, way.info.source)
         way.session = session
         while self._way is way:
             if way.is_over():
-                self._place.pages.show("live")
+                self._shared.pages.show("live")
                 return
             await asyncio.sleep(_LOOK)
 
@@ -232,15 +228,15 @@ class GoLive:
 
     def can_go_home(self) -> bool:
         """Whether the live session was opened here."""
-        home = self._place.home
-        return home is not None and self._place.session is not home
+        home = self._shared.home
+        return home is not None and self._shared.session is not home
 
     def go_home(self) -> None:
         """Return to the session that a person opened; the other session ends."""
-        if self._place.home is None:
+        if self._shared.home is None:
             return
-        self._place.session = self._place.home
-        self._place.pages.show("live")
+        self._shared.session = self._shared.home
+        self._shared.pages.show("live")
         self._let_go()
 
     def let_go(self) -> None:
@@ -262,7 +258,7 @@ class GoLive:
             self._ending.begin(lambda: _end(*own))
 
     def _say(self, text: str) -> None:
-        tell_all(self._place.server, "This recording cannot be continued", text, "red")
+        tell_all(self._shared.server, "This recording cannot be continued", text, "red")
 
 
 class GoLivePart(PagePart[ReviewView]):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from workbench.app.go_live import GoLive
 from workbench.app.session import KeptWork, Session
+from workbench.app.shared import Shared
 from workbench.live.commands import PauseRun
 from workbench.machine.folders import example_tasks
 from workbench.machine.loop import Aside, begin, result_of
@@ -22,9 +23,6 @@ from workbench.task.find import is_below
 from workbench.task.new_task import write_new_task
 from workbench.task.reference import TaskName, file_and_class, lasting
 from workbench.trust.clearance import Clearances, NotCleared
-
-if TYPE_CHECKING:
-    from workbench.app.server import Workplace
 
 OpenSession = Callable[[TaskName, TaskOptions, KeptWork | None], Session]
 """Opens a task, with what was kept of an earlier session of it."""
@@ -52,18 +50,24 @@ class OpenTask:
     the old session is closed as at the end of the program. Used on the loop, but for `close`.
 
     Args:
-        place: The pages and the open session.
+        shared: The pages and the open session.
+        go_live: Gives up a session that it opened.
         open_session: Opens a task.
         catalogue: What may be chosen.
         clearances: Decide whether a file may run.
     """
 
     def __init__(
-        self, place: Workplace, open_session: OpenSession, catalogue: Catalogue, clearances: Clearances
+        self,
+        shared: Shared,
+        go_live: GoLive,
+        open_session: OpenSession,
+        catalogue: Catalogue,
+        clearances: Clearances,
     ) -> None:
-        self._place, self._open_session = place, open_session
+        self._shared, self._go_live, self._open_session = shared, go_live, open_session
         self.catalogue, self._clearances = catalogue, clearances
-        home = place.home
+        home = shared.home
         self._open_reference = "" if home is None else lasting(str(home.reference))
         """Reference of the task that a person opened, as `Entry.lasting` has it."""
         self._wish: Entry | None = None
@@ -99,7 +103,7 @@ class OpenTask:
 
     def is_open(self, entry: Entry) -> bool:
         """Whether this is the open task."""
-        return self._place.home is not None and self._open_reference == entry.lasting
+        return self._shared.home is not None and self._open_reference == entry.lasting
 
     def close(self) -> None:
         """Withdraw a question and end the thread; a session that is being closed is waited for."""
@@ -124,18 +128,18 @@ class OpenTask:
 
     async def _open(self, entry: Entry) -> None:
         if entry.section is Section.RECORDINGS:
-            self._place.pages.show("review")
+            self._shared.pages.show("review")
             return
         file = entry.file
         if file is not None and not await self._aside.run(file.is_file):
             self._say(f"{entry.name} is gone", f"There is no file {entry.file} any more.")
             self.catalogue.refresh()
             return
-        home = self._place.home
+        home = self._shared.home
         if home is not None and self.is_open(entry):
-            self._place.go_live.let_go()
-            self._place.session = home
-            self._place.pages.show("live")
+            self._go_live.let_go()
+            self._shared.session = home
+            self._shared.pages.show("live")
             return
         self._doing = f"Opening {entry.name}: asking whether its code may run"
         try:
@@ -162,8 +166,8 @@ class OpenTask:
         return self._clearances.clear_file(file, file_and_class(entry.reference)[1], self._withdrawn)
 
     async def _change(self, reference: TaskName, entry: Entry) -> None:
-        place, old = self._place, self._place.home
-        place.go_live.let_go()
+        shared, old = self._shared, self._shared.home
+        self._go_live.let_go()
         if old is not None:
             old.do(PauseRun())
             self._kept[self._open_reference] = old.kept_work()
@@ -173,14 +177,14 @@ class OpenTask:
         kept = self._kept.get(entry.lasting)
         options = entry.options or self.catalogue.options
         session = await self._aside.run(lambda: self._open_session(reference, options, kept))
-        place.session = place.home = session
+        shared.session = shared.home = session
         self._open_reference = entry.lasting
         # Until then the old page draws the old session.
-        shown = asyncio.wrap_future(place.pages.show("live", anew=True))
+        shown = asyncio.wrap_future(shared.pages.show("live", anew=True))
         await asyncio.wait([shown], timeout=_SHOWN_WITHIN)
         if old is not None:
             self._doing = "Closing the task before: its recordings are written …"
             await self._aside.run(old.close)
 
     def _say(self, title: str, text: str) -> None:
-        tell_all(self._place.server, title, text, "red")
+        tell_all(self._shared.server, title, text, "red")

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 import viser
 
-from workbench.app.go_live import GoLivePart
+from workbench.app.go_live import GoLive, GoLivePart
+from workbench.app.open_task import OpenTask
 from workbench.app.pages import draw_apart
+from workbench.app.shared import Shared
 from workbench.cameras.panel import CamerasPanel
 from workbench.cameras.view import ShownCameras
 from workbench.envs.camera_data import CameraKey, Picture
@@ -49,7 +51,8 @@ from workbench.page.widgets.parts import Clock, DrawDue, PagePart, Parts
 from workbench.page.widgets.templates import render
 from workbench.page.widgets.tools import tool, tools_html
 from workbench.page.widgets.visitors import Done, Visitor
-from workbench.rescore.recordings_panel import RescorePanel
+from workbench.rescore.recording_jobs import Rescorer
+from workbench.rescore.recordings_panel import RescoreChoices, RescorePanel
 from workbench.review.commands import RescoreChosen
 from workbench.review.compare_panel import ReviewComparePanel
 from workbench.review.curves_panel import ReviewCurves, ReviewNumbers
@@ -58,11 +61,9 @@ from workbench.review.playback import Review
 from workbench.review.scene_view import ReviewIn3D, shown_together
 from workbench.review.state import MOST_OPEN
 from workbench.review.view import PictureReader, ReviewView, column_at, outcome_text
+from workbench.share.panel import Sharing
 from workbench.start.panel import OpenDialog
 from workbench.sweep.panel import SweepPanel
-
-if TYPE_CHECKING:
-    from workbench.app.server import Workplace
 
 TOLD_EVERY = 0.1
 """Seconds between two drawings of the panels while a recording plays; numbers cannot be read faster."""
@@ -97,21 +98,41 @@ DOES: frozenset[type[Command]] = frozenset(
 """Commands that the page itself carries out; its parts carry out the others."""
 
 
+@dataclass(frozen=True)
+class ReviewTools:
+    """What outlives a review page."""
+
+    go_live: GoLive
+    rescorer: Rescorer
+    rescore_choices: RescoreChoices
+    sharing: Sharing
+
+
 class ReviewPage:
     """The review's page, built and redrawn like the live page, without a worker or a task file.
 
     Args:
-        place: The recordings, and what can be done with them.
+        shared: The recordings, and what else all pages share.
+        open_task: The list of tasks.
+        tools: What can be done with recordings.
+        also: Further commands that all pages have.
         dark: The first theme.
         anew: Show the first tab also to a browser that left the page at another one.
         clock: Of all parts of the page.
     """
 
     def __init__(
-        self, place: Workplace, dark: bool = True, anew: bool = False, clock: Clock = time.monotonic
+        self,
+        shared: Shared,
+        open_task: OpenTask,
+        tools: ReviewTools,
+        also: frozenset[type[Command]],
+        dark: bool = True,
+        anew: bool = False,
+        clock: Clock = time.monotonic,
     ) -> None:
-        self._place, self._clock = place, clock
-        self._server, self._review = server, review = place.server, place.shelf.review
+        self._shared, self._tools, self._clock = shared, tools, clock
+        self._server, self._review = server, review = shared.server, shared.recordings.review
         self._reader = PictureReader()
         self._requests: tuple[CameraRequest, ...] = ()
         self._pictures: dict[CameraKey, Picture] = {}
@@ -128,33 +149,36 @@ class ReviewPage:
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Recordings")
         self._status = server.gui.add_html("")
-        self._opening = OpenDialog(server, place.open_task)
+        self._opening = OpenDialog(server, open_task)
         self._opening.add_button()
-        self._open_tabs = OpenTabs(place.visitors)
+        self._open_tabs = OpenTabs(shared.visitors)
         server.gui.add_html(render("which", which="review", anew=anew, says=False))
-        place.stage.in_software.ask()
+        shared.stage.in_software.ask()
         self._add_way_back()
         review_tab, in_tabs = self._add_tabs(dark)
         self._timeline = ReviewTimeline(server, review)
-        self._in_3d = ReviewIn3D(server, review, place.stage)
+        self._in_3d = ReviewIn3D(server, review, shared.stage)
         self._parts = Parts((self._panel, self._timeline, *in_tabs, self._opening), clock)
         if self._sweep is not None:
             self._parts.add(self._sweep)
-        kinds = DOES | self._parts.does | place.does
+        kinds = DOES | self._parts.does | also
         register(
-            server, place.visitors, kinds if place.session is not None else kinds - {ShowLive}, "review page"
+            server,
+            shared.visitors,
+            kinds if shared.session is not None else kinds - {ShowLive},
+            "review page",
         )
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", rows=key_rows(kinds)))
 
     def _add_way_back(self) -> None:
-        if self._place.session is not None:
+        if self._shared.session is not None:
             self._server.gui.add_html(tools_html([tool(BACK, ShowLive())]))
 
     def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
         """Returns the Review tab, which gets more content later, and the parts of all tabs."""
-        server, review, place = self._server, self._review, self._place
-        library, go_live = place.shelf.library, place.go_live
+        server, review, shared = self._server, self._review, self._shared
+        library, go_live = shared.recordings.library, self._tools.go_live
         tabs = server.gui.add_tab_group()
         review_tab = tabs.add_tab("Review", viser.Icon.PLAYER_PLAY)
         with review_tab:
@@ -169,15 +193,20 @@ class ReviewPage:
         share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
         with tabs.add_tab("Rescore", viser.Icon.GAVEL):
             self._rescore = RescorePanel(
-                server, place.rescorer, review, library, place.rescore_choices, place.task_files
+                server,
+                self._tools.rescorer,
+                review,
+                library,
+                self._tools.rescore_choices,
+                shared.task_files,
             )
         self._add_library(library)
         with share_tab:
-            sharing = place.sharing
+            sharing = self._tools.sharing
             self._share = sharing.part(server, library, self._library, self._make_way)
         with review_tab:
             going = GoLivePart(server, go_live)
-            self._view_panel = ViewPanel(server, dark, place.stage.choice)
+            self._view_panel = ViewPanel(server, dark, shared.stage.choice)
         return review_tab, [
             numbers,
             curves,
@@ -190,7 +219,7 @@ class ReviewPage:
         ]
 
     def _running(self) -> OpenVersion | None:
-        session = self._place.session
+        session = self._shared.session
         task = None if session is None else session.view().task
         return None if task is None else OpenVersion(task.env_id, task.source_hash)
 
@@ -233,7 +262,7 @@ class ReviewPage:
 
     def _add_late_sweep(self) -> None:
         """Add the tab of a sweep whose results came after the page."""
-        if self._sweep is None and (sweep := self._sweep_of(self._place.shelf.library)) is not None:
+        if self._sweep is None and (sweep := self._sweep_of(self._shared.recordings.library)) is not None:
             self._sweep = sweep
             self._parts.add(sweep)
 
@@ -278,7 +307,7 @@ class ReviewPage:
         self._status.content = render(
             "review_status",
             view=view,
-            going=self._place.go_live.going(),
+            going=self._tools.go_live.going(),
             outcome_text=outcome_text,
         )
         self._draw_cameras(view)
@@ -389,15 +418,15 @@ class ReviewPage:
         """Carry out a command of a page. Raises `Refused`."""
         match command:
             case ShowLive():
-                if self._place.session is None:
+                if self._shared.session is None:
                     raise Refused("No task is open.")
-                self._place.pages.show("live")
+                self._shared.pages.show("live")
             case ShowTab(tab=tab, fold=fold):
                 self._open_tabs.open(visitor, tab, fold)
             case TellUnfolded(panel=panel):
                 self._panel_unfolded(panel)
             case TellDrawnInSoftware():
-                self._place.stage.in_software.told_by(visitor)
+                self._shared.stage.in_software.told_by(visitor)
             case ToggleTable():
                 self._show_library(not self._library_open)
             case FrameScene():

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 import workbench
+from workbench.app.open_task import OpenTask
+from workbench.app.shared import Shared
 from workbench.live.panels.view_panel import BRAND
 from workbench.page.command import Command, Refused
 from workbench.page.commands import ShowRecordings, TellDrawnInSoftware, ToggleTheme
@@ -15,44 +16,50 @@ from workbench.page.widgets.templates import render
 from workbench.page.widgets.visitors import Done, Visitor
 from workbench.start.panel import TaskList
 
-if TYPE_CHECKING:
-    from workbench.app.server import Workplace
-
 
 class StartPage:
     """The list in a panel over the whole window (``.wb-start`` in page.css): there is no scene to look at.
 
     Args:
-        place: The pages, and the list.
+        shared: What all pages share.
+        open_task: The list of tasks.
+        also: Further commands that all pages have.
         dark: The first theme.
         clock: Of all parts of the page.
     """
 
-    def __init__(self, place: Workplace, dark: bool = True, clock: Clock = time.monotonic) -> None:
-        self._server = server = place.server
+    def __init__(
+        self,
+        shared: Shared,
+        open_task: OpenTask,
+        also: frozenset[type[Command]],
+        dark: bool = True,
+        clock: Clock = time.monotonic,
+    ) -> None:
+        self._server = server = shared.server
         self.dark = dark
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label("Workbench")
         self._apply_theme()
         server.gui.add_html(render("start_head", version=workbench.__version__))
-        place.open_task.catalogue.refresh()
-        self._list = TaskList(server, place.open_task)
-        self._place = place
-        kinds = frozenset({ShowRecordings, ToggleTheme, *TaskList.does}) | place.does
-        register(server, place.visitors, kinds, "start page")
+        open_task.catalogue.refresh()
+        self._list = TaskList(server, open_task)
+        self._shared = shared
+        kinds = frozenset({ShowRecordings, ToggleTheme, *TaskList.does}) | also
+        register(server, shared.visitors, kinds, "start page")
 
     def do(self, command: Command, visitor: Visitor) -> Done:
         """Carry out a command of a page. Raises `Refused`."""
         match command:
             case ShowRecordings():
-                self._place.pages.show("review")
+                self._shared.pages.show("review")
             case ToggleTheme():
                 self.dark = not self.dark
                 self._apply_theme()
             case _ if isinstance(command, TaskList.does):
                 return self._list.do(command, visitor)
             case TellDrawnInSoftware():
-                self._place.stage.in_software.told_by(visitor)
+                self._shared.stage.in_software.told_by(visitor)
             case _:
                 raise Refused(f"Not on this page: {command.help()}.")
         return None

@@ -18,7 +18,7 @@ from rich.markup import escape
 import workbench
 from workbench.app.open_task import Choices
 from workbench.app.pages import Which
-from workbench.app.server import Workplace
+from workbench.app.server import App
 from workbench.app.session import HISTORY_BYTES, KeptWork, Session
 from workbench.cli.output import out, print_addresses, print_event, print_line, print_text, refuse, warn
 from workbench.envs.recorded_run import HOW_IT_IS_RUN
@@ -82,8 +82,8 @@ def open_in_terminal(
     if waits_for_a_file:
         how.recents.add(task, options)
     session = how.open(task, options, on_event=on_event)
-    place = _workplace(gated_server, how, _for_others(options), session, trust, editor=editor)
-    _serve(gated_server, place, "live", f"{task}, {options.num_envs} envs", requests)
+    app = _app(gated_server, how, _for_others(options), session, trust, editor=editor)
+    _serve(gated_server, app, "live", f"{task}, {options.num_envs} envs", requests)
 
 
 @loop_in_main
@@ -107,10 +107,10 @@ def start_in_terminal(
     if isinstance(gated_server, int):
         return gated_server
     how = _HowToOpen(recordings, worker, history_bytes, RecentTasks())
-    place = _workplace(gated_server, how, options, None, trust, editor=editor)
+    app = _app(gated_server, how, options, None, trust, editor=editor)
     requests = _Requests()
     requests.put(partial(_print_address, gated_server))
-    _serve(gated_server, place, "start", f"tasks in {Path.cwd()}", requests)
+    _serve(gated_server, app, "start", f"tasks in {Path.cwd()}", requests)
 
 
 @loop_in_main
@@ -134,10 +134,10 @@ def review_in_terminal(
     if isinstance(gated_server, int):
         return gated_server
     how = _HowToOpen(folder, worker, HISTORY_BYTES, RecentTasks())
-    place = _workplace(gated_server, how, base, None, trust, tasks, editor)
+    app = _app(gated_server, how, base, None, trust, tasks, editor)
     requests = _Requests()
     requests.put(partial(_print_address, gated_server))
-    _serve(gated_server, place, "review", f"recordings in {folder}", requests)
+    _serve(gated_server, app, "review", f"recordings in {folder}", requests)
 
 
 def _start_server(at: ServerOptions, label: str) -> GatedServer | int:
@@ -212,7 +212,7 @@ def _for_others(options: TaskOptions) -> TaskOptions:
     return replace(options, env_kwargs=kwargs)
 
 
-def _workplace(
+def _app(
     gated_server: GatedServer,
     how: _HowToOpen,
     options: TaskOptions,
@@ -220,9 +220,9 @@ def _workplace(
     trust: bool,
     tasks: tuple[Path, ...] = (),
     editor: str = "",
-) -> Workplace:
+) -> App:
     base = TaskOptions(rules=options.rules, imports=options.imports)
-    return Workplace(
+    return App(
         gated_server,
         how.recordings,
         how.open_for_recording,
@@ -238,43 +238,45 @@ def _workplace(
 
 def _serve(
     gated_server: GatedServer,
-    place: Workplace,
+    app: App,
     first: Which,
     what: str,
     requests: _Requests,
 ) -> NoReturn:
     renew = partial(requests.put, partial(_renew_token, gated_server))
     if gated_server.options.token:
-        place.renew_token = renew
+        app.renew_token = renew
     on_signal(signal.SIGUSR1, renew)
     # Not SIGHUP, by which a closed terminal ends its processes.
     for number in (signal.SIGINT, signal.SIGTERM):
         on_signal(number, partial(requests.put, 0))
     try:
-        place.pages.start(first)
+        app.shared.pages.start(first)
         out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(what)}", soft_wrap=True)
         while not isinstance(request := requests.get(), int):
             request()
         code = request
     finally:
         out.print("closing")
-        _close(place, gated_server)
+        _close(app, gated_server)
     _exit(code)
 
 
-def _close(place: Workplace, gated_server: GatedServer) -> None:
+def _close(app: App, gated_server: GatedServer) -> None:
     """Close all that is open. What takes longer than `_CLOSING_SECONDS` is left, unless episodes are written meanwhile."""
-    closing = Aside("closing").begin(place.close)
-    written = _episodes_written(place)
+    closing = Aside("closing").begin(app.close)
+    written = _episodes_written(app)
     while not futures.wait([closing], _CLOSING_SECONDS).done:
-        if written == (written := _episodes_written(place)):
+        if written == (written := _episodes_written(app)):
             warn("closing takes too long; what was being recorded is recovered at the next start")
             break
     gated_server.close()
 
 
-def _episodes_written(place: Workplace) -> int:
-    return sum(session.episodes_written for session in {place.home, place.session} if session is not None)
+def _episodes_written(app: App) -> int:
+    return sum(
+        session.episodes_written for session in {app.shared.home, app.shared.session} if session is not None
+    )
 
 
 def _renew_token(gated_server: GatedServer) -> None:

@@ -152,7 +152,7 @@ def _in_page(files: Sequence[Path], host: str, port: int) -> int:
     web_viewer_folder()
     gated_server = open_server(ServerOptions(host=host, port=port))
     try:
-        address = RerunPages(gated_server, Downloads(gated_server)).address(files)
+        address = RerunPages(gated_server, Downloads(gated_server.add_route)).address(files)
         if gated_server.warning:
             warn(gated_server.warning)
         print_addresses(gated_server.addresses(address))

@@ -302,7 +302,7 @@ class Sharing:
     """Downloads, rerun and work in progress: what outlives the pages. One for each `GatedServer`."""
 
     def __init__(self, gated_server: GatedServer) -> None:
-        self._offers = Downloads(gated_server)
+        self._offers = Downloads(gated_server.add_route)
         self._rerun = RerunPages(gated_server, self._offers)
         self._making = Making()
 

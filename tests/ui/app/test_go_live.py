@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from tests.drive.waiting import until
 from tests.ui.scenes import problem
 from workbench.app.go_live import GoLive, GoLivePart
 from workbench.app.pages import Which
-from workbench.app.server import Workplace
+from workbench.app.server import App
 from workbench.app.session import Session
 from workbench.live.commands import PlayRun
 from workbench.live.messages import LoadFailed
@@ -49,17 +50,17 @@ class Person(Clearances):
 class Desk:
     """A review with an episode of the task that is open, 0, and one of another, 1."""
 
-    def __init__(self, place: Workplace, live: Session, other: Session, panels: Panels) -> None:
-        self.place, self.live, self.other, self.panels = place, live, other, panels
+    def __init__(self, app: App, live: Session, other: Session, panels: Panels) -> None:
+        self.app, self.live, self.other, self.panels = app, live, other, panels
         self.person = Person()
         self.opened: list[TaskName] = []
         self.shown: list[str] = []
         """Pages that were asked for; none is built."""
-        place.pages.show = self._show
-        self.go_live = GoLive(place, self._make, self.person, TaskOptions())
-        self.part = GoLivePart(place.server, self.go_live)
+        app.shared.pages.show = self._show
+        self.go_live = GoLive(app.shared, self._make, self.person, TaskOptions())
+        self.part = GoLivePart(app.shared.server, self.go_live)
         panels.visitors.do = self.part.do
-        place.go_live = self.go_live
+        app.review_tools = replace(app.review_tools, go_live=self.go_live)
 
     def _make(self, task: TaskName, options: TaskOptions) -> Session:
         self.opened.append(task)
@@ -70,7 +71,7 @@ class Desk:
         return Future()
 
     def go(self, which: int, state: int = 2) -> None:
-        opened = self.place.shelf.review.view().opened[which]
+        opened = self.app.shared.recordings.review.view().opened[which]
         do(lambda: self.go_live.go(opened.id, state))
 
     def is_led_to_the_live_page(self) -> None:
@@ -101,22 +102,22 @@ def desk(
     def no_other(task: TaskName, options: TaskOptions) -> Session:
         raise AssertionError("this test opens it itself")
 
-    place = Workplace(gated_server, folder, no_other, TaskOptions(), session=live)
-    library, review = place.shelf.library, place.shelf.review
+    app = App(gated_server, folder, no_other, TaskOptions(), session=live)
+    library, review = app.shared.recordings.library, app.shared.recordings.review
     library.refresh()
     review.open([row.id for row in sorted(library.view().rows, key=lambda row: row.seed or 0)])
     until(lambda: len(review.view().opened) == 2, "the recordings", seen=lambda: review.view().problems)
-    desk = Desk(place, live, other, panels)
+    desk = Desk(app, live, other, panels)
     yield desk
     desk.go_live.close()
-    place.close()
+    app.close()
 
 
 def test_into_the_task_that_is_open_one_goes_at_once_and_the_page_follows_also_if_nobody_looks(
     desk: Desk,
 ) -> None:
     desk.go(0, state=3)
-    assert desk.person.asked == 0 and desk.opened == [] and desk.place.session is desk.live
+    assert desk.person.asked == 0 and desk.opened == [] and desk.app.shared.session is desk.live
     until(lambda: desk.live.view().timeline.entered, "the recorded state")
     desk.is_led_to_the_live_page()
     assert not desk.go_live.can_go_home()
@@ -138,29 +139,29 @@ def test_another_task_is_opened_beside_the_one_that_is_open_once_somebody_says_y
     desk.go(1)
     until(lambda: desk.person.asked, "the question")
     assert desk.go_live.going() == "waiting for permission to run the code of Pull-v1"
-    assert desk.place.session is desk.live and desk.opened == []
+    assert desk.app.shared.session is desk.live and desk.opened == []
     desk.person.says_yes.set()
-    until(lambda: desk.place.session is desk.other, "the other session")
+    until(lambda: desk.app.shared.session is desk.other, "the other session")
     assert desk.opened == ["Pull-v1"] and desk.go_live.can_go_home()
     until(lambda: not desk.live.view().playing, "the pause of the task that nobody sees")
     until(lambda: desk.other.view().timeline.entered, "the recorded state")
     desk.is_led_to_the_live_page()
-    desk.part.draw(desk.place.shelf.review.view())
+    desk.part.draw(desk.app.shared.recordings.review.view())
     desk.panels.press("Back to the first task")
-    assert desk.place.session is desk.live and not desk.go_live.can_go_home()
-    desk.part.draw(desk.place.shelf.review.view())
+    assert desk.app.shared.session is desk.live and not desk.go_live.can_go_home()
+    desk.part.draw(desk.app.shared.recordings.review.view())
     assert not desk.panels.shows("Back to the first task")
 
 
 def test_which_code_and_which_envs_are_kept_for_the_next_review(desk: Desk) -> None:
-    desk.part.draw(desk.place.shelf.review.view())
+    desk.part.draw(desk.app.shared.recordings.review.view())
     assert desk.panels.field("Code").value == "today's"
     desk.panels.set("Code", "as recorded")
     desk.panels.set("Into", "all envs")
     assert desk.go_live.recorded_source and desk.go_live.everywhere
-    desk.place.server.gui.reset()
-    desk.part = GoLivePart(desk.place.server, desk.go_live)
-    desk.part.draw(desk.place.shelf.review.view())
+    desk.app.shared.server.gui.reset()
+    desk.part = GoLivePart(desk.app.shared.server, desk.go_live)
+    desk.part.draw(desk.app.shared.recordings.review.view())
     assert desk.panels.field("Code").value == "as recorded" and desk.panels.field("Into").value == "all envs"
     desk.panels.do(ReturnToFirstTask())
     assert desk.panels.client.notices == ["No other task is open."]
@@ -172,12 +173,12 @@ def test_who_presses_again_stays_and_nobody_is_asked_any_more(desk: Desk) -> Non
     desk.go(1)
     assert desk.go_live.going() == ""
     until(lambda: desk.person.left, "that nobody waits for the answer")
-    assert desk.opened == [] and desk.place.session is desk.live
+    assert desk.opened == [] and desk.app.shared.session is desk.live
 
 
 def test_a_review_that_is_shown_anew_waits_for_nothing_that_is_under_way(desk: Desk) -> None:
     desk.live._worker.goes_back = False  # type: ignore[attr-defined]
     desk.go(0)
     until(lambda: desk.go_live.going().startswith("restoring"), "the way")
-    GoLivePart(desk.place.server, desk.go_live)
+    GoLivePart(desk.app.shared.server, desk.go_live)
     assert desk.go_live.going() == ""

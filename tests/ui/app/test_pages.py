@@ -18,7 +18,7 @@ from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import tabs_of
 from workbench.app.pages import ShownPage, Which
-from workbench.app.server import Workplace
+from workbench.app.server import App
 from workbench.app.session import Session
 from workbench.live.commands import PlayRun
 from workbench.page.commands import ToggleTable
@@ -39,28 +39,28 @@ def no_session(task: object, options: object) -> Session:
 
 
 @pytest.fixture
-def place(
+def app(
     child_process: None, tmp_path: Path, gated_server: GatedServer, scripted_session: Callable[..., Session]
-) -> Iterator[Workplace]:
+) -> Iterator[App]:
     write(tmp_path, made(5))
-    place = Workplace(gated_server, tmp_path, no_session, TaskOptions(), scripted_session(2))
-    yield place
-    place.close()
+    app = App(gated_server, tmp_path, no_session, TaskOptions(), scripted_session(2))
+    yield app
+    app.close()
 
 
 @pytest.mark.slow
 def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
-    place: Workplace, gated_server: GatedServer, server: viser.ViserServer, panels: Panels
+    app: App, gated_server: GatedServer, server: viser.ViserServer, panels: Panels
 ) -> None:
-    session = place.session
+    session = app.shared.session
     assert session is not None
-    place.pages.start("live")
+    app.shared.pages.start("live")
     session.do(PlayRun())
     seen: dict[str, list[dict[str, int]]] = {"live": [], "review": []}
     threads: list[int] = []
     for number in range(SWAPS):
         which = "review" if number % 2 == 0 else "live"
-        place.pages.show(which).result(60)
+        app.shared.pages.show(which).result(60)
         with tabs_of(gated_server.url) as tabs:
             tab = tabs.open()
             until(lambda tab=tab: tab.open and panels.html("wb-status"), f"the {which} page, drawn")
@@ -92,33 +92,33 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
     child_process: None, tmp_path: Path, gated_server: GatedServer
 ) -> None:
     begin(tmp_path, made(5, seed=8))
-    place = Workplace(gated_server, tmp_path, no_session, TaskOptions())
-    place.pages.start("review")
+    app = App(gated_server, tmp_path, no_session, TaskOptions())
+    app.shared.pages.start("review")
     try:
         until(
-            lambda: "is back in the library" in " ".join(place.shelf.review.view().problems),
+            lambda: "is back in the library" in " ".join(app.shared.recordings.review.view().problems),
             "the word for it",
         )
-        until(lambda: [row.seed for row in place.shelf.library.view().rows] == [8], "its row")
+        until(lambda: [row.seed for row in app.shared.recordings.library.view().rows] == [8], "its row")
     finally:
-        place.close()
+        app.close()
 
 
 def test_what_is_pressed_while_another_page_is_built_is_refused_and_nothing_fails(
-    place: Workplace, panels: Panels, monkeypatch: pytest.MonkeyPatch
+    app: App, panels: Panels, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    panels.come_to(place.visitors)
-    place.pages.start("review")
+    panels.come_to(app.shared.visitors)
+    app.shared.pages.start("review")
     building, go_on = threading.Event(), threading.Event()
-    make = place.pages._make
+    make = app.shared.pages._make
 
     def slow(which: Which, dark: bool) -> ShownPage:
         building.set()
         assert go_on.wait(60)
         return make(which, dark)
 
-    monkeypatch.setattr(place.pages, "_make", slow)
-    shown = place.pages.show("live")
+    monkeypatch.setattr(app.shared.pages, "_make", slow)
+    shown = app.shared.pages.show("live")
     try:
         assert building.wait(60)
         panels.do(ToggleTable())
@@ -142,14 +142,14 @@ def test_serving_the_pages_needs_no_simulator(child_process: None) -> None:
 
 
 def test_a_recording_that_is_wanted_is_opened_also_if_it_is_not_the_newest(
-    place: Workplace, gated_server: GatedServer, tmp_path: Path
+    app: App, gated_server: GatedServer, tmp_path: Path
 ) -> None:
     (older,) = tmp_path.glob("*.rrd")
     write(tmp_path, made(4, seed=9))
-    place.pages.start("live")
-    place.look_at(older)
-    until(lambda: place.pages.shown == "review", "the page")
-    review = place.shelf.review
+    app.shared.pages.start("live")
+    app.shared.look_at(older)
+    until(lambda: app.shared.pages.shown == "review", "the page")
+    review = app.shared.recordings.review
     with tabs_of(gated_server.url) as tabs:
         tabs.open()
         opened = until(lambda: review.view().opened, "an open recording", seen=lambda: review.view().problems)

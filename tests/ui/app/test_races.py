@@ -17,7 +17,7 @@ from tests.drive.session import wait_until
 from tests.drive.waiting import PATIENCE, until
 from tests.ui.tabs import handshake, tabs_of
 from workbench.app.live_page import Page
-from workbench.app.server import Workplace
+from workbench.app.server import App
 from workbench.app.session import Session
 from workbench.live.commands import PauseRun, PlayRun, Step
 from workbench.live.env_commands import SelectEnv
@@ -84,20 +84,20 @@ def two(
     child_process: None, tmp_path: Path, gated_server: GatedServer, scripted_session: Callable[..., Session]
 ) -> Iterator[Two]:
     session = scripted_session(2)
-    place = Workplace(gated_server, tmp_path, no_session, TaskOptions(), session)
-    place.pages.start("live")
+    app = App(gated_server, tmp_path, no_session, TaskOptions(), session)
+    app.shared.pages.start("live")
     address, how = handshake(gated_server.url)
     del how["subprotocols"]
     with tabs_of(gated_server.url) as tabs:
         opened = [tabs.open(), tabs.open()]
-        until(lambda: all(tab.open for tab in opened) and len(place.visitors.all()) == 2, "both pages")
+        until(lambda: all(tab.open for tab in opened) and len(app.shared.visitors.all()) == 2, "both pages")
         one, other = (
             connect(f"{address.rstrip('/')}{PATH}?page={visitor.name}", proxy=None, **how)
-            for visitor in place.visitors.all()
+            for visitor in app.shared.visitors.all()
         )
         with one, other:
             yield Two(session, Pressing(one), Pressing(other))
-    place.close()
+    app.close()
 
 
 def test_two_pages_that_press_at_once_count_once_each_and_in_their_order(two: Two) -> None:

@@ -12,7 +12,7 @@ from tests.drive.session import wait_until
 from tests.drive.waiting import until
 from tests.ui.tabs import camera_message, handshake, messages_in
 from workbench.app.pages import Which
-from workbench.app.server import Workplace
+from workbench.app.server import App
 from workbench.app.session import Session
 from workbench.live.commands import Step
 from workbench.live.events import EnvsReset
@@ -36,9 +36,9 @@ def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServ
     def no_other(*_: object) -> Session:
         raise AssertionError("no other task is opened")
 
-    place = Workplace(gated_server, folder, no_other, TaskOptions(), session, on_notice=told.append)
-    place.open_task.catalogue.registered.close()
-    place.pages.start(page)
+    app = App(gated_server, folder, no_other, TaskOptions(), session, on_notice=told.append)
+    app.open_task.catalogue.registered.close()
+    app.shared.pages.start(page)
     address, how = handshake(gated_server.url)
     with websockets.sync.client.connect(address, **how) as connection:
         connection.send(camera_message())
@@ -66,5 +66,5 @@ def test_each_page_tells_it(page: Which, tmp_path: Path, gated_server: GatedServ
         session.do(Step())
         wait_until(session, lambda view: not view.of(RecordingStatus).saving.message, "the message's end")
     assert len(told) == 2
-    place.close()
+    app.close()
     session.close()

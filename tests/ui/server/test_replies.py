@@ -15,6 +15,7 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from workbench.page.door.connection_limits import RareLog
+from workbench.page.door.file_response import Handler
 from workbench.page.door.responses import (
     EVERY_REPLY,
     LONGEST_NAME,
@@ -22,7 +23,6 @@ from workbench.page.door.responses import (
     PAGE_OF_OURS,
     SCRIPTS,
     STYLES,
-    Handler,
     admitted_reply,
     folder_handler,
     page_policy,

@@ -48,7 +48,7 @@ def panels(gated_server: GatedServer) -> Panels:
 
 @pytest.fixture
 def panel(panels: Panels, gated_server: GatedServer, making: Noted, tmp_path: Path) -> SharePanel:
-    panel = SharePanel(gated_server.server, Downloads(gated_server), making, tmp_path)
+    panel = SharePanel(gated_server.server, Downloads(gated_server.add_route), making, tmp_path)
     panels.visitors.do = panel.do
     return panel
 

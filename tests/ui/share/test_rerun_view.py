@@ -36,7 +36,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def pages(child_process: None, gated_server: GatedServer) -> RerunPages:
-    return RerunPages(gated_server, Downloads(gated_server))
+    return RerunPages(gated_server, Downloads(gated_server.add_route))
 
 
 def get(gated_server: GatedServer, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
@@ -53,7 +53,7 @@ def get(gated_server: GatedServer, path: str, **headers: str) -> tuple[int, http
 def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(
     gated_server: GatedServer, tmp_path: Path
 ) -> None:
-    offers = Downloads(gated_server)
+    offers = Downloads(gated_server.add_route)
     big = tmp_path / "big one.rrd"
     big.write_bytes(bytes(range(256)) * 20_000)
     address = offers.address(big)

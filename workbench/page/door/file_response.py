@@ -13,14 +13,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Response
-
-if TYPE_CHECKING:
-    from workbench.page.door.gated_server import GatedServer
 
 BLOCK = 1 << 18
 """Number of bytes that are read and sent at a time."""
@@ -38,6 +35,13 @@ class FileReply:
     browser accepts gzip."""
     download_as: str | None = None
     """Name under which the browser saves the file instead of showing it."""
+
+
+Handler = Callable[[str], tuple[int, str, bytes] | FileReply]
+"""Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns status, content type
+and body, or a file. Runs in a thread, so it may read files."""
+AddRoute = Callable[[str, Handler, Mapping[str, str]], object]
+"""Adds a route: its prefix, what answers it, and headers of every reply."""
 
 
 class _Sent(Response):
@@ -145,11 +149,15 @@ class Downloads:
     by that part alone. The name behind it is for people (and for rerun, which tells a recording by its suffix).
     """
 
-    def __init__(self, gated_server: GatedServer) -> None:
+    def __init__(self, add_route: AddRoute) -> None:
+        """
+        Args:
+            add_route: `GatedServer.add_route`.
+        """
         self._secret = secrets.token_bytes(32)
         self._files: dict[str, FileReply] = {}
         """Files by the random part of their address; requests read it on other threads."""
-        gated_server.add_route(PREFIX, self._answer, headers=_POLICY)
+        add_route(PREFIX, self._answer, _POLICY)
 
     def address(self, path: Path, kind: str = "application/octet-stream", download: bool = False) -> str:
         """The address of a file, from the root of the server; always the same for the same file.

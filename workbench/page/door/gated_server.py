@@ -19,6 +19,7 @@ from workbench.machine.folders import web_assets_folder
 from workbench.machine.versions import command_for_tested_versions
 from workbench.page.door import access, viser_private
 from workbench.page.door.connection_limits import Connection, RareLog, of_peer
+from workbench.page.door.file_response import Handler
 from workbench.page.door.listening_socket import (
     DEFAULT_PORT,
     Listening,
@@ -27,7 +28,6 @@ from workbench.page.door.listening_socket import (
     listen_on_port,
 )
 from workbench.page.door.responses import (
-    Handler,
     admitted_reply,
     entered_reply,
     folder_handler,

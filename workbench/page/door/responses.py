@@ -20,11 +20,7 @@ from workbench.machine.folders import web_assets_folder
 from workbench.machine.text import short_line
 from workbench.page.door import access, viser_private
 from workbench.page.door.connection_limits import RareLog
-from workbench.page.door.file_response import FileReply, send_file
-
-Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
-"""Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns status, content type
-and body, or a file. Runs in a thread, so it may read files."""
+from workbench.page.door.file_response import FileReply, Handler, send_file
 
 SCRIPTS = (
     "browser.js",

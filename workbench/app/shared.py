@@ -1,0 +1,137 @@
+"""What the pages of one server share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import psutil
+
+from workbench.app.pages import Pages, ShownPage, Which
+from workbench.app.session import Session
+from workbench.episodes.reader.reading import recover_confined, recovered_text
+from workbench.library.folder import Library
+from workbench.machine.loop import Aside
+from workbench.page.door.gated_server import GatedServer
+from workbench.page.scene.viewpoint import Stage
+from workbench.page.widgets.visitors import PATH, Visitors
+from workbench.review.playback import Review
+from workbench.review.recorded_scene import SceneProcess
+
+ENOUGH_MEMORY = 4 << 30
+"""Minimum free memory in bytes for drawing pictures of tasks while a task is open."""
+_RECOVERED_WITHIN = 10.0
+"""Timeout in seconds, at the end of the program, for the recovery of episodes."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """The recordings of a folder, and the review of those that are open."""
+
+    library: Library
+    review: Review
+
+
+class Shared:
+    """The sessions, the recordings, the 3-D view, and which page is shown.
+
+    Args:
+        gated_server: The server of the pages.
+        folder: The folder that is recorded to and reviewed.
+        make_page: Builds a page, as `Pages` asks for it.
+        session: The live env, if there is one.
+        tasks: Task files that may define the envs of foreign recordings.
+        imports: Modules that register tasks, as in `TaskOptions.imports`.
+        on_notice: Called, on any thread, with a message for the terminal.
+    """
+
+    def __init__(
+        self,
+        gated_server: GatedServer,
+        folder: Path,
+        make_page: Callable[[Which, bool], ShownPage],
+        session: Session | None,
+        tasks: tuple[Path, ...],
+        imports: tuple[str, ...],
+        on_notice: Callable[[str], None],
+    ) -> None:
+        self.server, self._folder, self._tasks = gated_server.server, folder, tasks
+        self._imports, self._on_notice = imports, on_notice
+        self._recordings: Recordings | None = None
+        self._first: Path | Literal["newest"] = "newest"
+        """Recording that the first review opens."""
+        self.looks_at = False
+        """Whether the next review page is for a recording that a person chose on another page."""
+        self._recovering = Aside("recover")
+        self.visitors = Visitors(self.server)
+        gated_server.add_channel(PATH, self.visitors.serve)
+        self.session = session
+        """Session that the live page shows when it is next built."""
+        self.home = session
+        """The session that a person opened, by command or from the list. `session` is another one while a recording of
+        another task is continued."""
+        self.stage = Stage(self.server)
+        self.pages = Pages(self.server, self.stage, make_page)
+
+    @property
+    def recordings(self) -> Recordings:
+        """The folder is read at the first access, by the first review page; it stays open until the program ends."""
+        self._recordings = self._recordings or self._open_recordings()
+        return self._recordings
+
+    def _open_recordings(self) -> Recordings:
+        library = Library(self._folder)
+        review = Review(library, make_scene=SceneProcess(self._tasks, self._imports))
+        library.on_change.add(review.library_changed)
+        review.open_first(self._first)
+        library.watch()
+        opened = Recordings(library, review)
+        if self.session is None:
+            # With a live env its recorder has recovered them already, and is writing.
+            self._recovering.begin(lambda: self._recover(opened))
+        return opened
+
+    def _recover(self, opened: Recordings) -> None:
+        """Recover episodes of a writer that was killed."""
+        try:
+            recovered = [str(file) for file in recover_confined(self._folder)]
+        except OSError as error:
+            opened.review.add_problem(str(error))
+            self._on_notice(str(error))
+            return
+        if recovered:
+            what = "An episode" if len(recovered) == 1 else f"{len(recovered)} episodes"
+            opened.review.add_problem(f"{what} left half written by a killed program is back in the library.")
+            self._on_notice(recovered_text(recovered))
+            opened.library.request_scan()
+
+    def look_at(self, recording: Path) -> None:
+        """Open the recording with this file in the review."""
+        self._first, self.looks_at = recording, True
+        if self._recordings is not None:
+            self._recordings.review.open_first(recording)
+        self.pages.show("review")
+
+    def task_files(self) -> tuple[Path, ...]:
+        """The task files that this program was started with or has open."""
+        task = None if self.session is None else self.session.view().task
+        live = () if task is None or task.file is None else (Path(task.file),)
+        return tuple(file.absolute() for file in (*live, *self._tasks))
+
+    def is_idle(self) -> bool:
+        """Whether the machine is free for other work than an open task."""
+        session = self.session
+        if session is None:
+            return True
+        view = session.view()
+        free = psutil.virtual_memory().available
+        return view.state in ("paused", "error", "stopped") and view.busy is None and free > ENOUGH_MEMORY
+
+    def close(self) -> None:
+        """End the recovery of episodes, and close the recordings. The sessions stay."""
+        self._recovering.close(_RECOVERED_WITHIN)
+        if self._recordings is not None:
+            self._recordings.review.close()
+            self._recordings.library.close()
