@@ -121,7 +121,9 @@ def test_ctrl_c_keeps_what_is_over_and_ends_the_cluster(tmp_path: Path, ray_fold
     said, errors = process.communicate(timeout=90)
     assert process.returncode == 130 and "interrupted" in errors and "Traceback" not in errors
     written = sorted((tmp_path / "out").glob("*.json"))
-    assert len(said.splitlines()) == len(written) + 1
+    listed = {Path(line.split(".rrd")[0] + ".json") for line in said.splitlines()[:-1]}
+    # Reports of the last ones may have been on their way when the cluster ended.
+    assert len(listed) > 20 and listed <= set(written) and len(written) - len(listed) < 10
     assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])
     _, alive = psutil.wait_procs(family, timeout=20)
     assert not alive
