@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from collections import defaultdict
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import packages_distributions
@@ -18,21 +17,25 @@ from packaging.utils import canonicalize_name
 
 PACKAGE = Path(__file__).parents[1] / "workbench"
 TESTS = Path(__file__).parent
-LAYERS = (
-    "cli",
-    "ui",
-    "session",
-    "jobs",
-    "checks",
-    "planning",
-    "recording",
-    "authoring",
-    "core",
-    "commands",
-    "machine",
+ORDER = (
+    *("machine", "envs", "pictures", "source", "task", "jobs", "planning", "episodes", "actions"),
+    *(
+        "page",
+        "trust",
+        "live",
+        "record",
+        "cameras",
+        "checks",
+        "library",
+        "review",
+        "rescore",
+        "solve",
+        "share",
+        "sweep",
+    ),
+    *("start", "app", "cli"),
 )
-"""From the top to the bottom: a layer imports those behind it. Recording and authoring do not import each other."""
-APART = {("recording", "authoring")}
+"""The folders, as the architecture page draws them: each imports only those before it."""
 
 
 def modules() -> dict[str, Path]:
@@ -76,66 +79,64 @@ def imports() -> dict[str, tuple[tuple[int, str], ...]]:
     return {module: tuple(imported(file)) for module, file in MODULES.items()}
 
 
-def layer_of(module: str) -> str:
-    """Modules at the top of the package are what users import (`workbench.make`): no layer imports them."""
+def folder_of(module: str) -> str:
+    """Modules at the top of the package are what users import (`workbench.commands`)."""
     return module.split("/")[0] if "/" in module else ""
 
 
-def folder_of(module: str) -> str:
-    return module.rpartition("/")[0]
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("layer", LAYERS)
-def test_imports_run_one_way(layer: str) -> None:
-    below = {layer, *LAYERS[LAYERS.index(layer) :]} - {b for a, b in APART if a == layer}
+def test_each_folder_imports_only_those_before_it() -> None:
+    assert {folder_of(module) for module in MODULES} == {"", *ORDER}
     wrong = [
         f"{module}:{line} imports {name}"
         for module in MODULES
-        if layer_of(module) == layer
+        if (folder := folder_of(module))
         for line, name in imports()[module]
-        if layer_of(name) not in below
-    ]
-    assert any(layer_of(module) == layer for module in MODULES) and wrong == []
-
-
-def test_what_users_import_needs_no_session_and_no_page() -> None:
-    wrong = [
-        f"{module}:{line} imports {name}"
-        for module in MODULES
-        if layer_of(module) == ""
-        for line, name in imports()[module]
-        if layer_of(name) in ("cli", "ui", "session")
+        if folder_of(name) not in ORDER[: ORDER.index(folder) + 1]
+        and not (name == "commands" and folder in ("app", "cli"))
     ]
     assert wrong == []
 
 
-def test_no_folder_imports_one_that_imports_it() -> None:
-    below: dict[str, set[str]] = defaultdict(set)
-    for module, names in imports().items():
-        below[folder_of(module)] |= {folder_of(name) for _, name in names} - {folder_of(module)}
-    reached: dict[str, set[str]] = {}
+def test_no_module_imports_one_that_imports_it() -> None:
+    """Not for types alone either."""
+    done: set[str] = set()
 
-    def reach(folder: str, way: tuple[str, ...]) -> set[str]:
-        assert folder not in way, f"a circle: {' imports '.join((*way[way.index(folder) :], folder))}"
-        if folder not in reached:
-            reached[folder] = below[folder].union(*(reach(f, (*way, folder)) for f in sorted(below[folder])))
-        return reached[folder]
+    def reach(module: str, way: tuple[str, ...]) -> None:
+        assert module not in way, f"a circle: {' imports '.join((*way[way.index(module) :], module))}"
+        if module not in done:
+            for _, name in imports()[module]:
+                reach(name, (*way, module))
+            done.add(module)
 
-    for folder in sorted(below):
-        reach(folder, ())
-    assert "core" in reached["ui/app"]
+    for module in MODULES:
+        reach(module, ())
+    assert "machine/loop" in done
 
 
-def test_the_page_is_the_only_part_that_knows_viser() -> None:
-    knowing = {
-        file.relative_to(PACKAGE).parts[0]
-        for file in PACKAGE.rglob("*.py")
+def reached_from(*modules: str) -> set[str]:
+    reached, waiting = set[str](), list(modules)
+    while waiting:
+        if (module := waiting.pop()) not in reached:
+            reached.add(module)
+            waiting += [name for _, name in imports()[module]]
+    return reached
+
+
+def test_state_jobs_and_workers_do_without_the_page() -> None:
+    """So they run where viser cannot, and a test of them needs no page."""
+    with_viser = {
+        module
+        for module, file in MODULES.items()
         for node in import_statements(file)
-        if (isinstance(node, ast.Import) and any(a.name.split(".")[0] == "viser" for a in node.names))
-        or (isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "viser")
+        for name in [getattr(node, "module", None) or "", *(alias.name for alias in node.names)]
+        if name.split(".")[0] == "viser"
     }
-    assert knowing == {"ui"}
+    assert "app/live_page" in with_viser
+    jobs = [module for module in MODULES if module.endswith("/job")]
+    assert len(jobs) > 3
+    assert not with_viser & reached_from(
+        "app/session", "review/state", "app/worker/loop", "record/recorder", *jobs
+    )
 
 
 def test_what_is_imported_is_a_dependency_of_ours_and_not_only_of_one() -> None:

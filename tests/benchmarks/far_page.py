@@ -42,6 +42,7 @@ from tests.ui.tabs import camera_message, handshake, messages_in
 from workbench.app.live_page import Page
 from workbench.app.pages import Pages
 from workbench.app.session import Session
+from workbench.commands import COMMANDS
 from workbench.page.door.gated_server import ServerOptions, open_server
 from workbench.page.scene.viewpoint import FOV, Stage
 from workbench.page.widgets.visitors import Visitors
@@ -131,7 +132,7 @@ def measure(played: Played, options: Options) -> str:
             make_worker=partial(Playing, played, made),  # type: ignore[arg-type]
         )
         stage = Stage(gated.server)
-        page = Page(gated.server, Visitors(gated.server), session, stage=stage)
+        page = Page(gated.server, Visitors(gated.server, COMMANDS), session, stage=stage)
         pages = Pages(gated.server, stage, lambda which, dark: page)
         wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
         page.redraw()

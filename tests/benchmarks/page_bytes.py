@@ -37,6 +37,7 @@ from tests.drive.session import wait_until
 from tests.ui.tabs import camera_message, handshake, messages_in
 from workbench.app.live_page import Page
 from workbench.app.session import Session
+from workbench.commands import COMMANDS
 from workbench.envs import action_vector as actions
 from workbench.envs.step_result import StepResult
 from workbench.live.messages import Status
@@ -162,7 +163,7 @@ def measure(played: Played, options: Options, exact: bool) -> Update:
             recordings=Path(folder) / "kept",
             make_worker=partial(Player, played, made),  # type: ignore[arg-type]
         )
-        page = Page(gated.server, Visitors(gated.server), session, stage=stage, clock=clock)
+        page = Page(gated.server, Visitors(gated.server, COMMANDS), session, stage=stage, clock=clock)
         mark = gated.server.gui.add_text("mark", "")
         wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
         page.redraw()

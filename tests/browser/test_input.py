@@ -16,6 +16,7 @@ from tests.drive.page import page_at
 from tests.drive.panels import drop_viser
 from tests.drive.waiting import until
 from workbench.cameras.commands import PickPixel
+from workbench.commands import COMMANDS
 from workbench.library.commands import OpenRow, PressRow
 from workbench.live.commands import PauseLog, ResetAll, SetSeed, Step, TogglePlay
 from workbench.live.env_commands import SelectEnv
@@ -75,7 +76,7 @@ class Small:
 @pytest.fixture(scope="module")
 def opened(browser: Browser) -> Iterator[Small]:
     gated_server = open_server(ServerOptions(port=0))
-    server, visitors = gated_server.server, Visitors(gated_server.server)
+    server, visitors = gated_server.server, Visitors(gated_server.server, COMMANDS)
     gated_server.add_channel(PATH, visitors.serve)
     seed = Field(server, "Seed", SetSeed, "seed", "7")
     pause = tick(server, "Pause", PauseLog, "on", False)

@@ -12,6 +12,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.recording.library_files import describe
+from workbench.commands import COMMANDS
 from workbench.library.folder import Library
 from workbench.library.panel import LibraryPanel
 from workbench.page.command import Command
@@ -52,7 +53,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterat
         describe(folder, f"r{k:02}", id=f"id{k:02}", seed=k, written_at=when, tags=["even"] * (k % 2 == 0))
     gated_server = open_server(ServerOptions(port=0))
     server = gated_server.server
-    visitors = Visitors(server)
+    visitors = Visitors(server, COMMANDS)
     library, opened = Library(folder), []
     library.watch()
     window = server.gui.add_panel()

@@ -11,6 +11,7 @@ from playwright.sync_api import Browser, expect
 
 from tests.drive.far_line import line_to
 from tests.drive.page import TASK, new_page, open_tab, open_workbench
+from workbench.commands import COMMANDS
 from workbench.page.door.gated_server import ServerOptions, open_server
 from workbench.page.widgets.visitors import PATH, Visitors
 
@@ -31,7 +32,7 @@ def test_a_server_that_is_gone_is_said_with_its_address(browser: Browser, tmp_pa
 
 def test_the_notice_goes_when_the_server_can_be_reached_again(browser: Browser) -> None:
     gated_server = open_server(ServerOptions(port=0))
-    gated_server.add_channel(PATH, Visitors(gated_server.server).serve)
+    gated_server.add_channel(PATH, Visitors(gated_server.server, COMMANDS).serve)
     try:
         with line_to(gated_server.url) as line:
             page, _ = new_page(browser, drawn=False)

@@ -115,7 +115,7 @@ def test_the_list_follows_its_folder_and_takes_a_path(
         expect(marked(page)).to_contain_text("elsewhere/other.py")
         page.keyboard.press("Enter")
         # It is outside of the folder: nothing runs unasked.
-        question = page.get_by_role("dialog")
+        question = page.get_by_role("dialog", name="Run this code?")
         expect(question).to_contain_text(f"{folder}/elsewhere/other.py", timeout=PATIENT)
         question.get_by_role("button", name=DO_NOT).click()
         expect(question).to_be_hidden()
@@ -175,7 +175,7 @@ def test_from_the_start_page_to_a_task_to_another_and_back(
         # A file from elsewhere asks first.
         open_list(page)
         row(page, "other.py").click()
-        question = page.get_by_role("dialog")
+        question = page.get_by_role("dialog", name="Run this code?")
         expect(question).to_contain_text("outside of the folder", timeout=PATIENT)
         expect(question).to_contain_text(str(folder / "elsewhere/other.py"))
         question.get_by_role("button", name=ONCE).click()

@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from tests.drive.waiting import until
 from tests.ui.scenes import table_scene
+from workbench.commands import COMMANDS
 from workbench.envs.scene.shapes import Mesh
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 from workbench.page.scene.bodies import Looks
@@ -122,7 +123,7 @@ def test_shapes_are_simpler_only_while_every_page_draws_in_software(
     gated_server: GatedServer, show: Show
 ) -> None:
     in_software = InSoftware(gated_server.server)
-    visitors = Visitors(gated_server.server)
+    visitors = Visitors(gated_server.server, COMMANDS)
     visitors.do = lambda command, visitor: in_software.told_by(visitor)
     gated_server.add_channel(PATH, visitors.serve)
     page = show()

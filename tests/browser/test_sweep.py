@@ -12,6 +12,7 @@ from playwright.sync_api import Browser, Page, expect
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.recording.sweep_files import sweep_folder
+from workbench.commands import COMMANDS
 from workbench.library.folder import Library
 from workbench.page.door.gated_server import ServerOptions, open_server
 from workbench.page.widgets.visitors import PATH, Visitors
@@ -32,7 +33,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterato
     folder = tmp_path_factory.mktemp("sweep")
     sweep_folder(folder)
     gated_server = open_server(ServerOptions(port=0))
-    server, visitors = gated_server.server, Visitors(gated_server.server)
+    server, visitors = gated_server.server, Visitors(gated_server.server, COMMANDS)
     gated_server.add_channel(PATH, visitors.serve)
     library, opened = Library(folder), []
     library.refresh()

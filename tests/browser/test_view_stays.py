@@ -10,6 +10,7 @@ from playwright.sync_api import Browser, expect
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
+from workbench.commands import COMMANDS
 from workbench.live.commands import Step
 from workbench.live.timeline_commands import StepBack
 from workbench.page.door.gated_server import ServerOptions, open_server
@@ -23,7 +24,7 @@ pytestmark = pytest.mark.browser
 def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
     gated_server = open_server(ServerOptions(port=0))
     stepped, walked = threading.Event(), threading.Event()
-    visitors = Visitors(gated_server.server)
+    visitors = Visitors(gated_server.server, COMMANDS)
     gated_server.add_channel(PATH, visitors.serve)
     events = {Step(): stepped, StepBack(): walked}
     visitors.do = lambda command, visitor: events[command].set()

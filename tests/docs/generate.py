@@ -83,7 +83,7 @@ def keys_page() -> str:
 
 
 def table(kinds: Sequence[type[Command]]) -> list[str]:
-    rows = [f"| {key} | {what} |" for key, what in key_rows(kinds)]
+    rows = [f"| {key} | {what} |" for key, what in key_rows(COMMANDS, kinds)]
     return ["| key | what it does |", "| --- | --- |", *rows]
 
 

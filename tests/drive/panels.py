@@ -20,6 +20,7 @@ from markupsafe import escape
 from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage
 
 from tests.drive.own_controls import Controls, SeenButton, SeenField
+from workbench.commands import COMMANDS
 from workbench.machine.loop import result_of
 from workbench.page.command import Command, Refused
 from workbench.page.door.gated_server import GatedServer
@@ -142,7 +143,7 @@ class Panels:
         gui._thread_executor = self._threads
         gui._resolve_client = lambda client_id: self.client
         self.visitor = Visitor("a page", self.client)  # type: ignore[arg-type]
-        self.come_to(Visitors(server))
+        self.come_to(Visitors(server, COMMANDS))
         self.visitors.do = _nobody_does
 
     def come_to(self, visitors: Visitors) -> None:

@@ -99,8 +99,8 @@ def test_ten_thousand_steps_at_four_cameras_do_not_grow_the_process(tmp_path: Pa
     short, long = peaks(tmp_path / "short", 500), peaks(tmp_path / "long", 10_000)
     print(short, long)
     assert sum(long["files"]) > 100e6, "too little was recorded for this to say anything"
-    assert long["appended"] - short["appended"] < 40
-    assert long["finished"] - short["finished"] < 60
+    assert long["appended"] - short["appended"] < 80, "MB; the recording has hundreds"
+    assert long["finished"] - short["finished"] < 80
     assert verify_rrd(Path(long["rrd"]), timeout=300) is None
     child = subprocess.run(
         [sys.executable, "-c", READER, long["rrd"]], check=True, capture_output=True, text=True

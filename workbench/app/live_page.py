@@ -192,7 +192,7 @@ class Page:
         kinds = DOES | state.DOES | self._parts.does | also
         register(server, visitors, kinds, "live page")
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
-            server.gui.add_html(render("keys", rows=key_rows(kinds)))
+            server.gui.add_html(render("keys", rows=key_rows(visitors.commands, kinds)))
         # viser awaits coroutines, although its types do not say so.
         server.scene.on_click()(self._on_scene_click)  # type: ignore[arg-type]
 
@@ -231,7 +231,9 @@ class Page:
                 RescoredAbove(server),
                 CurvesPanel(server, lambda tick: session.do(Seek(step=tick))),
             ]
-            self._rescored = PastRescorePanel(server, session, session.rescored_curve)
+            self._rescored = PastRescorePanel(
+                server, session, lambda name, env: session.rescored_curve(name, env)
+            )
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session, clock)
         with tabs.add_tab(EPISODES, viser.Icon.MOVIE):

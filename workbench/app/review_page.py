@@ -169,7 +169,7 @@ class ReviewPage:
             "review page",
         )
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
-            server.gui.add_html(render("keys", rows=key_rows(kinds)))
+            server.gui.add_html(render("keys", rows=key_rows(shared.visitors.commands, kinds)))
 
     def _add_way_back(self) -> None:
         if self._shared.session is not None:

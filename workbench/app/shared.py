@@ -11,6 +11,7 @@ import psutil
 
 from workbench.app.pages import Pages, ShownPage, Which
 from workbench.app.session import Session
+from workbench.commands import COMMANDS
 from workbench.episodes.reader.reading import recover_confined, recovered_text
 from workbench.library.folder import Library
 from workbench.machine.loop import Aside
@@ -65,7 +66,7 @@ class Shared:
         self.looks_at = False
         """Whether the next review page is for a recording that a person chose on another page."""
         self._recovering = Aside("recover")
-        self.visitors = Visitors(self.server)
+        self.visitors = Visitors(self.server, COMMANDS)
         gated_server.add_channel(PATH, self.visitors.serve)
         self.session = session
         """Session that the live page shows when it is next built."""

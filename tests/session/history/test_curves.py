@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
@@ -69,7 +69,12 @@ NUMBERS = arrays(
 )
 
 
+INFINITE_AT_THE_END = np.zeros((2, 812), np.float32)
+INFINITE_AT_THE_END[:, -1] = np.inf
+
+
 @given(NUMBERS)
+@example(INFINITE_AT_THE_END)
 @settings(max_examples=15)
 def test_all_steps_stay_in_bounded_memory_and_every_peak_at_its_own_step(
     rewards: NDArray[np.float32],

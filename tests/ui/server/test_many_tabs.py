@@ -21,6 +21,7 @@ from tests.ui.tabs import Tabs, open_deaf_tab, tabs_of
 from workbench.app.live_page import Page
 from workbench.app.pages import Pages
 from workbench.app.session import Session
+from workbench.commands import COMMANDS
 from workbench.live.commands import PauseRun, PlayRun
 from workbench.live.events import PagesCounted, RunEvent
 from workbench.page.door import connection_limits as strangers
@@ -65,7 +66,7 @@ class Told(Session):
 def house(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     gated_server, told = open_server(ServerOptions(port=0)), [0]
     session, stage = Told(told, tmp_path_factory.mktemp("author")), Stage(gated_server.server)
-    page = Page(gated_server.server, Visitors(gated_server.server), session, stage=stage)
+    page = Page(gated_server.server, Visitors(gated_server.server, COMMANDS), session, stage=stage)
     pages = Pages(gated_server.server, stage, lambda which, dark: page)
     pages.start("live")
     try:

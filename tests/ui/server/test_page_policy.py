@@ -15,6 +15,7 @@ from playwright.sync_api import Page
 from tests.drive.page import page_at
 from tests.drive.waiting import until
 from tests.ui.knocking import ask
+from workbench.commands import COMMANDS
 from workbench.machine.folders import web_assets_folder
 from workbench.page.door.gated_server import GatedServer, ServerOptions, open_server
 from workbench.page.door.responses import DIRECTIVES
@@ -118,7 +119,7 @@ def test_code_that_came_into_the_page_as_html_does_not_run(gated_server, browser
 @pytest.mark.browser
 def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
     gated_server = open_server(ServerOptions(port=0))
-    gated_server.add_channel(PATH, Visitors(gated_server.server).serve)
+    gated_server.add_channel(PATH, Visitors(gated_server.server, COMMANDS).serve)
     try:
         with page_at(browser, gated_server.url) as (page, _):
             page.wait_for_selector("[data-page]", state="attached")

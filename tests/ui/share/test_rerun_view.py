@@ -14,6 +14,7 @@ from playwright.sync_api import Browser, Request
 
 from tests.drive.page import page_at
 from tests.drive.waiting import until
+from workbench.commands import COMMANDS
 from workbench.episodes.rerun.viewer import VIEWER_FILES, web_viewer_folder
 from workbench.page.door.access import cookie_name
 from workbench.page.door.file_response import Downloads
@@ -99,7 +100,7 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         gated_server.server.gui.add_html("...")
     library.dock_left()
     library.minimize()
-    visitors = Visitors(gated_server.server)
+    visitors = Visitors(gated_server.server, COMMANDS)
     gated_server.add_channel(PATH, visitors.serve)
     view = RerunView(gated_server.server, pages, lambda fold: 850)
     visitors.do = view.do

@@ -61,7 +61,7 @@ class House:
 
 @pytest.fixture
 def house(gated_server: GatedServer) -> Iterator[House]:
-    visitors = Visitors(gated_server.server)
+    visitors = Visitors(gated_server.server, COMMANDS)
     house = House(gated_server, visitors)
     visitors.do = house.do
     gated_server.add_channel(PATH, visitors.serve)

@@ -206,7 +206,8 @@ class Spans:
         x, drawn = at[wanted], values[:, wanted]
         if x[-1] < self.end:
             x = np.append(x, float(self.end))
-            drawn = np.concatenate([drawn, self.last[:, None].astype(np.float64)], axis=1)
+            last = np.where(np.isfinite(self.last), self.last, np.nan)
+            drawn = np.concatenate([drawn, last[:, None].astype(np.float64)], axis=1)
         return x, drawn
 
 

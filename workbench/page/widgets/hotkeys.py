@@ -7,9 +7,8 @@ from collections.abc import Collection
 
 import viser
 
-from workbench.commands import COMMANDS
 from workbench.machine.kept_choices import kept_choices
-from workbench.page.command import Command, key_in_words
+from workbench.page.command import Command, CommandList, key_in_words
 from workbench.page.commands import CloseHints, ShowTab
 from workbench.page.door.viser_private import places
 from workbench.page.widgets.templates import render
@@ -25,9 +24,9 @@ def with_key(kind: type[Command], hint: str = "") -> str:
     return f"{hint or kind.help()} ({key})" if key else hint or kind.help()
 
 
-def key_rows(kinds: Collection[type[Command]]) -> list[tuple[str, str]]:
+def key_rows(commands: CommandList, kinds: Collection[type[Command]]) -> list[tuple[str, str]]:
     """Key and help of those that have a key, in the order of the list of commands."""
-    return [(key_in_words(kind.key), kind.help()) for kind in COMMANDS if kind.key and kind in kinds]
+    return [(key_in_words(kind.key), kind.help()) for kind in commands if kind.key and kind in kinds]
 
 
 def register(
@@ -42,19 +41,19 @@ def register(
     """
     keys = [
         (key.key, key.context, key.command, key.repeats)
-        for kind, key in COMMANDS.keys().items()
+        for kind, key in visitors.commands.keys().items()
         if kind in kinds
     ]
     server.gui.add_html(
         render(
             "all_keys",
-            rows=key_rows(kinds),
+            rows=key_rows(visitors.commands, kinds),
             keys=json.dumps(keys),
             contexts=contexts,
         ),
         order=_LAST,
     )
-    for kind in COMMANDS:
+    for kind in visitors.commands:
         if kind in kinds and kind.is_in_palette():
             add(server, visitors, kind.help(), kind(), key_in_words(kind.key))
     for tab, fold in places(server):

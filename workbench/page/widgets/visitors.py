@@ -14,9 +14,8 @@ import msgspec
 import viser
 from websockets.asyncio.server import ServerConnection
 
-from workbench.commands import COMMANDS
 from workbench.machine.loop import submit
-from workbench.page.command import Command, Refused
+from workbench.page.command import Command, CommandList, Refused
 from workbench.page.door.connection_limits import RareLog
 from workbench.page.widgets.templates import render
 
@@ -66,11 +65,14 @@ class Visitors:
     """The open pages of a server, and the one way by which they ask for anything: `do`.
 
     Args:
-        do: Changes with the page that is shown.
+        server: Of viser.
+        commands: All commands that a page can ask for.
     """
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, commands: CommandList) -> None:
+        self.commands = commands
         self.do: Do = _nothing
+        """Carries out a command; changes with the page that is shown."""
         self._told = RareLog()
         self._by_name: dict[str, Visitor] = {}
         self._by_client: dict[int, Visitor] = {}
@@ -134,7 +136,7 @@ class Visitors:
                 message = _decoder.decode(raw)
                 refused = ""
                 try:
-                    command = COMMANDS.decode(*message.do)
+                    command = self.commands.decode(*message.do)
                 except Refused as reason:
                     refused = str(reason)
                     visitor.tell(refused)
