@@ -163,9 +163,8 @@ def text(options: Options) -> Iterator[str]:
     packed = time.perf_counter() - began
     local, cluster, alone = middle["local"], middle["ray"], middle["one"]
     yield (
-        f"Measured on {date.today():%B %-d, %Y}, {CORES} cores, {options.task}, {options.episodes} episodes of 50 steps "
-        f"without pictures, {options.num_envs} envs a worker; medians of {options.turns} turns of all sides in one run "
-        "(`tests/benchmarks/cluster.py`)."
+        f"Measured on {date.today():%B %-d, %Y}: {CORES} cores, {options.task}, {options.episodes} episodes of 50 steps "
+        f"without pictures, {options.num_envs} envs a worker, medians of {options.turns} runs (`tests/benchmarks/cluster.py`)."
     )
     yield ""
     yield "| | episodes a second | first episode after | with the start |"
@@ -178,20 +177,18 @@ def text(options: Options) -> Iterator[str]:
         yield f"| {name} | {run.rate:.1f} | {run.start:.1f} s | {run.whole:.1f} |"
     yield ""
     yield (
-        f"Ray makes {cluster.rate / local.rate:.0%} of the local rate. Its daemons start once, in {started:.1f} s, and take "
-        f"their part of the same cores. From one core to {CORES} the local rate grows {local.rate / alone.rate:.2f} times."
+        f"Ray reaches {cluster.rate / local.rate:.0%} of the local rate; its daemons start in {started:.1f} s and use the same "
+        f"cores."
     )
     yield ""
-    yield "| what does not grow with the machines | cost |"
-    yield "| --- | ---: |"
-    yield f"| a request for a chunk through the post, and its answer | {1000 * trip:.1f} ms |"
-    yield f"| messages a second that the post takes, from two senders on these cores | {messages:,.0f} |"
-    yield f"| a result ({size} bytes) at the process that deals | {1e6 * taken:.0f} µs |"
-    yield f"| a result in the job file, on disk | {1000 * kept:.1f} ms |"
-    yield (
-        f"| the files that travel ({len(baggage.data) / 1e6:.1f} MB, the examples in `tasks/`), packed once | {1000 * packed:.0f} ms |"
+    print(
+        f"{local.rate / alone.rate:.2f} times the rate of one core on {CORES}\n"
+        f"{1000 * trip:.1f} ms: a request for a chunk through the post, and its answer\n"
+        f"{messages:,.0f} messages a second that the post takes, from two senders on these cores\n"
+        f"{1e6 * taken:.0f} µs: a result ({size} bytes) at the process that deals\n"
+        f"{1000 * kept:.1f} ms: a result in the job file, on disk\n"
+        f"{1000 * packed:.0f} ms: the files that travel ({len(baggage.data) / 1e6:.1f} MB, the examples in `tasks/`), packed"
     )
-    yield ""
     yield from on_paper(cluster.rate / CORES, messages, taken, kept, options.num_envs)
 
 
@@ -210,18 +207,10 @@ def on_paper(rate: float, messages: float, taken: float, kept: float, envs: int)
     }
     name, most = min(parts.items(), key=lambda pair: pair[1])
     yield (
-        f"So {MANY:,} cores would make {results:,.0f} such episodes a second, if their files have a place to go: "
-        f"{MANY:,} messages a second (each worker says once a second what it has made). The post could carry "
-        f"{parts['the post']:,.0f} episodes a second, the process that deals take {parts['the process that deals']:,.0f}, the "
-        f"job file keep {parts['the job file']:,.0f}. "
-        + (
-            f"The first that would be too slow is {name}, from {most / rate:,.0f} cores on: "
-            if most < results
-            else f"The first to be too slow is {name}, at {most / rate:,.0f} cores: "
-        )
-        + "then a job goes in parts, each with a cluster's driver of its own (`--shard`), and `merge` puts them together. "
-        f"Planned episodes take a core seconds each, and are far from that. The last chunk of {envs} envs ends alone: with "
-        f"fewer than some ten chunks a worker, cores wait for it."
+        f"Computed for {MANY:,} cores: {results:,.0f} such episodes a second. The post carries {parts['the post']:,.0f}, the "
+        f"process that deals takes {parts['the process that deals']:,.0f}, the job file keeps {parts['the job file']:,.0f}. "
+        f"The first limit is {name}, from {most / rate:,.0f} cores on. Beyond it use `--shard`, one driver for each part, and "
+        f"`merge`. Give each worker ten chunks of {envs} envs or more: the last chunk ends alone."
     )
 
 
